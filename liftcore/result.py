@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import AfterValidator, BaseModel, ConfigDict
 
+from liftcore.scene.views import composed
 from liftcore.settings import LiftSettings
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ class LiftMetadata(BaseModel):
     encoder: str = ""  # the 2D encoder's name as the pack tells it; "" when unknown
     text_space: str = ""  # the text encoder that shares the space; "" not named, "none" when there is none
     words: tuple[str, ...] = ()  # that its packs brought: it is asked in these without an encoder
-    views: tuple[str, ...]  # the views that were lifted
+    views: tuple[Annotated[str, AfterValidator(composed)], ...]  # the views that were lifted
     poses: str = ""  # of their cameras (`liftcore.io.lift_file.poses_of`); "" in older lifts
     certificate: dict[str, Any]
     timings: dict[str, float]  # seconds a stage

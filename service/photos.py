@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from liftcore.errors import InvalidCameras, InvalidPhotos, NotFound
+from liftcore.io.files import is_system_file
 from liftcore.scene.views import cameras_of_views, view_names
 
 MOST = 10_000  # photos in a zip
@@ -46,13 +47,9 @@ def describe_photos(path: Path) -> dict[str, Any]:
 
 def _members(entries: Collection[zipfile.ZipInfo]) -> dict[str, zipfile.ZipInfo]:
     """View -> photo, of what has the name of one; what systems put beside it (``__MACOSX``, dot files) has not."""
-    photos = [entry for entry in entries if _media_type(entry.filename) and not _beside(entry.filename)]
+    named = [(entry, PurePosixPath(entry.filename.replace("\\", "/"))) for entry in entries]
+    photos = [entry for entry, path in named if _media_type(entry.filename) and not is_system_file(path)]
     return dict(zip(view_names([photo.filename for photo in photos]), photos, strict=True))
-
-
-def _beside(name: str) -> bool:
-    path = PurePosixPath(name)
-    return path.name.startswith(".") or "__MACOSX" in path.parts
 
 
 def _media_type(name: str) -> str:

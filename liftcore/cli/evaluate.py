@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from liftcore.cli.options import THRESHOLDS, Parser, add_encoder, add_negative, text_encoder
 from liftcore.cli.reply import progress_bars, reply
 from liftcore.errors import InvalidInput
+from liftcore.io.files import visible_files
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -87,7 +88,7 @@ def find_lifts(given: Sequence[str], scenes: Collection[str]) -> dict[str, Path]
 
 
 def _named_lifts(path: Path, scenes: Collection[str]) -> list[tuple[str, Path]]:
-    files = sorted(path.glob(f"*{_LIFT_SUFFIX}")) if path.is_dir() else [path]
+    files = visible_files(path, f"*{_LIFT_SUFFIX}") if path.is_dir() else [path]
     named = [(file.name.partition(".")[0], file) for file in files]
     pairs = [(name, file) for name, file in named if name in scenes]
     if not pairs and len(scenes) == 1 and path.is_file():

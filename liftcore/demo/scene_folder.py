@@ -13,6 +13,7 @@ import numpy as np
 
 from liftcore.errors import InvalidInput
 from liftcore.features.pack import read_features
+from liftcore.io.files import visible_files
 from liftcore.query.text import BUILT_IN, NO_WORDS, OWN_WORDS
 
 if TYPE_CHECKING:
@@ -139,7 +140,7 @@ def find_scene(folder: Path, phrases: Sequence[str], scratch: Path, pack: Path |
 def _splats(folder: Path) -> Path:
     """The splats of a folder, or of the last iteration that a 3DGS trainer kept in it."""
     for suffix in _SPLATS:
-        found = sorted(folder.glob(f"*{suffix}")) or sorted(folder.glob(f"point_cloud/*/*{suffix}"))
+        found = visible_files(folder, f"*{suffix}") or visible_files(folder, f"point_cloud/*/*{suffix}")
         if found:
             return found[-1]
     raise InvalidInput(f"splats of {folder.name}", expected=f"a file of {', '.join(_SPLATS)}", got="none")
@@ -168,7 +169,7 @@ def _packs(folder: Path) -> list[Path]:
     """The feature packs of a folder, ``features.safetensors`` first."""
     from liftcore.io.kinds import kind_of
 
-    found = [path for path in sorted(folder.glob("*.safetensors")) if kind_of(path) == "features"]
+    found = [path for path in visible_files(folder, "*.safetensors") if kind_of(path) == "features"]
     if not found:
         raise InvalidInput(f"features of {folder.name}", expected="a feature pack (.safetensors)", got="none")
     return sorted(found, key=lambda path: path.name != "features.safetensors")

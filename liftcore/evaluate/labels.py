@@ -14,6 +14,8 @@ import numpy as np
 from PIL import Image, ImageDraw, UnidentifiedImageError
 
 from liftcore.errors import InvalidInput
+from liftcore.io.files import is_system_file, visible_files
+from liftcore.scene.views import composed
 
 Box = tuple[int, int, int, int]  # x1 y1 x2 y2, pixels, both ends inside
 
@@ -102,7 +104,7 @@ def lerf_scenes(data: Path) -> dict[str, LerfScene]:
     folders = sorted(path for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
     found = {}
     for folder in [*folders, root]:
-        files = {path.stem: path for path in sorted(folder.glob("*.json"))}
+        files = {composed(path.stem): path for path in visible_files(folder, "*.json")}
         if files:
             found[folder.name] = LerfScene(folder.name, files)
     if not found:
@@ -191,7 +193,7 @@ class ThreeDOvsScene:
             InvalidInput: a mask is no image, or the view has masks of none of the classes.
         """
         folder = self.folders[view]
-        found = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() in _SUFFIXES}
+        found = {composed(path.stem): path for path in visible_files(folder) if path.suffix.lower() in _SUFFIXES}
         if not any(name in found for name in self.classes):
             got = ", ".join(sorted(found)[:3]) or "no images"
             raise InvalidInput(str(folder), expected=f"masks named like the classes of {_CLASSES}", got=got)
@@ -213,7 +215,8 @@ def three_d_ovs_scenes(data: Path) -> dict[str, ThreeDOvsScene]:
     for root in roots:
         labels = root / "segmentations"
         if (labels / _CLASSES).is_file():
-            views = {path.name: path for path in sorted(labels.iterdir()) if path.is_dir()}
+            folders = [path for path in sorted(labels.iterdir()) if path.is_dir()]
+            views = {composed(path.name): path for path in folders if not is_system_file(Path(path.name))}
             name = root.resolve().name
             found[name] = ThreeDOvsScene(name, _classes(labels / _CLASSES), views)
     if not found:
@@ -227,7 +230,7 @@ def _classes(path: Path) -> tuple[str, ...]:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InvalidInput(str(path), expected="a class a line", got=str(error)[:120]) from None
-    names = tuple(dict.fromkeys(line.strip() for line in lines if line.strip()))
+    names = tuple(dict.fromkeys(composed(line.strip()) for line in lines if line.strip()))
     if not names:
         raise InvalidInput(str(path), expected="a class a line", got="none")
     return names

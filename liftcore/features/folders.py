@@ -1,7 +1,7 @@
 """Folders of NumPy files, a view a file: dense maps, LangSplat's regions, and what masks are read from.
 
 ``camA/000.npy`` is of the view ``camA/000``, as rigs have them, and ``IMG.jpg.npy`` of the view ``IMG``, as the
-camera of ``IMG.jpg`` is. Hidden sub-folders are left out.
+camera of ``IMG.jpg`` is. Hidden files and folders are left out, and what systems put beside files.
 
 LangSplat's ``IMG_s.npy`` [L, H, W] holds mask ids, -1 for none, counted on over the levels, so that an id is a row of
 ``IMG_f.npy`` [M, F]. Occam's LGS, OpenGaussian, LaGa and VALA write the same files.
@@ -15,8 +15,9 @@ import numpy as np
 
 from liftcore.errors import InvalidFeatures
 from liftcore.features.views import NO_LABEL, FeatureGrid, Regions, ViewFeatures
+from liftcore.io.files import visible_files
 from liftcore.io.npy import open_npy, read_floats
-from liftcore.scene.views import without_image_suffix
+from liftcore.scene.views import composed, without_image_suffix
 
 PICKLED = (".pt", ".pth", ".pkl")
 LABELS, CODEBOOK = "_s.npy", "_f.npy"  # of LangSplat
@@ -76,7 +77,7 @@ def langsplat_views(folder: Path) -> ViewFolder[Regions]:
             malformed, an id has no embedding, or an embedding is not finite.
     """
     files = npy_files(folder, LABELS)
-    labels = {path.relative_to(folder).as_posix().removesuffix(LABELS): path for path in files}
+    labels = {composed(path.relative_to(folder).as_posix().removesuffix(LABELS)): path for path in files}
     codebooks = {view: path.with_name(path.name.removesuffix(LABELS) + CODEBOOK) for view, path in labels.items()}
     for view, path in codebooks.items():
         if not path.is_file():
@@ -115,9 +116,8 @@ def mask_ids(stored: np.ndarray, rows: int, path: Path) -> np.ndarray:
 
 
 def files_below(folder: Path) -> list[Path]:
-    """The files of a folder and its sub-folders, sorted; hidden sub-folders are left out."""
-    inner = {path: path.relative_to(folder).parts[:-1] for path in sorted(folder.rglob("*")) if path.is_file()}
-    return [path for path, parts in inner.items() if not any(part.startswith(".") for part in parts)]
+    """The files of a folder and its sub-folders, sorted, without those of `is_system_file`."""
+    return visible_files(folder, "**/*")
 
 
 def npy_files(folder: Path, suffix: str) -> list[Path]:

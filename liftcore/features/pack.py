@@ -28,7 +28,7 @@ from liftcore.io.safetensors_file import MAX_HEADER_BYTES, TYPES, check_header, 
 from liftcore.progress import Progress, silent
 from liftcore.query.text.table import TableEncoder
 from liftcore.scene.cameras import Camera
-from liftcore.scene.views import require_pairs
+from liftcore.scene.views import composed, require_pairs
 from liftcore.torch_modes import callers_modes
 
 U8_NO_LABEL = 255
@@ -93,7 +93,8 @@ class Views(Mapping[str, ViewFeatures]):
         if found.codebook.shape[1] != self.channels:
             got = f"{found.codebook.shape[1]} in {view!r}"
             raise InvalidFeatures("features", expected=f"{self.channels} channels in every view", got=got)
-        return as_pinhole_sees(found, self._cameras[view]) if view in self._cameras else found
+        camera = self.seeing(view)
+        return found if camera is None else as_pinhole_sees(found, camera)
 
     def is_regions(self, view: str) -> bool:
         """Whether the view is a region map; else it is a grid."""
@@ -102,7 +103,7 @@ class Views(Mapping[str, ViewFeatures]):
     def specs(self, view: str) -> dict[str, TensorSpec]:
         """The tensors of a view by part (labels and codebook, or grid), from the header alone."""
         specs = dict(self._find(view).specs)
-        camera = self._cameras.get(view)
+        camera = self.seeing(view)
         if camera is None or (camera.lens is None and camera.face is None):
             return specs
         if "grid" in specs:
@@ -125,12 +126,13 @@ class Views(Mapping[str, ViewFeatures]):
 
     def seeing(self, view: str) -> Camera | None:
         """The camera whose pinhole sees the view; None of views that are not paired."""
-        return self._cameras.get(view)
+        return self._cameras.get(composed(view))
 
     def _find(self, view: str) -> _Source:
-        if view not in self._sources:
+        found = self._sources.get(composed(view))
+        if found is None:
             raise InvalidFeatures("view", expected="a view of the features", got=repr(view))
-        return self._sources[view]
+        return found
 
 
 def as_views(
@@ -158,8 +160,7 @@ def as_views(
     if not isinstance(views, Mapping):
         return _spooled(views, scratch)
     given = cast("Mapping[str, ViewFeatures]", views)
-    _check_names(given)
-    sources = {name: _Given(given, name) for name in given}
+    sources = {name: _Given(given, key) for name, key in _composed_names(given).items()}
     if not sources:
         raise InvalidFeatures("features", expected="at least one view", got="none")
     if isinstance(views, dict):  # other mappings may read files: theirs are checked one by one
@@ -180,11 +181,11 @@ def read_features(*paths: str | Path) -> Views:
     sources: dict[str, _Stored] = {}
     channels: dict[int, str] = {}
     for pack in packs:
-        for view in _views(pack):
+        for view, stored in _composed_names(_views(pack)).items():
             if view in sources:
                 got = f"{view!r} in {sources[view].pack.path} and {pack.path}"
                 raise InvalidFeatures("features", expected="each view in one pack", got=got)
-            sources[view] = _Stored(pack, view)
+            sources[view] = _Stored(pack, stored)
             channels.setdefault(_check_specs(sources[view]), sources[view].where)
     if not sources:
         raise InvalidFeatures("features", expected="at least one view", got=f"{len(packs)} packs without any")
@@ -306,7 +307,7 @@ def _spooled(pairs: Iterable[tuple[str, ViewFeatures]], scratch: Path | None) ->
                 got = type(pair).__name__
                 raise InvalidFeatures("features", expected="pairs of a name and a view", got=got)
             name, features = pair
-            _check_names([name])
+            (name,) = _composed_names([name])
             if name in files:
                 raise InvalidFeatures("features", expected="each view once", got=f"{name!r} twice")
             files[name] = Path(folder, f"{len(files)}.safetensors")
@@ -325,11 +326,17 @@ def _spooled(pairs: Iterable[tuple[str, ViewFeatures]], scratch: Path | None) ->
         return replace(read_features(*files.values()), paths=())  # mapped: the files may lose their names
 
 
-def _check_names(names: Iterable[Any]) -> None:
-    strange = next((name for name in names if not isinstance(name, str)), None)
-    if strange is not None:
-        expected, got = "names that are texts, as of cameras", f"{type(strange).__name__} {strange!r}"[:80]
-        raise InvalidFeatures("features", expected=expected, got=got)
+def _composed_names(names: Iterable[Any]) -> dict[str, str]:
+    """Composed name (NFC) -> the name as it came."""
+    found: dict[str, str] = {}
+    for name in names:
+        if not isinstance(name, str):
+            expected, got = "names that are texts, as of cameras", f"{type(name).__name__} {name!r}"[:80]
+            raise InvalidFeatures("features", expected=expected, got=got)
+        if found.setdefault(composed(name), name) != name:
+            got = f"{name!a} and {found[composed(name)]!a}, which are one name in other forms of Unicode"
+            raise InvalidFeatures("features", expected="each view once", got=got[:200])
+    return found
 
 
 def _in_callers_modes(values: Iterable[Any]) -> Iterator[Any]:

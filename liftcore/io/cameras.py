@@ -16,7 +16,7 @@ from typing import TypeVar
 
 from liftcore.errors import InvalidCameras, Unavailable
 from liftcore.io.colmap import MODEL_FILES, has_model, is_whole, model_files, read_colmap
-from liftcore.io.files import BROKEN_ZIP, refuse_pointer
+from liftcore.io.files import BROKEN_ZIP, is_system_file, refuse_pointer
 from liftcore.io.inria import parse_inria
 from liftcore.io.json_file import read_json
 from liftcore.io.remote import local_path
@@ -232,7 +232,7 @@ def _models_below(folder: Path) -> list[PurePosixPath]:
     for parent, inner, files in islice(os.walk(folder), MAX_FOLDERS):
         here = Path(parent).relative_to(folder)
         names += [(here / name).as_posix() for name in files if name in MODEL_FILES]
-        inner[:] = [name for name in sorted(inner) if not name.startswith(".") and len(here.parts) < DEPTH]
+        inner[:] = [name for name in sorted(inner) if len(here.parts) < DEPTH and not is_system_file(Path(name))]
     return _whole_models(names)
 
 
@@ -316,7 +316,7 @@ def _files(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
     for member in archive.infolist():
         parts = PurePosixPath(member.filename.replace("\\", "/")).parts
         inner = [part for part in parts if part not in ("/", "..")]
-        if inner and not member.is_dir() and not any(part.startswith(".") for part in inner):
+        if inner and not member.is_dir() and not is_system_file(PurePosixPath(*inner)):
             files["/".join(inner)] = member
     return files
 

@@ -12,6 +12,7 @@ import torch
 from liftcore.errors import InvalidMasks
 from liftcore.features.pack import U8_NO_LABEL
 from liftcore.io.safetensors_file import check_header
+from liftcore.scene.views import composed
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -72,7 +73,7 @@ def _masks(path: Path, classes: int | None) -> Iterator[tuple[str, Tensor, int]]
                 mask = handle.get_tensor(name).long()
                 if part.get_dtype() == "U8":  # as in the labels of feature packs: it has no -1
                     mask[mask == U8_NO_LABEL] = NO_CLASS
-                yield name.removesuffix("/mask"), mask, _highest(where, mask, classes)
+                yield composed(name.removesuffix("/mask")), mask, _highest(where, mask, classes)
     except (SafetensorError, OSError) as error:
         got = f"a file that does not open as one ({str(error)[:120]})"
         raise InvalidMasks(str(path), expected=EXPECTED, got=got) from None

@@ -13,13 +13,15 @@ from __future__ import annotations
 
 import hashlib
 import os
+import unicodedata
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from liftcore.errors import InvalidInput, InvalidLift
+from liftcore.io.files import visible_files
 from liftcore.io.remote import landing, local_path
 from liftcore.io.safetensors_file import map_tensors
 from liftcore.io.shards import INDEX, SUFFIX, map_shards, write_shards
@@ -164,7 +166,7 @@ def input_file(path: Path) -> InputFile:
         return InputFile(path=str(resolved), sha256=sha256_of(resolved))
     return InputFile(
         path=str(resolved),
-        sha256=_digest_of_several(sorted(file for file in resolved.iterdir() if file.is_file()), resolved),
+        sha256=_digest_of_several(visible_files(resolved), resolved),
     )
 
 
@@ -215,7 +217,7 @@ def _beside(lift: Path, path: Path) -> Iterator[Path]:
     for above in (folder, *folder.parents[:NEAR]):
         yield from (above.joinpath(*parts[-count:]) for count in range(1, min(len(parts), NEAR) + 1))
     if path.suffix:
-        yield from sorted(other for other in folder.glob(f"*{path.suffix}") if other != lift)[:MOST_BESIDE]
+        yield from [other for other in visible_files(folder, f"*{path.suffix}") if other != lift][:MOST_BESIDE]
 
 
 def has_poses(place: Path, metadata: LiftMetadata) -> bool:
@@ -232,15 +234,18 @@ def has_poses(place: Path, metadata: LiftMetadata) -> bool:
         return False
     cameras = read_cameras(place, choosing=False)
     known = [cameras[view] for view in metadata.views if view in cameras]
-    return len(known) == len(metadata.views) and poses_of(known) == metadata.poses
+    if len(known) != len(metadata.views):
+        return False
+    # Lifts from before names were composed have the digest of those that a Mac gave.
+    return metadata.poses in (poses_of(known), poses_of(known, "NFD"))
 
 
-def poses_of(cameras: Sequence[Camera]) -> str:
-    """A digest of what cameras see, in their order."""
+def poses_of(cameras: Sequence[Camera], form: Literal["NFC", "NFD"] = "NFC") -> str:
+    """A digest of what cameras see, in their order, with their names in a form of Unicode."""
     total = hashlib.sha256()
     for camera in cameras:
         total.update(camera.viewmat.tobytes() + camera.K.tobytes())
-        seen = (camera.name, camera.width, camera.height, camera.lens)
+        seen = (unicodedata.normalize(form, camera.name), camera.width, camera.height, camera.lens)
         total.update(repr(seen if camera.face is None else (*seen, camera.face)).encode())
     return total.hexdigest()
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from liftcore.errors import InvalidSplats
-from liftcore.io.files import BROKEN_ZIP
+from liftcore.io.files import BROKEN_ZIP, visible_files
 from liftcore.io.quantised import MOST_GROWTH, Fields, decoded, field_shapes, logits, smallest_three
 
 META = "meta.json"
@@ -37,7 +37,9 @@ def read_sog(path: Path, *, colour: bool = True) -> Fields:
     """
     try:
         if path.is_dir():
-            return _Pictures(path, path, sum(file.stat().st_size for file in path.iterdir())).fields(colour=colour)
+            return _Pictures(path, path, sum(file.stat().st_size for file in visible_files(path))).fields(
+                colour=colour
+            )
         with zipfile.ZipFile(path) as archive:
             return _Pictures(zipfile.Path(archive), path, path.stat().st_size).fields(colour=colour)
     except BROKEN_ZIP as error:

@@ -14,7 +14,7 @@ from liftcore.errors import InvalidCameras, NotFound
 from liftcore.nearest import nearest
 from liftcore.scene.distortion import MAX_SIDE, Distortion, Lens, Rectangle, shared_lens
 from liftcore.scene.panorama import TURNS, Face
-from liftcore.scene.views import cameras_of_views, without_image_suffix
+from liftcore.scene.views import cameras_of_views, composed, without_image_suffix
 
 if TYPE_CHECKING:  # torch is taken, and not loaded for it
     from torch import Tensor
@@ -49,7 +49,7 @@ class Camera:
         width: pixels. height: pixels.
         lens: of a distorted photo, which this pinhole stands for; None: the photo is as it says.
         face: of a panorama, whose features this pinhole reads; None: of no panorama.
-        name: the image's name without its extension; pairs the view with its features.
+        name: the image's name without its extension; pairs the view with its features. Kept composed (NFC).
 
     Raises:
         InvalidCameras: a size, an intrinsic or the pose is out of range; the error names which.
@@ -75,7 +75,7 @@ class Camera:
         name: str = "",
     ) -> None:
         fields = {"viewmat": _matrix(viewmat), "K": _matrix(K), "width": _pixels(width), "height": _pixels(height)}
-        for field, value in {**fields, "lens": lens, "face": face, "name": name}.items():
+        for field, value in {**fields, "lens": lens, "face": face, "name": composed(name)}.items():
             object.__setattr__(self, field, value)
         if not (0 < self.width <= MAX_SIDE and 0 < self.height <= MAX_SIDE):
             self._refuse("size", f"width and height, whole numbers in 1..{MAX_SIDE}", f"{width!r} x {height!r}")
@@ -236,7 +236,7 @@ class Cameras(Mapping[str, Camera]):
             NotFound: no view has it; the error, which is a KeyError, names the nearest ones.
         """
         plain = without_image_suffix(name)  # a photo's file names its view
-        found = self._by_name.get(name) or self._by_name.get(plain)
+        found = self._by_name.get(composed(name)) or self._by_name.get(plain)
         found = found or self._by_name.get(cameras_of_views([plain], self).get(plain, ""))
         if found is None:
             got, hint = repr(name[:SHOWN]), nearest(name, self, NEAREST)
@@ -245,7 +245,7 @@ class Cameras(Mapping[str, Camera]):
 
     def __contains__(self, name: object) -> bool:
         """Whether a view has exactly that name."""
-        return name in self._by_name
+        return isinstance(name, str) and composed(name) in self._by_name
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._by_name)

@@ -1,8 +1,13 @@
-"""The names that pair cameras, photos and their features."""
+"""The names that pair cameras, photos and their features.
+
+Names are compared, and made, in Unicode's composed form (NFC): macOS stores the name of a file decomposed (NFD), and
+other systems and JSON hold the same name composed.
+"""
 
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections import Counter
 from collections.abc import Collection, Sequence
 from pathlib import PurePosixPath
@@ -18,6 +23,11 @@ NAMED_AFTER = (
     "repeat (camA/000)"
 )
 UNSAYABLE = re.compile("[\\x00-\\x1f\\x7f\\ud800-\\udfff]")
+
+
+def composed(name: str) -> str:
+    """The name in Unicode's composed form (NFC)."""
+    return unicodedata.normalize("NFC", name)
 
 
 def view_names(images: Sequence[str]) -> list[str]:
@@ -38,8 +48,8 @@ def view_names(images: Sequence[str]) -> list[str]:
 
 
 def without_image_suffix(image: str) -> str:
-    """The relative path of an image without its extension, if that is one of images."""
-    path = PurePosixPath(image.replace("\\", "/").removeprefix("./"))
+    """The relative path of an image, composed, without its extension, if that is one of images."""
+    path = PurePosixPath(composed(image).replace("\\", "/").removeprefix("./"))
     return str(path.with_suffix("")) if path.suffix.lower() in IMAGE_SUFFIXES else str(path)
 
 
@@ -47,18 +57,22 @@ def cameras_of_views(views: Collection[str], cameras: Collection[str]) -> dict[s
     """View -> camera, of the views that have one.
 
     Names pair as they are. Else one may have folders before it that the other leaves out, where no other view and no
-    other camera has the same last part: ``camA/000`` and ``000``, but never ``train/000`` and ``test/000``.
+    other camera ends like the shorter one: ``/photos/camA/000`` and ``camA/000``, ``camA/000`` and ``000``, but never
+    ``train/000`` and ``test/000``.
     """
-    known = set(cameras)
-    named, seen = Counter(map(_last, views)), Counter(map(_last, cameras))
-    alone = {_last(camera): camera for camera in cameras if seen[_last(camera)] == 1}
+    known = {composed(camera): camera for camera in cameras}
+    named = {composed(view): view for view in views}
+    ends = Counter(ending for name in named for ending in _endings(name))
+    ending_in = Counter(ending for name in known for ending in _endings(name))
+    alone = {ending: name for name in known for ending in _endings(name) if ending_in[ending] == 1}
     pairs = {}
-    for view in views:
-        other = alone.get(_last(view)) if named[_last(view)] == 1 else None
-        if view in known:
-            pairs[view] = view
-        elif other is not None and (_ends(view, other) or _ends(other, view)):
-            pairs[view] = other
+    for name, view in named.items():
+        shorter = (ending for ending in _endings(name) if ending == name or ending in known)
+        found = next((alone[ending] for ending in shorter if ending in alone and ends[ending] == 1), None)
+        if name in known:
+            pairs[view] = known[name]
+        elif found is not None:
+            pairs[view] = known[found]
     return pairs
 
 
@@ -84,9 +98,7 @@ def some_of(names: Collection[str]) -> str:
     return ", ".join(repr(name) for name in sorted(names)[:3])
 
 
-def _last(name: str) -> str:
-    return name.rpartition("/")[2]
-
-
-def _ends(name: str, end: str) -> bool:
-    return name.endswith(f"/{end}")
+def _endings(name: str) -> list[str]:
+    """The name, the name without its first folder, without its first two, and so on, down to the last part."""
+    parts = name.split("/")
+    return ["/".join(parts[start:]) for start in range(len(parts))]

@@ -150,7 +150,7 @@ def _images_of(path: Path) -> list[Path]:
         return [path]
     if not path.is_dir():
         raise InvalidInput("images", expected="images or folders of images", got=f"nothing at {path}")
-    files = [file for file in files_below(path) if not file.name.startswith(".")]
+    files = files_below(path)
     images = [file for file in files if file.suffix.lower() in IMAGE_SUFFIXES]
     if not images:
         raise InvalidInput(str(path), expected="readable images (.jpg, .png, ...)", got=f"{len(files)} other files")

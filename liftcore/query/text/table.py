@@ -2,6 +2,7 @@
 
 import json
 import re
+import unicodedata
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Self
@@ -19,8 +20,11 @@ _NEAREST = 5  # words named when one is unknown
 
 
 def plain(text: str) -> str:
-    """The text as tables compare it: cases, ``_`` for a space and a leading article make no difference."""
-    parts = text.casefold().replace("_", " ").split()
+    """The text as tables compare it, in Unicode's composed form.
+
+    Cases, ``_`` for a space and a leading article make no difference.
+    """
+    parts = unicodedata.normalize("NFC", text.casefold()).replace("_", " ").split()
     return " ".join(parts[1:] if len(parts) > 1 and parts[0] in _ARTICLES else parts)
 
 

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import io
+import zipfile
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from liftcore.errors import InvalidFeatures
-from liftcore.features.folders import array_views, langsplat_views
+from liftcore.features.folders import array_views, files_below, langsplat_views
 from liftcore.features.pack import read_features, write_pack
 from liftcore.features.views import Regions
 from liftcore.io.npy import open_npy
+from service.photos import describe_photos
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -136,3 +139,29 @@ def test_arrays_that_are_broken_or_bombs_are_refused(content: bytes | None, mess
     with pytest.raises(InvalidFeatures, match=message) as caught:
         open_npy(tmp_path / "a.npy")
     assert "\n" not in str(caught.value)
+
+
+BESIDE = (
+    "._frame_1_s.npy",
+    ".DS_Store",
+    "Thumbs.db",
+    "desktop.ini",
+    "__MACOSX/frame_2_s.npy",
+    ".cache/frame_2_s.npy",
+)
+
+
+def test_what_systems_put_beside_files_is_left_out(tmp_path: Path) -> None:
+    langsplat(tmp_path)
+    for name in BESIDE:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"\x00\x05\x16\x07\x00\x02\x00\x00Mac OS X")
+    assert [*langsplat_views(tmp_path)] == ["frame_1"]
+    assert [path.name for path in files_below(tmp_path)] == ["frame_1_f.npy", "frame_1_s.npy"]
+    assert [path.name for path in files_below(tmp_path / ".cache")] == ["frame_2_s.npy"]  # what is named is read
+    photo = io.BytesIO()
+    Image.new("RGB", (4, 3)).save(photo, format="PNG")
+    with zipfile.ZipFile(tmp_path / "photos.zip", "w") as archive:
+        for name in ("a/IMG.png", "a/._IMG.png", "__MACOSX/a/._IMG.png", "__MACOSX\\a\\IMG.png", "a/Thumbs.db"):
+            archive.writestr(name, photo.getvalue() if name == "a/IMG.png" else b"no photo")
+    assert describe_photos(tmp_path / "photos.zip")["names"] == ["IMG"]

@@ -318,3 +318,24 @@ def test_real_packs_pair_with_their_cameras(shared_data: Path) -> None:
     assert isinstance(view, Regions)
     assert view.labels.shape == (4, 371, 495)
     assert len(read_features(shared_data / "tabletop" / "features_hard.safetensors").views) == 52
+
+
+MAC, OTHERS = "Ku\u0308che_0", "K\u00fcche_0"  # one name, decomposed and composed
+
+
+@pytest.mark.parametrize(("stored", "photographed"), [(MAC, OTHERS), (OTHERS, MAC), (MAC, MAC)])
+def test_a_name_of_a_mac_is_the_name_of_other_systems(stored: str, photographed: str, tmp_path: Path) -> None:
+    save_file({f"{stored}/grid": torch.ones(2, 2, 3)}, tmp_path / "a.pack")
+    cameras = Cameras([Camera.pinhole(photographed, 4, 3, 4.0, 4.0, 2.0, 1.5, np.eye(4))])
+    for views in (read_features(tmp_path / "a.pack"), as_views({stored: FeatureGrid(np.ones((2, 2, 3)))})):
+        paired, left_over = pair(views, cameras)
+        assert (paired.views, left_over) == ((OTHERS,), [])
+        assert torch.equal(paired[photographed].codebook, torch.ones(4, 3))
+        assert torch.equal(views[MAC].codebook, views[OTHERS].codebook)
+    assert cameras[MAC] is cameras[OTHERS] and MAC in cameras and OTHERS in cameras
+
+
+def test_a_pack_with_both_forms_of_a_name_is_refused(tmp_path: Path) -> None:
+    save_file({f"{name}/grid": torch.ones(2, 2, 3) for name in (MAC, OTHERS)}, tmp_path / "a.pack")
+    with pytest.raises(InvalidFeatures, match=r"each view once.*forms of Unicode"):
+        read_features(tmp_path / "a.pack")

@@ -156,6 +156,11 @@ def test_a_lift_of_prompts_is_asked_in_its_words_alone(tmp_path: Path, capsys: p
         result.query("mug")
 
 
+def test_phrases_of_a_mac_are_asked_as_they_are_typed(tmp_path: Path) -> None:
+    found = prompt_views(save(tmp_path, {"ku\u0308che/a.png": MASKS["middle"]["Lamp"]}))
+    assert found.table.encode(["K\u00fcche"]).tolist() == [[1, 0]]
+
+
 def test_masks_that_overlap_count_for_both_phrases(tmp_path: Path) -> None:
     mask = MASKS["middle"]["Lamp"]
     nothing, everything = np.zeros_like(mask), np.ones_like(mask)

@@ -20,8 +20,11 @@ from liftcore.io import cameras, json_file
 from liftcore.io.cameras import MODEL_FOLDERS, other_models, read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.inspect import describe_camera_file, inspect_file
+from liftcore.io.lift_file import has_poses, poses_of
+from liftcore.result import LiftMetadata
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.distortion import Brown, Fisheye, Lens
+from liftcore.settings import LiftSettings
 
 ONE = IMAGES[:1]
 OPENCV = Brown(k1=0.01, k2=-0.02, p1=0.001, p2=0.002)
@@ -350,3 +353,24 @@ def test_error_in_a_zip_names_the_zip(tmp_path: Path) -> None:
     path.write_bytes(content)
     with pytest.raises(InvalidCameras, match="a zip of a COLMAP sparse model, got one that does not open"):
         read_cameras(path)
+
+
+def test_lifts_that_remember_names_as_a_mac_wrote_them_know_their_cameras(tmp_path: Path) -> None:
+    """As lifts of before were: names decomposed (NFD), and the digest of their poses too."""
+    frames = [{"file_path": f"Ku\u0308che_{k}.png", "transform_matrix": np.eye(4).tolist()} for k in range(2)]
+    path = with_json(tmp_path, {"w": 4, "h": 3, "fl_x": 4.0, "fl_y": 4.0, "frames": frames})
+    found = read_cameras(path)
+    assert [*found] == ["K\u00fcche_0", "K\u00fcche_1"]
+    views = tuple(f"Ku\u0308che_{k}" for k in range(2))
+    known = [found[view] for view in views]
+    old = LiftMetadata(
+        version="0.4.0",
+        settings=LiftSettings.of(),
+        views=views,
+        poses=poses_of(known, "NFD"),
+        certificate={},
+        timings={},
+    )
+    assert old.views == tuple(found) and has_poses(path, old)
+    assert has_poses(path, old.model_copy(update={"poses": poses_of(known)}))
+    assert not has_poses(path, old.model_copy(update={"poses": poses_of(known[:1])}))

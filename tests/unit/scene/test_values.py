@@ -208,6 +208,10 @@ def test_bombs_of_empty_images_are_refused(tmp_path: Path) -> None:
         (["images/camA/0"], ["camA/0"], {"images/camA/0": "camA/0"}),
         (["train/0"], ["test/0"], {}),  # folders that disagree are other photos
         (["A/0"], ["camA/0"], {}),  # whole folders only
+        # Folders may go on before those that tell cameras of a rig apart.
+        (["/d/camA/0", "/d/camB/0"], ["camA/0", "camB/0"], {"/d/camA/0": "camA/0", "/d/camB/0": "camB/0"}),
+        (["0", "camB/0"], ["camA/0"], {}),
+        (["K\u00fcche_0", "K\u00fcche_1"], ["Ku\u0308che_1"], {"K\u00fcche_1": "Ku\u0308che_1"}),  # of a Mac
     ],
 )
 def test_names_pair_as_they_are_or_by_their_last_part_where_it_is_one_of_a_kind(
