@@ -210,9 +210,11 @@ def pace_of(settings: ServiceSettings) -> Pace:
 
 def server_of(app: FastAPI, settings: ServiceSettings, announce: Callable[[str], None] = say) -> AnnouncingServer:
     """The server of an application, which announces the address at which it listens."""
+    proxies = settings.forwarded_allow
     config = uvicorn.Config(
         app, http=watched(pace_of(settings)), log_config=None, log_level="warning", access_log=False,
         server_header=False, ws="none", timeout_graceful_shutdown=math.ceil(settings.stop_seconds),
+        proxy_headers=bool(proxies), forwarded_allow_ips=proxies,
     )  # fmt: skip
     return AnnouncingServer(config, app.state.stopping, announce)
 
@@ -252,6 +254,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             log.warning("SPLATLIFT_KEYS is none: nobody needs a key, though keys were made for %s", settings.data)
         try:
             app = assemble(settings, store)
+            app.state.documents.get(keys=False)  # for whoever comes first, and for all who come at once
             keep_pauses_short()
             announce = partial(say_in_json, data=settings.data) if "json" in options(given) else say
             server_of(app, settings, announce).run(sockets=[listener])

@@ -73,7 +73,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
         openapi_url=None,  # `service.routes.operations` tells it, and of keys, beside the event loop
         redirect_slashes=False,
     )
-    app.state.stopping, app.state.metrics = stopping, metrics
+    app.state.stopping, app.state.metrics, app.state.documents = stopping, metrics, operations.Documents(app)
     app.add_middleware(AnswerHead)
     app.add_middleware(Gate, keys=store.keys, settings=settings, stopping=lambda: stopping.begun)
     app.add_middleware(Turns)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import json
 import os
 import signal
 import sys
 import threading
 from collections.abc import Mapping
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from liftcore.errors import SplatliftError
 
@@ -24,6 +25,11 @@ def own_stdout() -> BinaryIO:
     out = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     return out
+
+
+def line_of(message: Mapping[str, Any]) -> bytes:
+    """A message as a line of JSON in UTF-8: of many names in other scripts, escapes would be three times that."""
+    return json.dumps(message, ensure_ascii=False).encode("utf-8", "surrogatepass") + b"\n"
 
 
 def end_with_parent(lifeline: int | None = None) -> None:

@@ -27,8 +27,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NoReturn
 
-from service.child import die_with_parent, end_with_parent, memory_of
-from service.errors import Busy, Crashed
+from service.child import die_with_parent, end_with_parent, line_of, memory_of
+from service.errors import Busy
 
 IMPORTED = ("service.uploads.check", "service.jobs.planning")  # by the template
 TICK_SECONDS = 0.5  # how soon the end of the server is seen by who waits
@@ -118,8 +118,7 @@ class _Template:
         """A new task.
 
         Raises:
-            Busy: the system has no room for a process.
-            Crashed: the template does not start.
+            Busy: the system has no room for a process, or the template does not start.
         """
         with contextlib.ExitStack() as theirs, contextlib.ExitStack() as ours:
             ends = []
@@ -132,7 +131,7 @@ class _Template:
             with self._turn:
                 pid = self._ask(request, given) or self._ask(request, given)  # it may have died while idle
             if not pid:
-                raise Crashed("check", expected="a process that starts", got="one that ended")
+                raise Busy("upload", expected="a process that starts", got="one that ended", hint="try again soon")
             if pid < 0:
                 raise Busy("upload", expected="room for a process", got="none", hint="try again soon")
             ours.pop_all()
@@ -169,8 +168,7 @@ def run_errand(module: str, arguments: Sequence[str], scratch: Path, limits: Err
         What it said; None when it took longer than it may, and was ended.
 
     Raises:
-        Busy: the server ended meanwhile, or the system has no room for a process.
-        Crashed: there is no process at all.
+        Busy: the server ended meanwhile, or there is no process.
     """
     request = {
         "module": module, "arguments": list(arguments), "scratch": str(scratch), "memory": limits.memory_bytes,
@@ -311,7 +309,7 @@ def _work(request: dict[str, Any], said: int, lifeline: int) -> NoReturn:
 
 
 def _say(said: int, message: dict[str, Any]) -> None:
-    line = memoryview(json.dumps(message).encode() + b"\n")
+    line = memoryview(line_of(message))
     while line:
         line = line[os.write(said, line) :]
 

@@ -23,6 +23,7 @@ SAFE_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
     "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",  # renders and photos are no other site's to show
     "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
 }
 

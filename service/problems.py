@@ -37,6 +37,8 @@ UNUSABLE = (
     sqlite3.SQLITE_READONLY, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_CANTOPEN,
     sqlite3.SQLITE_NOTADB,
 )  # fmt: skip
+# Of the disk: it may only be read, fails, or was taken away.
+UNWRITABLE = (errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ENODEV, errno.ESTALE)
 NO_SPACE = "There is no room left"
 BUSY = "The server is busy"
 MALFORMED = "The request is malformed"
@@ -158,6 +160,10 @@ def _of_system(what: str, error: Exception) -> JSONResponse:
         log.error("%s: the disk is full", what)
         detail = "The server's disk is full; what was sent is not kept."
         return answer(Problem(type="/problems/no-space", title=NO_SPACE, status=507, detail=detail))
+    if isinstance(error, OSError) and error.errno in UNWRITABLE:
+        log.error("%s: the data directory cannot be used", what, exc_info=error)
+        got = f"another: {error.strerror}"  # without its file, which is the server's
+        return answer_to(errors.NotReady("disk", expected="a disk that can be read and written", got=got))
     if code is not None and code & 0xFF in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
         log.error("%s: another process holds the database", what)
         return answer_to(errors.Busy("database", expected="a turn at it", got="one that another process holds"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import email.message
 import json
+import re
 from collections.abc import Iterator
 from typing import Annotated, Any, TypeVar
 
@@ -13,9 +14,10 @@ from fastapi.dependencies.models import Dependant
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import APIRoute
 from pydantic import BaseModel, ValidationError
-from pydantic.json_schema import models_json_schema
+from pydantic.json_schema import JsonSchemaMode, models_json_schema
 from starlette.exceptions import HTTPException
 
+from service import models
 from service.errors import InvalidRequest, UnreadableBody
 from service.models import NAME_CHARACTERS, one_of
 from service.problems import CLOSE
@@ -127,8 +129,11 @@ def described_body(model: type[BaseModel]) -> dict[str, Any]:
     return {"requestBody": {"required": True, "content": {"application/json": {"schema": schema}}}}
 
 
-def with_bodies(document: dict[str, Any], *models: type[BaseModel]) -> dict[str, Any]:
-    """An OpenAPI document with the schemas of these bodies."""
-    _, found = models_json_schema([(model, "validation") for model in models], ref_template=SCHEMAS + "{model}")
+def with_bodies(document: dict[str, Any]) -> dict[str, Any]:
+    """An OpenAPI document with the schemas of the bodies that it refers to (`described_body`)."""
     components = document["components"]
+    missing = set(re.findall(f"{SCHEMAS}(\\w+)", json.dumps(document))) - components["schemas"].keys()
+    named: list[type[BaseModel]] = [getattr(models, name) for name in sorted(missing)]
+    bodies: list[tuple[type[BaseModel], JsonSchemaMode]] = [(model, "validation") for model in named]
+    _, found = models_json_schema(bodies, ref_template=SCHEMAS + "{model}")
     return {**document, "components": {**components, "schemas": found["$defs"] | components["schemas"]}}

@@ -26,6 +26,12 @@ class ServiceSettings(BaseSettings):
         (), description="names in Host and Origin beside those of loopback and the bound address, with commas between"
     )
 
+    forwarded_allow: str = Field(
+        "",
+        description="addresses or networks of proxies whose X-Forwarded-For tells the client's address, for the log, "
+        "with commas between; not set = nobody's",
+    )
+
     keys: Literal["required", "none"] | None = Field(
         None,
         description="required: requests need a key even before one was made, and the service may bind to any "

@@ -89,9 +89,9 @@ class Readiness:
         if self._stopping.begun:
             raise NotReady("stopping", expected="a service that goes on", got="one that stops")
         found = self._found if self._fresh() else await self._look_in_time()
-        if found:
-            told = "; ".join(f"{name}: {why}" for name, why in found.items())
-            raise NotReady(", ".join(found), expected="checks that pass", got=told)
+        if found:  # why, is for the log: it may name files of the server
+            failed = ", ".join(found)
+            raise NotReady(failed, expected="checks that pass", got=f"{failed} failed", hint="the log says why")
 
     async def _look_in_time(self) -> dict[str, str]:
         with anyio.move_on_after(PATIENCE_SECONDS):
@@ -106,6 +106,8 @@ class Readiness:
                 self._looking_at = name
                 found[name] = check()
             self._found = {name: why for name, why in found.items() if why is not None}
+            for name, why in self._found.items():
+                log.warning("the check of the %s failed: %s", name, why)
             self._looked = time.monotonic()
         return self._found
 

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from liftcore.errors import SplatliftError
-from service.child import end_with_parent, fault_of, own_stdout
+from service.child import end_with_parent, fault_of, line_of, own_stdout
 from service.errors import NoSpace, OverLimit
 from service.models import JobKind
 
@@ -57,7 +57,7 @@ class Reporter:
     def say(self, message: dict[str, Any]) -> None:
         """Write one message."""
         with self._turn:
-            self._out.write(json.dumps(message).encode() + b"\n")
+            self._out.write(line_of(message))
             self._out.flush()
 
     def beat(self) -> None:

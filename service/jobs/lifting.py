@@ -77,8 +77,10 @@ def _as_clients_know(metadata: LiftMetadata, names: Mapping[str, str]) -> LiftMe
     """
 
     def named(file: InputFile) -> InputFile:
-        return file.model_copy(update={"path": resolved[file.path]})
+        return file.model_copy(update={"path": resolved[str(Path(file.path).resolve())]})
 
-    resolved = {str(Path(path).resolve()): name for path, name in names.items()}  # as lifts remember paths
+    resolved = {
+        str(Path(path).resolve()): name for path, name in names.items()
+    }  # a data directory may be behind a link
     inputs = {"splats": named(metadata.splats), "cameras": named(metadata.cameras)}
     return metadata.model_copy(update={**inputs, "features": tuple(map(named, metadata.features))})

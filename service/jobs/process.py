@@ -64,7 +64,7 @@ class JobProcess:
         self._poll = select.poll()  # not select(), which takes no file of a number above 1023
         self._poll.register(self._pipe, select.POLLIN)
         self._open = True
-        self._rest = b""
+        self._rest: list[bytes] = []  # pieces of a line whose end has not come
         self._status: int | None = None
         os.set_blocking(self._pipe, False)
 
@@ -86,11 +86,15 @@ class JobProcess:
             return []
         if not self._poll.poll(seconds * 1000):
             return []
+        lines: list[bytes] = []
         with contextlib.suppress(BlockingIOError):
             while piece := os.read(self._pipe, PIECE):
-                self._rest += piece
-            self._open = False
-        *lines, self._rest = self._rest.split(b"\n")  # a half line at the end is what a killed writer leaves
+                first, *more = piece.split(b"\n")
+                self._rest.append(first)
+                for begun in more:  # joined once, at its end: an answer may be of a hundred thousand names
+                    lines.append(b"".join(self._rest))
+                    self._rest = [begun]
+            self._open = False  # a half line at the end is what a killed writer leaves
         return [json.loads(line) for line in lines]
 
     def ended(self) -> bool:

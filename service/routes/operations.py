@@ -6,12 +6,13 @@ from __future__ import annotations
 import base64
 import hashlib
 import re
+import threading
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import anyio
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.openapi.docs import get_swagger_ui_html
 from fastapi.responses import HTMLResponse, JSONResponse
 
@@ -24,10 +25,6 @@ WEB = Path(__file__).parents[1] / "web" / "built"  # by `make web`
 SWAGGER = Path(str(files("fastapi_offline"))) / "static"  # shipped, as a robot's network may lead nowhere
 NO_PICTURE = "data:,"  # the page asks another host for one unless it is told
 METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-BODIES = (
-    models.LiftRequest, models.TradeoffRequest, models.AskedInBody, models.AskedToSegment, models.AskedWhat,
-    models.AskedToRender, models.LiftChange,
-)  # fmt: skip
 METRICS: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "The Prometheus text format",
@@ -108,12 +105,28 @@ def page_licences() -> Response:
     return Response((WEB / "LICENSES.txt").read_bytes(), media_type="text/plain; charset=utf-8")
 
 
+class Documents:
+    """The routes as OpenAPI has them, without keys and with them: made once, as that takes half a second."""
+
+    def __init__(self, app: FastAPI) -> None:
+        self._app = app
+        self._turn = threading.Lock()
+        self._made: tuple[bytes, ...] = ()
+
+    def get(self, *, keys: bool) -> bytes:
+        """The one of the two, as JSON."""
+        with self._turn:
+            if not self._made:
+                found = with_bodies(self._app.openapi())
+                self._made = tuple(bytes(JSONResponse(made).body) for made in (found, with_keys(found)))
+        return self._made[keys]
+
+
 @router.get("/openapi.json", include_in_schema=False)
-def document(request: Request, deps: Deps) -> JSONResponse:
+def document(request: Request, deps: Deps) -> Response:
     """The routes as OpenAPI has them, as things are now: with keys or without."""
-    found = with_bodies(request.app.openapi(), *BODIES)
     required = deps.store.keys.under(deps.settings.keys).required()
-    return JSONResponse(with_keys(found) if required else found)
+    return Response(request.app.state.documents.get(keys=required), media_type="application/json")
 
 
 @router.get("/docs", response_class=HTMLResponse, include_in_schema=False)

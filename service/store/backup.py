@@ -89,6 +89,8 @@ def verify(data: Path) -> list[str]:
 
 
 def _damage_of(path: Path, size: int, digest: str) -> str | None:
+    if path.exists() and not path.is_file():
+        return "no regular file"
     try:
         with path.open("rb") as handle:
             found = hashlib.file_digest(handle, "sha256").hexdigest()
@@ -122,7 +124,9 @@ def _digest_of(content: bytes) -> str:
 
 
 def _linked(source: Path, target: Path) -> bool:
-    """Whether a file, that is there, is there too."""
+    """Whether a regular file, that is there, is there too."""
+    if not source.is_file():
+        return False
     if target.exists():
         return source.exists()
     target.parent.mkdir(parents=True, exist_ok=True)

@@ -34,6 +34,7 @@ def collect(store: Store, older_than: float) -> list[Path]:
         What was moved or removed.
     """
     files, moved = store.files, []
+    files.make_folders()
     with files.blobs_changing, store.database.read() as connection:  # so no upload is between its blob and its row
         known = {row["file"] for row in connection.execute("SELECT file FROM assets")}
         moved += _lost(files, (files.root / "blobs").glob("*/*"), known, older_than)

@@ -6,6 +6,7 @@ import fcntl
 import os
 import secrets
 import shutil
+import stat
 import threading
 import time
 from collections.abc import Iterable, Iterator
@@ -34,14 +35,13 @@ class DataDirectory:
     """
 
     def __init__(self, root: Path, *, floor_bytes: int = 0) -> None:
-        self.root = root.absolute()
+        self.root = root.resolve()  # a path in an error is the one that was opened
         self._floor = floor_bytes
         # Held while a blob appears or goes, so that no delete removes the bytes of a new upload.
         self.blobs_changing = threading.Lock()
         self._live: set[str] = set()  # names below tmp/ that are in use; adding and removing one is atomic
         keep_private(self.root)
-        for name in (*ROOMS, "tmp"):
-            (self.root / name).mkdir(exist_ok=True)
+        self.make_folders()
         self._lock = (self.root / "lock").open("w")
         if not _locked(self._lock):
             self._lock.close()
@@ -53,9 +53,15 @@ class DataDirectory:
         shutil.rmtree(self.root / "tmp")
         (self.root / "tmp").mkdir()
 
+    def make_folders(self) -> None:
+        """Make the folders of files and drafts that are missing: somebody may tidy up while the server runs."""
+        for name in (*ROOMS, "tmp"):
+            (self.root / name).mkdir(exist_ok=True)
+
     @contextmanager
     def draft(self, suffix: str) -> Iterator[Path]:
         """A path to write to; what is still there when the block ends is removed."""
+        self.make_folders()
         path = self.root / "tmp" / f"{secrets.token_hex(16)}{suffix}"
         self._live.add(path.name)
         try:
@@ -68,6 +74,7 @@ class DataDirectory:
     @contextmanager
     def scratch(self) -> Iterator[Path]:
         """A folder for what a child process unpacks; nothing of it is left, however the child ends."""
+        self.make_folders()
         folder = self.root / "tmp" / secrets.token_hex(16)
         self._live.add(folder.name)
         folder.mkdir(mode=0o700)
@@ -163,8 +170,7 @@ class DataDirectory:
         names = (*ROOMS, *(f"{database}{part}" for part in ("", "-wal", "-shm")))
         # The marker last: as long as it is here, a start that was cut off is refused and not half done.
         self.quarantine(path for name in (*names, marker) if (path := self.root / name).exists())
-        for name in ROOMS:
-            (self.root / name).mkdir()
+        self.make_folders()
 
     def publish(self, draft: Path, path: Path) -> None:
         """Make a draft the file at ``path``: on the disk first, then there at once or not at all.
@@ -203,11 +209,12 @@ def remove(path: Path) -> None:
 
 
 def is_whole(path: Path, size: int) -> bool:
-    """Whether a file that was stored with so many bytes still has them."""
+    """Whether a regular file still has the bytes that it was stored with; a pipe in its place would be waited for."""
     try:
-        return path.stat().st_size == size
+        status = path.stat()
     except OSError:
         return False
+    return stat.S_ISREG(status.st_mode) and status.st_size == size
 
 
 def _locked(lock: TextIO) -> bool:

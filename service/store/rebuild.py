@@ -59,6 +59,8 @@ def rebuild(store: Store, settings: ServiceSettings) -> dict[str, Any]:
 
 def _add_asset(store: Store, settings: ServiceSettings, path: Path) -> AssetKind:
     """A blob is whole when its name is its digest; what it holds is read by the check of uploads."""
+    if not path.is_file():
+        raise NotFound("asset", expected="a regular file", got="something else")
     with path.open("rb") as handle:
         digest = hashlib.file_digest(handle, "sha256").hexdigest()
     if path != store.files.blob(digest, path.suffix):
@@ -92,7 +94,7 @@ def _add_lift(store: Store, settings: ServiceSettings, path: Path) -> None:
 
     One that was brought may have been made with a folder of cameras: then those of its poses are looked for.
     """
-    if not re.match(JOB_ID, path.stem) or path != store.files.lift(path.stem):
+    if not re.match(JOB_ID, path.stem) or path != store.files.lift(path.stem) or not path.is_file():
         raise InvalidLift("lift", expected="a file named after its job", got=path.name)
     _, metadata, shape = header_of(path)
     try:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-from service.errors import StaleDatabase
+from service.errors import Misconfigured, StaleDatabase
 from service.store.assets import AssetStore
 from service.store.database import (
     DATABASE,
@@ -48,7 +48,8 @@ class Store:
 
         Raises:
             StaleDatabase: it is so, and neither was asked for.
-            Misconfigured: another server holds it, a later release wrote it, or its database is none.
+            Misconfigured: another server holds it, a later release wrote it, its database is none, or it is to begin
+                anew and is the right one.
         """
         files = DataDirectory(root, floor_bytes=floor_bytes)
         try:
@@ -80,8 +81,15 @@ def _database(files: DataDirectory, *, new: bool, rebuilding: bool) -> Database:
     path = files.root / DATABASE
     if rebuilding:  # until `Database.catch_up` it is not the one that belongs here
         remember_generation(files.root, (expected_generation(files.root) or 0) + 1)
+    known = path.exists()
     try:
         database = Database(path, rebuilding=rebuilding)
+        if new and known:
+            database.close()
+            raise Misconfigured(
+                "--new", expected="a database that is gone or older than its files", got="the right one",
+                hint="start without --new, or name another directory with --data",
+            )  # fmt: skip
     except StaleDatabase:
         if not new:
             raise

@@ -86,8 +86,10 @@ def check_lift(path: Path, cameras: Path | None = None) -> dict[str, Any]:
     parsed = parse_metadata(told, path)
     metadata = finite(json.loads(parsed.model_dump_json()))
     if cameras is not None and not has_poses(cameras, parsed):
-        got = "others" if parsed.poses else "a lift from before lifts remembered what their cameras saw"
+        got = "others" if parsed.poses else "a lift that does not tell what its cameras saw"
         hint = "bring the folder or file that was lifted with; a zip of the folder will do"
+        if not parsed.poses:
+            hint = "leave ?cameras= out, and PUT the camera file that it was made with; or lift again"
         raise InvalidLift("cameras", expected="cameras that see what the lift's did", got=got, hint=hint)
     for name, values in arrays.items():
         for first in range(0, len(values), BLOCK_ROWS):

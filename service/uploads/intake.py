@@ -24,7 +24,7 @@ from liftcore.errors import InvalidLift, NotFound
 from liftcore.scene.views import require_pairs
 from service.child import error_of
 from service.errand import ErrandLimits, run_errand
-from service.errors import Crashed, DigestMismatch, InvalidEncoding, TooLarge, UnsupportedEncoding
+from service.errors import Busy, Crashed, DigestMismatch, InvalidEncoding, TooLarge, UnsupportedEncoding
 from service.models import AssetKind, UploadKind
 from service.store.assets import ALL, SHOWN_CHARACTERS, AssetRecord, CheckedUpload
 from service.store.files import is_whole
@@ -318,7 +318,7 @@ def check(kind: UploadKind, path: Path, scratch: Path, limits: ErrandLimits, *be
     Raises:
         InvalidInput: the file is malformed, or it takes more time or memory than it may.
         Crashed: the process did not get as far as opening the file.
-        Busy: the server ended meanwhile.
+        Busy: the server ended meanwhile, or what makes processes was ended, twice.
     """
     memory = min(limits.memory_bytes, CHECK_BASE_BYTES + CHECK_FACTOR * sum(map(_size, (path, *beside))))
     given = [kind, str(path), *map(str, beside)]
@@ -338,6 +338,8 @@ def check(kind: UploadKind, path: Path, scratch: Path, limits: ErrandLimits, *be
             kind, expected="a file that its reader can take", got=f"one that ended it with {heard.returncode}",
             hint="it may be broken, or need more memory than an upload may take",
         )  # fmt: skip
+    if heard.returncode is None:
+        raise Busy("upload", expected="a process that checks it", got="one that was ended", hint="try again soon")
     raise Crashed("check", expected="a process that starts", got=f"one that ended with {heard.returncode}")
 
 

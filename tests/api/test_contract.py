@@ -6,10 +6,12 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fastapi.testclient import TestClient
 
 from .contract import conformance, served
 
@@ -20,6 +22,24 @@ def copied(data: Path, lift: dict[str, Any], tmp_path: Path) -> Path:
     folder = tmp_path / "data"
     shutil.copytree(data, folder, ignore=shutil.ignore_patterns("lock", "*-shm", "tmp"))
     return folder
+
+
+def references(document: Any) -> Iterator[str]:
+    if isinstance(document, dict):
+        yield from [document["$ref"]] if isinstance(document.get("$ref"), str) else []
+        document = list(document.values())
+    if isinstance(document, list):
+        for part in document:
+            yield from references(part)
+
+
+def test_document_refers_to_what_is_in_it(client: TestClient) -> None:
+    document = client.get("/openapi.json").json()
+    for reference in set(references(document)):
+        found = document
+        for part in reference.removeprefix("#/").split("/"):
+            assert part in found, reference
+            found = found[part]
 
 
 def test_answers_are_as_the_document_says_and_what_is_deleted_is_gone(copied: Path, table: Path) -> None:

@@ -62,6 +62,7 @@ def fails(client: TestClient, check: str) -> None:
         return replies[-1].json().get("argument") == check
 
     until(says_so)
+    assert "/" not in replies[-1].json()["detail"]  # no file of the server
     assert (replies[-1].status_code, assert_problem(replies[-1])["type"]) == (503, "/problems/not-ready")
     assert int(replies[-1].headers["retry-after"]) > 0
 
@@ -92,7 +93,9 @@ def test_readyz_names_what_fails_until_it_works_again(start: Start, tmp_path: Pa
             fails(client, "disk")
         until(lambda: client.get("/readyz").status_code == 200)
         with monkeypatch.context() as read_only:
-            read_only.setattr(DataDirectory, "draft", Mock(side_effect=OSError(30, "Read-only file system")))
+            read_only.setattr(
+                DataDirectory, "draft", Mock(side_effect=OSError(30, "Read-only file system", "/srv/tmp"))
+            )
             fails(client, "disk")
         until(lambda: client.get("/readyz").status_code == 200)
         with closing(sqlite3.connect(tmp_path / "data" / "service.sqlite", isolation_level=None)) as other:
@@ -495,6 +498,7 @@ def test_every_answer_tells_browsers_to_guess_and_frame_nothing(client: TestClie
     for path in ("/", "/docs", "/healthz", "/nowhere", "/assets", "/lifts/x"):
         told = client.get(path).headers
         assert (told["x-content-type-options"], told["x-frame-options"]) == ("nosniff", "DENY"), path
+        assert told["cross-origin-resource-policy"] == "same-origin", path
         assert "default-src 'none'" in told["content-security-policy"], path
         assert "frame-ancestors 'none'" in told["content-security-policy"], path
     policy = client.get("/").headers["content-security-policy"]

@@ -88,6 +88,18 @@ def test_server_process_does_the_main_job_and_its_log_holds_no_secret(
     assert access[-1]["received"] == len(b"the-secret") and access[-1]["sent"] > 0
 
 
+@pytest.mark.parametrize("allowed", ["", "10.0.0.0/8,127.0.0.1"])
+def test_client_of_a_proxy_is_believed_where_the_operator_names_the_proxy(
+    allowed: str, tmp_path: Path, table: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SPLATLIFT_FORWARDED_ALLOW", allowed)
+    with (tmp_path / "log").open("w") as stderr, server(tmp_path / "data", table, stderr=stderr) as address:
+        httpx.get(f"{address}/healthz", headers={"X-Forwarded-For": "192.0.2.7"})
+    told = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
+    clients = [line["client"] for line in told if line["logger"] == "service.access"]
+    assert clients == ["192.0.2.7" if allowed else "127.0.0.1"]
+
+
 def test_server_that_speaks_json_says_one_object_when_it_is_ready_and_nothing_after(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "liftcore.cli", "serve", "--json", "--port", "0", "--data", "kept"]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}

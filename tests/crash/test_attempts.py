@@ -30,7 +30,7 @@ from service import errand
 from service.jobs import process as processes
 from service.jobs.child import Reporter
 from service.jobs.lifting import lift_as_ordered
-from service.jobs.process import LONGEST, mark
+from service.jobs.process import LONGEST, JobProcess, mark
 from service.jobs.supervisor import Lease
 from service.models import AssetKind, JobState
 from service.observe import JsonLines
@@ -415,6 +415,19 @@ def test_every_line_that_a_job_prints_is_a_record_with_its_job_and_request(
     assert "unforeseen" not in capfd.readouterr().err  # and nothing of it goes past the log
 
 
+def test_long_answer_is_heard_in_time_that_grows_with_its_length() -> None:
+    """An answer of 48 MB: copied anew with each of its pieces it would be 17 GB."""
+    said = "import sys, time; sys.stdout.write('{\"said\": \"' + 'x' * (48 << 20) + '\"}\\n{\"sai')"
+    heard: list[dict[str, Any]] = []
+    begun = time.process_time()
+    with JobProcess([sys.executable, "-S", "-c", said], {}, "0" * 32) as process:
+        while not (ended := process.ended()) or not heard:
+            heard += process.listen(0 if ended else 0.2)
+        heard += process.listen(0)
+    assert [len(message["said"]) for message in heard] == [48 << 20]  # the half line at its end is none
+    assert time.process_time() - begun < 2.0
+
+
 # A job in blocks goes on from finished ones
 
 
@@ -475,3 +488,16 @@ def test_job_that_needs_all_regions_is_lifted_whole_whatever_the_engine(tmp_path
     (tmp_path / "work").mkdir()
     lift_as_ordered(order, Reporter(io.BytesIO()))
     assert lc.load_lift(order["output"]).confidence is not None
+
+
+def test_lift_in_a_data_directory_behind_a_link_names_its_inputs_as_clients_do(tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "data").symlink_to("disk")
+    order = order_of(tmp_path / "data", preset="row-sum")
+    (tmp_path / "data" / "work").mkdir()
+    metadata = lift_as_ordered(order, Reporter(io.BytesIO()))["metadata"]
+    files = (metadata["splats"], metadata["cameras"], *metadata["features"])
+    assert [file["path"] for file in files] == ["s.ply", "c.json", "f.safetensors"]
+    store = Store.open(tmp_path / "data")  # so that errors, too, have paths that are known
+    assert store.files.root == tmp_path / "disk"
+    store.close()

@@ -100,8 +100,14 @@ def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-1])
 
 
+def pipe(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
 @pytest.mark.parametrize(
-    ("damage", "told"), [(flip, "other bytes"), (cut, "in place of"), (Path.unlink, "No such file")]
+    ("damage", "told"),
+    [(flip, "other bytes"), (cut, "in place of"), (Path.unlink, "No such file"), (pipe, "no regular file")],
 )
 def test_damaged_file_is_told_and_not_restored(
     damage: Callable[[Path], None], told: str, filled: Store, tmp_path: Path

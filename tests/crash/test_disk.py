@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import sqlite3
 import subprocess
@@ -12,6 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from fastapi.testclient import TestClient
@@ -75,6 +77,18 @@ def test_full_disk_is_507_and_the_service_lives(small_disk: Path) -> None:
         assert reply.status_code == 202
         assert ended(store, reply.json()["id"]).state == "succeeded"
         assert {ended(store, job).state for job in acknowledged} <= {"succeeded", "failed"}
+
+
+def test_upload_to_a_disk_that_may_only_be_read_is_503_with_its_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with serving(tmp_path / "data") as (_, client, _):
+        refused = OSError(errno.EROFS, "Read-only file system", "/srv/data/tmp/1")
+        monkeypatch.setattr(Path, "open", Mock(side_effect=refused))
+        reply = client.put("/assets/cameras", content=b"{}")
+        monkeypatch.undo()
+        assert (reply.status_code, reply.json()["type"]) == (503, "/problems/not-ready")
+        assert "Read-only file system" in reply.json()["detail"] and "/srv" not in reply.text
 
 
 def test_delete_works_on_a_full_disk_and_makes_room(small_disk: Path) -> None:

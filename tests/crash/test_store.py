@@ -172,7 +172,9 @@ def test_new_moves_the_files_to_quarantine_and_begins_an_empty_database(data: Pa
     assert kept.relative_to(data / "quarantine").parts[1:] == blob.relative_to(data).parts
     asset = asset_of(store, AssetKind.SPLATS, {})
     store.close()
-    store = Store.open(data, new=True)  # a service that is started so each time begins anew but once
+    with pytest.raises(Misconfigured, match="the right one"):
+        Store.open(data, new=True)
+    store = Store.open(data)  # which was left as it is, and let go
     assert [found.id for found in store.assets.all(SERVICE)] == [asset]
     store.close()
 
@@ -189,6 +191,17 @@ def test_new_keeps_the_database_and_remembers_its_keys(data: Path) -> None:
     assert store.keys.all() == [] and store.keys.required()
     store.close()
     assert [*data.glob(f"quarantine/*/{DATABASE}")]
+
+
+def test_folder_that_somebody_removed_is_made_again(data: Path) -> None:
+    store = Store.open(data)
+    for name in ("tmp", "blobs", "lifts", "work"):
+        shutil.rmtree(data / name)
+    collect(store, older_than=0)
+    asset = asset_of(store, AssetKind.CAMERAS, {})
+    with store.files.scratch() as folder:
+        assert folder.is_dir() and store.assets.get(SERVICE, asset).whole
+    store.close()
 
 
 def test_collector_moves_to_quarantine_and_removes_from_there_after_its_time(data: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import json
 import os
 import re
@@ -48,9 +49,23 @@ def test_the_proxy_has_the_limits_of_the_service() -> None:
     caddy = text("docker/Caddyfile")
     gib, mib = DEFAULTS.max_features_bytes >> 30, DEFAULTS.max_body_bytes >> 20
     assert f"max_size {gib}GiB # SPLATLIFT_MAX_FEATURES_BYTES" in caddy
+    assert f"max_size {DEFAULTS.max_lift_bytes >> 30}GiB # SPLATLIFT_MAX_LIFT_BYTES" in caddy
     assert f"max_size {mib}MiB # SPLATLIFT_MAX_BODY_BYTES" in caddy
     assert f"read_header {DEFAULTS.header_seconds:g}s" in caddy
     assert f"splatlift:{DEFAULTS.port}" in caddy and "Host localhost" in caddy
+    uploads = re.findall(r"@(\w+) \{\s+method (\w+)\s+path (\S+)\s+\}\s+request_body @\1 ", caddy)
+    assert [(method, path) for _, method, path in uploads] == [("PUT", "/assets/*"), ("POST", "/lifts")]
+    assert re.findall(r"not \{\s+method (\w+)\s+path (\S+)", caddy) == [upload[1:] for upload in uploads]
+    assert "health_uri /healthz" in caddy  # what must come through on a full disk does
+
+
+def test_the_service_believes_the_proxy_alone_about_clients() -> None:
+    compose = yaml.safe_load(text("docker/compose.yaml"))
+    address = compose["services"]["proxy"]["networks"]["default"]["ipv4_address"]
+    assert {one["environment"]["SPLATLIFT_FORWARDED_ALLOW"] for one in services().values()} == {address}
+    (network,) = compose["networks"]["default"]["ipam"]["config"]
+    default = ipaddress.ip_address(address.rpartition(":-")[2].rstrip("}"))
+    assert default in ipaddress.ip_network(network["subnet"].rpartition(":-")[2].rstrip("}"))
 
 
 def health_check() -> list[str]:
