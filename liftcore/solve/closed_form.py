@@ -191,15 +191,16 @@ def _halved_to_fit(work: Callable[[int, int], None], first: int, last: int) -> N
     _halved_to_fit(work, middle, last)
 
 
-def morton_codes(points: Tensor) -> Tensor:
+def morton_codes(points: Tensor, bounds: Tensor | None = None) -> Tensor:
     """[n] i64: places along a curve that fills space, near to one another on it is near in space (Morton, 1966).
 
     Args:
         points: [n, 3] f32, finite, any frame and unit; of 2^21 cells an axis between the least and the greatest.
+        bounds: [2, 3], the least and the greatest; None: of the points.
     """
     codes = torch.zeros(points.shape[0], dtype=torch.int64)
     for axis, values in enumerate(points.double().T if codes.numel() else ()):
-        low, high = values.aminmax()
+        low, high = values.aminmax() if bounds is None else bounds[:, axis].double()
         cells = ((values - low) * ((2**21 - 1) / (high - low) if high > low else 0.0)).long()
         for shift, mask in (  # 21 bits in a row to the same with two zeros before each
             (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F),

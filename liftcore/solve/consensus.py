@@ -29,8 +29,15 @@ numbers of STEPS: the order of the views then changes no bit.
 Memory is that of the entries, a number and a byte each, of a tuple a splat and view, and of BLOCK_ENTRIES of W by
 region at a time; no matrix of regions is ever made, only a row of R for each thread. A region's R comes from
 MOST_SPLATS of its splats and an entry asks MOST_WITNESSES views, evenly chosen: a share needs no more.
+
+**How it splits.** A tuple is a function of the splat's weights in one view, so views number their own
+(`splat_tuples`). The sums of q of the entries of a view (`region_shares`) need of other views the tuples of its
+splats and their t_j, and nothing else: a few bytes a splat and view. What is summed over the scene are whole numbers,
+and the scene's mean comes last (`with_mean`), where a block of splats uses its entries. Splats are read along one
+curve through the scene, whoever reads them (`along_curve`), for the sampled ones depend on it.
 """
 
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -40,10 +47,9 @@ from torch import Tensor
 from liftcore.jit import kernel
 from liftcore.one_thread import one_thread
 from liftcore.solve.closed_form import morton_codes
+from liftcore.solve.membership import Memberships, RegionGroups, memberships
 from liftcore.solve.weights import RegionWeights, run_each
 
-BELONGS = 0.7  # of a splat's weight in a level of a view: less, and the splat lies on the border of two regions
-FAINT = 0.05  # of rays; a level that weighs less at a splat hardly sees it
 OBSERVES = 0.3  # of a region, that a level of a view must see to say anything of it
 PRIOR = 2.0  # views' worth of the scene's mean: one view alone may be the one that is wrong
 MOST_SPLATS = 1 << 13
@@ -55,9 +61,38 @@ ONE_VIEW = 1 << 40  # that says something; MOST_WITNESSES shares are less
 UNKNOWN = 1 << 56  # what a tuple says, before anybody asked it
 
 
+@dataclass(frozen=True)
+class SplatTuples:
+    """The tuple of each splat in every view in which it belongs to a region, and what tuples are made of."""
+
+    starts: np.ndarray  # [n + 1] i64, where the tuples of each splat begin
+    tuples: np.ndarray  # i32, ascending by view in a splat
+    parents: np.ndarray  # [T] i32, the tuple without its last region; -1: nothing
+    members: np.ndarray  # [T] i32, its last region
+
+
+@dataclass(frozen=True)
+class RegionShares:
+    """What other views say of the entries of some regions."""
+
+    sums: np.ndarray  # [nnz] f32, of q over the views that say anything
+    views: np.ndarray  # [nnz] u8, how many these are
+    told: int  # the sum of all q, in STEPS
+
+    @property
+    def asked(self) -> int:
+        """The number of all q."""
+        return int(self.views.sum(dtype=np.int64))
+
+
 @one_thread()
 def mask_consensus(
-    W: RegionWeights, levels: np.ndarray, threads: int | None = None, *, means: Tensor | None = None
+    W: RegionWeights,
+    levels: np.ndarray,
+    threads: int | None = None,
+    *,
+    means: Tensor | None = None,
+    members: Memberships | None = None,
 ) -> np.ndarray:
     """c_jm of every entry of W, [nnz] f32 in 0..1; one where nothing in the scene says anything.
 
@@ -66,23 +101,82 @@ def mask_consensus(
         levels: [M] i8, the level of each region in its view; -1 for cells of grids, which take no part.
         threads: None takes the cores that this process may use. The number changes no bit.
         means: [P, 3] of the splats: neighbours, which belong to the same regions, are read together.
+        members: of W, where they are known.
     """
-    indptr, region, weight = (tensor.numpy() for tensor in (W.indptr, W.region, W.weight))
-    offsets, levels = W.offsets.numpy(), levels.astype(np.int64)
-    view = np.repeat(np.arange(offsets.size - 1), np.diff(offsets)).astype(np.int32)
-    several = int(levels.max(initial=0)) + 1
-    group = np.where(levels < 0, -1, view * several + levels).astype(np.int32)
-    rows = np.flatnonzero(np.diff(indptr))
+    groups = RegionGroups.of(W.offsets.numpy(), levels)
+    members = members or memberships(W, groups, threads)
+    rows = np.flatnonzero(np.diff(W.indptr.numpy()))
     if means is not None:
-        rows = rows[np.argsort(morton_codes(means[torch.from_numpy(rows)]).numpy(), kind="stable")]
-    lengths = np.diff(indptr)[rows]
-    pieces = [(piece, *ends) for piece, ends in enumerate(_edges(lengths, max(region.size // PIECES, 1)))]
-    sizes = np.zeros((len(pieces), levels.size), np.int32)  # of the regions in each piece
-    total, own, counts = np.zeros(rows.size), np.zeros(region.size, np.bool_), np.zeros(rows.size + 1, np.int64)
-    splat_by_splat = [rows, indptr, region, weight, view, group, several, total, own, counts, sizes]
-    run_each(lambda *ends: belong(*ends, *splat_by_splat), pieces, threads)
+        rows = rows[along_curve(means[torch.from_numpy(rows)])]
+    tuples = splat_tuples(W, members.own, groups, rows, threads)
+    shares = region_shares(W, members.own, groups, rows, members.totals[rows], tuples, threads=threads)
+    return with_mean(shares.sums, shares.views, mean_share(shares.told, shares.asked), threads)
+
+
+def along_curve(points: Tensor, bounds: Tensor | None = None) -> np.ndarray:
+    """[n] i64: the order of points along a curve that fills space; those of one place keep theirs.
+
+    Args:
+        points: [n, 3], any frame. bounds: [2, 3] f64, the least and the greatest of the scene; None: of the points.
+    """
+    return np.argsort(morton_codes(points, bounds).numpy(), kind="stable")
+
+
+def mean_share(told: int, asked: int) -> float:
+    """c, the mean of all q, from their sum in STEPS and their number; one where there is none."""
+    return told / STEPS / asked if asked else 1.0
+
+
+def with_mean(sums: np.ndarray, views: np.ndarray, usual: float, threads: int | None = None) -> np.ndarray:
+    """Sums of q become c_jm, in place: [nnz] f32, as `RegionShares` has both."""
+    step = BLOCK_ENTRIES >> 2
+    blocks = [(first, min(first + step, sums.size)) for first in range(0, sums.size, step)]
+    run_each(lambda first, last: finish(first, last, sums, views, usual), blocks, threads)
+    return sums
+
+
+def splat_tuples(
+    W: RegionWeights, own: np.ndarray, groups: RegionGroups, rows: np.ndarray, threads: int | None = None
+) -> SplatTuples:
+    """The tuples of some rows of W [n] i64, in their order.
+
+    Args:
+        W, own: as `memberships` has them, of any views.
+    """
+    indptr, region = W.indptr.numpy(), W.region.numpy()
+    counts = np.zeros(rows.size + 1, np.int64)
+    pieces = _edges(np.diff(indptr)[rows], max(region.size // PIECES, 1))
+    arrays = rows, indptr, region, own, groups.view, counts
+    run_each(lambda *ends: count_views(*[*ends, *arrays]), pieces, threads)
     starts = np.cumsum(counts)
-    tuples, parents, members = number_tuples(rows, indptr, region, own, view, starts)
+    return SplatTuples(starts, *number_tuples(rows, indptr, region, own, groups.view, starts))
+
+
+def region_shares(
+    W: RegionWeights,
+    own: np.ndarray,
+    groups: RegionGroups,
+    rows: np.ndarray,
+    totals: np.ndarray,
+    tuples: SplatTuples,
+    *,
+    base: int = 0,
+    threads: int | None = None,
+) -> RegionShares:
+    """The sums of q of all entries of W, which has all splats of its regions.
+
+    Args:
+        W, own: as `memberships` has them, of the regions ``base..base + offsets[-1]`` alone.
+        rows: [n] i64, those of W that have entries, in the order in which splats are read.
+        totals: [n] f64, t_j of these. tuples: of these, in all views.
+    """
+    indptr, region = W.indptr.numpy(), W.region.numpy()
+    pieces = [
+        (piece, *ends) for piece, ends in enumerate(_edges(np.diff(indptr)[rows], max(region.size // PIECES, 1)))
+    ]
+    sizes = np.zeros((len(pieces), int(W.offsets[-1])), np.int32)  # of the regions in each piece
+    arrays = rows, indptr, region, base, sizes
+    run_each(lambda *ends: count_splats(*[*ends, *arrays]), pieces, threads)
     consensus, witnesses = np.ones(region.size, np.float32), np.zeros(region.size, np.uint8)
     told, here, whole = 0, indptr[rows], sizes.sum(axis=0, dtype=np.int64)
     for first, last in _edges(whole, BLOCK_ENTRIES):
@@ -90,20 +184,17 @@ def mask_consensus(
         at = begins[:-1] + np.cumsum(sizes[:, first:last], axis=0, dtype=np.int64) - sizes[:, first:last]
         splats, there = np.empty(begins[-1], np.int32), here.copy()
         sums, views = np.zeros(begins[-1], np.float32), np.zeros(begins[-1], np.uint8)
-        order = [first, last, rows, here, there, indptr, region, own, at, splats]
+        order = [base + first, base + last, rows, here, there, indptr, region, own, at, splats]
         run_each(lambda *ends, order=order: by_region(*ends, *order), pieces, threads)
         parts = [(part, *ends) for part, ends in enumerate(_edges(whole[first:last], max(BLOCK_ENTRIES // 64, 1)))]
         shares = np.zeros(len(parts), np.int64)
-        block = [first, begins, splats, starts, tuples, parents, members, total]
-        block += [view, group, several, sums, views, shares]
+        block = [base + first, begins, splats, tuples.starts, tuples.tuples, tuples.parents, tuples.members, totals]
+        block += [groups.view, groups.group, groups.levels, sums, views, shares]
         run_each(lambda *ends, block=block: agree(*ends, *block), parts, threads)
-        back = [first, here, there, region, at, sums, views, consensus, witnesses]
+        back = [base + first, here, there, region, at, sums, views, consensus, witnesses]
         run_each(lambda *ends, back=back: by_row(*ends, *back), pieces, threads)
         told, here = told + int(shares.sum()), there
-    asked = int(witnesses.sum(dtype=np.int64))
-    usual = told / STEPS / asked if asked else 1.0
-    run_each(lambda _, a, b: finish(a, b, rows, indptr, consensus, witnesses, usual), pieces, threads)
-    return consensus
+    return RegionShares(consensus, witnesses, told)
 
 
 def _edges(lengths: np.ndarray, entries: int) -> list[tuple[int, int]]:
@@ -114,37 +205,27 @@ def _edges(lengths: np.ndarray, entries: int) -> list[tuple[int, int]]:
 
 
 @kernel
-def belong(piece, first, last, rows, indptr, region, weight, view, group, several, total, own, counts, sizes):
-    """For rows ``first..last``: their sums, sizes of regions, which entries belong, and in how many views."""
-    sums = np.zeros(several)
+def count_views(first, last, rows, indptr, region, own, view, counts):
+    """Of rows ``first..last``, the number of views in which they belong to a region, at the row + 1."""
     for j in range(first, last):
-        k, end = indptr[rows[j]], indptr[rows[j] + 1]
-        while k < end:
-            begin, v, any_own = k, view[region[k]], False
-            sums[:] = 0.0
-            while k < end and view[region[k]] == v:
-                total[j] += weight[k]
-                sizes[piece, region[k]] += 1
-                if group[region[k]] >= 0:
-                    sums[group[region[k]] - v * several] += weight[k]
-                k += 1
-            for n in range(begin, k):
-                g = group[region[n]]
-                if g >= 0:
-                    most = sums[g - v * several]
-                    if most > FAINT and weight[n] >= BELONGS * most:
-                        own[n] = any_own = True
-            counts[j + 1] += any_own
+        before = -1
+        for k in range(indptr[rows[j]], indptr[rows[j] + 1]):
+            if own[k] and view[region[k]] != before:
+                before = view[region[k]]
+                counts[j + 1] += 1
+
+
+@kernel
+def count_splats(piece, first, last, rows, indptr, region, base, sizes):
+    """The entries of each region in rows ``first..last``."""
+    for j in range(first, last):
+        for k in range(indptr[rows[j]], indptr[rows[j] + 1]):
+            sizes[piece, region[k] - base] += 1
 
 
 @kernel
 def number_tuples(rows, indptr, region, own, view, starts):
-    """The tuple of each splat and view in which it belongs to a region, and what tuples are made of.
-
-    Returns:
-        tuples: [n] i32, of row j from ``starts[j]`` on. parents, members: [T] i32, the tuple without its last region
-        (-1: nothing), and that region.
-    """
+    """`SplatTuples` of some rows, whose own begin at ``starts``: tuples, parents and members."""
     tuples = np.empty(starts[-1], np.int32)
     parents, members = np.empty(1 << 10, np.int32), np.empty(1 << 10, np.int32)
     table, count = np.full(1 << 12, -1, np.int32), 0
@@ -287,9 +368,8 @@ def best_share(t, mine, enough, R, seen, parents, members, view, group):
 
 
 @kernel
-def finish(first, last, rows, indptr, sums, counts, usual):
+def finish(first, last, sums, views, usual):
     """Sums of q become c, with the scene's mean as PRIOR views."""
-    for j in range(first, last):
-        for k in range(indptr[rows[j]], indptr[rows[j] + 1]):
-            asked = sums[k] if counts[k] > 0 else 0.0
-            sums[k] = (asked + PRIOR * usual) / (counts[k] + PRIOR)
+    for k in range(first, last):
+        asked = sums[k] if views[k] > 0 else 0.0
+        sums[k] = (asked + PRIOR * usual) / (views[k] + PRIOR)

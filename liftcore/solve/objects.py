@@ -18,19 +18,27 @@ at it, if these have half of all objects' weight there. Objects are numbered by 
 Memory and time are bounded: nodes are the regions of evenly chosen views, MOST_REGIONS at most, with two tables of
 that square (134 MB); regions of other views then join the object that has most of them. Counts are whole numbers and
 sums have the order of splats, so that the number of threads changes no bit.
+
+**How it splits.** What contains a node is a function of MOST_SPLATS of its splats and of the nodes that these belong
+to, so blocks of views find it for their own nodes (`node_views`). The graph is the driver's. The object of a splat is
+a function of its row of W (`object_labels`); the objects of the other regions and the best views are sums over
+splats, taken by pieces (`object_shares`, `view_shares`).
 """
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import csr_array
 
 from liftcore.jit import kernel
+from liftcore.solve.consensus import SplatTuples
+from liftcore.solve.membership import Memberships, RegionGroups, memberships
+from liftcore.solve.sums import PieceSums, added, in_order, piece_sums, pieces
 from liftcore.solve.weights import RegionWeights, row_blocks, run_each
 
 NO_OBJECT = -1
-BELONGS, FAINT = 0.7, 0.05  # as for mask consensus: of a splat's weight in a level, and the least weight there
-OBSERVES = 0.3  # of a region, that a level must see to say anything of it, likewise
+OBSERVES = 0.3  # of a region, that a level must see to say anything of it, as for mask consensus
 CONTAINS = 0.7  # of what a level sees of a region: less, and the region lies across two others
 TOGETHER = 0.5  # of the views that see two regions: most of them
 LEAST_VIEWS = 3  # with a region of a thing: two may make the same mistake
@@ -42,15 +50,22 @@ BLOCK_ENTRIES = 1 << 18
 
 
 @dataclass(frozen=True)
-class _Nodes:
-    """The regions that are clustered, and what belongs to each."""
+class NodeSplats:
+    """The splats of some nodes, and the nodes, of all, that each of these splats belongs to."""
 
-    regions: np.ndarray  # [N] i64 ascending
-    begins: np.ndarray  # [N + 1], where the splats of each begin
+    begins: np.ndarray  # [n + 1], where the splats of each node begin
     splats: np.ndarray  # i32, ascending in a node
-    starts: np.ndarray  # [P + 1], where the nodes of each splat begin
-    members: np.ndarray  # i32, ascending in a splat
-    counts: np.ndarray  # [P] f64, how much each splat counts
+    starts: np.ndarray  # [s + 1], where the nodes of each splat begin
+    members: np.ndarray  # i32, numbers of nodes, ascending in a splat
+    counts: np.ndarray  # [s] f64, how much each splat counts: sqrt(t_j)
+
+
+@dataclass(frozen=True)
+class NodeViews:
+    """What levels and views say of some nodes."""
+
+    container: np.ndarray  # [n, views * levels] i32, the node of each level that contains it; -1: none
+    sees: np.ndarray  # [n, views] f32, one where the view sees it
 
 
 @dataclass(frozen=True)
@@ -63,90 +78,175 @@ class RegionObjects:
 
 
 def region_objects(
-    W: RegionWeights, levels: np.ndarray, evidence: np.ndarray, threads: int | None = None
+    W: RegionWeights,
+    levels: np.ndarray,
+    evidence: np.ndarray,
+    threads: int | None = None,
+    *,
+    members: Memberships | None = None,
 ) -> RegionObjects:
-    """The objects of a scene.
+    """The objects of a scene whose W lies in one place.
 
     Args:
         W: of all views, by rows of codebooks, on the CPU.
         levels: [M] i8, the level of each region in its view; -1 for cells of grids, which take no part.
         evidence: [P], sums of plain weights; objects are numbered by it.
         threads: None takes the cores that this process may use. The number changes no bit.
+        members: of W, where they are known.
     """
-    view = np.repeat(np.arange(len(W.offsets) - 1), W.offsets.diff().numpy())
-    nodes = _nodes(W, levels.astype(np.int64), view, threads)
-    own = nodes.regions
-    clusters = np.full(levels.size, NO_OBJECT, np.int32)
-    if own.size:
-        clusters[own] = _of_enough_views(clustered(*_graph(nodes, view[own], levels[own], threads)), view[own])
+    groups = RegionGroups.of(W.offsets.numpy(), levels)
+    members = members or memberships(W, groups, threads)
+    sizes = np.bincount(W.region.numpy()[members.own], minlength=levels.size)
+    nodes, others = choose_nodes(groups, sizes)
+    table = node_splats(W, members, nodes, threads)
+    clusters = node_clusters(nodes, groups, node_views(table, nodes, groups, threads), threads)
     number = int(clusters.max(initial=-1)) + 1
-    labels = _labels(W, clusters, number, threads)
-    left = np.flatnonzero((levels >= 0) & ~np.isin(view, view[own]))
-    if number and left.size:
-        clusters[left] = _joined(W, labels, number)[left]
-        labels = _labels(W, clusters, number, threads)
-    order = np.argsort(-np.bincount(labels[labels >= 0], evidence[labels >= 0], number), kind="stable")
-    order = order[np.bincount(labels[labels >= 0], minlength=number)[order] > 0]  # without a splat it is none
-    place = np.full(number + 1, NO_OBJECT, np.int32)  # the last is of -1
-    place[order] = np.arange(order.size)
-    labels = place[labels]
-    return RegionObjects(labels, _best_views(W, labels, order.size), place[clusters])
+    labels = object_labels(W, clusters, number, threads)
+    if number and others.size:
+        join(clusters, others, object_shares(W, labels, number, others, threads), number)
+        labels = object_labels(W, clusters, number, threads)
+    shown = added(view_shares(W, groups, labels, number, threads), (1, number * groups.views))
+    return numbered(labels, clusters, evidence, shown.reshape(number, groups.views))
 
 
-def _nodes(W: RegionWeights, levels: np.ndarray, view: np.ndarray, threads: int | None) -> _Nodes:
-    """The regions of evenly chosen views; of more than MOST_REGIONS those with the most splats."""
-    indptr, region, weight = (part.numpy() for part in (W.indptr, W.region, W.weight))
-    rows = indptr.size - 1
-    masks = np.bincount(view[levels >= 0], minlength=len(W.offsets) - 1)
+def choose_nodes(groups: RegionGroups, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The regions of evenly chosen views; of more than MOST_REGIONS those with the most splats.
+
+    Args:
+        sizes: [M], how many splats belong to each region.
+
+    Returns:
+        The nodes, [N] i64 ascending, and the masks of views that give none, [n] i64 ascending.
+    """
+    masks = np.bincount(groups.view[groups.group >= 0], minlength=groups.views)
     showing = np.flatnonzero(masks)
     every = max(min(-(-int(masks.sum()) // MOST_REGIONS), showing.size // FEWEST_VIEWS), 1)
     while every * FEWEST_VIEWS < showing.size and masks[showing[::every]].sum() > MOST_REGIONS:
         every += 1
-    chosen = np.isin(view, showing[::every]) & (levels >= 0)
-    several = int(levels.max(initial=0)) + 1
-    group = np.where(chosen, view * several + levels, -1).astype(np.int32)
-    total, own, counts = np.zeros(rows), np.zeros(region.size, np.bool_), np.zeros(rows + 1, np.int64)
-    numbers = view.astype(np.int32)
-    run_each(
-        lambda a, b: belong(a, b, indptr, region, weight, numbers, group, several, total, own, counts),
-        row_blocks(np.diff(indptr), rows + 1, BLOCK_ENTRIES),
-        threads,
-    )
-    starts = np.cumsum(counts)
-    members = region[own]
-    sizes = np.bincount(members, minlength=levels.size)
+    chosen = np.isin(groups.view, showing[::every]) & (groups.group >= 0)
+    sizes = np.where(chosen, sizes, 0)
     nodes = np.sort(np.argsort(-sizes, kind="stable")[: min(MOST_REGIONS, int((sizes > 0).sum()))])
-    number = np.full(levels.size, -1, np.int32)
+    giving = np.isin(groups.view, groups.view[nodes])
+    return nodes, np.flatnonzero((groups.group >= 0) & ~giving)
+
+
+def node_numbers(nodes: np.ndarray, regions: int) -> np.ndarray:
+    """[M] i32: the number of each region among the nodes, -1 for none."""
+    number = np.full(regions, -1, np.int32)
     number[nodes] = np.arange(nodes.size)
-    members = number[members]
-    if nodes.size < int((sizes > 0).sum()):
-        starts = np.concatenate([[0], np.cumsum(members >= 0)])[starts]
-        members = members[members >= 0]
-    by_splat = csr_array((np.ones(members.size, np.int8), members, starts), shape=(rows, nodes.size))
-    by_node = by_splat.tocsc()
-    return _Nodes(nodes, by_node.indptr, by_node.indices, starts, members, np.sqrt(total))
+    return number
 
 
-def _graph(nodes: _Nodes, view: np.ndarray, levels: np.ndarray, threads: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """How many views support each pair of nodes, and how many observe it: [N, N] f32 each."""
-    numbers = np.unique(view, return_inverse=True)[1]
-    several, size, views = int(levels.max()) + 1, view.size, int(numbers.max()) + 1
-    group = (numbers * several + levels).astype(np.int32)
-    container = np.full((size, several * views), -1, np.int32)
-    sees = np.zeros((size, views), np.float32)
-    given = nodes.begins, nodes.splats, nodes.starts, nodes.members, nodes.counts
+def node_splats(W: RegionWeights, members: Memberships, nodes: np.ndarray, threads: int | None = None) -> NodeSplats:
+    """Of all nodes, from W of all views."""
+    indptr, region = W.indptr.numpy(), W.region.numpy()
+    number, starts = node_numbers(nodes, int(W.offsets[-1])), np.zeros(indptr.size, np.int64)
+    blocks = W.blocks(1 << 16, BLOCK_ENTRIES << 2)
+    run_each(lambda a, b: count_nodes(a, b, indptr, region, members.own, number, starts), blocks, threads)
+    np.cumsum(starts, out=starts)
+    found = np.empty(starts[-1], np.int32)
+    run_each(lambda a, b: list_nodes(a, b, indptr, region, members.own, number, starts, found), blocks, threads)
+    return NodeSplats(*by_node(starts, found, nodes.size), starts, found, np.sqrt(members.totals))
+
+
+def sampled_splats(W: RegionWeights, own: np.ndarray, nodes: np.ndarray, base: int) -> tuple[np.ndarray, np.ndarray]:
+    """The splats that speak for the nodes of some views: where those of each begin [n + 1] i64, and their rows of W.
+
+    Args:
+        W, own: as `memberships` has them, of the regions ``base..base + offsets[-1]``. nodes: [N] i64, of all views.
+    """
+    own_nodes = nodes[slice(*np.searchsorted(nodes, [base, base + int(W.offsets[-1])]))]
+    number = node_numbers(own_nodes - base, int(W.offsets[-1]))
+    entries = np.flatnonzero(own)
+    members = number[W.region.numpy()[entries] - base]
+    entries, members = entries[members >= 0], members[members >= 0]
+    rows = np.searchsorted(W.indptr.numpy(), entries, side="right") - 1
+    order = np.argsort(members, kind="stable")
+    parts = [rows[part[:: max(-(-part.size // MOST_SPLATS), 1)]] for part in _split(order, members, own_nodes.size)]
+    return np.cumsum([0, *(part.size for part in parts)]), np.concatenate([np.zeros(0, np.int64), *parts])
+
+
+def _split(order: np.ndarray, members: np.ndarray, nodes: int) -> list[np.ndarray]:
+    """The parts of an order by node, of which an empty one has no node."""
+    return np.split(order, np.cumsum(np.bincount(members, minlength=nodes))[:-1]) if nodes else []
+
+
+def sampled_nodes(
+    begins: np.ndarray, splats: np.ndarray, tuples: SplatTuples, totals: np.ndarray, nodes: np.ndarray, regions: int
+) -> NodeSplats:
+    """Of the nodes of some views, from the tuples of the splats that speak for them.
+
+    Args:
+        begins, splats: where those of each node begin, and their numbers among the tuples' and totals'.
+        tuples: of these splats in all views. totals: [s] f64, t_j. regions: M.
+    """
+    number, starts = node_numbers(nodes, regions), np.zeros(tuples.starts.size, np.int64)
+    parts = tuples.starts, tuples.tuples, tuples.parents, tuples.members, number
+    count_tuple_nodes(*[*parts, starts])
+    np.cumsum(starts, out=starts)
+    members = np.empty(starts[-1], np.int32)
+    list_tuple_nodes(*[*parts, starts, members])
+    return NodeSplats(begins, splats.astype(np.int32), starts, members, np.sqrt(totals))
+
+
+def by_node(starts: np.ndarray, members: np.ndarray, nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where the splats of each node begin, and these splats, from the nodes of each splat."""
+    ones = np.ones(members.size, np.int8)
+    table = csr_array((ones, members, starts), shape=(starts.size - 1, nodes)).tocsc()
+    return table.indptr, table.indices
+
+
+def node_views(table: NodeSplats, nodes: np.ndarray, groups: RegionGroups, threads: int | None = None) -> NodeViews:
+    """What the levels and views of all nodes say of those of a table.
+
+    Args:
+        nodes: [N] i64, all of them, as the table's members number them.
+    """
+    number, group, views = _node_groups(nodes, groups)
+    size = table.begins.size - 1
+    found = NodeViews(np.full((size, groups.levels * views), -1, np.int32), np.zeros((size, views), np.float32))
+    arrays = table.begins, table.splats, table.starts, table.members, table.counts
     run_each(
-        lambda a, b: contain(a, b, *given, group, several, container, sees),
-        row_blocks(np.diff(nodes.begins), size, BLOCK_ENTRIES >> 3),
+        lambda a, b: contain(a, b, *arrays, group, groups.levels, found.container, found.sees),
+        row_blocks(np.diff(table.begins), max(size, 1), BLOCK_ENTRIES >> 3) if number.size else [],
         threads,
     )
+    return found
+
+
+def _node_groups(nodes: np.ndarray, groups: RegionGroups) -> tuple[np.ndarray, np.ndarray, int]:
+    """The view of each node among those of nodes, [N] i64, its group among theirs [N] i32, and how many views."""
+    view = groups.view[nodes]
+    number = np.unique(view, return_inverse=True)[1]
+    level = groups.group[nodes] - view * groups.levels
+    return number, (number * groups.levels + level).astype(np.int32), int(number.max(initial=-1)) + 1
+
+
+def node_clusters(
+    nodes: np.ndarray, groups: RegionGroups, found: NodeViews, threads: int | None = None
+) -> np.ndarray:
+    """[M] i32: the cluster of each region, numbered from 0; -1 for regions of none.
+
+    Args:
+        found: of all nodes, in their order.
+    """
+    clusters = np.full(groups.view.size, NO_OBJECT, np.int32)
+    if nodes.size:
+        parts = clustered(*_graph(found, groups.levels, threads))
+        clusters[nodes] = _of_enough_views(parts, groups.view[nodes])
+    return clusters
+
+
+def _graph(found: NodeViews, levels: int, threads: int | None) -> tuple[np.ndarray, np.ndarray]:
+    """How many views support each pair of nodes, and how many observe it: [N, N] f32 each."""
+    container, size = found.container, len(found.container)
     node, at = np.nonzero(container >= 0)
     held = csr_array((np.ones(node.size, np.int8), (node, container[node, at])), shape=(size, size)).tocsc()
     held.sort_indices()
     supporting = np.zeros((size, size), np.float32)
     blocks = [(first, min(first + 64, size)) for first in range(0, size, 64)]
-    run_each(lambda a, b: support(a, b, container, several, held.indptr, held.indices, supporting), blocks, threads)
-    return supporting, sees @ sees.T
+    run_each(lambda a, b: support(a, b, container, levels, held.indptr, held.indices, supporting), blocks, threads)
+    return supporting, found.sees @ found.sees.T
 
 
 def clustered(supporting: np.ndarray, observing: np.ndarray) -> np.ndarray:
@@ -174,8 +274,12 @@ def _of_enough_views(clusters: np.ndarray, view: np.ndarray) -> np.ndarray:
     return np.where(enough, np.cumsum(enough) - 1, NO_OBJECT)[clusters].astype(np.int32)
 
 
-def _labels(W: RegionWeights, clusters: np.ndarray, number: int, threads: int | None) -> np.ndarray:
-    """[P] i32: the object of each splat."""
+def object_labels(W: RegionWeights, clusters: np.ndarray, number: int, threads: int | None = None) -> np.ndarray:
+    """[n] i32: the cluster of each splat of a block, -1 for none.
+
+    Args:
+        W: of all views, a row for each splat of the block. clusters: [M] i32 below the number, -1 for none.
+    """
     labels = np.full(W.indptr.shape[0] - 1, NO_OBJECT, np.int32)
     indptr, region, weight = (part.numpy() for part in (W.indptr, W.region, W.weight))
     run_each(
@@ -186,56 +290,120 @@ def _labels(W: RegionWeights, clusters: np.ndarray, number: int, threads: int | 
     return labels
 
 
-def _joined(W: RegionWeights, labels: np.ndarray, number: int) -> np.ndarray:
-    """[M] i32: the object that has over half of each region's weight, -1 where none has."""
-    regions = int(W.offsets[-1])
-    shares = csr_array((number + 1, regions), dtype=np.float64)
-    for first, last in W.blocks(1 << 16, 1 << 20):
+def object_shares(
+    W: RegionWeights, labels: np.ndarray, number: int, others: np.ndarray, threads: int | None = None
+) -> Iterator[PieceSums]:
+    """The weight of some regions [n] i64 in each object at every piece of a block: [1, (number + 1) n], -1 first."""
+    place = node_numbers(others, int(W.offsets[-1]))
+
+    def summed(first: int, last: int) -> PieceSums:
         own = slice(int(W.indptr[first]), int(W.indptr[last]))
-        of_row = np.repeat(labels[first:last], W.indptr[first : last + 1].diff().numpy())
-        parts = W.weight[own].double().numpy(), (of_row + 1, W.region[own].numpy())
-        shares = shares + csr_array(parts, shape=(number + 1, regions))
-    parts = shares.tocoo()
-    totals = np.bincount(parts.col, parts.data, regions)
-    most = (parts.row > 0) & (parts.data > totals[parts.col] / 2)  # one of a region at most
-    joined = np.full(regions, NO_OBJECT, np.int32)
-    joined[parts.col[most]] = parts.row[most] - 1
-    return joined
+        rows = np.repeat(labels[first:last] + 1, W.indptr[first : last + 1].diff().numpy())
+        columns = place[W.region[own].numpy()]
+        kept = columns >= 0
+        parts = W.weight[own].double().numpy()[kept], (rows[kept], columns[kept])
+        table = csr_array(parts, shape=(number + 1, others.size)).tocoo()
+        places = table.row.astype(np.int64) * others.size + table.col
+        order = np.argsort(places)
+        return PieceSums(places[order], table.data[None, order])
+
+    return in_order(summed, pieces(W.indptr.shape[0] - 1), threads)
 
 
-def _best_views(W: RegionWeights, labels: np.ndarray, number: int) -> np.ndarray:
+def join(clusters: np.ndarray, others: np.ndarray, shares: Iterable[PieceSums], number: int) -> None:
+    """Regions of views without nodes take the cluster that has over half of their weight, in place.
+
+    Args:
+        clusters: [M] i32. others: [n] i64, these regions. shares: theirs (`object_shares`), of all splats.
+    """
+    shape = number + 1, others.size
+    table = csr_array(shape, dtype=np.float64)
+    for part in shares:
+        table = table + csr_array((part.values[0], np.divmod(part.places, others.size)), shape=shape)
+    found = table.tocoo()
+    totals = np.bincount(found.col, found.data, others.size)
+    most = (found.row > 0) & (found.data > totals[found.col] / 2)  # one of a region at most
+    clusters[others[found.col[most]]] = found.row[most] - 1
+
+
+def view_shares(
+    W: RegionWeights, groups: RegionGroups, labels: np.ndarray, number: int, threads: int | None = None
+) -> Iterator[PieceSums]:
+    """The weight of each object in each view at every piece of a block: [1, number views]."""
+    arrays = labels, W.indptr.numpy(), W.region.numpy(), W.weight.numpy(), groups.view, groups.views
+
+    def add(first: int, last: int, table: np.ndarray) -> None:
+        show(*[first, last, *arrays, table[0]])
+
+    return piece_sums(add, labels.size, (1, number * groups.views), threads)
+
+
+def numbered(labels: np.ndarray, clusters: np.ndarray, evidence: np.ndarray, shown: np.ndarray) -> RegionObjects:
+    """The objects of a scene, the most evidence first.
+
+    Args:
+        labels: [P] i32, the cluster of each splat. clusters: [M] i32, of each region. evidence: [P].
+        shown: [K, V] f64, the weight of each cluster in each view.
+    """
+    own, number = labels >= 0, len(shown)
+    order = np.argsort(-np.bincount(labels[own], evidence[own], number), kind="stable")
+    order = order[np.bincount(labels[own], minlength=number)[order] > 0]  # without a splat it is none
+    place = np.full(number + 1, NO_OBJECT, np.int32)  # the last is of -1
+    place[order] = np.arange(order.size)
+    return RegionObjects(place[labels], _best_views(shown[order]), place[clusters])
+
+
+def _best_views(shown: np.ndarray) -> np.ndarray:
     """[K, BEST_VIEWS] i32: the views in which each object weighs most."""
-    views = len(W.offsets) - 1
-    shown = np.zeros((number, views))
-    view = np.repeat(np.arange(views, dtype=np.int32), W.offsets.diff().numpy())
-    show(labels, W.indptr.numpy(), W.region.numpy(), W.weight.numpy(), view, shown)
-    best = np.full((number, BEST_VIEWS), -1, np.int32)
+    best = np.full((len(shown), BEST_VIEWS), -1, np.int32)
     order = np.argsort(-shown, axis=1, kind="stable")[:, :BEST_VIEWS]
     best[:, : order.shape[1]] = np.where(np.take_along_axis(shown, order, axis=1) > 0, order, -1)
     return best
 
 
 @kernel
-def belong(first, last, indptr, region, weight, view, group, several, total, own, counts):
-    """For rows ``first..last``: their sums, which entries belong, and how many (at the row + 1)."""
-    sums = np.zeros(several)
+def count_nodes(first, last, indptr, region, own, number, counts):
+    """The nodes that each of the splats ``first..last`` belongs to, at the splat + 1."""
     for j in range(first, last):
-        k, end = indptr[j], indptr[j + 1]
-        while k < end:
-            begin, v = k, view[region[k]]
-            sums[:] = 0.0
-            while k < end and view[region[k]] == v:
-                total[j] += weight[k]
-                if group[region[k]] >= 0:
-                    sums[group[region[k]] - v * several] += weight[k]
-                k += 1
-            for n in range(begin, k):
-                g = group[region[n]]
-                if g >= 0:
-                    most = sums[g - v * several]
-                    if most > FAINT and weight[n] >= BELONGS * most:
-                        own[n] = True
-                        counts[j + 1] += 1
+        for k in range(indptr[j], indptr[j + 1]):
+            if own[k] and number[region[k]] >= 0:
+                counts[j + 1] += 1
+
+
+@kernel
+def list_nodes(first, last, indptr, region, own, number, starts, members):
+    """These nodes, from ``starts`` on."""
+    for j in range(first, last):
+        at = starts[j]
+        for k in range(indptr[j], indptr[j + 1]):
+            if own[k] and number[region[k]] >= 0:
+                members[at] = number[region[k]]
+                at += 1
+
+
+@kernel
+def count_tuple_nodes(begins, tuples, parents, members, number, counts):
+    """The nodes that each splat belongs to by its tuples, at the splat + 1."""
+    for j in range(begins.size - 1):
+        for k in range(begins[j], begins[j + 1]):
+            t = tuples[k]
+            while t >= 0:
+                counts[j + 1] += number[members[t]] >= 0
+                t = parents[t]
+
+
+@kernel
+def list_tuple_nodes(begins, tuples, parents, members, number, starts, found):
+    """These nodes, from ``starts`` on and ascending: a tuple names its regions from the last one to the first."""
+    for j in range(begins.size - 1):
+        at = starts[j + 1]
+        for k in range(begins[j + 1] - 1, begins[j] - 1, -1):
+            t = tuples[k]
+            while t >= 0:
+                if number[members[t]] >= 0:
+                    at -= 1
+                    found[at] = number[members[t]]
+                t = parents[t]
 
 
 @kernel
@@ -347,9 +515,9 @@ def elect(first, last, indptr, region, weight, clusters, number, labels):
 
 
 @kernel
-def show(labels, indptr, region, weight, view, shown):
-    """Add the weight [K, V] that each object has in each view."""
-    for j in range(labels.size):
+def show(first, last, labels, indptr, region, weight, view, views, shown):
+    """Add the weight [K V] that each object has in each view, of splats ``first..last``."""
+    for j in range(first, last):
         if labels[j] >= 0:
             for k in range(indptr[j], indptr[j + 1]):
-                shown[labels[j], view[region[k]]] += weight[k]
+                shown[labels[j] * views + view[region[k]]] += weight[k]

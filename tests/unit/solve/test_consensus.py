@@ -11,7 +11,8 @@ import torch
 from liftcore.features.levels import region_levels
 from liftcore.features.views import Regions
 from liftcore.solve import consensus
-from liftcore.solve.consensus import BELONGS, FAINT, OBSERVES, PRIOR, mask_consensus
+from liftcore.solve.consensus import OBSERVES, PRIOR, mask_consensus
+from liftcore.solve.membership import BELONGS, FAINT
 from liftcore.solve.reweight import SHARPNESS, Agreement, agreement_factors
 from liftcore.solve.weights import RegionWeights, stacked
 from tests.unit.solve.sparse_views import codebook_of, dense, of_dense

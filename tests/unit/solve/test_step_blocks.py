@@ -3,14 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 import torch
 
+from liftcore.solve import objects
 from liftcore.solve.codebook import Codebook
+from liftcore.solve.consensus import (
+    SplatTuples,
+    along_curve,
+    mask_consensus,
+    mean_share,
+    region_shares,
+    splat_tuples,
+    with_mean,
+)
 from liftcore.solve.directions import RegionDirections, region_totals
+from liftcore.solve.membership import RegionGroups, memberships
 from liftcore.solve.reweight import SceneAgreement, ViewConsistency, agreement_factors
+from liftcore.solve.rows import SomeRows, gather_rows, take_rows
 from liftcore.solve.sums import PIECE, PieceSums, added, packed, unpacked
 from liftcore.solve.weights import RegionWeights, one_view, stacked
 from tests.unit.solve.sparse_views import codebook_of
@@ -22,8 +35,8 @@ LEVELS = np.tile(np.repeat(np.array([0, 1], np.int8), REGIONS // 2), VIEWS)
 
 def random_view(rng: np.random.Generator) -> RegionWeights:
     """Some splats, most with a region of each level, which their place gives, some with another one beside."""
-    splats = np.flatnonzero(rng.random(SPLATS) < 0.2).astype(np.int32)
-    own = splats // (SPLATS // 4) + rng.integers(0, 2, splats.size)
+    splats = np.flatnonzero(rng.random(SPLATS) < 0.6).astype(np.int32)
+    own = np.where(rng.random(splats.size) < 0.1, rng.integers(0, 6, splats.size), splats // (SPLATS // 4))
     coarse = np.where(rng.random(splats.size) < 0.1, rng.integers(0, REGIONS // 2, splats.size), own)
     view = np.zeros((splats.size, REGIONS), np.float32)
     every = np.arange(splats.size)
@@ -36,10 +49,15 @@ def random_view(rng: np.random.Generator) -> RegionWeights:
     return one_view(ids, starts, regions, weights, ids, torch.rand(ids.shape[0]), regions=REGIONS)
 
 
-@pytest.fixture(scope="module", name="W")
-def weights() -> RegionWeights:
+@pytest.fixture(scope="module")
+def views() -> list[RegionWeights]:
     rng = np.random.default_rng(0)
-    return stacked([random_view(rng) for _ in range(VIEWS)], SPLATS)
+    return [random_view(rng) for _ in range(VIEWS)]
+
+
+@pytest.fixture(scope="module", name="W")
+def weights(views: list[RegionWeights]) -> RegionWeights:
+    return stacked(views, SPLATS)
 
 
 @pytest.fixture(scope="module")
@@ -96,3 +114,115 @@ def test_robust_steps_in_blocks_are_those_of_the_whole_scene(
     assert whole.confidence is not None and torch.equal(confidence, whole.confidence)
     assert whole.explained is not None and torch.equal(explained, whole.explained)
     assert len(torch.unique(whole.factors)) > 1000
+
+
+@dataclass(frozen=True)
+class ViewBlock:
+    """What a worker has of some views: their splats, and W of these, with the numbers that regions have in all."""
+
+    base: int  # the first region
+    splats: np.ndarray  # [n] i64
+    W: RegionWeights
+    own: np.ndarray  # who belongs to what
+    tuples: SplatTuples  # of these views alone
+
+
+def view_blocks(views: list[RegionWeights], groups: RegionGroups, size: int) -> list[ViewBlock]:
+    blocks = []
+    for first in range(0, VIEWS, size):
+        whole = stacked(views[first : first + size], SPLATS)
+        splats, base = np.flatnonzero(whole.indptr.diff().numpy()), first * REGIONS
+        indptr = torch.cat([whole.indptr[:1], whole.indptr[1:][torch.from_numpy(splats)]])
+        W = replace(whole, indptr=indptr, region=whole.region + base)
+        own = memberships(W, groups, 1).own
+        tuples = splat_tuples(W, own, groups, np.arange(splats.size), 1)
+        blocks.append(ViewBlock(base, splats, W, own, tuples))
+    return blocks
+
+
+def all_tuples(parts: list[ViewBlock]) -> SplatTuples:
+    """Of all splats in all views, from the views' own numbers of tuples."""
+    bases = np.cumsum([0, *(part.tuples.members.size for part in parts)])
+    starts, (tuples,) = gather_rows(
+        lambda: (
+            SomeRows(part.splats, part.tuples.starts, [part.tuples.tuples + np.int32(base)])
+            for part, base in zip(parts, bases, strict=False)
+        ),
+        SPLATS,
+        [np.int32],
+    )
+    own = [np.where(p.tuples.parents < 0, -1, p.tuples.parents + b) for p, b in zip(parts, bases, strict=False)]
+    parents, members = np.concatenate(own).astype(np.int32), np.concatenate([p.tuples.members for p in parts])
+    return SplatTuples(starts, tuples, parents, members)
+
+
+@pytest.mark.parametrize("size", [1, 4])
+def test_consensus_by_blocks_of_views_is_that_of_the_whole_scene(
+    views: list[RegionWeights], W: RegionWeights, means: torch.Tensor, size: int
+) -> None:
+    groups = RegionGroups.of(W.offsets.numpy(), LEVELS)
+    parts, totals = view_blocks(views, groups, size), W.row_sums().numpy()
+    tuples, seen = all_tuples(parts), torch.nonzero(W.indptr.diff())[:, 0]
+    bounds, shares = torch.stack([means[seen].amin(dim=0), means[seen].amax(dim=0)]), []
+    for part in parts:
+        rows = along_curve(means[torch.from_numpy(part.splats)], bounds)
+        splats = part.splats[rows]
+        own = SplatTuples(*take_rows(tuples.starts, splats, tuples.tuples), tuples.parents, tuples.members)
+        shares.append(region_shares(part.W, part.own, groups, rows, totals[splats], own, base=part.base, threads=1))
+    usual = mean_share(sum(part.told for part in shares), sum(part.asked for part in shares))
+    _, (sums, counts) = gather_rows(
+        lambda: (
+            SomeRows(part.splats, part.W.indptr.numpy(), [share.sums, share.views])
+            for part, share in zip(parts, shares, strict=True)
+        ),
+        SPLATS,
+        [np.float32, np.uint8],
+    )
+    assert np.unique(counts).size > 3
+    expected = mask_consensus(W, LEVELS, 2, means=means)
+    np.testing.assert_array_equal(with_mean(sums, counts, usual, 1), expected)
+
+
+def test_objects_by_blocks_are_those_of_the_whole_scene(
+    views: list[RegionWeights], W: RegionWeights, blocks: list[tuple[int, int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(objects, "MOST_REGIONS", VIEWS * REGIONS // 2)  # so that some views give no nodes
+    monkeypatch.setattr(objects, "FEWEST_VIEWS", 3)
+    evidence = np.random.default_rng(4).random(SPLATS)
+    whole = objects.region_objects(W, LEVELS, evidence, 2)
+    groups = RegionGroups.of(W.offsets.numpy(), LEVELS)
+    parts, totals = view_blocks(views, groups, 2), W.row_sums().numpy()
+    tuples = all_tuples(parts)
+    sizes = np.concatenate([np.bincount(p.W.region.numpy()[p.own] - p.base, minlength=2 * REGIONS) for p in parts])
+    nodes, others = objects.choose_nodes(groups, sizes)
+    assert nodes.size and others.size
+    found = []
+    for part in parts:
+        begins, rows = objects.sampled_splats(part.W, part.own, nodes, part.base)
+        local, numbers = np.unique(rows, return_inverse=True)
+        splats = part.splats[local]
+        own = SplatTuples(*take_rows(tuples.starts, splats, tuples.tuples), tuples.parents, tuples.members)
+        table = objects.sampled_nodes(begins, numbers, own, totals[splats], nodes, LEVELS.size)
+        found.append(objects.node_views(table, nodes, groups, 1))
+    together = [np.concatenate([getattr(part, name) for part in found]) for name in ("container", "sees")]
+    clusters = objects.node_clusters(nodes, groups, objects.NodeViews(*together), 1)
+    number = int(clusters.max()) + 1
+    cut = [W.of_splats(*ends) for ends in blocks]
+    labels = [objects.object_labels(part, clusters, number, 1) for part in cut]
+    shares = [
+        sums
+        for part, own in zip(cut, labels, strict=True)
+        for sums in objects.object_shares(part, own, number, others, 1)
+    ]
+    objects.join(clusters, others, over_files(shares), number)
+    labels = [objects.object_labels(part, clusters, number, 1) for part in cut]
+    sums = [
+        sums
+        for part, own in zip(cut, labels, strict=True)
+        for sums in objects.view_shares(part, groups, own, number, 1)
+    ]
+    shown = added(over_files(sums), (1, number * VIEWS)).reshape(number, VIEWS)
+    got = objects.numbered(np.concatenate(labels), clusters, evidence, shown)
+    assert (got.labels >= 0).any() and len(got.views) > 1
+    for name in ("labels", "views", "regions"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(whole, name))

@@ -1,0 +1,79 @@
+"""Rows of a sparse table that lie in parts, by views, put together for a block of splats.
+
+Each part has some rows of the block and some columns of the table, in the order of the columns: so a row of the block
+is what the parts have of it, one after the other. W, what other views say of its entries, and tuples lie so.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from liftcore.jit import kernel
+
+
+@dataclass(frozen=True)
+class SomeRows:
+    """Rows of one part."""
+
+    rows: np.ndarray  # [r] i32 or i64 ascending, their numbers in the block
+    starts: np.ndarray  # [r + 1] i64, where each begins among the values, of which the first may lie before
+    values: Sequence[np.ndarray]  # each [n]
+
+
+def row_starts(parts: Iterable[SomeRows], count: int) -> np.ndarray:
+    """Where the rows of a block of so many begin, [count + 1] i64."""
+    lengths = np.zeros(count + 1, np.int64)
+    for part in parts:
+        lengths[part.rows + 1] += np.diff(part.starts)
+    return np.cumsum(lengths)
+
+
+def fill_rows(parts: Iterable[SomeRows], starts: np.ndarray, targets: Sequence[np.ndarray]) -> None:
+    """Put the values of all parts into those of the block, whose rows begin at ``starts`` (`row_starts`)."""
+    cursors = starts[:-1].copy()
+    for part in parts:
+        at = cursors[part.rows]
+        for source, target in zip(part.values, targets, strict=True):
+            copy_rows(part.starts, at, source, target)
+        cursors[part.rows] += np.diff(part.starts)
+
+
+def gather_rows(
+    parts: Callable[[], Iterable[SomeRows]], count: int, dtypes: Sequence[type]
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """The rows of a block of so many: where they begin [count + 1] i64, and their values, of those types.
+
+    Args:
+        parts: gives the parts, one in memory at a time; it is called twice.
+    """
+    starts = row_starts(parts(), count)
+    targets = [np.empty(starts[-1], dtype) for dtype in dtypes]
+    fill_rows(parts(), starts, targets)
+    return starts, targets
+
+
+def take_rows(starts: np.ndarray, rows: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Some rows [r] of a table: where they begin [r + 1] i64, and their values."""
+    begins = np.concatenate([[0], np.cumsum(np.diff(starts)[rows])])
+    taken = np.empty(begins[-1], values.dtype)
+    take(starts, rows, begins, values, taken)
+    return begins, taken
+
+
+@kernel
+def copy_rows(starts, at, source, target):
+    """Copy row i of the source, from ``starts[i]`` on, to where ``at[i]`` says."""
+    for i in range(at.size):
+        shift = at[i] - starts[i]
+        for k in range(starts[i], starts[i + 1]):
+            target[k + shift] = source[k]
+
+
+@kernel
+def take(starts, rows, begins, values, taken):
+    """`take_rows`."""
+    for i in range(rows.size):
+        shift = begins[i] - starts[rows[i]]
+        for k in range(starts[rows[i]], starts[rows[i] + 1]):
+            taken[k + shift] = values[k]
