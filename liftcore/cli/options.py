@@ -17,6 +17,7 @@ BAD_INPUT = 2
 ROLES = {  # of arguments that name files: what belongs there
     "splats": "splats", "cameras": "cameras", "features": "features", "lift": "lift", "table": "table",
 }  # fmt: skip
+ORDER = ("splats", "cameras", "features")
 ORDERED = ("lift", "plan", "check", "tradeoff")  # commands that take splats, cameras and features
 PRESETS = "default, row-sum, tikhonov, argmax, top-k, front-mass, centre or mean"
 THRESHOLDS = "auto, valley, paper, otsu, stability or a number"
@@ -46,17 +47,28 @@ class Parser(argparse.ArgumentParser):
 
 
 def misplaced(options: argparse.Namespace) -> InvalidInput | None:
-    """What to say of files that stand in each other's place; None where none does."""
-    from liftcore.io.kinds import kind_of
+    """The error of the first file that stands where another kind belongs; None where none does.
 
+    That the order is wrong is said only where what belongs there was given elsewhere.
+    """
+    from liftcore.io.kinds import kind_of, wrong_kind
+
+    given = {name: _paths(getattr(options, name, None)) for name in ROLES}
     for name, wanted in ROLES.items():
-        given = getattr(options, name, None) or []
-        for path in given if isinstance(given, list) else [given]:
-            kind = kind_of(path) if isinstance(path, Path) else None
-            if kind not in (None, wanted):
-                hint = "the order is SPLATS CAMERAS FEATURES" if options.command in ORDERED else ""
-                return InvalidInput(str(path), expected=f"{wanted} as {name.upper()}", got=kind, hint=hint)
+        for path in given[name]:
+            error = wrong_kind(path, wanted, InvalidInput, expected=f"{wanted} as {name.upper()}")
+            if error is None:
+                continue
+            others = (path for other in ORDER if other != name for path in given[other])
+            if options.command in ORDERED and name in ORDER and any(kind_of(other) == wanted for other in others):
+                hint = "the order is SPLATS CAMERAS FEATURES"
+                error = InvalidInput(error.argument, expected=error.expected, got=error.got, hint=hint)
+            return error
     return None
+
+
+def _paths(given: Any) -> list[Path]:
+    return [path for path in (given if isinstance(given, list) else [given]) if isinstance(path, Path)]
 
 
 def shared_options() -> Parser:

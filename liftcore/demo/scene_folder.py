@@ -14,13 +14,13 @@ import numpy as np
 from liftcore.errors import InvalidInput
 from liftcore.features.pack import read_features
 from liftcore.io.files import visible_files
+from liftcore.io.kinds import SPLATS_SENT, identify, kind_of
 from liftcore.query.text import BUILT_IN, NO_WORDS, OWN_WORDS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 SHIPPED = Path(__file__).with_name("tabletop")
-_SPLATS = (".ply", ".sog", ".spz", ".splat")  # the first kind that is there
 _CAMERA_FILES = ("cameras.json", "transforms.json", "cameras.zip")
 _TABLE = "text_table.safetensors"
 _ENCODERS = {space: encoder for encoder, space in BUILT_IN.items()}
@@ -139,11 +139,10 @@ def find_scene(folder: Path, phrases: Sequence[str], scratch: Path, pack: Path |
 
 def _splats(folder: Path) -> Path:
     """The splats of a folder, or of the last iteration that a 3DGS trainer kept in it."""
-    for suffix in _SPLATS:
-        found = visible_files(folder, f"*{suffix}") or visible_files(folder, f"point_cloud/*/*{suffix}")
-        if found:
-            return found[-1]
-    raise InvalidInput(f"splats of {folder.name}", expected=f"a file of {', '.join(_SPLATS)}", got="none")
+    found = next((name for name in identify(folder).splats if name.lower().endswith(SPLATS_SENT)), None)
+    if found is None:
+        raise InvalidInput(f"splats of {folder.name}", expected=f"a file of {', '.join(SPLATS_SENT)}", got="none")
+    return folder / found
 
 
 def _cameras(folder: Path, scratch: Path) -> Path:
@@ -167,8 +166,6 @@ def _cameras(folder: Path, scratch: Path) -> Path:
 
 def _packs(folder: Path) -> list[Path]:
     """The feature packs of a folder, ``features.safetensors`` first."""
-    from liftcore.io.kinds import kind_of
-
     found = [path for path in visible_files(folder, "*.safetensors") if kind_of(path) == "features"]
     if not found:
         raise InvalidInput(f"features of {folder.name}", expected="a feature pack (.safetensors)", got="none")

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from liftcore.errors import InvalidSplats
+from liftcore.io.kinds import EXPORT_PLY
 from liftcore.io.quantised import Fields
 
 # Our fields by what the two trainers call them.
@@ -17,10 +18,6 @@ GSPLAT = {"means": "means", "quats": "quats", "log_scales": "scales", "opacity_l
 GSPLAT_COLOUR = ("sh0", "shN")
 NERFSTUDIO_COLOUR = ("features_dc", "features_rest")
 NERFSTUDIO = ("_model.gauss_params.", "_model.")  # before the names, in newer and older versions
-EXPORT_PLY = (
-    "export the splats as PLY from the program that trained them (nerfstudio: ns-export gaussian-splat; gsplat's "
-    "simple_trainer: --save-ply)"
-)
 
 
 def read_checkpoint(path: Path, *, colour: bool = True) -> Fields:

@@ -1,12 +1,16 @@
 """Files that are written whole or not at all, what systems put beside files, and pointers of Git LFS."""
 
+import errno
 import lzma
 import os
 import secrets
+import stat
+import struct
 import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path, PurePath
 from typing import IO
 
@@ -20,6 +24,10 @@ BROKEN_ZIP = (
 )
 # What Windows, macOS and Synology put beside files, in lower case; all else that is theirs begins with a dot.
 SYSTEM_FILES = frozenset(("thumbs.db", "ehthumbs.db", "desktop.ini", "__macosx", "@eadir", "$recycle.bin"))
+MAX_DIRECTORY_BYTES = 16 << 20  # of a zip's list of files, of which zipfile makes an object each
+_END = struct.Struct("<4s4H2LH")  # of a zip: its list's size is the sixth field
+_END64_LOCATOR = struct.Struct("<4sLQL")
+_END64 = struct.Struct("<4sQ2H2L4Q")
 LFS_HINT = "run 'git lfs pull' in the repository where it lies"
 
 
@@ -47,6 +55,52 @@ def refuse_pointer(source: str, head: bytes) -> None:
     if head.startswith(LFS_POINTER):
         got = "a Git LFS pointer, which stands for the file"
         raise InvalidCameras(source, expected="a camera file", got=got, hint=LFS_HINT)
+
+
+def open_regular(path: Path) -> BufferedReader:
+    """Open a regular file to read: devices may have no end, and pipes may wait for ever.
+
+    Raises:
+        OSError: it does not open, or is none.
+    """
+    handle = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | getattr(os, "O_CLOEXEC", 0)), "rb")
+    if stat.S_ISREG(os.fstat(handle.fileno()).st_mode):
+        return handle
+    handle.close()
+    raise OSError(errno.EINVAL, "no regular file", str(path))
+
+
+def open_zip(path: Path) -> zipfile.ZipFile:
+    """Open a zip whose list of files is bounded, before zipfile reads it whole.
+
+    Raises:
+        zipfile.BadZipFile: it is none, or its list is larger. OSError: it does not open, or is no regular file.
+    """
+    with open_regular(path) as handle:
+        size = _directory_bytes(handle)
+    if size > MAX_DIRECTORY_BYTES:
+        raise zipfile.BadZipFile(f"its list of files takes {size} bytes, more than {MAX_DIRECTORY_BYTES}")
+    return zipfile.ZipFile(path)
+
+
+def _directory_bytes(handle: IO[bytes]) -> int:
+    """The size of a zip's list of files, as the record at its end says; 0 where there is none."""
+    end = handle.seek(0, 2)
+    handle.seek(max(0, end - _END.size - 0xFFFF))
+    tail = handle.read()
+    place = tail.rfind(b"PK\5\6")
+    if place < 0 or len(tail) - place < _END.size:
+        return 0
+    size = _END.unpack_from(tail, place)[5]
+    locator = place - _END64_LOCATOR.size
+    if locator >= 0 and tail[locator : locator + 4] == b"PK\6\7":
+        before = end - len(tail) + locator - _END64.size
+        for record_at in (before, _END64_LOCATOR.unpack_from(tail, locator)[2]):  # readers look at either
+            handle.seek(max(0, min(end, record_at)))
+            record = handle.read(_END64.size)
+            if len(record) == _END64.size and record[:4] == b"PK\6\6":
+                size = max(size if size != 0xFFFFFFFF else 0, _END64.unpack(record)[8])
+    return size
 
 
 @contextmanager

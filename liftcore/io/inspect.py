@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,10 +17,10 @@ from liftcore.features.smoothness import some_grids, unlike_maps
 from liftcore.features.views import NO_LABEL, Regions
 from liftcore.io.cameras import TRANSFORMS, camera_source, has_nerfstudio_beside, other_models, read_cameras
 from liftcore.io.class_masks import describe_masks
-from liftcore.io.kinds import LIFT_KEY, keys_of, looks_like_safetensors
+from liftcore.io.kinds import SplatFormat, identify
 from liftcore.io.ply import nearest_dialect
-from liftcore.io.splats import SplatFormat, format_of, is_splats, read_splats
-from liftcore.io.transforms import FRAME_FILE
+from liftcore.io.splats import format_of, read_splats, splat_files
+from liftcore.io.transforms import FRAME_FILE, frame_warning
 from liftcore.query.text.table import plain
 from liftcore.raster.base import ALPHA_FLOOR
 from liftcore.scene.cameras import Cameras, distortion_warning, photo_size
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from liftcore.features.views import ViewFeatures
     from liftcore.result import LiftMetadata, LiftResult
 
+ANY_KIND = "splats, cameras, features, masks, a text table or a lift"
 QUANTILES = {"min": 0.0, "q01": 0.01, "median": 0.5, "q99": 0.99, "max": 1.0}
 FAR = 1e5  # scene units; float32 resolves only a hundredth there
 TINY = 1e-7  # scene units
@@ -61,24 +63,35 @@ def inspect_file(path: Path) -> dict[str, Any]:
     """
     if not path.exists():
         raise InvalidInput(str(path), expected="a file or a folder", got="nothing of that name")
-    if is_splats(path):
-        found = describe_splat_file(path)  # first: what is no file is told better by who reads it
-        return {"kind": "splats", "bytes": path.stat().st_size, **found}
-    if path.is_dir() or not looks_like_safetensors(path):
-        found = describe_camera_file(path)  # first: which of its files are there is told better by who reads them
-        size = sum(file.stat().st_size for file in camera_source(path).files)
-        return {"kind": "cameras", "bytes": size, **found}
-    keys, metadata = keys_of(path)
-    size = path.stat().st_size
-    if LIFT_KEY in metadata:
-        from liftcore.io.lift_file import load_lift
+    found = identify(path)
+    describe, files_of = DESCRIPTIONS.get(found.kind or "", (None, None))
+    if describe is None or files_of is None:
+        if not found.recognised and (path.is_dir() or path.suffix.lower() == ".json"):
+            describe_camera_file(path)  # raises with what cameras lack
+        raise InvalidInput(str(path), expected=ANY_KIND, got=found.name, hint=found.hint)
+    description = describe(path)  # first: a reader says better which of its files is not there
+    size = sum(file.stat().st_size for file in files_of(path))
+    return {"kind": found.kind, "bytes": size, **description}
 
-        return {"kind": "lift", "bytes": size, **describe_lift(load_lift(path))}
-    if keys == {"embeddings"}:
-        return {"kind": "table", "bytes": size, **describe_table(path)}
-    if any(key.endswith("/mask") for key in keys):
-        return {"kind": "masks", "bytes": size, **describe_masks(path)}
-    return {"kind": "features", "bytes": size, **describe_packs(read_features(path))}
+
+def describe_lift_file(path: Path) -> dict[str, Any]:
+    """`describe_lift` of a file or a folder of shards.
+
+    Raises:
+        InvalidLift: it is malformed.
+    """
+    from liftcore.io.lift_file import load_lift
+
+    return describe_lift(load_lift(path))
+
+
+def _files_of_lift(path: Path) -> list[Path]:
+    return sorted(path.iterdir()) if path.is_dir() else [path]
+
+
+def _refuse_photos(path: Path) -> dict[str, Any]:
+    hint = "'splatlift encode' and 'splatlift pack masks' make features of photos"
+    raise InvalidInput(str(path), expected=ANY_KIND, got="photos", hint=hint)
 
 
 def describe_splat_file(path: Path) -> dict[str, Any]:
@@ -194,7 +207,7 @@ def _camera_warnings(cameras: Cameras, centres: np.ndarray) -> list[str]:
         for name, photo in photos.items()
         if abs(photo.cx / photo.width - 0.5) > OFF_CENTRE or abs(photo.cy / photo.height - 0.5) > OFF_CENTRE
     ]
-    warnings = distortion_warning(list(cameras.values())) + list(cameras.warnings)
+    warnings = distortion_warning(list(cameras.values())) + frame_warning(cameras)
     if off:
         warnings.append(f"{len(off)} views have their principal point far off the centre, such as {off[0]!r}")
     places = len(np.unique(centres, axis=0))
@@ -368,3 +381,15 @@ def _words(metadata: dict[str, str]) -> list[str]:
     except ValueError:
         return []
     return [str(word) for word in words] if isinstance(words, list) else []
+
+
+# By kind: how a file is described, and the files whose bytes count.
+DESCRIPTIONS: dict[str, tuple[Callable[[Path], dict[str, Any]], Callable[[Path], list[Path]]]] = {
+    "splats": (describe_splat_file, splat_files),
+    "cameras": (describe_camera_file, lambda path: camera_source(path).files),
+    "features": (lambda path: describe_packs(read_features(path)), lambda path: [path]),
+    "masks": (describe_masks, lambda path: [path]),
+    "table": (describe_table, lambda path: [path]),
+    "lift": (describe_lift_file, _files_of_lift),
+    "photos": (_refuse_photos, lambda path: [path]),
+}

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from liftcore.errors import InvalidCameras
-from liftcore.io.files import refuse_pointer
+from liftcore.io.files import open_regular, refuse_pointer
 
 MAX_JSON_BYTES = 64 * 1024 * 1024
 FORMATS = "an object with 'frames' (nerfstudio) or a list of cameras with 'img_name' (Inria)"
@@ -22,7 +22,7 @@ def read_json(path: Path) -> Any:
         InvalidCameras: the file does not open, is too large or is not JSON.
     """
     try:
-        with path.open("rb") as handle:
+        with open_regular(path) as handle:
             content = handle.read(MAX_JSON_BYTES + 1)
         if len(content) > MAX_JSON_BYTES:
             raise InvalidCameras(str(path), expected=f"JSON of at most {MAX_JSON_BYTES} bytes", got="a larger file")

@@ -1,60 +1,359 @@
-"""What a file or folder is, by its beginning: so that one in another's place is told as that. Loads no torch."""
+"""The kind of any file or folder, and what to do with one that no reader takes. Loads no torch.
 
+`identify` looks at the beginning of a file, at the names in a zip or a folder, and at a name's suffix last: files are
+renamed, and their names are lost on the way to a server. What it reads is bounded. Readers, the command line, the
+check of uploads and `inspect` all ask it; the page has its table of suffixes (`page_table`).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import stat
+import struct
 import zipfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from pathlib import Path
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from itertools import islice
+from pathlib import Path, PurePosixPath
+from typing import Any, TypeVar
 
 from liftcore.errors import InvalidInput
-from liftcore.io.cameras import camera_source
-from liftcore.io.files import BROKEN_ZIP
-from liftcore.io.splats import is_splats
+from liftcore.io.colmap import MODEL_FILES
+from liftcore.io.files import BROKEN_ZIP, LFS_HINT, LFS_POINTER, is_system_file, open_regular, open_zip
+from liftcore.io.ply import MAX_HEADER_BYTES, cloud_without_splats
+from liftcore.io.shards import INDEX
+from liftcore.io.sog import META, is_sog_document, sog_folder
+from liftcore.io.splat import looks_like_splat
+from liftcore.io.spz import begins_like_spz
+from liftcore.io.transforms import FRAME_FILE
 from liftcore.scene.views import IMAGE_SUFFIXES
 
 LIFT_KEY = "splatlift"  # of the metadata of a lift
 PARTS = {"labels", "codebook", "grid"}  # of a feature pack's views
+LOD_META = "lod-meta.json"  # of a streamed SOG
+CAMERA_FILES = re.compile(r"(^|/)((cameras|images|frames|rigs)\.(bin|txt)|transforms[^/]*\.json|cameras\.json)$")
+MAX_JSON_BYTES = 64 << 20  # that are parsed to tell what a document is
+HEAD_BYTES = 4096  # of what is told by its first bytes
+DEPTH = 5  # folders down
+MAX_FOLDERS = 2_000
+MAX_NAMES = 50_000  # of files in a folder that are looked at
+MOST_HEADERS = 32  # of PLYs in a folder or zip that are read, the likeliest first
+TEXT_SHOWN = 60  # characters
+
+CONVERT = "convert it with PlayCanvas's splat-transform: npx @playcanvas/splat-transform IN OUT.ply"
+NOT_CONVERTED = (
+    "splat-transform does not read it: export the splats as .ply, .spz or .sog from the program that has them"
+)
+EXPORT_PLY = (
+    "export the splats as PLY from the program that trained them (nerfstudio: ns-export gaussian-splat; gsplat's "
+    "simple_trainer: --save-ply)"
+)
+UNPACK = "unpack it and give the splats in it"
+MAYBE_DOWNLOAD = "if it was downloaded, that went wrong: fetch the file itself"
+DOWNLOAD = "the download went wrong: fetch the file itself"
+TRAINED = "give the trained splats; the 3DGS trainers keep them in point_cloud/iteration_N/point_cloud.ply"
+OPEN_COPY = "open it where it lies, so that it is downloaded, and copy that"
+
+
+class SplatFormat(StrEnum):
+    """A format that is read, as people call it."""
+
+    PLY = "PLY"  # of every dialect
+    COMPRESSED_PLY = "compressed PLY"
+    SPLAT = ".splat"
+    SPZ = ".spz"
+    SOG = ".sog"
+    CHECKPOINT = "checkpoint"  # of gsplat or nerfstudio: a pickle, if only of tensors
+
+
+SUFFIX = {
+    SplatFormat.PLY: ".ply",
+    SplatFormat.COMPRESSED_PLY: ".ply",
+    SplatFormat.SPLAT: ".splat",
+    SplatFormat.SPZ: ".spz",
+    SplatFormat.SOG: ".sog",
+    SplatFormat.CHECKPOINT: ".pt",
+}
+PICKLED = (".pt", ".pth", ".ckpt", ".pkl")
+SPLATS_SENT = (".ply", ".splat", ".spz", ".sog")  # over HTTP, where no pickle is opened
+
+
+@dataclass(frozen=True)
+class FileKind:
+    """The kind of a file or folder, in the words of an error."""
+
+    kind: str | None  # splats, cameras, photos (a zip or folder), features, masks, table or lift; None: none of these
+    name: str  # as it stands behind "got"
+    hint: str = ""  # what to do with it
+    format: SplatFormat | None = None  # of splats
+    splats: tuple[str, ...] = ()  # splat files in a folder or zip, the one to give first
+    recognised: bool = True  # False: nothing is known of it but its first bytes
+
+
+_WEB_PAGE = FileKind(None, "a web page", DOWNLOAD)
+_VIEWER = FileKind(
+    None,
+    "a web page that shows splats",
+    "export them from SuperSplat's editor as .ply or .sog in place of the viewer",
+)
+_GLTF = FileKind(None, "a glTF model", f"if it holds splats, {NOT_CONVERTED}; a mesh has none")
+_GLTF_SPLATS = FileKind(None, "splats as glTF (KHR_gaussian_splatting)", NOT_CONVERTED)
+_USD = FileKind(None, "a USD scene", f"if it holds splats, {NOT_CONVERTED}; a mesh has none")
+_PICTURE = FileKind(None, "a picture")
+_VIDEO = FileKind(
+    None, "a video", "take frames of it, reconstruct their cameras with COLMAP, and train splats on them"
+)
+_RAD = FileKind(None, "splats in Spark's .rad format", f"{NOT_CONVERTED}; or give the file that it was made of")
+_SPX = FileKind(None, "splats in Reall3D's .spx format", NOT_CONVERTED)
+_MESH = FileKind(None, "a mesh", TRAINED)
+_CLOUD = FileKind(None, "a point cloud", TRAINED)
+_UNFINISHED = FileKind(None, "a download that has not finished", "wait until it has, or fetch the file again")
+_PLACEHOLDER = FileKind(None, "a placeholder of a file that lies in a cloud", OPEN_COPY)
+_LINK = FileKind(None, "a shortcut to a file", "give the file that it leads to")
+_TABLE_OF_MATCHES = FileKind(
+    None, "a database of COLMAP or another program", "of COLMAP give the folder of the model, such as sparse/0"
+)
+
+# By the bytes at a place of a file. Of two that fit the first counts.
+_MAGIC: tuple[tuple[int, bytes, FileKind], ...] = (
+    (0, LFS_POINTER, FileKind(None, "a Git LFS pointer, which stands for the file", LFS_HINT)),
+    (0, b"/annex/objects/", FileKind(None, "a git-annex pointer, which stands for the file", "run 'git annex get'")),
+    (0, b"\x1f\x8b", FileKind(
+        None, "a gzip file", f"{UNPACK} (gunzip), or upload it with the header 'Content-Encoding: gzip'")),
+    (0, b"7z\xbc\xaf\x27\x1c", FileKind(None, "a 7z archive", UNPACK)),
+    (0, b"Rar!\x1a\x07", FileKind(None, "a RAR archive", UNPACK)),
+    (0, b"\xfd7zXZ\x00", FileKind(None, "an xz file", UNPACK)),
+    (0, b"BZh", FileKind(None, "a bzip2 file", UNPACK)),
+    (0, b"\x28\xb5\x2f\xfd", FileKind(None, "a zstd file", UNPACK)),
+    (257, b"ustar", FileKind(None, "a tar archive", UNPACK)),
+    (0, b"\x93NUMPY", FileKind(
+        None, "a NumPy array", "of features, 'splatlift pack npy' makes a pack of a folder of them; of splats, "
+        "export PLY from the program that trained them")),
+    (0, b"glTF", _GLTF),
+    (0, b"PXR-USDC", _USD),
+    (0, b"#usda", _USD),
+    (0, b"RAD0", _RAD),
+    *((0, b"spx" + version, _SPX) for version in (b"\1", b"\2", b"\3")),
+    (0, b"\x89HDF\r\n\x1a\n", FileKind(None, "an HDF5 file", "save its arrays; 'splatlift pack npy' takes them")),
+    (0, b"SQLite format 3\x00", _TABLE_OF_MATCHES),
+    (0, b"BLENDER", FileKind(None, "a Blender file", TRAINED)),
+    (0, b"Kaydara FBX Binary", _MESH),
+    (0, b"LASF", _CLOUD),
+    (0, b"ASTM-E57", _CLOUD),
+    (0, b"# .PCD", _CLOUD),
+    (0, b"\xff\xd8\xff", _PICTURE),
+    (0, b"\x89PNG\r\n", _PICTURE),
+    (0, b"GIF8", _PICTURE),
+    (0, b"II*\x00", _PICTURE),
+    (0, b"MM\x00*", _PICTURE),
+    (0, b"\x76\x2f\x31\x01", _PICTURE),
+    (8, b"WEBP", _PICTURE),
+    *((8, brand, _PICTURE) for brand in (b"heic", b"heix", b"mif1", b"avif")),
+    (4, b"ftyp", _VIDEO),
+    (0, b"\x1a\x45\xdf\xa3", _VIDEO),
+    (8, b"AVI ", _VIDEO),
+    (0, b"%PDF", FileKind(None, "a PDF")),
+    (0, b"\x00\x05\x16\x07", FileKind(
+        None, "what macOS keeps beside a file", "give the file of that name without '._' before it")),
+    (0, b"L\x00\x00\x00\x01\x14\x02\x00", _LINK),
+    (0, b"book\x00\x00\x00\x00mark", _LINK),
+    (0, b"[InternetShortcut]", _LINK),
+    (0, b"bplist00", _PLACEHOLDER),
+    (0, b"!!python/object", FileKind(
+        None, "a run's config.yml of nerfstudio", "give its last nerfstudio_models/step-*.ckpt, or ns-export "
+        "gaussian-splat --load-config config.yml --output-dir OUT and give OUT/splat.ply")),
+)  # fmt: skip
+# By the suffix, where the bytes say nothing.
+_BY_SUFFIX: dict[str, FileKind] = {
+    ".ksplat": FileKind(None, "splats in GaussianSplats3D's .ksplat format", CONVERT),
+    ".lcc": FileKind(None, "splats in XGRIDS's .lcc format", CONVERT),
+    ".lcc2": FileKind(None, "splats in XGRIDS's .lcc2 format", CONVERT),
+    ".psht": FileKind(None, "a project of Postshot", "export the splats from Postshot as .ply (Export Splat PLY)"),
+    ".lfsp": FileKind(None, "a project of LichtFeld Studio", "export the splats from it as .ply"),
+    ".ssproj": FileKind(
+        None,
+        "a project of SuperSplat",
+        "export the splats from SuperSplat as .ply, or unzip it: splat_0.ply is in it",
+    ),
+    ".vkgs": FileKind(None, "a project of vk_gaussian_splatting", "give the .ply, .spz or .splat that it names"),
+    ".glb": _GLTF,
+    ".gltf": _GLTF,
+    **dict.fromkeys((".usdz", ".usdc", ".usda", ".usd"), _USD),
+    ".rad": _RAD,
+    ".spx": _SPX,
+    ".html": _VIEWER,
+    ".htm": _VIEWER,
+    **dict.fromkeys((".obj", ".fbx", ".stl", ".mtl", ".off", ".dae", ".3ds"), _MESH),
+    **dict.fromkeys((".las", ".laz", ".e57", ".pcd", ".pts", ".ptx", ".xyz"), _CLOUD),
+    ".blend": FileKind(None, "a Blender file", TRAINED),
+    **dict.fromkeys((".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".insv", ".360"), _VIDEO),
+    **dict.fromkeys((".crdownload", ".download", ".part", ".partial"), _UNFINISHED),
+    ".icloud": _PLACEHOLDER,
+    **dict.fromkeys((".lnk", ".url", ".webloc"), _LINK),
+    ".db": _TABLE_OF_MATCHES,
+    **dict.fromkeys(
+        (".pkl", ".pickle"),
+        FileKind(None, "a Python pickle, which may run code when it is opened", EXPORT_PLY),
+    ),
+    **dict.fromkeys(
+        (".gz", ".tgz", ".bz2", ".xz", ".zst", ".tar", ".7z", ".rar"), FileKind(None, "an archive", UNPACK)
+    ),
+}
+_COLMAP_POINTS = ("points3D.bin", "points3D.txt", "frames.bin", "rigs.bin", "frames.txt", "rigs.txt")
+_TRAINERS = {  # by what lies in their folders
+    "cfg_args": "3DGS's trainer", "ckpts/": "gsplat's trainer", "nerfstudio_models/": "nerfstudio",
+    "point_cloud/iteration_": "3DGS's trainer",
+}  # fmt: skip
+_STEP = re.compile(r"(?:iteration|point_cloud|export|step|ckpt|splat)s?[_-]?0*([0-9]+)")
+_CHECKPOINT = re.compile(r"(^|/)(ckpt_[0-9]+[^/]*\.pt|step-[0-9]+\.ckpt)$")
+_NO_SCENE = re.compile(r"(^|/)(points?3d|sparse_pc|input|fused|dense|mesh|poisson|meshed)[^/]*\.ply$", re.IGNORECASE)
+_OF_FEATURES = re.compile(r"(_features|_filtered|_labels)\.pt$")  # of splat-distiller, beside the checkpoint
+Found = TypeVar("Found", bound=InvalidInput)
 
 
 def kind_of(path: Path) -> str | None:
-    """What a file or folder looks like, by its beginning; None where it looks like nothing of ours, or does not open.
+    """The kind of a file or folder; None where it is none of those of `FileKind`, or does not open."""
+    return identify(path).kind
 
-    Returns:
-        splats, cameras, photos (a zip), features, masks, table or lift.
+
+def wrong_kind(
+    path: Path, wanted: str, fault: type[Found], *, argument: str = "", expected: str = ""
+) -> Found | None:
+    """The error for a file or folder in the place of one of another kind; None where it may be of the wanted kind.
+
+    Args:
+        path: the file or folder. wanted: of `FileKind.kind`. fault: the error's type. argument: its name there, the
+        path if empty. expected: what belongs there, ``wanted`` if empty.
     """
-    with suppress(InvalidInput, *BROKEN_ZIP):
-        if is_splats(path):
-            return "splats"
-        if not path.is_file():
-            return "cameras" if path.is_dir() and camera_source(path).files else None
-        return _kind_in(path)
-    return None
+    found = identify(path)
+    if found.kind == wanted or not found.recognised:
+        return None
+    hint = found.hint
+    if found.kind is not None or (wanted == "splats" and found.splats):
+        hint = _instead(path, found, wanted) or hint
+    return fault(argument or str(path), expected=expected or wanted, got=found.name, hint=hint)
 
 
-def _kind_in(path: Path) -> str | None:
-    if zipfile.is_zipfile(path):
-        with zipfile.ZipFile(path) as archive:
-            suffixes = {Path(name).suffix.lower() for name in archive.namelist()}
-        return "photos" if suffixes & IMAGE_SUFFIXES else "cameras"
-    if not looks_like_safetensors(path):
-        with path.open("rb") as handle:
-            return "cameras" if handle.read(1) in (b"[", b"{") else None
-    keys, metadata = keys_of(path)
+def _instead(path: Path, found: FileKind, wanted: str) -> str:
+    """What to give in the place of a file or folder of ours."""
+    if wanted == "splats" and found.splats:
+        one = found.splats[0]
+        if path.is_dir():
+            return f"give {path / one}"
+        return f"unzip it and give {one}"
+    made = {
+        ("features", "photos"): "'splatlift encode IMAGES -o PACK' makes a feature pack of photos",
+        ("features", "masks"): "masks to judge by have no vectors; 'splatlift pack' makes feature packs",
+        ("cameras", "photos"): "give the COLMAP model, transforms.json or cameras.json of these photos",
+        ("lift", "features"): "'splatlift lift SPLATS CAMERAS FEATURES -o LIFT' makes a lift of them",
+        ("lift", "splats"): "'splatlift lift SPLATS CAMERAS FEATURES -o LIFT' makes a lift of them",
+    }
+    return made.get((wanted, found.kind or ""), "")
+
+
+def identify(path: Path) -> FileKind:
+    """Find what a file or folder is, without an error: what does not open says so in its name."""
+    try:
+        mode = path.stat().st_mode
+        if stat.S_ISDIR(mode):
+            return _folder(path)
+        if not stat.S_ISREG(mode):
+            return FileKind(None, "no regular file (a device, pipe or socket)", "give the file itself")
+        return _file(path)
+    except FileNotFoundError:
+        if path.with_name(f".{path.name}.icloud").exists():
+            return _PLACEHOLDER
+        return FileKind(None, "no such file or folder", recognised=False)
+    except (OSError, ValueError) as error:
+        return FileKind(
+            None, f"one that does not open ({getattr(error, 'strerror', None) or error})", recognised=False
+        )
+
+
+def splat_format(path: Path) -> SplatFormat | None:
+    """The format of splats that are read, by content; None of anything else."""
+    return identify(path).format
+
+
+# ---- files
+
+
+def _file(path: Path) -> FileKind:
+    with open_regular(path) as handle:
+        head, size = handle.read(MAX_HEADER_BYTES), handle.seek(0, 2)
+    return _first(_file_rules(path, head, size))
+
+
+def _first(rules: Iterable[FileKind | None]) -> FileKind:
+    """The first that fits; the last of such rules always does."""
+    return next(found for found in rules if found is not None)
+
+
+def _file_rules(path: Path, head: bytes, size: int) -> Iterator[FileKind | None]:
+    suffix = path.suffix.lower()
+    yield FileKind(None, "an empty file", "copy or export it again") if not head else None
+    yield _colmap_part(path) if path.name in (*MODEL_FILES, *_COLMAP_POINTS) else None
+    yield _ply(head) if head[:4] in (b"ply\n", b"ply\r") else None
+    yield _splats_as(SplatFormat.SPZ) if begins_like_spz(head) else None
+    yield _zip(path) if head[:2] == b"PK" and zipfile.is_zipfile(path) else None
+    damaged = FileKind(None, "a zip that is cut short or damaged", "copy or download it again")
+    yield damaged if head[:4] == b"PK\3\4" else None
+    yield _safetensors(path) if suffix == ".safetensors" or _is_safetensors(head, size) else None
+    known = _by_magic(head) or (_by_text(path, head, size) if _is_text(head) else None)
+    is_splat = suffix == ".splat" or (known is None and suffix not in _BY_SUFFIX and looks_like_splat(head, size))
+    yield _splats_as(SplatFormat.SPLAT) if is_splat else None
+    meta = path.parent / META
+    is_part = known is _PICTURE and meta.is_file() and _is_sog(meta)
+    yield replace(_PICTURE, name="a picture of a SOG", hint=f"give {meta}") if is_part else None
+    yield known
+    yield _BY_SUFFIX[".ksplat"] if _is_ksplat(head, size) else None
+    yield _BY_SUFFIX.get(suffix)
+    zeros = FileKind(None, "a file of zeros", "a copy or download did not finish: fetch it again")
+    yield None if head.strip(b"\0") else zeros
+    yield FileKind(None, f"a file that begins with {head[:8]!r}", recognised=False)
+
+
+def _splats_as(found: SplatFormat) -> FileKind:
+    return FileKind("splats", "splats", format=found)
+
+
+def _ply(head: bytes) -> FileKind:
+    lines = head.partition(b"end_header")[0].decode("latin1").splitlines()
+    if found := cloud_without_splats(lines):
+        return FileKind(None, *found)
+    first = next((line.split()[1:2] for line in lines if line.startswith("element ")), [])
+    ours = SplatFormat.COMPRESSED_PLY if first == ["chunk"] else SplatFormat.PLY
+    return FileKind("splats", "splats", format=ours)
+
+
+def _is_safetensors(head: bytes, size: int) -> bool:
+    return head[8:9] == b"{" and int.from_bytes(head[:8], "little") < size
+
+
+def _safetensors(path: Path) -> FileKind:
+    try:
+        keys, metadata = keys_of(path)
+    except InvalidInput as error:
+        return FileKind(None, error.got, error.hint, recognised=False)
     parts = {key.rpartition("/")[2] for key in keys}
     signs = {
         "lift": LIFT_KEY in metadata, "table": keys == {"embeddings"}, "masks": "mask" in parts,
         "features": bool(parts & PARTS),
     }  # fmt: skip
-    return next((kind for kind, fits in signs.items() if fits), None)
-
-
-def looks_like_safetensors(path: Path) -> bool:
-    """Whether a file is named or begins like one."""
-    with path.open("rb") as handle:
-        start = handle.read(9)
-    return path.suffix.lower() == ".safetensors" or start[8:] == b"{"
+    kind = next((kind for kind, fits in signs.items() if fits), None)
+    if kind is not None:
+        return FileKind(kind, kind)
+    some = ", ".join(repr(key[:40]) for key in sorted(keys)[:3]) or "no tensor"
+    hint = "weights of an encoder go to --weights or the encoder's name; 'splatlift pack' makes feature packs"
+    return FileKind(None, f"a safetensors file of {some}", hint)
 
 
 def keys_of(path: Path) -> tuple[set[str], dict[str, str]]:
-    """The names of its tensors, and its metadata.
+    """The names of a safetensors file's tensors, and its metadata.
 
     Raises:
         InvalidInput: it does not open.
@@ -67,3 +366,279 @@ def keys_of(path: Path) -> tuple[set[str], dict[str, str]]:
     except (SafetensorError, OSError) as error:
         got = f"one that does not open ({str(error)[:120]})"
         raise InvalidInput(str(path), expected="a safetensors file", got=got) from None
+
+
+def _by_magic(head: bytes) -> FileKind | None:
+    found = next((kind for place, magic, kind in _MAGIC if head.startswith(magic, place)), None)
+    if found is None and head[:1] == b"\x80" and head[1:2] in b"\x02\x03\x04\x05":
+        found = FileKind(None, "a Python pickle, which may run code when it is opened", EXPORT_PLY)
+    if found is _GLTF and b"KHR_gaussian_splatting" in head:
+        return _GLTF_SPLATS
+    return found
+
+
+def _is_ksplat(head: bytes, size: int) -> bool:
+    """Whether a header of GaussianSplats3D's format fits: version 0.1, sections and splats within their maxima."""
+    if len(head) < HEAD_BYTES or head[:2] != b"\0\1":
+        return False
+    most_sections, sections, most_splats, splats, level = struct.unpack_from("<4IH", head, 4)
+    return 0 < sections <= most_sections and 0 < splats <= most_splats and level <= 2 and splats < size
+
+
+def _by_text(path: Path, head: bytes, size: int) -> FileKind | None:
+    """What a text is: JSON, a page, a mesh, COLMAP's text, or a server's error."""
+    start = head[:HEAD_BYTES].lstrip(b"\xef\xbb\xbf \t\r\n")
+    lower, suffix = start.lower(), path.suffix.lower()
+    if start[:1] in (b"{", b"["):
+        return _json(path, size)
+    if lower.startswith((b"<!doctype html", b"<html", b"<head", b"<!--")):
+        is_viewer = suffix in (".html", ".htm") or (size > HEAD_BYTES and b"splat" in head.lower())
+        return _VIEWER if is_viewer else _WEB_PAGE
+    if lower.startswith((b"solid ", b"mtllib ", b"o ", b"v ", b"off\n", b"# blender")):
+        return _MESH
+    if re.match(rb"#[^\n]*list with one line of data per", lower):
+        return _colmap_part(path)
+    is_answer = size < HEAD_BYTES and suffix not in (*_BY_SUFFIX, ".txt", ".yml", ".yaml", ".md", ".csv")
+    return FileKind(None, f"a text that begins with {_shown(start)}", MAYBE_DOWNLOAD) if is_answer else None
+
+
+def _colmap_part(path: Path) -> FileKind:
+    is_model = path.name in MODEL_FILES
+    return FileKind("cameras" if is_model else None, "a part of a COLMAP model", "give the folder that it lies in")
+
+
+def _is_text(head: bytes) -> bool:
+    return not any(byte < 9 or 13 < byte < 32 for byte in head[:HEAD_BYTES])
+
+
+def _shown(start: bytes) -> str:
+    text = " ".join(start[: 4 * TEXT_SHOWN].decode("utf-8", "replace").split())
+    return repr(text[:TEXT_SHOWN])
+
+
+def _json(path: Path, size: int) -> FileKind:
+    if size > MAX_JSON_BYTES:
+        return FileKind(None, f"a JSON file of {size} bytes", recognised=False)
+    try:
+        with open_regular(path) as handle:
+            document = json.loads(handle.read(MAX_JSON_BYTES))
+    except (ValueError, RecursionError, MemoryError):
+        return FileKind("cameras", "JSON that does not parse", recognised=False)
+    return _document(document, path)
+
+
+def _document(document: Any, path: Path) -> FileKind:
+    """What a JSON document is, by its keys."""
+    if isinstance(document, list):
+        return _first(_list_rules(document))
+    if isinstance(document, dict):
+        return _first(_object_rules(document, path))
+    return FileKind(None, f"JSON ({str(document)[:TEXT_SHOWN]!r})", recognised=False)
+
+
+def _list_rules(document: list[Any]) -> Iterator[FileKind | None]:
+    first = document[0] if document and isinstance(document[0], dict) else {}
+    is_cameras = not document or first.keys() & {"img_name", "transform", "file_path"}
+    yield FileKind("cameras", "cameras") if is_cameras else None
+    hint = "'splatlift pack masks' or 'splatlift pack prompts' makes a feature pack of its folder"
+    yield FileKind(None, "masks as JSON", hint) if "segmentation" in first else None
+    yield FileKind(None, "a JSON list of something else", recognised=False)
+
+
+def _object_rules(document: dict[str, Any], path: Path) -> Iterator[FileKind | None]:
+    keys = document.keys()
+    yield _splats_as(SplatFormat.SOG) if is_sog_document(document) else None
+    is_streamed = keys >= {"tree", "filenames"} or path.name == LOD_META
+    yield _streamed(f"a streamed SOG ({LOD_META})", path) if is_streamed else None
+    yield FileKind("cameras", "cameras") if "frames" in keys else None
+    frame = FileKind(None, f"the frame of a nerfstudio run ({FRAME_FILE})", "give the cameras that it belongs to")
+    yield frame if keys >= {"transform", "scale"} else None
+    is_gltf = "asset" in keys and keys & {"buffers", "accessors", "scenes", "meshes"}
+    has_splats = "KHR_gaussian_splatting" in str(document.get("extensionsUsed", ""))
+    yield (_GLTF_SPLATS if has_splats else _GLTF) if is_gltf else None
+    hint = "'splatlift pack prompts' makes a feature pack of its folder"
+    yield FileKind(None, "masks as JSON (COCO)", hint) if keys >= {"annotations", "images"} else None
+    is_project = keys >= {"splats", "camera"} or keys >= {"view", "poseSets"} or keys >= {"timeline", "version"}
+    yield replace(_BY_SUFFIX[".ssproj"], name="the document of a SuperSplat project") if is_project else None
+    is_viewer = keys >= {"camera", "background"} or "postEffectSettings" in keys
+    hint = "give the splats that it shows, as .ply or .sog"
+    yield FileKind(None, "settings of a SuperSplat viewer", hint) if is_viewer else None
+    yield _BY_SUFFIX.get(path.suffix.lower())
+    is_answer = len(keys) <= 6 and keys & {"error", "errors", "detail", "message", "Message"}
+    yield FileKind(None, f"an answer of a server ({str(document)[:TEXT_SHOWN]!r})", DOWNLOAD) if is_answer else None
+    some = ", ".join(map(str, list(keys)[:5]))[:TEXT_SHOWN]
+    yield FileKind(None, f"a JSON object with {some or 'nothing'}", recognised=False)
+
+
+def _streamed(name: str, path: Path | str) -> FileKind:
+    return FileKind(None, name, f"make one file of it: npx @playcanvas/splat-transform {path} OUT.ply")
+
+
+def _is_sog(path: Path) -> bool:
+    with suppress(OSError, ValueError):
+        return path.stat().st_size <= MAX_JSON_BYTES and _json(path, path.stat().st_size).format is SplatFormat.SOG
+    return False
+
+
+# ---- zips
+
+
+def _zip(path: Path) -> FileKind:
+    try:
+        with open_zip(path) as archive:
+            names = _visible(archive.namelist())
+            return _first(_of_names_in_zip(names, lambda name: _first_bytes(archive, name)))
+    except BROKEN_ZIP as error:
+        return FileKind(None, f"a zip that does not open ({str(error)[:120]})", recognised=False)
+
+
+def _first_bytes(archive: zipfile.ZipFile, name: str) -> bytes:
+    with archive.open(name) as member:
+        return member.read(MAX_HEADER_BYTES)
+
+
+def _visible(names: Iterable[str]) -> list[str]:
+    """The files but those that systems put there."""
+    files = [name for name in names if not name.endswith("/")]
+    return [name for name in files if not is_system_file(PurePosixPath(name.replace("\\", "/")))]
+
+
+def _of_names_in_zip(names: list[str], head_of: Callable[[str], bytes]) -> Iterator[FileKind | None]:
+    lasts = {name.rpartition("/")[2] for name in names}
+    suffixes = {PurePosixPath(last).suffix.lower() for last in lasts}
+    yield FileKind(None, "a zip without a file", "zip or export it again") if not names else None
+    yield _splats_as(SplatFormat.SOG) if sog_folder(names) is not None else None
+    yield _splats_as(SplatFormat.CHECKPOINT) if any(name.endswith("/data.pkl") for name in names) else None
+    yield _USD if names[0].lower().endswith((".usd", ".usda", ".usdc")) else None
+    hint = "save each as .npy; 'splatlift pack npy' makes a feature pack of them"
+    yield FileKind(None, "NumPy arrays (.npz)", hint) if suffixes == {".npy"} else None
+    yield _streamed(f"a zip of a streamed SOG ({LOD_META})", f"(unzipped) {LOD_META}") if LOD_META in lasts else None
+    yield _BY_SUFFIX[".ssproj"] if "document.json" in lasts and ".ply" in suffixes else None
+    splats = _splat_files(names, lambda name: _begins_with_splats(head_of(name)))
+    is_cameras = any(CAMERA_FILES.search(name.replace("\\", "/")) for name in names)
+    yield FileKind("cameras", "a zip of cameras", splats=splats) if is_cameras else None
+    yield _zip_with(splats) if splats else None
+    yield FileKind("photos", "photos") if suffixes & IMAGE_SUFFIXES else None
+    yield _zip_with(packs) if (packs := [name for name in names if name.endswith(".safetensors")]) else None
+    known = next((kind for last in lasts if (kind := _BY_SUFFIX.get(PurePosixPath(last).suffix.lower()))), None)
+    yield replace(_zip_with(names), hint=known.hint if known else "unzip it and give the file itself")
+
+
+def _zip_with(names: Sequence[str]) -> FileKind:
+    """A zip with files of interest, the first of which is the one to give."""
+    several = f" and {len(names) - 1} more" if len(names) > 1 else ""
+    splats = tuple(name for name in names if name.lower().endswith((*SPLATS_SENT, *PICKLED)))
+    return FileKind(None, f"a zip with {names[0]}{several} in it", f"unzip it and give {names[0]}", splats=splats)
+
+
+def _begins_with_splats(head: bytes) -> bool:
+    """Whether the first bytes are a PLY's that has splats."""
+    return head[:3] == b"ply" and _ply(head).kind == "splats"
+
+
+def _splat_files(names: Iterable[str], has_splats: Callable[[str], bool]) -> tuple[str, ...]:
+    """Splat files among names of a folder or zip: those of the last step, plain files before checkpoints, first."""
+
+    def order(name: str) -> tuple[int, bool, int, str]:
+        steps = [int(step) for step in _STEP.findall(name.lower())] or [-1]
+        return -max(steps), name.lower().endswith(PICKLED), name.count("/"), name
+
+    likely = [
+        name
+        for name in names
+        if name.lower().endswith(SPLATS_SENT) or (_CHECKPOINT.search(name) and not _OF_FEATURES.search(name))
+    ]
+    likely.sort(key=order)
+    plys = [name for name in likely if name.lower().endswith(".ply")]
+    wrong = {name for name in plys if _NO_SCENE.search(name.replace("\\", "/"))}
+    wrong |= {name for name in [name for name in plys if name not in wrong][:MOST_HEADERS] if not has_splats(name)}
+    return tuple(name for name in likely if name not in wrong)
+
+
+# ---- folders
+
+
+def _folder(path: Path) -> FileKind:
+    return _first(_folder_rules(path))
+
+
+def _folder_rules(path: Path) -> Iterator[FileKind | None]:
+    yield _splats_as(SplatFormat.SOG) if (path / META).is_file() and _is_sog(path / META) else None
+    yield FileKind("lift", "lift") if (path / INDEX).is_file() else None
+    is_streamed = (path / LOD_META).is_file()
+    yield _streamed(f"a folder of a streamed SOG ({LOD_META})", path / LOD_META) if is_streamed else None
+    names = _names_below(path)
+    splats = _splat_files(names, lambda name: _has_splats(path / name))
+    named = _folder_name(names, splats)
+    yield FileKind("cameras", named or "a folder of cameras", splats=splats) if _has_cameras(path) else None
+    yield FileKind(None, named or "a folder", f"give {path / splats[0]}", splats=splats) if splats else None
+    suffixes = {PurePosixPath(name).suffix.lower() for name in names}
+    is_langsplat = all(any(name.endswith(end) for name in names) for end in ("_f.npy", "_s.npy"))
+    hint = f"'splatlift pack langsplat {path} -o PACK.safetensors' makes a feature pack of it"
+    yield FileKind(None, "a folder of LangSplat's features", hint) if is_langsplat else None
+    hint = f"'splatlift pack npy {path}' or 'splatlift pack masks {path}' makes a feature pack of it"
+    yield FileKind(None, "a folder of NumPy arrays", hint) if ".npy" in suffixes else None
+    tensors = [str(path / name) for name in names if name.endswith(".safetensors")]
+    hint = f"give the file itself, such as {tensors[0]}" if tensors else ""
+    yield FileKind(None, "a folder with safetensors files in it", hint) if tensors else None
+    yield FileKind("photos", "a folder of photos") if suffixes & IMAGE_SUFFIXES else None
+    yield FileKind(None, "a folder without any of them" if names else "an empty folder", recognised=False)
+
+
+def _has_cameras(path: Path) -> bool:
+    from liftcore.io.cameras import camera_source  # which asks here what a wrong file is
+
+    with suppress(InvalidInput):
+        return bool(camera_source(path).files)
+    return False
+
+
+def _has_splats(path: Path) -> bool:
+    with suppress(OSError), open_regular(path) as handle:
+        return _begins_with_splats(handle.read(MAX_HEADER_BYTES))
+    return False
+
+
+def _folder_name(names: Sequence[str], splats: Sequence[str]) -> str:
+    """Whose folder it is, as far as that shows, and how many files of splats are in it."""
+    trainer = next((who for sign, who in _TRAINERS.items() if any(sign in name for name in names)), None)
+    if trainer is None and any(re.search(r"(^|/)export_[0-9]+\.ply$", name) for name in names):
+        trainer = "Brush"
+    named = f"a folder of {trainer}" if trainer else "a folder" if len(splats) > 1 else ""
+    return f"{named} with {len(splats)} files of splats in it" if len(splats) > 1 else named
+
+
+def _names_below(folder: Path) -> list[str]:
+    """The files below a folder, relative to it, without hidden ones; links are not followed."""
+    names: list[str] = []
+    for parent, inner, files in islice(os.walk(folder), MAX_FOLDERS):
+        here = Path(parent).relative_to(folder)
+        names += [(here / name).as_posix() for name in sorted(files) if not is_system_file(Path(name))]
+        if len(names) > MAX_NAMES:
+            break
+        inner[:] = [name for name in sorted(inner) if len(here.parts) < DEPTH and not is_system_file(Path(name))]
+    return names
+
+
+# ---- the page
+
+
+def page_table() -> dict[str, Any]:
+    """The suffixes by which the page sends files, and those that it does not send, in the words above."""
+    return {
+        "kinds": {
+            **dict.fromkeys(SPLATS_SENT, "splats"), ".json": "cameras", ".safetensors": "features", ".zip": "cameras",
+        },
+        "images": sorted(IMAGE_SUFFIXES),
+        "cameras": CAMERA_FILES.pattern,
+        "others": {
+            suffix: {"got": kind.name, "hint": kind.hint}
+            for suffix, kind in sorted((_BY_SUFFIX | dict.fromkeys(PICKLED, _BY_SUFFIX[".pkl"])).items())
+        },
+    }  # fmt: skip
+
+
+__all__ = [
+    "CONVERT", "EXPORT_PLY", "PICKLED", "SPLATS_SENT", "SUFFIX", "FileKind", "SplatFormat", "identify",
+    "keys_of", "kind_of", "page_table", "splat_format", "wrong_kind",
+]  # fmt: skip

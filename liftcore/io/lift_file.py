@@ -21,13 +21,13 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from liftcore.errors import InvalidInput, InvalidLift
-from liftcore.io.files import visible_files
+from liftcore.io.files import open_regular, visible_files
 from liftcore.io.remote import landing, local_path
 from liftcore.io.safetensors_file import map_tensors
 from liftcore.io.shards import INDEX, SUFFIX, map_shards, write_shards
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
 
     from liftcore.result import InputFile, LiftMetadata, LiftResult
     from liftcore.scene.cameras import Camera
@@ -152,39 +152,37 @@ def _check_shapes(arrays: dict[str, np.ndarray], path: Path | str) -> None:
             raise InvalidLift(str(path), expected=f"a {pair[0]} of -1 or a row of {pair[1]} for each splat", got=got)
 
 
-def input_files(
-    splats: Path, cameras: Path, features: Sequence[Path], views: Collection[str] = ()
-) -> list[InputFile]:
-    """The inputs of a lift with their digests: splats, cameras (as `camera_input` has them) and feature packs."""
-    return [input_file(splats), camera_input(cameras, views), *(input_file(pack) for pack in features)]
+def input_files(splats: Path, cameras: Path, features: Sequence[Path]) -> list[InputFile]:
+    """The inputs of a lift with their digests: splats, cameras and feature packs."""
+    return [input_file(splats), camera_input(cameras), *(input_file(pack) for pack in features)]
 
 
 def input_file(path: Path) -> InputFile:
-    """Where a file, or a folder of a SOG, is, and its digest."""
+    """Where a file, or a SOG that is not bundled, is, and its digest.
+
+    Raises:
+        OSError: it does not open, or is no regular file.
+    """
+    from liftcore.io.sog import META, sog_files
     from liftcore.result import InputFile
 
     resolved = path.resolve()
-    if not resolved.is_dir():
-        return InputFile(path=str(resolved), sha256=sha256_of(resolved))
-    return InputFile(
-        path=str(resolved),
-        sha256=_digest_of_several(visible_files(resolved), resolved),
-    )
+    folder = resolved if resolved.is_dir() else resolved.parent
+    if resolved in (folder, folder / META):
+        return InputFile(path=str(resolved), sha256=_digest_of_several(sog_files(resolved), folder))
+    return InputFile(path=str(resolved), sha256=sha256_of(resolved))
 
 
-def camera_input(path: Path, views: Collection[str] = ()) -> InputFile:
+def camera_input(path: Path) -> InputFile:
     """Where cameras are, and the digest of their file or, of several, of the names and digests of all that are read.
 
     Photos, features and lifts that lie in the same folder do not count: they may come and go.
-
-    Args:
-        path: of the cameras. views: of the features, as `read_cameras` has them.
     """
     from liftcore.io.cameras import camera_source
     from liftcore.result import InputFile
 
     given = Path(os.path.abspath(path))  # links stay: other files count beside them than where they lead
-    files = camera_source(given, views).files
+    files = camera_source(given).files
     if files == [given]:
         return InputFile(path=str(given), sha256=sha256_of(given))
     return InputFile(path=str(given), sha256=_digest_of_several(files, given if given.is_dir() else given.parent))
@@ -207,11 +205,11 @@ def found_input(role: str, remembered: InputFile, metadata: LiftMetadata, lift: 
     """
     path = Path(remembered.path)
     places = [path] if lift is None else [path, *_beside(lift, path)]
+    of = camera_input if role == "cameras" else input_file
     for place in places:
         if place.exists():
             with suppress(InvalidInput, OSError):
-                found = camera_input(place, metadata.views) if role == "cameras" else input_file(place)
-                if found.sha256 == remembered.sha256 or (role == "cameras" and has_poses(place, metadata)):
+                if of(place).sha256 == remembered.sha256 or (role == "cameras" and has_poses(place, metadata)):
                     return place
     return None
 
@@ -237,7 +235,7 @@ def has_poses(place: Path, metadata: LiftMetadata) -> bool:
 
     if not metadata.poses:
         return False
-    cameras = read_cameras(place, choosing=False, views=metadata.views)
+    cameras = read_cameras(place, choosing=False)
     known = [cameras[view] for view in metadata.views if view in cameras]
     if len(known) != len(metadata.views):
         return False
@@ -256,6 +254,10 @@ def poses_of(cameras: Sequence[Camera], form: Literal["NFC", "NFD"] = "NFC") -> 
 
 
 def sha256_of(path: Path) -> str:
-    """The digest of a file, in hexadecimal digits."""
-    with path.open("rb") as handle:
+    """The digest of a file, in hexadecimal digits.
+
+    Raises:
+        OSError: it does not open, or is no regular file.
+    """
+    with open_regular(path) as handle:
         return hashlib.file_digest(handle, "sha256").hexdigest()

@@ -7,6 +7,7 @@ from tokenize import TokenError
 import numpy as np
 
 from liftcore.errors import InvalidFeatures
+from liftcore.io.files import open_regular
 
 # Version 3 is for named columns only, which no array of numbers has.
 READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
@@ -23,7 +24,7 @@ def open_npy(path: Path, kinds: str = NUMBERS) -> np.ndarray:
         InvalidFeatures: the file is no ``.npy`` file, holds Python objects, or has another size than it says.
     """
     try:
-        with path.open("rb") as handle:
+        with open_regular(path) as handle:
             version = np.lib.format.read_magic(handle)
             if version not in READERS:
                 raise ValueError(f"format version {version}")

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from liftcore.errors import InvalidSplats
-from liftcore.io.files import whole_file
+from liftcore.io.files import open_regular, whole_file
 from liftcore.scene.kernel import DARK_LOBE, LOBE_COLOURS, Kernel, kernel_named, scale_count
 
 if TYPE_CHECKING:
@@ -477,7 +477,7 @@ def read_head(path: Path) -> tuple[bytes, int]:
         InvalidSplats: it does not open.
     """
     try:
-        with path.open("rb") as handle:
+        with open_regular(path) as handle:
             return handle.read(MAX_HEADER_BYTES), handle.seek(0, 2)
     except OSError as error:
         got = f"one that does not open ({error.strerror})"
@@ -577,15 +577,21 @@ def _header_lines(head: bytes, source: str) -> tuple[tuple[str, ...], int]:
 
 
 def _refuse_clouds(lines: tuple[str, ...], source: str) -> None:
-    """Point clouds and meshes: what is wrong with them is not how they are written."""
+    if found := cloud_without_splats(lines):
+        expected = "splats (properties such as 'opacity', 'scale_0', 'rot_0')"
+        raise InvalidSplats(source, expected=expected, got=f"{found[0]} without any of them", hint=found[1])
+
+
+def cloud_without_splats(lines: Sequence[str]) -> tuple[str, str] | None:
+    """The name of a point cloud or mesh by the lines of its header, and what to do with it; None of splats.
+
+    What is wrong with such a file is not how it is written.
+    """
     words = [line.split() for line in lines]
     names = {line[-1] for line in words if line[:1] == ["property"]}
     if not names.issuperset("xyz") or names.intersection(SPLAT_PROPERTIES):
-        return
-    is_mesh = any(line[:2] == ["element", "face"] for line in words)
+        return None
     hint = "give the trained splats; the 3DGS trainers keep them in point_cloud/iteration_N/point_cloud.ply"
     if any(name.startswith("scalar_") for name in names):
         hint = "CloudCompare renames properties (scalar_opacity): give the file that it was opened from"
-    expected = "splats (properties such as 'opacity', 'scale_0', 'rot_0')"
-    got = f"a {'mesh' if is_mesh else 'point cloud'} without any of them"
-    raise InvalidSplats(source, expected=expected, got=got, hint=hint)
+    return ("a mesh" if any(line[:2] == ["element", "face"] for line in words) else "a point cloud"), hint

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liftcore.errors import InvalidInput
-from liftcore.io.files import whole_file
+from liftcore.io.files import open_regular, whole_file
 
 DTYPES = {
     "F64": np.float64, "F32": np.float32, "F16": np.float16, "I64": np.int64, "I32": np.int32, "I16": np.int16,
@@ -53,7 +53,7 @@ def check_header(path: Path, name: str, fault: type[InvalidInput], *, expected: 
         hint: how to make one.
     """
     try:
-        with path.open("rb") as handle:
+        with open_regular(path) as handle:
             start = handle.read(_START)
     except OSError as error:
         got = "a folder" if path.is_dir() else f"a file that does not open ({error.strerror})"

@@ -1,5 +1,7 @@
 """PlayCanvas's ``.sog`` of version 2: a zip or folder of lossless WebP pictures, a pixel a splat, and ``meta.json``.
 
+Unbundled, it is named by its folder or, as in other programs, by the ``meta.json`` in it.
+
 Means have 16 bits an axis in two pictures, between bounds, of ``sign(v) log(1 + |v|)``; quaternions their smallest
 three parts and 252 to 255 for the largest of w x y z; log scales and constant terms are rows of codebooks of 256;
 opacities u8. Higher harmonics are rows of a palette, 64 entries a line of its picture. The writer sorts the rows;
@@ -10,18 +12,20 @@ import io
 import json
 import warnings
 import zipfile
+from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
 from liftcore.errors import InvalidSplats
-from liftcore.io.files import BROKEN_ZIP, visible_files
+from liftcore.io.files import BROKEN_ZIP, open_regular, open_zip
 from liftcore.io.quantised import MOST_GROWTH, Fields, decoded, field_shapes, logits, smallest_three
 
 META = "meta.json"
 MAX_META_BYTES = 1 << 20
-SPLAT_BYTES = 18  # of a splat's pixels
+FIELD_BYTES, TERM_BYTES = 44, 12  # of a decoded splat without its colour, and of a row of harmonics
 PALETTE_COLUMNS = 64
 MAX_PALETTE = 1 << 16
 SH_ROWS = (0, 3, 8, 15)  # higher harmonics by degree
@@ -30,37 +34,116 @@ HINT = "export it again with SuperSplat or splat-transform, or as PLY"
 
 
 def read_sog(path: Path, *, colour: bool = True) -> Fields:
-    """The fields of a ``.sog`` file, or of a folder of what such a file holds.
+    """The fields of a ``.sog`` file, of a folder of what such a file holds, or of the ``meta.json`` in one.
 
     Raises:
         InvalidSplats: the file is malformed, of another version, or has more splats than its size can be of.
     """
     try:
-        if path.is_dir():
-            return _Pictures(path, path, sum(file.stat().st_size for file in visible_files(path))).fields(
-                colour=colour
-            )
-        with zipfile.ZipFile(path) as archive:
-            return _Pictures(zipfile.Path(archive), path, path.stat().st_size).fields(colour=colour)
+        if not is_bundled(path):
+            meta, folder = _meta_of(path), _meta_of(path).parent
+            size = sum(file.stat().st_size for file in sog_files(path))
+            return _Pictures(_in_folder(folder), meta.name, path, size).fields(colour=colour)
+        with open_zip(path) as archive:
+            prefix = sog_folder(archive.namelist()) or ""
+            pictures = _Pictures(partial(_in_archive, archive, prefix), META, path, path.stat().st_size)
+            return pictures.fields(colour=colour)
     except BROKEN_ZIP as error:
         got = f"one that does not open ({str(error)[:120]})"
         raise InvalidSplats(str(path), expected="a .sog file", got=got, hint=HINT) from None
 
 
-class _Pictures:
-    """What is in an open file, or a folder."""
+def is_sog_document(document: Any) -> bool:
+    """Whether a JSON document is the ``meta.json`` of a SOG of any version."""
+    parts = ("means", "scales", "quats")
+    return isinstance(document, dict) and all(isinstance(document.get(part), dict) for part in parts)
 
-    def __init__(self, members: zipfile.Path | Path, path: Path, size: int) -> None:
-        self.members, self.path, self.size = members, path, size
+
+def sog_folder(names: Iterable[str]) -> str | None:
+    """The folder, with a slash if any, in which a zip of these names holds a SOG; None if in none."""
+    known = set(names)
+    if META in known:
+        return ""
+    folders = (name.removesuffix(META) for name in known if name.endswith(f"/{META}") and "__MACOSX/" not in name)
+    return min((folder for folder in folders if f"{folder}means_l.webp" in known), default=None)
+
+
+def sog_files(path: Path) -> list[Path]:
+    """The files that an unbundled SOG is read from, sorted: its ``meta.json`` and the pictures that this names."""
+    meta = _meta_of(path)
+    try:
+        with open_regular(meta) as handle:
+            document = json.loads(handle.read(MAX_META_BYTES))
+    except (ValueError, RecursionError):
+        document = None
+    parts = (
+        [part for part in (document or {}).values() if isinstance(part, dict)] if is_sog_document(document) else []
+    )
+    names = {name for part in parts for name in _names_in(part)}
+    return sorted([meta, *(meta.parent / name for name in names if (meta.parent / name).is_file())])
+
+
+def _names_in(part: dict[str, Any]) -> list[str]:
+    names = part.get("files")
+    return [name for name in names if _is_beside(name)] if isinstance(names, list) else []
+
+
+def _is_beside(name: Any) -> bool:
+    return isinstance(name, str) and name not in ("", META) and PurePosixPath(name).name == name and "\0" not in name
+
+
+def is_bundled(path: Path) -> bool:
+    """Whether a SOG is one file, a zip: else it is a folder, or the ``meta.json`` in one."""
+    if path.is_dir():
+        return False
+    with open_regular(path) as handle:
+        return handle.read(2) == b"PK"
+
+
+def _meta_of(path: Path) -> Path:
+    return path / META if path.is_dir() else path
+
+
+def _in_folder(folder: Path) -> Callable[[str, int], bytes | None]:
+    def read(name: str, most: int) -> bytes | None:
+        if not (folder / name).is_file():
+            return None
+        with open_regular(folder / name) as file:
+            return file.read(most)
+
+    return read
+
+
+def _in_archive(archive: zipfile.ZipFile, prefix: str, name: str, most: int) -> bytes | None:
+    try:
+        with archive.open(prefix + name) as member:
+            return member.read(most)
+    except KeyError:
+        return None
+
+
+class _Pictures:
+    """What is in an open file, or a folder.
+
+    Args:
+        read: name, most bytes -> the first bytes of that member; None where there is none. meta: the name of its
+        description. path: what errors name. size: bytes of all members as they are stored.
+    """
+
+    def __init__(self, read: Callable[[str, int], bytes | None], meta: str, path: Path, size: int) -> None:
+        self.read, self.path, self.size = read, path, size
         try:
-            self.meta: Any = json.loads(self._member(META, MAX_META_BYTES))
+            self.meta: Any = json.loads(self._member(meta, MAX_META_BYTES))
         except (ValueError, RecursionError) as error:
             raise self._refused(f"{META} as JSON", str(error)[:120]) from None
         version = self.meta.get("version") if isinstance(self.meta, dict) else None
         if version != 2:
             raise self._refused("version 2", repr(version)[:60])
         count = self.meta.get("count")
-        if type(count) is not int or not 0 < count * SPLAT_BYTES <= MOST_GROWTH * self.size:
+        bands = self.meta["shN"].get("bands") if isinstance(self.meta.get("shN"), dict) else 0
+        higher = SH_ROWS[bands] if bands in (1, 2, 3) else 0
+        row_bytes = FIELD_BYTES + TERM_BYTES * (1 + higher)
+        if type(count) is not int or not 0 < count * row_bytes <= MOST_GROWTH * self.size:
             raise self._refused("a count of splats that the file's size can be of", repr(count)[:60])
         self.count: int = count  # P
 
@@ -148,11 +231,9 @@ class _Pictures:
             raise self._refused(f"a WebP picture as {names[index]!r}", str(error)[:120]) from None
 
     def _member(self, name: str, most: int) -> bytes:
-        member = self.members / name
-        if PurePosixPath(name).name != name or not member.is_file():  # beside meta.json, and nowhere else
+        content = self.read(name, most + 1) if PurePosixPath(name).name == name else None  # beside meta.json alone
+        if content is None:
             raise self._refused(f"{name!r} beside {META}", "none")
-        with member.open("rb") as file:
-            content = file.read(most + 1)
         if len(content) > most:
             raise self._refused(f"at most {most} bytes of {name!r}", "more")
         return content

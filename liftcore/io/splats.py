@@ -6,11 +6,9 @@ what it is and what to do.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,14 +16,14 @@ import numpy as np
 
 from liftcore.errors import InvalidSplats
 from liftcore.io import ply
-from liftcore.io.checkpoint import EXPORT_PLY, read_checkpoint
+from liftcore.io.checkpoint import read_checkpoint
 from liftcore.io.compressed_ply import read_compressed_ply
-from liftcore.io.files import BROKEN_ZIP, LFS_HINT, LFS_POINTER
+from liftcore.io.kinds import CONVERT, SplatFormat, identify, wrong_kind
 from liftcore.io.quantised import Fields
 from liftcore.io.remote import local_path
-from liftcore.io.sog import META, read_sog
-from liftcore.io.splat import looks_like_splat, read_splat, splat_blocks
-from liftcore.io.spz import begins_like_spz, read_spz, spz_blocks
+from liftcore.io.sog import is_bundled, read_sog, sog_files
+from liftcore.io.splat import read_splat, splat_blocks
+from liftcore.io.spz import read_spz, spz_blocks
 from liftcore.scene.harmonics import constant_terms
 from liftcore.scene.kernel import Kernel, kernel_named
 
@@ -33,29 +31,7 @@ if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
 
 
-class SplatFormat(StrEnum):
-    """A format that is read, as people call it."""
-
-    PLY = "PLY"  # of every dialect
-    COMPRESSED_PLY = "compressed PLY"
-    SPLAT = ".splat"
-    SPZ = ".spz"
-    SOG = ".sog"
-    CHECKPOINT = "checkpoint"  # of gsplat or nerfstudio: a pickle, if only of tensors
-
-
-SUFFIX = {
-    SplatFormat.PLY: ".ply",
-    SplatFormat.COMPRESSED_PLY: ".ply",
-    SplatFormat.SPLAT: ".splat",
-    SplatFormat.SPZ: ".spz",
-    SplatFormat.SOG: ".sog",
-    SplatFormat.CHECKPOINT: ".pt",
-}
-PICKLED = (".pt", ".pth", ".ckpt", ".pkl")
-SUFFIXES = frozenset([*SUFFIX.values(), *PICKLED, ".ksplat"])
 EXPECTED = "splats as PLY, compressed PLY, .splat, .spz, .sog or a checkpoint"
-CONVERT = "convert it with PlayCanvas's splat-transform: npx @playcanvas/splat-transform IN OUT.ply"
 _READERS: dict[SplatFormat, Callable[..., Fields]] = {
     SplatFormat.COMPRESSED_PLY: read_compressed_ply,
     SplatFormat.SPLAT: read_splat,
@@ -64,16 +40,6 @@ _READERS: dict[SplatFormat, Callable[..., Fields]] = {
     SplatFormat.CHECKPOINT: read_checkpoint,
 }
 _WRITERS: dict[str, Callable[[Splats], Iterator[bytes]]] = {".splat": splat_blocks, ".spz": spz_blocks}
-_WEB_PAGE = ("a web page", "the download went wrong: fetch the file itself")
-_OTHERS = {  # by their first bytes
-    LFS_POINTER: ("a Git LFS pointer, which stands for the file", LFS_HINT),
-    b"\x1f\x8b": ("a gzip file", "unzip it, or upload it with the header 'Content-Encoding: gzip'"),
-    b"PK\x03\x04": ("a zip", "unzip it and give the splats in it"),
-    b"\x80": ("a Python pickle, which may run code when it is opened", EXPORT_PLY),
-    b"\x93NUMPY": ("a NumPy array", "export the splats as PLY from the program that trained them"),
-    b"<!doctype": _WEB_PAGE,
-    b"<html": _WEB_PAGE,
-}
 
 
 def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool = True) -> Splats:
@@ -124,25 +90,23 @@ def format_of(path: Path) -> SplatFormat:
     Raises:
         InvalidSplats: it is of none; the error says what it is, if that can be told.
     """
-    if (path / META).is_file():
-        return SplatFormat.SOG
-    head, size = ply.read_head(path)
-    suffix = path.suffix.lower()
-    if head[:4] in (b"ply\n", b"ply\r"):
-        first = head.partition(b"\nelement ")[2]
-        return SplatFormat.COMPRESSED_PLY if first.startswith(b"chunk ") else SplatFormat.PLY
-    if begins_like_spz(head):
-        return SplatFormat.SPZ
-    if head[:4] == b"PK\x03\x04" and (inner := _in_zip(path)):
-        return inner
-    known = _known_as(head)
-    if suffix == ".splat" or (known is None and suffix != ".ksplat" and looks_like_splat(head, size)):
-        return SplatFormat.SPLAT
-    if suffix == ".ksplat":
-        known = ("splats in GaussianSplats3D's .ksplat format", CONVERT)
-    begins = f"a file that begins with {head[:8]!r}" if head else "an empty file"
-    got, hint = known or (begins, f"{ply.EXPORT}; or {CONVERT}")
-    raise InvalidSplats(str(path), expected=EXPECTED, got=got, hint=hint)
+    found = identify(path)
+    if found.format is not None:
+        return found.format
+    if error := wrong_kind(path, "splats", InvalidSplats, expected=EXPECTED):
+        raise error
+    hint = found.hint or (f"{ply.EXPORT}; or {CONVERT}" if path.is_file() else "")
+    raise InvalidSplats(str(path), expected=EXPECTED, got=found.name, hint=hint)
+
+
+def splat_files(path: Path) -> list[Path]:
+    """The files that splats are read from: one, or the several of a SOG that is not bundled.
+
+    Raises:
+        OSError: there is none.
+    """
+    is_one = format_of(path) is not SplatFormat.SOG or is_bundled(path)
+    return [path] if is_one else sog_files(path)
 
 
 def require_kernel(path: Path, kernel: Kernel, source: str) -> None:
@@ -213,36 +177,6 @@ def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
     if format_of(path) is SplatFormat.PLY:
         return ply.recoloured(path, terms)
     return ply.ply_blocks(replace(_of_count(path, len(terms), colour=False), sh=terms[:, None]))
-
-
-def is_splats(path: Path) -> bool:
-    """Whether a file begins like splats, or is named like them, if only to be refused."""
-    if path.suffix.lower() in SUFFIXES:
-        return True
-    try:
-        return (path.is_file() or (path / META).is_file()) and bool(format_of(path))
-    except InvalidSplats:
-        return False
-
-
-def _in_zip(path: Path) -> SplatFormat | None:
-    """What splats a zip holds, by the names of its members."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            names = archive.namelist()
-    except BROKEN_ZIP:
-        return None
-    if META in names:
-        return SplatFormat.SOG
-    return SplatFormat.CHECKPOINT if any(name.endswith("/data.pkl") for name in names) else None
-
-
-def _known_as(head: bytes) -> tuple[str, str] | None:
-    """What a file of no splats is, and what to do."""
-    start = head[:64].lstrip(b"\xef\xbb\xbf \t\r\n").lower()
-    return next(
-        (told for first, told in _OTHERS.items() if start.startswith(first.lower()) or head.startswith(first)), None
-    )
 
 
 def _of_count(path: Path, count: int, *, colour: bool = True) -> Splats:

@@ -216,8 +216,7 @@ class QueryScene:
         from liftcore.io.cameras import read_cameras
 
         # Which of several models was meant, the lift knew: its digest tells that the same is read.
-        path = self._unchanged("cameras", self.metadata.cameras)
-        return read_cameras(path, choosing=False, views=self.metadata.views)
+        return read_cameras(self._unchanged("cameras", self.metadata.cameras), choosing=False)
 
     @cached_property
     def packs(self) -> Views:

@@ -6,7 +6,6 @@ import hashlib
 import json
 import re
 import threading
-import zipfile
 from collections import Counter
 from contextlib import suppress
 from dataclasses import replace
@@ -16,10 +15,9 @@ from typing import Any
 from safetensors import SafetensorError, safe_open
 
 from liftcore.errors import InvalidInput, InvalidLift, NotFound, SplatliftError
-from liftcore.io.splats import SUFFIX
+from liftcore.io.kinds import identify
 from service.errand import ErrandLimits
 from service.models import JOB_ID, AssetKind, UploadKind
-from service.photos import holds_photos
 from service.settings import ServiceSettings
 from service.store.assets import CheckedUpload
 from service.store.lifts import FinishedLift, order_of
@@ -79,14 +77,10 @@ def _checked(store: Store, settings: ServiceSettings, kind: UploadKind, *paths: 
 
 
 def _kind_of(path: Path) -> AssetKind:
-    if path.suffix in SUFFIX.values():
-        return AssetKind.SPLATS
-    if path.suffix == ".json" or zipfile.is_zipfile(path):
-        return AssetKind.PHOTOS if path.suffix == ".zip" and holds_photos(path) else AssetKind.CAMERAS
-    names = header_of(path)[0]
-    if names == {"embeddings"}:
-        return AssetKind.TABLE
-    return AssetKind.MASKS if any(name.endswith("/mask") for name in names) else AssetKind.FEATURES
+    found = identify(path)
+    if found.kind not in set(AssetKind):
+        raise NotFound("asset", expected="a file of an asset", got=found.name)
+    return AssetKind(found.kind)
 
 
 def _add_lift(store: Store, settings: ServiceSettings, path: Path) -> None:

@@ -12,13 +12,12 @@ import numpy as np
 
 from liftcore.errors import InvalidCameras, InvalidInput, InvalidLift, InvalidSplats, SplatliftError
 from liftcore.features.pack import read_features
-from liftcore.io.checkpoint import EXPORT_PLY
 from liftcore.io.class_masks import describe_masks
 from liftcore.io.inspect import describe_camera_file, describe_packs, describe_splat_file, describe_table
 from liftcore.io.json_file import finite
-from liftcore.io.kinds import kind_of
+from liftcore.io.kinds import EXPORT_PLY, SUFFIX, SplatFormat, identify, wrong_kind
 from liftcore.io.lift_file import has_poses, parse_metadata, read_lift
-from liftcore.io.splats import SUFFIX, SplatFormat, format_of
+from liftcore.io.splats import format_of
 from liftcore.query.text.table import TableEncoder
 from service.child import fault_of
 from service.models import VIEW_CHARACTERS, AssetKind, UploadKind
@@ -147,11 +146,13 @@ def _invalid(error: SplatliftError, kind: UploadKind, path: Path) -> dict[str, A
 
 def _of_another_kind(kind: UploadKind, path: Path) -> InvalidInput | None:
     """What to say of a file that belongs elsewhere; None where it looks like what it was sent as, or like nothing."""
-    found = kind_of(path)
-    if found in (None, kind):
-        return None
+    found = identify(path).kind
+    if found is None:
+        return wrong_kind(path, kind, INVALID[kind], argument=kind, expected=f"a file of {kind}")
     hint = "POST it to /lifts" if found == LIFT else f"PUT it to /assets/{found}"
-    return INVALID[kind](kind, expected=f"a file of {kind}", got=f"one of {found}", hint=hint)
+    return (
+        None if found == kind else INVALID[kind](kind, expected=f"a file of {kind}", got=f"one of {found}", hint=hint)
+    )
 
 
 def _out_of_memory(kind: UploadKind) -> InvalidInput:

@@ -26,7 +26,7 @@ INRIA_CAMERA = {
 def folder(tmp_path: Path) -> Path:
     scene = tmp_path / "scene"
     (scene / "sparse" / "0").mkdir(parents=True)
-    (scene / "point_cloud.ply").touch()
+    (scene / "point_cloud.ply").write_bytes(b"ply\n")
     for name in ("cameras.bin", "images.bin"):
         (scene / "sparse" / "0" / name).write_bytes(b"model")
     save_file({"words": torch.ones(1)}, str(scene / "a.safetensors"))

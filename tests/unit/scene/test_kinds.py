@@ -1,0 +1,236 @@
+"""Every reader, the command line and uploads tell what a file is, and what to give in its place, by one function."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from liftcore.cli import main
+from liftcore.errors import InvalidCameras, InvalidInput, InvalidSplats
+from liftcore.io.cameras import read_cameras
+from liftcore.io.files import MAX_DIRECTORY_BYTES, open_zip
+from liftcore.io.inspect import inspect_file
+from liftcore.io.kinds import SplatFormat, identify, kind_of, wrong_kind
+from liftcore.io.lift_file import input_file
+from liftcore.io.ply import write_splats
+from liftcore.io.splats import read_splats, splat_files
+from tests.scenes import random_splats
+
+SOG = Path(__file__).parents[2] / "data" / "splats" / "degree3.sog"
+CLOUD = b"ply\nformat binary_little_endian 1.0\nelement vertex 0\n" + b"".join(
+    b"property float %c\n" % axis for axis in b"xyz"
+)
+OTHERS = {  # content, a word of its name and of what to do
+    "page.html": (b"<!DOCTYPE html><title>SuperSplat Viewer</title>", "web page", "SuperSplat"),
+    "failed.ply": (b"<!DOCTYPE html><h1>404</h1>", "web page", "download"),
+    "denied.spz": (b"<?xml version='1.0'?><Error><Code>AccessDenied</Code></Error>", "AccessDenied", "download"),
+    "error.ply": (b'{"error": "not found"}', "not found", "download"),
+    "pointer.ply": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "Git LFS", "git lfs pull"),
+    "model": (b"glTF\x02\0\0\0" + bytes(100), "glTF", "export"),
+    "scene.glb": (
+        b"glTF\x02\0\0\0\x60\0\0\0JSON{'extensionsUsed':['KHR_gaussian_splatting']}",
+        "splats as glTF",
+        "export",
+    ),
+    "scene.usdc": (b"PXR-USDC" + bytes(90), "USD", "export"),
+    "scene.ksplat": (bytes(5000), "ksplat", "splat-transform"),
+    "unnamed": (b"\0\1\0\0" + np.array([1, 1, 9, 9], "<u4").tobytes() + bytes(5000), "ksplat", "splat-transform"),
+    "scene.rad": (b"RAD0" + bytes(60), ".rad", "export"),
+    "scene.lcc": (b'{"version": "5.0", "guid": "0"}', ".lcc", "splat-transform"),
+    "scene.psht": (b"\x01\x02\x03\x04" * 20, "Postshot", "export"),
+    "lod-meta.json": (b'{"tree": {}, "filenames": []}', "streamed SOG", "splat-transform"),
+    "mesh.obj": (b"mtllib a.mtl\nv 0 0 0\n", "mesh", "trained splats"),
+    "mesh.ply": (CLOUD + b"element face 0\nproperty list uchar int a\nend_header\n", "mesh", "trained splats"),
+    "cloud.ply": (CLOUD + b"end_header\n", "point cloud", "trained splats"),
+    "a.mp4": (b"\0\0\0\x20ftypisom" + bytes(60), "video", "COLMAP"),
+    "a.7z": (b"7z\xbc\xaf\x27\x1c" + bytes(60), "7z", "unpack"),
+    "a.rar": (b"Rar!\x1a\x07\0" + bytes(60), "RAR", "unpack"),
+    "a.tar": (bytes(257) + b"ustar\x0000" + bytes(300), "tar", "unpack"),
+    "a.ply.gz": (b"\x1f\x8b\x08" + bytes(60), "gzip", "unpack"),
+    "a.pkl": (b"\x80\x04\x95.", "pickle", "export"),
+    "empty.ply": (b"", "empty", "again"),
+    "zeros.ply": (bytes(4000), "zeros", "again"),
+    "scene.ply.crdownload": (b"\x01\x02" * 50, "download", "finished|fetch"),
+    "config.yml": (b"!!python/object:nerfstudio.engine.trainer.TrainerConfig\n", "nerfstudio", r"step-\*\.ckpt"),
+    "database.db": (b"SQLite format 3\x00" + bytes(60), "database", "sparse/0"),
+    "weights.safetensors": (b"", "safetensors", "pack"),
+    "dataparser_transforms.json": (b'{"transform": [], "scale": 1.0}', "frame", "cameras"),
+}
+
+
+def write(path: Path, content: bytes) -> Path:
+    if path.suffix == ".safetensors":
+        from safetensors.numpy import save_file
+
+        save_file({"visual.conv1.weight": np.zeros(2, "f4")}, path)
+    else:
+        path.write_bytes(content)
+    return path
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_what_is_no_input_is_named_with_what_to_do(name: str, tmp_path: Path) -> None:
+    content, what, hint = OTHERS[name]
+    path = write(tmp_path / name, content)
+    found = identify(path)
+    assert found.kind is None and found.recognised
+    for wanted in ("splats", "cameras", "features", "lift", "table"):
+        error = wrong_kind(path, wanted, InvalidInput)
+        assert error is not None and re.search(what, error.got) and wanted in error.expected
+    for read, fault in ((read_splats, InvalidSplats), (read_cameras, InvalidCameras), (inspect_file, InvalidInput)):
+        with pytest.raises(fault, match=f"(?s){what}.*({hint})"):
+            read(path)
+
+
+def zipped(path: Path, files: dict[str, bytes]) -> Path:
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return path
+
+
+def splat_bytes(folder: Path) -> bytes:
+    write_splats(random_splats(0, 5), folder / "some.ply")
+    return (folder / "some.ply").read_bytes()
+
+
+def test_a_zip_is_what_is_in_it_and_names_the_file_to_give(tmp_path: Path) -> None:
+    splats = splat_bytes(tmp_path)
+    one = zipped(tmp_path / "one.zip", {"__MACOSX/._gs.ply": b"x", "3dgs/gs.ply": splats, "cloud.ply": CLOUD})
+    with pytest.raises(InvalidSplats, match=r"a zip with 3dgs/gs\.ply in it; unzip it and give 3dgs/gs\.ply"):
+        read_splats(one)
+    with pytest.raises(InvalidCameras, match=r"a zip with 3dgs/gs\.ply in it"):
+        read_cameras(one)
+    several = zipped(
+        tmp_path / "two.zip", {"a.spz": b"", "iteration_7000/p.ply": splats, "iteration_30000/p.ply": splats}
+    )
+    assert identify(several).splats == ("iteration_30000/p.ply", "iteration_7000/p.ply", "a.spz")
+    cases = {
+        "photos": {"a.jpg": b"", "b.jpg": b""},
+        "cameras": {"a.jpg": b"", "sparse/0/cameras.bin": b"", "sparse/0/images.bin": b"", "input.ply": CLOUD},
+    }
+    for kind, files in cases.items():
+        assert kind_of(zipped(tmp_path / f"{kind}.zip", files)) == kind
+    words = {
+        "project.ssproj": ({"document.json": b"{}", "splat_0.ply": splats}, "SuperSplat"),
+        "scene.usdz": ({"scene.usdc": b"PXR-USDC"}, "USD"),
+        "features.npz": ({"a.npy": b""}, r"\.npz"),
+        "pack.zip": ({"pack.safetensors": b""}, r"unzip it and give pack\.safetensors"),
+        "mesh.zip": ({"mesh.obj": b"v 0 0 0"}, "trained splats"),
+    }
+    for name, (files, word) in words.items():
+        with pytest.raises(InvalidSplats, match=word):
+            read_splats(zipped(tmp_path / name, files))
+
+
+@pytest.mark.parametrize(
+    ("files", "last", "whose"),
+    [
+        (["point_cloud/iteration_7000/point_cloud.ply", "point_cloud/iteration_30000/point_cloud.ply", "input.ply"],
+         "point_cloud/iteration_30000/point_cloud.ply", "3DGS"),
+        (["ckpts/ckpt_6999_rank0.pt", "ckpts/ckpt_29999_rank0.pt", "ply/point_cloud_29999.ply"],
+         "ply/point_cloud_29999.ply", "gsplat"),
+        (["ckpts/ckpt_6999_rank0.pt", "ckpts/ckpt_29999_rank0.pt", "ckpts/ckpt_29999_rank0_features.pt"],
+         "ckpts/ckpt_29999_rank0.pt", "gsplat"),
+        (["a/splatfacto/2024/nerfstudio_models/step-000029999.ckpt", "a/splatfacto/2024/config.yml"],
+         "a/splatfacto/2024/nerfstudio_models/step-000029999.ckpt", "nerfstudio"),
+        (["export_5000.ply", "export_30000.ply"], "export_30000.ply", "Brush"),
+    ],
+)  # fmt: skip
+def test_a_trainers_folder_names_its_last_splats(files: list[str], last: str, whose: str, tmp_path: Path) -> None:
+    splats, folder = splat_bytes(tmp_path), tmp_path / "output"
+    for name in files:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(CLOUD if name == "input.ply" else splats)
+    with pytest.raises(InvalidSplats, match=whose) as caught:
+        read_splats(folder)
+    assert str(folder / last) in caught.value.hint
+    (folder / "cameras.json").write_text("[]")  # which the original trainer puts there: its folder is cameras, too
+    assert kind_of(folder) == "cameras"
+    with pytest.raises(InvalidSplats) as caught:
+        read_splats(folder)
+    assert str(folder / last) in caught.value.hint
+
+
+def test_folders_of_features_and_photos_name_the_command(tmp_path: Path) -> None:
+    for folder, names, word in (
+        ("language_features", ["a_f.npy", "a_s.npy"], "pack langsplat"),
+        ("arrays", ["a.npy"], "pack npy"),
+        ("images", ["a.jpg"], "COLMAP"),
+    ):
+        (tmp_path / folder).mkdir()
+        for name in names:
+            (tmp_path / folder / name).touch()
+        with pytest.raises(InvalidCameras, match=word):
+            read_cameras(tmp_path / folder)
+
+
+def test_a_sog_is_its_folder_its_meta_json_and_a_zip_of_its_folder(tmp_path: Path) -> None:
+    with zipfile.ZipFile(SOG) as archive:
+        archive.extractall(tmp_path / "scene")
+        again = zipped(tmp_path / "z.zip", {f"scene/{name}": archive.read(name) for name in archive.namelist()})
+    whole, meta = read_splats(SOG), tmp_path / "scene" / "meta.json"
+    for path in (tmp_path / "scene", meta, again):
+        assert identify(path).format is SplatFormat.SOG
+        assert (read_splats(path).means == whole.means).all()
+    size = sum(file.stat().st_size for file in (tmp_path / "scene").iterdir())
+    assert inspect_file(meta)["bytes"] == inspect_file(tmp_path / "scene")["bytes"] == size
+    assert input_file(meta).sha256 == input_file(tmp_path / "scene").sha256
+    (tmp_path / "scene" / "notes.txt").write_text("beside it")
+    assert inspect_file(meta)["bytes"] == size and len(splat_files(meta)) == len(list(meta.parent.iterdir())) - 1
+    with pytest.raises(InvalidCameras, match="got splats"):
+        read_cameras(meta)
+    with pytest.raises(InvalidSplats, match=r"a picture of a SOG; give .*meta\.json"):
+        read_splats(tmp_path / "scene" / "quats.webp")
+    (tmp_path / "scene" / "quats.webp").unlink()
+    with pytest.raises(InvalidSplats, match=r"'quats\.webp' beside meta\.json, got none"):
+        read_splats(meta)
+
+
+def test_pipes_and_devices_are_refused_and_never_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.ply")
+    for path in (tmp_path / "pipe.ply", Path("/dev/zero")):
+        for read in (read_splats, read_cameras, inspect_file):
+            with pytest.raises(InvalidInput, match="no regular file"):
+                read(path)
+        with pytest.raises(OSError, match="no regular file"):
+            input_file(path)
+
+
+def test_a_placeholder_of_a_cloud_is_told_from_a_file_that_is_not_there(tmp_path: Path) -> None:
+    (tmp_path / ".scene.ply.icloud").write_bytes(b"bplist00")
+    with pytest.raises(InvalidSplats, match="placeholder"):
+        read_splats(tmp_path / "scene.ply")
+    with pytest.raises(InvalidSplats, match="no such file"):
+        read_splats(tmp_path / "other.ply")
+
+
+def test_a_zip_whose_list_is_huge_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    path = zipped(tmp_path / "a.zip", {"a": b""})
+    content = bytearray(path.read_bytes())
+    content[-10:-6] = (MAX_DIRECTORY_BYTES + 1).to_bytes(4, "little")
+    path.write_bytes(content)
+    with pytest.raises(zipfile.BadZipFile, match="list of files"):
+        open_zip(path)
+
+
+def test_the_order_is_blamed_only_where_it_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    splats = splat_bytes(tmp_path)
+    archive, ply = zipped(tmp_path / "luma.zip", {"point_cloud.ply": splats}), tmp_path / "some.ply"
+    cameras = tmp_path / "cameras.json"
+    cameras.write_text(json.dumps([{"img_name": "a"}]))
+
+    def said(*files: Path) -> str:
+        assert main(["plan", *map(str, files)]) == 2
+        return capsys.readouterr().err
+
+    for files in ((archive, cameras, cameras), (ply, ply, ply), (cameras, cameras, cameras)):
+        assert "the order is" not in said(*files)
+    assert "point_cloud.ply" in said(archive, cameras, cameras)
+    assert "the order is SPLATS CAMERAS FEATURES" in said(cameras, ply, cameras)
