@@ -26,8 +26,9 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
     """The options of the command."""
     formats = parser.add_subparsers(dest="format", required=True, metavar="FORMAT", parser_class=Parser)
     langsplat = formats.add_parser("langsplat", parents=[shared], help="IMG_s.npy and IMG_f.npy")
-    arrays = formats.add_parser("npy", parents=[shared], help="IMG.npy, a dense map a view")
-    arrays.add_argument("--layout", choices=("hwc", "chw"), default="hwc", help="the order of the axes")
+    arrays = formats.add_parser("npy", parents=[shared], help="IMG.npy (.npz, .pt), a dense map a view")
+    by = "the order of the axes, [h, w, F] or [F, h, w]; axes of length 1 before them are taken off"
+    arrays.add_argument("--layout", choices=("hwc", "chw"), default="hwc", help=by)
     masks = formats.add_parser(
         "masks", parents=[shared], help="IMG.npy, a vector a mask, with IMG.json (SAM's), IMG_masks.npy or IMG.png"
     )
@@ -46,13 +47,17 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
     prompts = formats.add_parser(
         "prompts",
         parents=[shared],
-        help="masks by phrase: PHRASE/VIEW.png, VIEW.json (COCO's), or named label pictures",
+        help="masks by phrase: PHRASE/VIEW.png, JSON (COCO's, Grounded SAM 2's), or named label pictures",
     )
     prompts.add_argument(
         "--names", type=Path, metavar="FILE", help="of label pictures, JSON from values to names, or a name a line"
     )
     by = "what folders of binary PNGs are named by: phrases (PHRASE/VIEW.png) or views (VIEW/PHRASE.png)"
     prompts.add_argument("--folders", choices=("phrases", "views"), default="phrases", help=by)
+    by = "of pictures, the value of pixels of which nobody decided what they show (255), which get no label"
+    prompts.add_argument("--unlabelled", type=_grey, metavar="VALUE", help=by)
+    by = "COCO's images without an annotation are left out (skip), or show none of the phrases (negative)"
+    prompts.add_argument("--unannotated", choices=("skip", "negative"), default="skip", help=by)
     retag = formats.add_parser("retag", parents=[shared], help="a pack under other names of its encoder or space")
     space = (
         "the text encoder whose words lie in the space of the features, as query's --encoder names it "
@@ -191,9 +196,16 @@ def _views(options: argparse.Namespace, progress: Progress) -> tuple[ViewFolder,
         return mask_views(options.folder, options.unlabelled), None, []
     from liftcore.features.prompts import prompt_views
 
-    found = prompt_views(options.folder, options.names, options.folders)
+    found = prompt_views(
+        options.folder,
+        options.names,
+        options.folders,
+        unlabelled=options.unlabelled,
+        unannotated=options.unannotated,
+    )
     empty = [phrase for phrase, views in found.counts.items() if not views]
-    return found.views, found.table, [f"no view has a mask of {shown(empty)}: left out"] if empty else []
+    left_out = [f"no view has a mask of {shown(empty)}: left out"] if empty else []
+    return found.views, found.table, [*found.warnings, *left_out]
 
 
 def _metadata(options: argparse.Namespace) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Folders of NumPy files, a view a file: dense maps, LangSplat's regions, and what masks are read from.
+"""Folders of arrays, of NumPy or torch, a view a file: dense maps, LangSplat's regions, and what masks are read from.
 
 ``camA/000.npy`` is of the view ``camA/000``, as rigs have them, and ``IMG.jpg.npy`` of the view ``IMG``, as the
 camera of ``IMG.jpg`` is. Hidden files and folders are left out, and what systems put beside files.
@@ -16,10 +16,12 @@ import numpy as np
 from liftcore.errors import InvalidFeatures
 from liftcore.features.views import NO_LABEL, FeatureGrid, Regions, ViewFeatures
 from liftcore.io.files import visible_files
-from liftcore.io.npy import open_npy, read_floats
+from liftcore.io.npy import ARRAYS, TENSORS, open_npy, read_floats, without_unit_axes
 from liftcore.scene.views import composed, without_image_suffix
 
 PICKLED = (".pt", ".pth", ".pkl")
+# What feature-3dgs writes after the name of an image, and the layout that it speaks of.
+CHANNELS_FIRST = "_fmap_CxHxW"
 LABELS, CODEBOOK = "_s.npy", "_f.npy"  # of LangSplat
 
 Layout = Literal["hwc", "chw"]
@@ -51,20 +53,26 @@ class ViewFolder(Mapping[str, V_co]):
 
 
 def array_views(folder: Path, layout: Layout = "hwc") -> ViewFolder[FeatureGrid]:
-    """The grids of a folder of ``.npy`` files [h, w, F], or [F, h, w] with the layout ``chw``.
+    """The grids of a folder of ``.npy``, ``.npz`` or ``.pt`` files [h, w, F], or [F, h, w] with the layout ``chw``.
+
+    Axes of length 1 before these are taken off. ``IMG_fmap_CxHxW.pt``, as feature-3dgs writes it, is [F, h, w].
 
     Raises:
         InvalidFeatures: the folder has no such files, or two of one view.
     """
-    return grids_of(files_by_view(npy_files(folder, ".npy"), folder, ".npy"), layout)
+    suffixes = (*ARRAYS, *TENSORS)
+    files = npy_files(folder, *suffixes)
+    named = [f"{CHANNELS_FIRST}{suffix}" for suffix in suffixes]
+    return grids_of(files_by_view(files, folder, *named, *suffixes), layout)
 
 
 def grids_of(files: Mapping[str, Path], layout: Layout = "hwc") -> ViewFolder[FeatureGrid]:
-    """The grids of ``.npy`` files by view."""
+    """The grids of files of arrays by view."""
 
     def read(view: str) -> FeatureGrid:
-        grid = read_floats(files[view], "F, h, w" if layout == "chw" else "h, w, F")
-        return FeatureGrid(grid.transpose(1, 2, 0) if layout == "chw" else grid, where=f"view {view!r}")
+        first = layout == "chw" or files[view].stem.endswith(CHANNELS_FIRST)
+        grid = read_floats(files[view], "F, h, w" if first else "h, w, F")
+        return FeatureGrid(grid.transpose(1, 2, 0) if first else grid, where=f"view {view!r}")
 
     return ViewFolder(files, read)
 
@@ -96,13 +104,15 @@ def mask_ids(stored: np.ndarray, rows: int, path: Path) -> np.ndarray:
     """[L, H, W] i32 of ids, -1 for none, stored as integers or as floats.
 
     Args:
-        stored: [L, H, W], or [H, W] for one level. rows: vectors that there are. path: named in errors.
+        stored: [L, H, W], or [H, W] for one level; axes of length 1 before these are taken off.
+        rows: vectors that there are. path: named in errors.
 
     Raises:
         InvalidFeatures: other axes, an id without a vector, or one that is no whole number.
     """
+    shape, stored = list(stored.shape), without_unit_axes(stored, 3)
     if stored.ndim not in (2, 3):
-        raise InvalidFeatures(str(path), expected="mask ids [L, H, W]", got=str(list(stored.shape)))
+        raise InvalidFeatures(str(path), expected="mask ids [L, H, W]", got=str(shape))
     low, high = float(stored.min()), float(stored.max())
     # NaN fails every comparison, so it is refused here too.
     if not (low >= NO_LABEL and high < rows):
@@ -120,16 +130,17 @@ def files_below(folder: Path) -> list[Path]:
     return visible_files(folder, "**/*")
 
 
-def npy_files(folder: Path, suffix: str) -> list[Path]:
-    """The files in the folder and its sub-folders whose names end so, sorted.
+def npy_files(folder: Path, *suffixes: str) -> list[Path]:
+    """The files in the folder and its sub-folders whose names end in one of these ways, sorted.
 
     Raises:
         InvalidFeatures: there is none; pickles are named as the reason where there are some.
     """
+    suffix = suffixes[0]
     if not folder.is_dir():
         raise InvalidFeatures(str(folder), expected=f"a folder of *{suffix} files", got="no such folder")
     files = files_below(folder)
-    found = [path for path in files if path.name.endswith(suffix)]
+    found = [path for path in files if path.name.endswith(suffixes)]
     pickles = [path.name for path in files if path.suffix.lower() in PICKLED]
     if not found and pickles:
         raise InvalidFeatures(

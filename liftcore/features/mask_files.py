@@ -1,15 +1,18 @@
-"""Files that hold masks: PNGs, and COCO's run lengths in JSON.
+"""Files that hold masks: PNGs, and COCO's run lengths and polygons in JSON.
 
 COCO's run lengths say how many pixels lie outside a mask, then inside, then outside, and so on, down the columns.
 They are a list of numbers ("uncompressed"), or a string of them, in which a number is written in groups of five bits,
 the lowest first, each a character from ``0`` on: 32 says that more groups follow, and 16 in the last that the number
 is negative. From the fourth on, a number is the difference to the one two before it. The format is of
 cocodataset/cocoapi, ``common/maskApi.c`` (``rleToString``, ``rleFrString``).
+
+A polygon is a list of parts, ``[[x1, y1, x2, y2, ...], ...]`` in pixels of the image, whose union is the mask; or, as
+LabelMe and ISAT write it, the points ``[[x, y], ...]`` of one part.
 """
 
 import json
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import accumulate
@@ -40,6 +43,10 @@ MORE, SIGN, VALUE = 32, 16, 31
 LOWEST, HIGHEST = ord("0"), ord("0") + 63  # the characters of a group
 MOST_GROUPS = 7  # 35 bits: differences of lengths in an image of MAX_SIDE squared, and their sign
 MAX_PIXELS = 178_956_970  # as many as Pillow opens
+MOST_CROSSINGS = 1 << 24  # of columns of pixels by the edges of a polygon
+MAX_COORDINATE = 1e6  # pixels; what lies beyond is no place on an image
+RECORD_LISTS = ("annotations", "shapes", "objects", "predictions")  # COCO's, LabelMe's, ISAT's, Roboflow's
+SEGMENTATIONS = ("segmentation", "points", "rle", "mask")  # of a record
 
 
 def label_png(path: Path) -> tuple[np.ndarray, dict[str, str]]:
@@ -53,8 +60,19 @@ def label_png(path: Path) -> tuple[np.ndarray, dict[str, str]]:
         return np.asarray(image).astype(np.int32), texts
 
 
-def binary_png(path: Path) -> np.ndarray:
-    """[h, w] bool, where a picture of one value beside black has that value.
+def panoptic_png(path: Path) -> np.ndarray:
+    """[h, w] i32, the ids of a picture of numbers, or of colours that hold them, R + 256 G + 65536 B (COCO).
+
+    Raises:
+        InvalidFeatures: no PNG, one of few bits, or one with transparency.
+    """
+    with _opened(path, BINARY, _refuse_transparency) as image:
+        values = np.asarray(image).astype(np.int32)
+    return values if values.ndim == 2 else values @ np.array([1, 256, 65_536], np.int32)
+
+
+def binary_picture(path: Path, unlabelled: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Where a picture of one value beside black has that value, and where it has ``unlabelled``, [h, w] bool both.
 
     Raises:
         InvalidFeatures: no PNG, one with transparency, or one of more values.
@@ -62,12 +80,13 @@ def binary_png(path: Path) -> np.ndarray:
     with _opened(path, BINARY, _refuse_transparency) as image:
         values = np.asarray(image)
     grey = values.max(axis=2) if values.ndim == 3 else values
-    inside = grey != 0
+    void = np.zeros(grey.shape, bool) if unlabelled is None else grey == unlabelled
+    inside = (grey != 0) & ~void
     told = grey[inside]
     if len(told) and told.min() != told.max():
         got, hint = f"values from {told.min()} to {told.max()} beside it", "label pictures need their --names"
         raise InvalidFeatures(str(path), expected="one value beside 0, a mask", got=got, hint=hint)
-    return inside
+    return inside, void
 
 
 @contextmanager
@@ -108,23 +127,55 @@ def _refuse_transparency(_: int, kind: str, path: Path) -> None:
 
 
 @dataclass(frozen=True)
-class RunMasks(Sequence[np.ndarray]):
-    """Masks of one size, kept as run lengths; each is made anew, [h, w] bool, when it is asked for."""
+class RunMask:
+    """A mask as run lengths."""
 
     size: tuple[int, int]  # h, w
-    runs: tuple[np.ndarray, ...]  # [n] i64 each, checked
+    lengths: np.ndarray  # [n] i64, checked: their sum is h w
+
+    def pixels(self) -> np.ndarray:
+        """[h, w] bool, made anew."""
+        return mask_of_runs(self.size, self.lengths)
+
+    def is_empty(self) -> bool:
+        """Return whether no pixel is inside."""
+        return not self.lengths[1::2].any()
+
+
+@dataclass(frozen=True)
+class PolygonMask:
+    """A mask as the union of polygons."""
+
+    size: tuple[int, int]  # h, w
+    parts: tuple[np.ndarray, ...]  # [n, 2] f64 each, x and y in pixels
+
+    def pixels(self) -> np.ndarray:
+        """[h, w] bool, made anew."""
+        return fill_polygons(self.size, self.parts)
+
+    def is_empty(self) -> bool:
+        """Return whether no pixel is inside."""
+        return not self.pixels().any()
+
+
+StoredMask = RunMask | PolygonMask
+
+
+@dataclass(frozen=True)
+class StoredMasks(Sequence[np.ndarray]):
+    """Masks of one size; each is made anew, [h, w] bool, when it is asked for."""
+
+    stored: tuple[StoredMask, ...]
 
     @overload
     def __getitem__(self, index: int) -> np.ndarray: ...
     @overload
-    def __getitem__(self, index: slice) -> "RunMasks": ...
-    def __getitem__(self, index: int | slice) -> "np.ndarray | RunMasks":
-        if isinstance(index, slice):
-            return RunMasks(self.size, self.runs[index])
-        return mask_of_runs(self.size, self.runs[index])
+    def __getitem__(self, index: slice) -> "StoredMasks": ...
+    def __getitem__(self, index: int | slice) -> "np.ndarray | StoredMasks":
+        return StoredMasks(self.stored[index]) if isinstance(index, slice) else self.stored[index].pixels()
 
     def __len__(self) -> int:
-        return len(self.runs)
+        return len(self.stored)
 
 
 def read_mask_json(path: Path) -> Any:
@@ -146,16 +197,111 @@ def read_mask_json(path: Path) -> Any:
 
 
 def mask_records(content: Any, path: Path) -> list[Any]:
-    """The records of masks in such a content: a list, or that under ``annotations``.
+    """The records of masks in such a content: a list, or that under ``annotations`` or another of RECORD_LISTS.
 
     Raises:
         InvalidFeatures: there is none.
     """
-    records = content.get("annotations") if isinstance(content, dict) else content
-    if not isinstance(records, list):
+    found = (content.get(key) for key in RECORD_LISTS) if isinstance(content, dict) else iter([content])
+    records = next((records for records in found if isinstance(records, list)), None)
+    if records is None:
         got = f"an object of {', '.join(map(repr, list(content)[:3]))}"[:120] if isinstance(content, dict) else "none"
         raise InvalidFeatures(str(path), expected=MASK_LIST, got=got, hint="files of no views belong elsewhere")
     return records
+
+
+def read_mask(record: Any, size: tuple[int, int] | None, where: str) -> StoredMask | None:
+    """The mask of a record: run lengths or polygons; None where it has none, or polygons of no part.
+
+    Args:
+        size: (h, w) of the image, which polygons are filled on; None: nobody says it.
+
+    Raises:
+        InvalidFeatures: as `read_runs` and `read_polygons`, or polygons of an image of no known size.
+    """
+    found = record if isinstance(record, dict) else {}
+    segmentation = next((found[key] for key in SEGMENTATIONS if found.get(key) is not None), None)
+    if segmentation is None or segmentation == []:
+        return None
+    if not isinstance(segmentation, list):
+        return RunMask(*read_runs(segmentation, where))
+    parts = read_polygons(segmentation, where)
+    if size is None:
+        hint = "give the image's width and height, or masks as run lengths"
+        raise InvalidFeatures(where, expected="the size of the image of a polygon", got="none", hint=hint)
+    check_size(size, where)
+    return PolygonMask(size, tuple(parts))
+
+
+def read_polygons(segmentation: Any, where: str) -> list[np.ndarray]:
+    """The parts of a polygon, [n, 2] f64 each: x and y in pixels.
+
+    Args:
+        segmentation: lists x1, y1, x2, y2 and so on, one a part, or one alone; or the points of one part, as lists
+            [x, y] or objects of x and y.
+
+    Raises:
+        InvalidFeatures: it is none of these, or a coordinate is no finite number within MAX_COORDINATE.
+    """
+    listed = segmentation if isinstance(segmentation, list) else [segmentation]
+    points = [[point.get("x"), point.get("y")] if isinstance(point, dict) else point for point in listed]
+    if points and all(isinstance(point, list) and len(point) == 2 for point in points):
+        points = [[number for point in points for number in point]]
+    elif points and not isinstance(points[0], list):
+        points = [points]
+    for part in points:
+        if not isinstance(part, list) or len(part) % 2 or not all(map(_is_coordinate, part)):
+            expected = "parts [x1, y1, x2, y2, ...] of a polygon, or its points [x, y], in pixels"
+            raise InvalidFeatures(where, expected=expected, got=repr(part)[:80])
+    return [np.array(part, np.float64).reshape(-1, 2) for part in points]
+
+
+def _is_coordinate(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MAX_COORDINATE
+
+
+def fill_polygons(size: tuple[int, int], parts: Iterable[np.ndarray]) -> np.ndarray:
+    """[h, w] bool: the union of polygons [n, 2], each filled where a ray from a pixel's centre meets it oddly often.
+
+    What lies outside the image is cut off. cocodataset/cocoapi (``rleFrPoly``) rounds corners to fifths of a pixel
+    first, so outlines differ from it by a part of a pixel.
+
+    Raises:
+        InvalidFeatures: a part's edges cross more than MOST_CROSSINGS columns of pixels.
+    """
+    height, width = size
+    inside = np.zeros(size, bool)
+    for part in parts:
+        ends = np.roll(part, -1, axis=0)
+        low, high = np.minimum(part, ends)[:, 0], np.maximum(part, ends)[:, 0]
+        first, last = (np.clip(np.ceil(side - 0.5), 0, width).astype(np.int64) for side in (low, high))
+        if (crossed := int((last - first).sum())) > MOST_CROSSINGS:
+            expected = f"at most {MOST_CROSSINGS} crossings of its edges with columns of pixels"
+            raise InvalidFeatures("polygon", expected=expected, got=f"{crossed} by {len(part)} corners")
+        edges = np.repeat(np.arange(len(part)), last - first)  # an entry for each column whose centre an edge crosses
+        if not len(edges):
+            continue
+        columns = np.arange(len(edges)) - np.repeat(np.cumsum(last - first) - last, last - first)
+        (x, y), (dx, dy) = part[edges].T, (ends - part)[edges].T
+        rows = np.clip(np.ceil(y + (columns + 0.5 - x) * dy / dx - 0.5), 0, height).astype(np.int64)
+        left, top = int(columns.min()), int(rows.min())
+        box = int(rows.max()) - top, int(columns.max()) + 1 - left
+        places = (rows - top) * box[1] + columns - left
+        crossings = np.bincount(places, minlength=(box[0] + 1) * box[1]).reshape(-1, box[1])[: box[0]] % 2 == 1
+        inside[top : top + box[0], left : left + box[1]] |= np.logical_xor.accumulate(crossings, axis=0)
+    return inside
+
+
+def check_size(size: tuple[int, int], where: str) -> None:
+    """Refuse a size of masks (h, w) out of bounds.
+
+    Raises:
+        InvalidFeatures: it is.
+    """
+    height, width = size
+    if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE and height * width <= MAX_PIXELS):
+        expected = f"sides in 1..{MAX_SIDE} and at most {MAX_PIXELS} pixels"
+        raise InvalidFeatures(where, expected=expected, got=f"size {height} x {width}"[:80])
 
 
 def read_runs(segmentation: Any, where: str) -> tuple[tuple[int, int], np.ndarray]:
@@ -165,20 +311,17 @@ def read_runs(segmentation: Any, where: str) -> tuple[tuple[int, int], np.ndarra
         (h, w), and the lengths [n] i64, whose sum is h w.
 
     Raises:
-        InvalidFeatures: a polygon or what else is no such mask, a size out of bounds, a string that is cut off or
+        InvalidFeatures: what is no such mask, a size out of bounds, a string that is cut off or
             has other characters, or lengths that do not cover the image exactly. ``where`` is named.
     """
     if not isinstance(segmentation, dict) or not {"size", "counts"} <= segmentation.keys():
-        got = "a polygon" if isinstance(segmentation, list) else "another thing"
         hint = "segment-anything writes them with output_mode='uncompressed_rle' or 'coco_rle'"
-        raise InvalidFeatures(where, expected="run lengths {size, counts}", got=got, hint=hint)
+        raise InvalidFeatures(where, expected="run lengths {size, counts}", got="another thing", hint=hint)
     size, counts = segmentation["size"], segmentation["counts"]
     if not (isinstance(size, list) and len(size) == 2 and all(type(side) is int for side in size)):
         raise InvalidFeatures(where, expected="size [h, w]", got=repr(size)[:80])
     height, width = size
-    if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE and height * width <= MAX_PIXELS):
-        expected = f"sides in 1..{MAX_SIDE} and at most {MAX_PIXELS} pixels"
-        raise InvalidFeatures(where, expected=expected, got=f"size {height} x {width}"[:80])
+    check_size((height, width), where)
     lengths = _decompressed(counts, where) if isinstance(counts, str) else counts
     if not isinstance(lengths, list) or not all(type(length) is int for length in lengths):
         raise InvalidFeatures(where, expected="counts, a list of whole numbers or a string", got=repr(counts)[:80])
@@ -198,7 +341,17 @@ def mask_of_runs(size: tuple[int, int], lengths: np.ndarray) -> np.ndarray:
     return np.repeat(inside, lengths).reshape(width, height).T
 
 
+def _without_bytes_notation(text: str) -> str:
+    """The counts in Python's text of bytes, ``b'...'``, which ``str`` makes of those that pycocotools gives.
+
+    Quotes are no characters of counts. Of these, Python writes the backslash alone otherwise: twice.
+    """
+    is_bytes = len(text) > 2 and text[0] == "b" and text[1] in "'\"" and text[-1] == text[1]
+    return text[2:-1].replace("\\\\", "\\") if is_bytes else text
+
+
 def _decompressed(text: str, where: str) -> list[int]:
+    text = _without_bytes_notation(text)
     numbers: list[int] = []
     number = groups = 0
     for character in text:

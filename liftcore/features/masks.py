@@ -1,7 +1,8 @@
 """Folders of masks with one vector each: SAM's masks, say, and CLIP's vector of the crop of each.
 
 ``IMG.npy`` [M, F] holds the vectors, row k of mask k. The masks are in one of: ``IMG.json``, run lengths as
-segment-anything returns them; ``IMG_masks.npy``, booleans [M, H, W] or ids [H, W] or [L, H, W] with -1 for none;
+segment-anything returns them, or polygons; ``IMG_masks.npy`` (or ``.npz``), booleans [M, H, W], also [M, 1, H, W] as
+SAM's predictor returns them, or ids [H, W] or [L, H, W] with -1 for none;
 ``IMG.png``, a label picture of one channel. They need not have the photo's size.
 
 In a label picture where 0 means unlabelled, as most programs have it, value v is mask v - 1. Where another value
@@ -21,12 +22,14 @@ import numpy as np
 
 from liftcore.errors import InvalidFeatures
 from liftcore.features.folders import ViewFolder, files_below, files_by_view, mask_ids, npy_files
-from liftcore.features.mask_files import RunMasks, label_png, mask_records, read_mask_json, read_runs
+from liftcore.features.mask_files import StoredMasks, label_png, mask_records, read_mask, read_mask_json
+from liftcore.features.mask_json import stated_size
 from liftcore.features.views import NO_LABEL, Regions
-from liftcore.io.npy import NUMBERS, open_npy, read_floats
+from liftcore.io.npy import NUMBERS, open_array, read_floats, without_unit_axes
 
 VECTORS = ".npy"
 ARRAY, RUNS, PICTURE = "_masks.npy", ".json", ".png"
+ZIPPED_ARRAY = "_masks.npz"
 OVERLAP = "photos belong in another folder than their masks"
 MAX_LEVELS = 32  # a hierarchy of four partitions, with masks 1 to 4 pixels over their neighbours, took 13 to 18
 
@@ -39,12 +42,14 @@ def mask_files(folder: Path) -> dict[str, Path]:
     """
     if not folder.is_dir():
         raise InvalidFeatures(str(folder), expected="a folder of masks", got="no such folder")
-    arrays = [path for path in files_below(folder) if path.name.endswith(VECTORS)]
-    vectors = [path.name for path in arrays if not path.name.endswith(ARRAY)]
+    arrays = [path for path in files_below(folder) if path.name.endswith((VECTORS, ZIPPED_ARRAY))]
+    vectors = [path.name for path in arrays if not path.name.endswith((ARRAY, ZIPPED_ARRAY))]
     if vectors:
         hint = "leave the encoder out: these are packed as they are"
         raise InvalidFeatures(str(folder), expected="masks without vectors", got=vectors[0], hint=hint)
-    found = files_by_view([*arrays, *_pictures(folder)], folder, ARRAY, what="file of masks", hint=OVERLAP)
+    found = files_by_view(
+        [*arrays, *_pictures(folder)], folder, ARRAY, ZIPPED_ARRAY, what="file of masks", hint=OVERLAP
+    )
     if not found:
         expected = f"masks as IMG{RUNS}, IMG{ARRAY} or IMG{PICTURE}"
         raise InvalidFeatures(str(folder), expected=expected, got="no such files")
@@ -64,7 +69,7 @@ def labels_alone(path: Path, unlabelled: int = 0) -> tuple[np.ndarray, int]:
         high = int(values.max(initial=0, where=values != unlabelled))
         rows = high + (unlabelled != 0 and bool((values != unlabelled).any()))
     else:
-        stored = open_npy(path, kinds=NUMBERS + "b")
+        stored = _planes(open_array(path, kinds=NUMBERS + "b"))
         high = float(stored.max())
         if not np.isfinite(high):
             raise InvalidFeatures(str(path), expected="mask ids, or booleans", got="numbers that are not finite")
@@ -97,10 +102,10 @@ def mask_views(
             return Regions(_labels(files[view], len(made[view]), unlabelled), made[view], where=f"view {view!r}")
 
         return ViewFolder(files, with_made)
-    arrays = npy_files(folder, VECTORS)
-    found = [*(path for path in arrays if path.name.endswith(ARRAY)), *_pictures(folder)]
-    masks = files_by_view(found, folder, ARRAY, what="file of masks", hint=OVERLAP)
-    found = [path for path in arrays if not path.name.endswith(ARRAY)]
+    arrays = npy_files(folder, VECTORS, ZIPPED_ARRAY)
+    found = [*(path for path in arrays if path.name.endswith((ARRAY, ZIPPED_ARRAY))), *_pictures(folder)]
+    masks = files_by_view(found, folder, ARRAY, ZIPPED_ARRAY, what="file of masks", hint=OVERLAP)
+    found = [path for path in arrays if not path.name.endswith((ARRAY, ZIPPED_ARRAY))]
     vectors = files_by_view(found, folder, what="file of vectors")
     for view, path in vectors.items():
         if view not in masks:
@@ -131,7 +136,7 @@ def _labels(path: Path, rows: int, unlabelled: int) -> np.ndarray:
         return picture_labels(path, rows, unlabelled)
     if path.suffix.lower() == RUNS:
         return layered(sam_masks(path, rows), str(path))
-    stored = open_npy(path, kinds=NUMBERS + "b")
+    stored = _planes(open_array(path, kinds=NUMBERS + "b"))
     got = f"{stored.dtype} {list(stored.shape)}"
     if stored.dtype.kind != "b":
         # Masks of zeros and ones, a plane each, would as ids all be of the first two vectors.
@@ -222,7 +227,15 @@ def picture_labels(path: Path, rows: int, unlabelled: int) -> np.ndarray:
     return np.where(labelled, values - (unlabelled == 0), NO_LABEL).astype(np.int32)[None]
 
 
-def sam_masks(path: Path, count: int) -> RunMasks:
+def _planes(stored: np.ndarray) -> np.ndarray:
+    """Masks [M, H, W] of such with an axis of length 1 before it, or, as SAM's predictor has them, behind M."""
+    found = without_unit_axes(stored, 4)
+    if found.ndim == 4 and found.shape[1] == 1 and found.dtype.kind == "b":
+        found = found[:, 0]
+    return without_unit_axes(found, 3)
+
+
+def sam_masks(path: Path, count: int) -> StoredMasks:
     """The masks of a file, in its order.
 
     Args:
@@ -230,19 +243,24 @@ def sam_masks(path: Path, count: int) -> RunMasks:
             they ceased to match, so that is refused before anything is decoded.
 
     Raises:
-        InvalidFeatures: no such JSON, not ``count`` masks, masks of several sizes, or as `read_runs`.
+        InvalidFeatures: no such JSON, not ``count`` masks, a record without one, masks of several sizes, or as
+            `read_mask`.
     """
-    records = mask_records(read_mask_json(path), path)
+    content = read_mask_json(path)
+    records, stated = mask_records(content, path), stated_size(content)
     if len(records) != count:
         hint = "leave out views without masks" if not records else "row k of the vectors is of mask k of the list"
         raise InvalidFeatures(str(path), expected=f"{count} masks, one a vector", got=str(len(records)), hint=hint)
-    found = [
-        read_runs(record.get("segmentation") if isinstance(record, dict) else None, f"{path} mask {number}")
-        for number, record in enumerate(records)
-    ]
-    size = found[0][0]
-    for number, (other, _) in enumerate(found):
-        if other != size:
+    found = []
+    for number, record in enumerate(records):
+        if (mask := read_mask(record, stated, f"{path} mask {number}")) is None:
+            hint = "segment-anything writes them with output_mode='uncompressed_rle' or 'coco_rle'"
+            expected = "a segmentation, run lengths {size, counts} or polygons"
+            raise InvalidFeatures(f"{path} mask {number}", expected=expected, got="none", hint=hint)
+        found.append(mask)
+    size = found[0].size
+    for number, mask in enumerate(found):
+        if (other := mask.size) != size:
             got = f"{size[0]} x {size[1]} of mask 0 and {other[0]} x {other[1]} of mask {number}"
             raise InvalidFeatures(str(path), expected="masks of one size", got=got, hint="write those of one photo")
-    return RunMasks(size, tuple(runs for _, runs in found))
+    return StoredMasks(tuple(found))

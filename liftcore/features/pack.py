@@ -417,11 +417,18 @@ def _open(path: Path) -> _PackFile:
     try:
         handle: Any = safe_open(str(path), framework="pt")
         slices = {name: handle.get_slice(name) for name in tuple(handle.keys())}
-        specs = {name: TensorSpec(part.get_dtype(), tuple(part.get_shape())) for name, part in slices.items()}
+        specs = {name: TensorSpec(part.get_dtype(), _axes(name, part.get_shape())) for name, part in slices.items()}
         return _PackFile(path, handle, specs, handle.metadata() or {})
     except (SafetensorError, OSError) as error:
         got = f"a file that does not open as one ({str(error)[:120]})"
         raise InvalidFeatures(str(path), expected=expected, got=got) from None
+
+
+def _axes(name: str, shape: Sequence[int]) -> tuple[int, ...]:
+    """The shape of a tensor of a pack without axes of length 1 before its own, which values do without too."""
+    most = {"labels": 3, "grid": 3, "codebook": 2}.get(name.rpartition("/")[2], len(shape))
+    extra = max(len(shape) - most, 0)
+    return tuple(shape[extra:]) if all(side == 1 for side in shape[:extra]) else tuple(shape)
 
 
 def _views(pack: _PackFile) -> list[str]:

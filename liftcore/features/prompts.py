@@ -7,68 +7,129 @@ table, and a lift of it is asked in these words without an encoder.
 
 A folder holds, with sub-folders where views have some (``camA/000``), one of:
 
-* binary PNGs, ``PHRASE/VIEW.png`` or, by ``folders="views"``, ``VIEW/PHRASE.png``; ``_`` stands for a space;
-* JSON, ``VIEW.json`` with records (a list, or ``annotations``) of a phrase and ``segmentation`` as run lengths, or
-  COCO's data set with ``images``, ``annotations`` and ``categories``, where SA-Co's images have a ``text_input``;
-* label PNGs ``VIEW.png`` with the names of their values: in a file, or in the picture's text ``legend``, as
+* binary pictures, ``PHRASE/VIEW.png`` or, by ``folders="views"``, ``VIEW/PHRASE.png``; ``_`` stands for a space.
+  They are PNGs, or arrays [h, w] in ``.npy`` or ``.npz``;
+* JSON: COCO's data sets and their kin, records of one image, or objects by ids (`liftcore.features.mask_json`);
+* label pictures ``VIEW.png`` with the names of their values: in a file, or in the picture's text ``legend``, as
   ``splatlift segment --labels`` writes it.
 
 Masks of one phrase in a view are put together. A view counts once it has a file or a record, if only of an empty
-mask.
+mask. A pixel has no label where nobody decided what it shows: what ``unlabelled`` marks, what lies in a box without a
+mask, and all that no mask covers in a view that was not searched for every phrase.
 """
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from liftcore.errors import InvalidFeatures
 from liftcore.features.folders import ViewFolder, files_below
-from liftcore.features.mask_files import (
-    binary_png,
-    label_png,
-    mask_of_runs,
-    mask_records,
-    read_mask_json,
-    read_runs,
+from liftcore.features.mask_files import binary_picture, label_png, panoptic_png
+from liftcore.features.mask_json import (
+    VOID,
+    IdObjects,
+    MaskDocument,
+    Masks,
+    read_mask_document,
+    tracked_view,
+    views_of_images,
 )
 from liftcore.features.masks import layered
 from liftcore.features.views import NO_LABEL, Regions
+from liftcore.io.files import visible_files
+from liftcore.io.npy import ARRAYS, NUMBERS, open_array, without_unit_axes
 from liftcore.query.text.table import TableEncoder, plain
-from liftcore.scene.views import without_image_suffix
+from liftcore.scene.views import composed, without_image_suffix
 
-PHRASE_KEYS = ("phrase", "prompt", "text", "label", "class_name", "category_name", "text_input")  # of a record
 MOST_PHRASES = 4_096
 LEGEND = "legend"  # the text of a label picture that names its values
-LAYOUTS = "PHRASE/VIEW.png, VIEW.json with run lengths, or label pictures VIEW.png with --names"
+LAYOUTS = "PHRASE/VIEW.png, VIEW.json with run lengths or polygons, or label pictures VIEW.png with --names"
+PICTURE = ".png"
+MASK_DATA = "mask_data"  # of Grounded SAM 2's tracking, beside json_data
 
 Folders = Literal["phrases", "views"]
+Unannotated = Literal["skip", "negative"]
+
+
+class _Source(Protocol):
+    """A file, or part of one, with masks of a view."""
+
+    def masks(self) -> Iterator[tuple[str | None, np.ndarray]]:
+        """Phrases, or VOID for what nobody decided, with [h, w] bool; read when they are asked for."""
+        ...
+
+
+@dataclass(frozen=True)
+class _BinaryPicture:
+    path: Path
+    phrase: str
+    unlabelled: int | None
+
+    def masks(self) -> Iterator[tuple[str | None, np.ndarray]]:
+        inside, void = _binary(self.path, self.unlabelled)
+        yield self.phrase, inside
+        yield VOID, void
+
+
+@dataclass(frozen=True)
+class _Records:
+    records: Masks
+
+    def masks(self) -> Iterator[tuple[str | None, np.ndarray]]:
+        for phrase, mask in self.records:
+            yield phrase, mask.pixels()
+
+
+@dataclass(frozen=True)
+class _IdPicture:
+    path: Path
+    phrases: Mapping[int, str | None]  # value -> phrase; values that are not here are none of the phrases
+
+    def masks(self) -> Iterator[tuple[str | None, np.ndarray]]:
+        values = _ids(self.path)
+        for phrase in dict.fromkeys(self.phrases.values()):
+            own = [value for value, other in self.phrases.items() if other == phrase]
+            yield phrase, np.isin(values, own)
 
 
 @dataclass
-class _Masks:
-    """Where the masks of each view are, by phrase; read when they are asked for."""
+class _View:
+    """The masks of a view."""
+
+    file: Path  # the first that names it
+    sources: list[_Source] = field(default_factory=list)
+    phrases: set[str] = field(default_factory=set)  # plain, that have a pixel
+    decided: set[str] = field(default_factory=set)  # plain, that it was searched for
+    undecided: set[str] = field(default_factory=set)  # plain, that some document did not search it for
+    has_void: bool = False
+
+    def was_searched(self, phrases: Iterable[str]) -> bool:
+        """Return whether each of these phrases is masked wherever it is."""
+        return not (self.undecided - self.decided).intersection(phrases)
+
+
+@dataclass
+class _MaskIndex:
+    """Where the masks of each view are, by phrase."""
 
     phrases: dict[str, str] = field(default_factory=dict)  # as tables compare them -> as it was said first
-    views: dict[str, list[tuple[str, Any]]] = field(default_factory=dict)  # (plain phrase, where), in their order
-    files: dict[str, Path] = field(default_factory=dict)  # the first of each view
+    views: dict[str, _View] = field(default_factory=dict)
 
-    def see(self, view: str, path: Path) -> None:
-        """A view that was looked at."""
-        self.views.setdefault(view, [])
-        self.files.setdefault(view, path)
+    def view(self, name: str, path: Path) -> _View:
+        """A view that a file names."""
+        return self.views.setdefault(name, _View(path))
 
-    def add(self, view: str, phrase: str, where: Any) -> None:
-        """A mask of a view: a binary PNG, a picture with a value, or run lengths; None is an empty one."""
+    def name(self, view: str, phrase: str) -> str:
+        """The plain form of a phrase of a view, which is known from then on."""
         if not (key := plain(phrase)):
             raise InvalidFeatures(f"view {view!r}", expected="a phrase for each mask", got="an empty one")
-        self.phrases.setdefault(key, " ".join(phrase.replace("_", " ").split()))
-        if where is not None:
-            self.views[view].append((key, where))
+        self.phrases.setdefault(key, " ".join(composed(phrase).replace("_", " ").split()))
+        return key
 
 
 @dataclass(frozen=True)
@@ -78,14 +139,24 @@ class Prompts:
     views: ViewFolder[Regions]
     table: TableEncoder
     counts: Mapping[str, int]  # in how many views each phrase has a mask; one that has none is not in the table
+    warnings: tuple[str, ...] = ()  # of what was left out, and of what no mask decides
 
 
-def prompt_views(folder: Path, names: Path | None = None, folders: Folders = "phrases") -> Prompts:
+def prompt_views(
+    folder: Path,
+    names: Path | None = None,
+    folders: Folders = "phrases",
+    *,
+    unlabelled: int | None = None,
+    unannotated: Unannotated = "skip",
+) -> Prompts:
     """The regions of a folder of masks by phrase (above); each view is read when it is asked for.
 
     Args:
-        folder: the folder. folders: what its sub-folders of binary PNGs are named by.
+        folder: the folder. folders: what its sub-folders of binary pictures are named by.
         names: of label pictures, JSON from values to names, or a text whose k-th line names the value k.
+        unlabelled: of pictures, the value of pixels of which nobody decided what they show (255).
+        unannotated: whether images of a data set without an annotation are left out, or show none of its phrases.
 
     Raises:
         InvalidFeatures: there are no masks, kinds of them are mixed, a record has no phrase, or there are too many
@@ -95,32 +166,52 @@ def prompt_views(folder: Path, names: Path | None = None, folders: Folders = "ph
         raise InvalidFeatures(str(folder), expected="a folder of masks", got="no such folder")
     files = [path for path in files_below(folder) if names is None or not path.samefile(names)]
     documents = [path for path in files if path.suffix.lower() == ".json"]
-    pictures = [path for path in files if path.suffix.lower() == ".png"]
-    if bool(documents) == bool(pictures):
-        got = f"{len(files)} other files" if not documents else f"{documents[0].name} and {pictures[0].name}"
-        hint = "" if not documents else "name the file of names with --names, or keep kinds of masks apart"
-        raise InvalidFeatures(str(folder), expected=f"one of {LAYOUTS}", got=got, hint=hint)
-    found = _Masks()
+    pictures = [path for path in files if path.suffix.lower() == PICTURE]
+    arrays = [path for path in files if path.suffix.lower() in ARRAYS]
+    named = {} if names is None else _names(names)
+    index, warnings = _MaskIndex(), list[str]()
     if documents:
-        for path in documents:
-            _add_json(found, path, _view(path, folder))
-    elif names is not None or LEGEND in label_texts(pictures[0]):
-        told = {} if names is None else _names(names)
+        read = _documents(documents, pictures, named, negative=unannotated == "negative")
+        if read is None:
+            got, hint = f"{documents[0].name} and {pictures[0].name}", "or keep kinds of masks apart"
+            raise InvalidFeatures(
+                str(folder),
+                expected=f"one of {LAYOUTS}",
+                got=got,
+                hint=f"name the file of names with --names, {hint}",
+            )
+        if unlabelled is not None:
+            raise InvalidFeatures("--unlabelled", expected="pictures, whose values it is of", got=documents[0].name)
+        warnings += _add_documents(index, read, folder, [*arrays, *pictures])
+    elif pictures and (names is not None or LEGEND in label_texts(pictures[0])):
         for path in pictures:
-            _add_labels(found, path, _view(path, folder), told)
+            _add_labels(index, path, _view_of(path, folder), named, unlabelled)
+    elif pictures or any(len(path.relative_to(folder).parts) > 1 for path in arrays):
+        for path in pictures or arrays:
+            _add_binary(index, path, path.relative_to(folder), folders, unlabelled)
     else:
-        for path in pictures:
-            _add_binary(found, path, path.relative_to(folder), folders)
-    seen_in = Counter(phrase for masks in found.views.values() for phrase in dict(masks))
+        hint = "ids need their names: give the folder that holds json_data too" if arrays else ""
+        got = f"{len(files)} other files"
+        raise InvalidFeatures(str(folder), expected=f"one of {LAYOUTS}", got=got, hint=hint)
+    seen_in = Counter(phrase for view in index.views.values() for phrase in view.phrases)
     order = sorted(seen_in)
     if not 1 <= len(order) <= MOST_PHRASES:
-        expected = f"1 to {MOST_PHRASES} phrases with masks"
-        raise InvalidFeatures(str(folder), expected=expected, got=f"{len(order)} of {len(found.phrases)} phrases")
+        expected, got = f"1 to {MOST_PHRASES} phrases with masks", f"{len(order)} of {len(index.phrases)} phrases"
+        raise InvalidFeatures(str(folder), expected=expected, got=got, hint="; ".join(warnings))
+    told = {name: one for name, one in index.views.items() if one.phrases or one.has_void or one.was_searched(order)}
+    partly = sum(not one.was_searched(order) for one in told.values())
+    if partly:
+        warnings.append(
+            f"{partly} of {len(told)} views were not searched for every phrase, as their files say: what no mask "
+            "covers has no label there"
+        )
     rows = {phrase: row for row, phrase in enumerate(order)}
     vectors = np.eye(len(order) + 1, dtype=np.float16)
-    views = ViewFolder(found.files, lambda view: _regions(view, found, rows, vectors), files)
-    table = TableEncoder("phrases", [found.phrases[phrase] for phrase in order], vectors[:-1])
-    return Prompts(views, table, {said: seen_in[phrase] for phrase, said in sorted(found.phrases.items())})
+    read_view = lambda name: _regions(name, told[name], rows, vectors)  # noqa: E731
+    views = ViewFolder({name: one.file for name, one in told.items()}, read_view, files)
+    table = TableEncoder("phrases", [index.phrases[phrase] for phrase in order], vectors[:-1])
+    counts = {said: seen_in[phrase] for phrase, said in sorted(index.phrases.items())}
+    return Prompts(views, table, counts, tuple(warnings))
 
 
 def label_texts(path: Path) -> dict[str, str]:
@@ -131,59 +222,99 @@ def label_texts(path: Path) -> dict[str, str]:
         return {}
 
 
-def _regions(view: str, found: _Masks, rows: Mapping[str, int], vectors: np.ndarray) -> Regions:
-    where = str(found.files[view])
+def _regions(name: str, view: _View, rows: Mapping[str, int], vectors: np.ndarray) -> Regions:
     masks: dict[str, np.ndarray] = {}
-    for phrase, mask in _read(found.views[view]):
-        before = masks.get(phrase, mask)
-        size = next(iter(masks.values()), mask).shape
+    void: np.ndarray | None = None
+    for phrase, mask in (pair for source in view.sources for pair in source.masks()):
+        size = next(iter(masks.values()), mask if void is None else void).shape
         if mask.shape != size:
             got = f"{size[0]} x {size[1]} and {mask.shape[0]} x {mask.shape[1]}"
-            raise InvalidFeatures(f"view {view!r}", expected="masks of one size", got=got, hint="those of one photo")
-        masks[phrase] = before | mask
-    if not masks:
-        labels = np.zeros((1, 1, 1), np.int32)
+            raise InvalidFeatures(f"view {name!r}", expected="masks of one size", got=got, hint="those of one photo")
+        if phrase is None:
+            void = mask if void is None else void | mask
+        elif (key := plain(phrase)) in view.phrases:
+            masks[key] = masks[key] | mask if key in masks else mask
+    if masks:
+        labels = layered(list(masks.values()), str(view.file))
     else:
-        labels = layered(list(masks.values()), where)
-        labels[0][(labels == NO_LABEL).all(axis=0)] = len(masks)
-    return Regions(labels, vectors[[*(rows[phrase] for phrase in masks), len(rows)]], where=f"view {view!r}")
+        labels = np.full((1, 1, 1) if void is None else (1, *void.shape), NO_LABEL, np.int32)
+    if view.was_searched(rows):
+        rest = (labels == NO_LABEL).all(axis=0)
+        labels[0][rest if void is None else rest & ~void] = len(masks)
+    return Regions(labels, vectors[[*(rows[phrase] for phrase in masks), len(rows)]], where=f"view {name!r}")
 
 
-def _read(masks: Iterable[tuple[str, Any]]) -> Iterator[tuple[str, np.ndarray]]:
-    opened: tuple[Path | None, np.ndarray] = None, np.empty(0)
-    for phrase, where in masks:
-        if isinstance(where, Path):
-            yield phrase, binary_png(where)
-        elif isinstance(where[0], Path):
-            opened = opened if opened[0] == where[0] else (where[0], label_png(where[0])[0])
-            yield phrase, opened[1] == where[1]
-        else:
-            yield phrase, mask_of_runs(*where)
-
-
-def _view(path: Path, folder: Path) -> str:
+def _view_of(path: Path, folder: Path) -> str:
     return without_image_suffix(path.relative_to(folder).with_suffix("").as_posix())
 
 
-def _add_binary(found: _Masks, path: Path, inner: Path, folders: Folders) -> None:
+def _binary(path: Path, unlabelled: int | None) -> tuple[np.ndarray, np.ndarray]:
+    """Where a mask of a picture or an array is, and where nobody decided, [h, w] bool both."""
+    if path.suffix.lower() == PICTURE:
+        return binary_picture(path, unlabelled)
+    values = _plane(open_array(path, kinds=NUMBERS + "b"), path)
+    void = np.zeros(values.shape, bool) if unlabelled is None else values == unlabelled
+    inside = (values != 0) & ~void
+    if len(told := np.unique(values[inside])) > 1:
+        got = f"values from {told[0]} to {told[-1]} beside it"
+        raise InvalidFeatures(str(path), expected="one value beside 0, a mask", got=got)
+    return inside, void
+
+
+def _ids(path: Path) -> np.ndarray:
+    """[h, w] integers of a picture or an array of ids."""
+    if path.suffix.lower() == PICTURE:
+        return panoptic_png(path)
+    return _plane(open_array(path, kinds=NUMBERS), path).astype(np.int64)
+
+
+def _plane(values: np.ndarray, path: Path) -> np.ndarray:
+    """[h, w] of an array with axes of length 1 before."""
+    found = without_unit_axes(values, 2)
+    if found.ndim != 2:
+        got = f"{values.dtype} {list(values.shape)}"
+        raise InvalidFeatures(str(path), expected="a mask or ids [h, w]", got=got)
+    return found
+
+
+def _add_binary(index: _MaskIndex, path: Path, inner: Path, folders: Folders, unlabelled: int | None) -> None:
     parts = PurePosixPath(inner.with_suffix("").as_posix()).parts
     if len(parts) < 2:
         raise InvalidFeatures(str(path), expected=LAYOUTS, got="a picture in no phrase's folder and without names")
-    phrase, view = (parts[0], parts[1:]) if folders == "phrases" else (parts[-1], parts[:-1])
-    name = without_image_suffix("/".join(view))
-    found.see(name, path)
-    found.add(name, phrase, path if binary_png(path).any() else None)
+    phrase, inside = (parts[0], parts[1:]) if folders == "phrases" else (parts[-1], parts[:-1])
+    name = without_image_suffix("/".join(inside))
+    view, key = index.view(name, path), index.name(name, phrase)
+    mask, void = _binary(path, unlabelled)
+    if mask.any() or void.any():
+        view.sources.append(_BinaryPicture(path, phrase, unlabelled))
+        view.has_void = view.has_void or bool(void.any())
+    if mask.any():
+        view.phrases.add(key)
 
 
-def _add_labels(found: _Masks, path: Path, view: str, names: Mapping[int, str]) -> None:
+def _add_labels(index: _MaskIndex, path: Path, name: str, names: Mapping[int, str], unlabelled: int | None) -> None:
     values, texts = label_png(path)
-    named = names or _numbered(_parsed(texts.get(LEGEND, "null")), f"{path} legend")
-    found.see(view, path)
-    for value in np.unique(values[values != 0]).tolist():
-        if value not in named:
-            expected = f"a name for each value but 0 ({', '.join(map(str, list(named)[:6]))})"
-            raise InvalidFeatures(str(path), expected=expected, got=f"the value {value}")
-        found.add(view, named[value], (path, value))
+    phrases: dict[int, str | None] = dict(names or _numbered(_parsed(texts.get(LEGEND, "null")), f"{path} legend"))
+    if unlabelled is not None:
+        phrases[unlabelled] = VOID
+    known = [value for value in phrases if value]
+    for value in np.unique(values[(values != 0) | (unlabelled == 0)]).tolist():
+        if value not in phrases:
+            expected = f"a name for each value but 0 ({', '.join(map(str, known[:6]))})"
+            hint = f"where it marks pixels that nobody decided on, give --unlabelled {value}"
+            raise InvalidFeatures(str(path), expected=expected, got=f"the value {value}", hint=hint)
+    _add_ids(index, index.view(name, path), name, path, values, phrases)
+
+
+def _add_ids(
+    index: _MaskIndex, view: _View, name: str, path: Path, values: np.ndarray, phrases: Mapping[int, str | None]
+) -> None:
+    present = {value: phrases[value] for value in np.unique(values).tolist() if value in phrases}
+    present = {value: phrase for value, phrase in present.items() if value or phrase is None}
+    if present:
+        view.sources.append(_IdPicture(path, present))
+    view.has_void = view.has_void or VOID in present.values()
+    view.phrases.update(index.name(name, phrase) for phrase in present.values() if phrase is not None)
 
 
 def _names(path: Path) -> dict[int, str]:
@@ -216,43 +347,131 @@ def _numbered(told: Any, where: str) -> dict[int, str]:
     return named
 
 
-def _add_json(found: _Masks, path: Path, view: str) -> None:
-    content = read_mask_json(path)
-    images, categories = _by_id(content, "images"), _by_id(content, "categories")
-    views = {number: _image_view(image, path) for number, image in images.items()} or {None: view}
-    for name in views.values():
-        found.see(name, path)
-    for number, record in enumerate(mask_records(content, path)):
-        where = f"{path} mask {number}"
-        if not isinstance(record, dict):
-            raise InvalidFeatures(where, expected="a mask with a phrase", got=type(record).__name__)
-        image = _id(record, "image_id") if images else None
-        if image not in views:
-            raise InvalidFeatures(where, expected="an image_id of the file", got=repr(image)[:80])
-        size, lengths = read_runs(record.get("segmentation"), where)
-        told = images.get(image, {}).get("text_input"), categories.get(_id(record, "category_id"), {}).get("name")
-        said = next((said for said in (*map(record.get, PHRASE_KEYS), *told) if isinstance(said, str)), None)
-        if said is None:
-            expected, hint = (
-                f"a phrase ({', '.join(PHRASE_KEYS[:5])} or a category)",
-                "'splatlift pack masks' needs none",
+def _documents(
+    paths: Sequence[Path], pictures: Sequence[Path], names: Mapping[int, str], *, negative: bool
+) -> list[MaskDocument] | None:
+    """The documents; None where pictures lie beside them that may be masks as well."""
+    try:
+        read = [read_mask_document(path, names, unannotated_negative=negative) for path in paths]
+    except InvalidFeatures:
+        if pictures:
+            return None
+        raise
+    # Documents that name their images lie beside photos (Roboflow) or pictures of ids.
+    own = all(image.image is not None or image.ids is not None for document in read for image in document.images)
+    return None if pictures and not own else read
+
+
+def _add_documents(
+    index: _MaskIndex, documents: Sequence[MaskDocument], folder: Path, ids: Sequence[Path]
+) -> list[str]:
+    """Add the masks of all documents; what a user should know of them."""
+    views = _document_views(documents, folder)
+    own: dict[str, str] = {}  # view -> its file, of data sets
+    for document, image in ((one, image) for one in documents for image in one.images):
+        id_file = None if image.ids is None else _id_file(image.ids, document.path, folder, ids)
+        if id_file is not None and image.image is None:
+            name = tracked_view(id_file, document.path, folder, image.ids.name if image.ids else "")
+        else:
+            name = views[document.path, image.image]
+        if image.file and own.setdefault(name, image.file) != image.file:
+            got = f"{own[name]} and {image.file}, both of the view {name!r}"
+            hint = "copies that were turned, cut or mirrored do not lie on their photo: export without augmentation"
+            raise InvalidFeatures(str(document.path), expected="one image a photo", got=got, hint=hint)
+        view = index.view(name, document.path)
+        view.decided |= image.decided
+        view.undecided |= image.undecided
+        for phrase in image.phrases:
+            index.name(name, phrase)
+        if image.masks:
+            view.sources.append(_Records(image.masks))
+            view.phrases.update(plain(phrase) for phrase, _ in image.masks if phrase is not None)
+            view.has_void = view.has_void or any(phrase is None for phrase, _ in image.masks)
+        if id_file is not None and image.ids is not None:
+            _add_named_ids(index, view, name, id_file, image.ids)
+    return _document_warnings(documents, views)
+
+
+def _add_named_ids(index: _MaskIndex, view: _View, name: str, path: Path, objects: IdObjects) -> None:
+    values = _ids(path)
+    unknown = sorted({*np.unique(values).tolist()} - {0, *objects.phrases})
+    if unknown:
+        known = ", ".join(map(str, list(objects.phrases)[:6]))
+        raise InvalidFeatures(str(path), expected=f"the ids of its JSON ({known}), and 0", got=f"the id {unknown[0]}")
+    _add_ids(index, view, name, path, values, objects.phrases)
+
+
+def _id_file(objects: IdObjects, document: Path, folder: Path, ids: Sequence[Path]) -> Path:
+    """The file of a document's ids: below the folder, the one that lies nearest; or in ``mask_data`` beside it."""
+    stem = composed(PurePosixPath(objects.name.replace("\\", "/")).stem)
+    beside = document.parent.parent / MASK_DATA
+    others = visible_files(beside) if not beside.is_relative_to(folder) and beside.is_dir() else []
+    found = [
+        path for path in [*ids, *others] if composed(path.stem) == stem and path.suffix.lower() in (*ARRAYS, PICTURE)
+    ]
+    if not found:
+        hint = f"give the folder that holds both, or keep {MASK_DATA} beside the folder of the JSON"
+        expected = f"its ids in {stem}.npy, .npz or .png"
+        raise InvalidFeatures(str(document), expected=expected, got="no such file", hint=hint)
+
+    def distance(path: Path) -> int:
+        return sum(not path.is_relative_to(parent) for parent in document.parents)
+
+    return min(found, key=distance)
+
+
+def _document_views(documents: Sequence[MaskDocument], folder: Path) -> dict[tuple[Path, str | None], str]:
+    """Document and image -> view.
+
+    Images of data sets keep the folders of their relative paths. A document of one image is of the view that it is
+    named after, unless it names another image.
+    """
+    views: dict[tuple[Path, str | None], str] = {}
+    by_path: dict[tuple[Path, str], str] = {}
+    for document, image in ((one, image) for one in documents for image in one.images):
+        own, name = _view_of(document.path, folder), image.image
+        if name is None:
+            views[document.path, None] = own
+            continue
+        path = without_image_suffix(name)
+        if image.listed and not _is_absolute(path):
+            views[document.path, name] = path
+        elif not image.listed and PurePosixPath(path).name == PurePosixPath(own).name:
+            views[document.path, name] = own
+        else:
+            by_path[document.path, name] = name
+    if by_path:
+        known = views_of_images([*by_path.values()])
+        views.update({key: known[name] for key, name in by_path.items()})
+    return views
+
+
+def _is_absolute(path: str) -> bool:
+    return path.startswith("/") or path[1:3] == ":/"
+
+
+def _document_warnings(documents: Sequence[MaskDocument], views: Mapping[tuple[Path, str | None], str]) -> list[str]:
+    warnings = list[str]()
+    for document in documents:
+        listed = {views[document.path, one.image] for one in document.images if one.listed and one.image}
+        come_to = {views[document.path, one.image] for one in document.images if one.annotated and one.listed}
+        if missing := len(listed - come_to):
+            warnings.append(
+                f"{missing} of {len(listed)} images of {document.path.name} have no annotation and are left out; "
+                "with --unannotated negative they show none of its phrases"
             )
-            raise InvalidFeatures(where, expected=expected, got="none", hint=hint)
-        found.add(views[image], said, (size, lengths) if lengths[1::2].any() else None)
-
-
-def _by_id(content: Any, key: str) -> dict[Any, dict[str, Any]]:
-    listed = content.get(key) if isinstance(content, dict) else None
-    entries = [entry for entry in listed if isinstance(entry, dict)] if isinstance(listed, list) else []
-    return {number: entry for entry in entries if (number := _id(entry, "id")) is not None}
-
-
-def _id(entry: Mapping[str, Any], key: str) -> int | str | None:
-    number = entry.get(key)
-    return number if isinstance(number, int | str) else None
-
-
-def _image_view(image: Mapping[str, Any], path: Path) -> str:
-    if not isinstance(image.get("file_name"), str):
-        raise InvalidFeatures(f"{path} images", expected="a file_name of each", got="none")
-    return without_image_suffix(image["file_name"])
+        if document.boxes:
+            warnings.append(
+                f"{document.boxes} annotations of {document.path.name} have a box or less and no mask: what lies in "
+                "the boxes has no label; make masks of them, with SAM say"
+            )
+    several = Counter(view for (_, image), view in views.items() if image is not None)
+    alone = {
+        views[document.path, image.image]
+        for document in documents
+        for image in document.images
+        if image.image is not None and not image.listed
+    }
+    for view in sorted(view for view in alone if several[view] > 1):
+        warnings.append(f"{several[view]} files are of one image, {view!r}: their masks are put together")
+    return warnings

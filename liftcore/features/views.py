@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from liftcore.errors import InvalidFeatures
+from liftcore.io.npy import without_unit_axes
 from liftcore.scene.splats import shared_tensor
 
 NO_LABEL = -1  # a pixel that a level leaves unlabelled
@@ -37,7 +38,8 @@ class Regions:
     ``labels[:, floor((y + 0.5) h / H), floor((x + 0.5) w / W)]``.
 
     Args:
-        labels: [L, h, w], or [h, w] for one level, of integers: rows of the codebook, -1 for none.
+        labels: [L, h, w], or [h, w] for one level, of integers: rows of the codebook, -1 for none. Here and in the
+            others, axes of length 1 before these are taken off.
         codebook: [M, F] of floats; float16 and float32 stay as they are, others become float32.
         where: what errors name before the argument.
 
@@ -129,6 +131,7 @@ def _features(values: object, axes: str, where: str) -> Tensor:
         found = shared_tensor(values)
     except (TypeError, ValueError):
         raise InvalidFeatures(where, expected=f"floats [{axes}]", got=type(values).__name__) from None
+    found = without_unit_axes(found, len(axes.split()))
     fits = found.ndim == len(axes.split()) and found.numel() and found.dtype in FLOATS
     if not fits or found.shape[-1] > MAX_CHANNELS:
         hint = f"at most {MAX_CHANNELS} channels, no side empty"
@@ -144,7 +147,7 @@ def _labels(values: object, rows: int, where: str) -> Tensor:
         found = shared_tensor(values)
     except (TypeError, ValueError):
         raise InvalidFeatures(where, expected="integers [L, h, w]", got=type(values).__name__) from None
-    found = found.to(torch.int64) if found.dtype in WIDENED else found
+    found = without_unit_axes(found.to(torch.int64) if found.dtype in WIDENED else found, 3)
     if found.ndim not in (2, 3) or not found.numel() or found.dtype not in INTEGERS:
         raise InvalidFeatures(where, expected="integers [L, h, w], no side empty", got=_kind(found))
     low, high = (int(value) for value in torch.aminmax(found))

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from safetensors.numpy import save_file
 
 from liftcore.errors import InvalidFeatures
-from liftcore.features.folders import array_views, files_below, langsplat_views
+from liftcore.features.folders import Layout, array_views, files_below, langsplat_views
 from liftcore.features.pack import read_features, write_pack
-from liftcore.features.views import Regions
+from liftcore.features.views import FeatureGrid, Regions
 from liftcore.io.npy import open_npy
 from service.photos import describe_photos
 
@@ -85,7 +86,7 @@ def test_array_folder_becomes_a_pack(layout, tmp_path: Path) -> None:
 
 
 def test_arrays_that_are_no_maps_are_refused(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", np.zeros((1, 2, 3, 4), np.float32))
+    np.save(tmp_path / "a.npy", np.zeros((5, 2, 3, 4), np.float32))
     np.save(tmp_path / "b.npy", np.zeros((2, 3, 4), np.int32))
     for view in ("a", "b"):
         with pytest.raises(InvalidFeatures, match=r"floats \[h, w, F\]"):
@@ -100,8 +101,8 @@ def test_folder_without_arrays_says_why(tmp_path: Path) -> None:
         array_views(tmp_path / "nowhere")
     with pytest.raises(InvalidFeatures, match="0 other files"):
         array_views(tmp_path)
-    (tmp_path / "a.pt").write_bytes(b"never opened")
-    with pytest.raises(InvalidFeatures, match=r"1 pickles \(a\.pt\), which may run code.*numpy\.save"):
+    (tmp_path / "a.pkl").write_bytes(b"never opened")
+    with pytest.raises(InvalidFeatures, match=r"1 pickles \(a\.pkl\), which may run code.*numpy\.save"):
         array_views(tmp_path)
 
 
@@ -165,3 +166,85 @@ def test_what_systems_put_beside_files_is_left_out(tmp_path: Path) -> None:
         for name in ("a/IMG.png", "a/._IMG.png", "__MACOSX/a/._IMG.png", "__MACOSX\\a\\IMG.png", "a/Thumbs.db"):
             archive.writestr(name, photo.getvalue() if name == "a/IMG.png" else b"no photo")
     assert describe_photos(tmp_path / "photos.zip")["names"] == ["IMG"]
+
+
+GRID = np.arange(24, dtype=np.float32).reshape(2, 3, 4)  # [h, w, F], whole numbers that bfloat16 has too
+
+
+@pytest.mark.parametrize("dtype", ["float16", "float32", "float64", "bfloat16"])
+@pytest.mark.parametrize("axes", [(), (1,), (1, 1)])
+@pytest.mark.parametrize("suffix", [".npy", ".npz", ".pt", ".pth"])
+@pytest.mark.parametrize("layout", ["hwc", "chw"])
+def test_maps_may_have_unit_axes_and_any_floats(
+    layout: Layout, suffix: str, axes: tuple[int, ...], dtype: str, tmp_path: Path
+) -> None:
+    grid = GRID if layout == "hwc" else GRID.transpose(2, 0, 1)
+    tensor = torch.from_numpy(grid.reshape(*axes, *grid.shape).copy()).to(getattr(torch, dtype))
+    # numpy.save writes the bfloat16 of other packages as plain bytes
+    array = tensor.view(torch.uint16).numpy().view("V2") if dtype == "bfloat16" else tensor.numpy()
+    if suffix == ".npy":
+        np.save(tmp_path / "a.npy", array)
+    elif suffix == ".npz":
+        np.savez_compressed(tmp_path / "a.npz", array)
+    else:
+        torch.save(tensor, tmp_path / f"a{suffix}")
+    found = array_views(tmp_path, layout)["a"]
+    assert found.grid.tolist() == GRID.tolist()
+    assert found.grid.dtype == (torch.float16 if dtype == "float16" else torch.float32)
+
+
+def test_maps_of_feature_3dgs_are_of_their_images_and_channels_first(tmp_path: Path) -> None:
+    torch.save(torch.from_numpy(GRID.transpose(2, 0, 1).copy()), tmp_path / "IMG_0_fmap_CxHxW.pt")
+    assert array_views(tmp_path)["IMG_0"].grid.tolist() == GRID.tolist()
+
+
+def test_values_in_memory_and_in_packs_may_have_unit_axes(tmp_path: Path) -> None:
+    assert FeatureGrid(GRID[None, None]).grid.tolist() == GRID.tolist()
+    regions = Regions(IDS[None], CODEBOOK[None])
+    assert regions.labels.tolist() == IDS.tolist() and regions.codebook.tolist() == CODEBOOK.tolist()
+    tensors = {
+        "a/grid": GRID[None],
+        "b/labels": IDS[None].astype(np.int32),
+        "b/codebook": np.ones((1, 4, 4), np.float32),
+    }
+    save_file(tensors, tmp_path / "a.pack")
+    packs = read_features(tmp_path / "a.pack")
+    assert packs["a"].codebook.tolist() == GRID.reshape(6, 4).tolist()
+    assert packs.map_size("a") == (3, 2) and packs.map_size("b") == (2, 2)
+    assert packs["b"].cpu().codebook.tolist() == np.ones((4, 4)).tolist()
+
+
+@pytest.mark.parametrize(
+    ("stored", "message"),
+    [
+        (np.ones((8, 6), np.float32), r"floats \[F, h, w\].*got float32 \[8, 6\]; .*reshape\(F, h, w\)"),
+        (np.ones((5, 2, 3, 4), np.float32), r"got float32 \[5, 2, 3, 4\]; a file is of one view: save each of the 5"),
+        (np.ones((2, 1, 3, 4), np.float32), "save each of the 2"),
+    ],
+)
+def test_other_axes_are_told_with_a_way_on(stored: np.ndarray, message: str, tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", stored)
+    with pytest.raises(InvalidFeatures, match=message):
+        array_views(tmp_path, "chw")["a"]
+
+
+class _Code:
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return print, ("run",)
+
+
+@pytest.mark.parametrize(
+    "stored",
+    [
+        _Code(), {"a": torch.ones(2, 3, 4)}, torch.ones(1).expand(1 << 10, 1 << 10, 1 << 10),
+        torch.ones(2, 3, 4).to_sparse(), torch.ones(2, 3, 4, dtype=torch.int64),
+        torch.ones(2, 3, 4, dtype=torch.complex64), torch.ones(0, 3, 4),
+    ],
+)  # fmt: skip
+def test_tensors_that_are_no_maps_are_refused_and_no_code_runs(
+    stored: object, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    torch.save(stored, tmp_path / "a.pt")
+    with pytest.raises(InvalidFeatures, match=r"a\.pt"):
+        array_views(tmp_path)["a"]
+    assert capsys.readouterr().out == ""

@@ -150,7 +150,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"a_masks.npy": np.full((3, 4), 3)}, r"ids in -1\.\.2"),
     ({"a_masks.npy": np.full((3, 4), 255, np.uint8)}, r"got ids from 255 to 255"),
     ({"a_masks.npy": np.full((3, 4), 0.5)}, "whole numbers"),
-    ({"a_masks.npy": np.zeros((1, 1, 3, 4), np.int32)}, r"mask ids \[L, H, W\]"),
+    ({"a_masks.npy": np.zeros((2, 1, 3, 4), np.int32)}, r"mask ids \[L, H, W\]"),
     ({"a_masks.npy": OBJECTS}, "Python objects, which may run code"),
     ({"a_masks.npy": np.array(["a"])}, "an array of numbers"),
     ({"a.json": ""}, r"a\.json.*no JSON"),
@@ -160,7 +160,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"a.json": {"frames": [], "w": 3}}, "an object of 'frames', 'w'; files of no views belong elsewhere"),
     ({"a.json": []}, "3 masks, one a vector, got 0; leave out views without masks"),
     ({"a.json": sam_records(MASKS[:2])}, "3 masks, one a vector, got 2; row k of the vectors is of mask k"),
-    ({"a.json": [*sam_records(MASKS[:2]), 3]}, r"a\.json mask 2: expected run lengths"),
+    ({"a.json": [*sam_records(MASKS[:2]), 3]}, r"a\.json mask 2: expected a segmentation"),
     ({"a.json": [*sam_records(MASKS[:2]), *OTHER_SIZE]}, "one size, got 3 x 4 of mask 0 and 2 x 4 of mask 2"),
     ({"a.png": GREY + 1}, r"values 1\.\.3 for 3 vectors, and 0 for none, got values up to 4; name the value"),
     ({"a.png": VALUES_255}, r"got values up to 255; .*--unlabelled \(255, 65535\)"),
@@ -249,7 +249,7 @@ def test_strings_that_coco_published_fill_the_boxes_that_it_published(
 @pytest.mark.parametrize(
     ("segmentation", "message"),
     [
-        ([[1.0, 2.0, 3.0, 4.0]], r"run lengths \{size, counts\}, got a polygon; .*output_mode"),
+        ([[1.0, 2.0, 3.0, 4.0]], r"run lengths \{size, counts\}, got another thing; .*output_mode"),
         ({"counts": [6]}, "got another thing"),
         ({"size": [2, 3, 1], "counts": [6]}, r"size \[h, w\], got \[2, 3, 1\]"),
         ({"size": [2.0, 3], "counts": [6]}, r"size \[h, w\]"),

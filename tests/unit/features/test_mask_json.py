@@ -1,0 +1,394 @@
+"""JSON documents of masks by phrase: what they mask is read, and what they do not decide is left without a label."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from liftcore.errors import InvalidFeatures
+from liftcore.features.mask_files import fill_polygons, mask_of_runs, read_polygons, read_runs
+from liftcore.features.masks import mask_views
+from liftcore.features.prompts import Prompts, prompt_views
+from liftcore.features.views import NO_LABEL, Regions
+from tests.run_lengths import sam_records
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+HEIGHT, WIDTH = 6, 8
+MUG, BOWL = np.zeros((2, HEIGHT, WIDTH), bool)
+MUG[1:4, 1:4] = BOWL[2:5, 5:8] = True
+CATEGORIES = [{"id": 1, "name": "red mug"}, {"id": 2, "name": "bowl"}]
+UNDECIDED = "-"  # of a pixel without a label
+MUG_POLYGON, BOWL_POLYGON = [[1, 1, 4, 1, 4, 4, 1, 4]], [[5, 2, 8, 2, 8, 5, 5, 5]]
+
+
+def rle(mask: np.ndarray, *, as_string: bool = True) -> dict[str, Any]:
+    return sam_records(mask[None], as_string=as_string)[0]["segmentation"]
+
+
+def coco(*masks: tuple[int, int, Any], images: int = 2, **entries: dict[str, Any]) -> dict[str, Any]:
+    """A data set of so many images, with (image, category, segmentation) annotated, and more for images by name."""
+    listed = [{"id": k, "file_name": f"{k}.jpg", "height": HEIGHT, "width": WIDTH} for k in range(images)]
+    for image in listed:
+        image.update(entries.get(f"image_{image['id']}", {}))
+    annotations = [
+        {"image_id": image, "category_id": category, "segmentation": segmentation, "bbox": [1, 1, 3, 3]}
+        for image, category, segmentation in masks
+    ]
+    return {"images": listed, "annotations": annotations, "categories": CATEGORIES}
+
+
+def write(folder: Path, **documents: Any) -> Path:
+    """JSON documents by their names, ``__`` for a folder; arrays and pictures with what follows ``_as_``."""
+    for name, content in documents.items():
+        stem, _, suffix = name.partition("_as_")
+        path = folder / f"{stem.replace('__', '/')}.{suffix or 'json'}"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if suffix == "npy":
+            np.save(path, content)
+        elif suffix == "npz":
+            np.savez_compressed(path, content)
+        elif suffix == "png":
+            Image.fromarray(content).save(path)
+        else:
+            path.write_text(json.dumps(content), encoding="utf-8")
+    return folder
+
+
+def shown(found: Prompts, view: str) -> list[str]:
+    """The rows of a view, a letter a pixel: the first one of its phrase, ``.`` for none, UNDECIDED."""
+    regions = found.views[view]
+    assert isinstance(regions, Regions)
+    letters = [word[0] for word in found.table.words] + ["."]
+    channels = regions.codebook.numpy().argmax(axis=1)
+    top = regions.labels.numpy().max(axis=0)
+    top = np.broadcast_to(top, (HEIGHT, WIDTH)) if top.size == 1 else top
+    return ["".join(UNDECIDED if k == NO_LABEL else letters[channels[k]] for k in row) for row in top]
+
+
+def drawing(mug: np.ndarray, bowl: np.ndarray, rest: str = ".") -> list[str]:
+    letters = np.where(mug, "r", np.where(bowl, "b", rest))
+    return ["".join(row) for row in letters]
+
+
+BOTH, NOTHING = drawing(MUG, BOWL), drawing(MUG & BOWL, MUG & BOWL)
+
+
+def test_images_that_nobody_annotated_are_left_out_unless_they_are_negatives(tmp_path: Path) -> None:
+    folder = write(tmp_path, a=coco((0, 1, rle(MUG)), (0, 2, rle(BOWL)), images=5))
+    found = prompt_views(folder)
+    assert [*found.views] == ["0"] and shown(found, "0") == BOTH
+    assert any("4 of 5 images of a.json" in warning for warning in found.warnings)
+    found = prompt_views(folder, unannotated="negative")
+    assert [*found.views] == ["0", "1", "2", "3", "4"] and shown(found, "3") == NOTHING and not found.warnings
+
+
+def test_a_file_that_says_what_is_absent_is_believed(tmp_path: Path) -> None:
+    """LVIS: image 1 has neither, image 2 was searched for a bowl alone, image 3 has more mugs than are masked."""
+    told = {
+        "image_0": {"neg_category_ids": [], "not_exhaustive_category_ids": []},
+        "image_1": {"neg_category_ids": [1, 2], "not_exhaustive_category_ids": []},
+        "image_2": {"neg_category_ids": [], "not_exhaustive_category_ids": []},
+        "image_3": {"neg_category_ids": [2], "not_exhaustive_category_ids": [1]},
+    }
+    masks = [(0, 1, rle(MUG)), (0, 2, rle(BOWL)), (2, 2, rle(BOWL)), (3, 1, rle(MUG))]
+    found = prompt_views(write(tmp_path, lvis=coco(*masks, images=5, **told)))
+    assert [*found.views] == ["0", "1", "2", "3"]
+    assert (shown(found, "0"), shown(found, "1")) == (BOTH, NOTHING)
+    assert shown(found, "2") == drawing(MUG & BOWL, BOWL, UNDECIDED)
+    assert shown(found, "3") == drawing(MUG, MUG & BOWL, UNDECIDED)
+
+
+def test_pairs_of_a_photo_and_a_phrase_decide_that_phrase_alone(tmp_path: Path) -> None:
+    """SA-Co: photo a was asked for both and has a mug, photo b was asked for a bowl, and has none."""
+    asked = [("a", "red mug"), ("a", "bowl"), ("b", "bowl"), ("b", "red mug"), ("c", "bowl")]
+    images = [{"id": k, "file_name": f"{name}.jpg", "text_input": text} for k, (name, text) in enumerate(asked)]
+    annotations = [{"image_id": 0, "segmentation": rle(MUG)}, {"image_id": 4, "segmentation": rle(BOWL)}]
+    found = prompt_views(write(tmp_path, gold={"images": images, "annotations": annotations}))
+    assert [*found.views] == ["a", "b", "c"]
+    assert shown(found, "a") == drawing(MUG, MUG & BOWL) and shown(found, "b") == NOTHING
+    assert shown(found, "c") == drawing(MUG & BOWL, BOWL, UNDECIDED)
+
+
+def test_a_file_a_phrase_decides_its_own_phrase_alone(tmp_path: Path) -> None:
+    mug, bowl = coco((0, 1, rle(MUG))), coco((0, 2, rle(BOWL)), (1, 2, rle(BOWL)))
+    mug["categories"], bowl["categories"] = CATEGORIES[:1], CATEGORIES[1:]
+    found = prompt_views(write(tmp_path, mug=mug, bowl=bowl))
+    assert shown(found, "0") == BOTH
+    assert shown(found, "1") == drawing(MUG & BOWL, BOWL, UNDECIDED)
+
+
+def test_polygons_and_run_lengths_of_one_image_are_masks_alike(tmp_path: Path) -> None:
+    parts = [[1, 1, 4, 1, 4, 2, 1, 2], [1, 2, 4, 2, 4, 4, 1, 4], [1, 1, 2, 1, 2, 4, 1, 4], [3, 3, 3, 3]]
+    found = prompt_views(
+        write(
+            tmp_path,
+            a=coco((0, 1, parts), (0, 2, rle(BOWL)), (1, 1, MUG_POLYGON), (1, 2, [5.0, 2, 8, 2, 8, 5, 5, 5])),
+        )
+    )
+    assert shown(found, "0") == shown(found, "1") == BOTH
+
+
+def test_polygons_are_filled_as_coco_fills_them() -> None:
+    """Each within a pixel of its outline; the masks are of pycocotools 2.0.11, ``frPyObjects`` and ``merge``."""
+    cases = [
+        ([[2.3, 1.2, 10.7, 2.1, 8.4, 9.6]], "U12:100O2N1O1OM3MU1"),
+        ([[1, 1, 9, 1, 9, 9, 1, 9], [5.5, 4.5, 12.5, 4.5, 12.5, 11, 5.5, 11]], "=84000000002N0004L0000007"),
+        ([[-3, -2, 20, 3.5, 6, 18]], "0662N2NV1OkN0000001O0O1OO"),  # cut off by the image
+        ([[2, 2, 12, 10, 12, 2, 2, 10]], "j085N2N2Ni00WO2N2N2e0"),  # crosses itself
+    ]
+    for polygon, counts in cases:
+        size = (12, 14)
+        ours = fill_polygons(size, read_polygons(polygon, "a"))
+        theirs = mask_of_runs(*read_runs({"size": [*size], "counts": counts}, "a"))
+        assert_within_a_pixel(ours, theirs)
+
+
+def assert_within_a_pixel(ours: np.ndarray, theirs: np.ndarray) -> None:
+    padded = np.pad(theirs, 1, mode="edge")
+    around = np.stack([padded[y : y + ours.shape[0], x : x + ours.shape[1]] for y in range(3) for x in range(3)])
+    assert not (ours & ~around.any(axis=0)).any() and not (around.all(axis=0) & ~ours).any()
+
+
+@pytest.mark.parametrize(
+    ("polygon", "covered"),
+    [
+        ([[-50, -50, 50, -50, 50, 50, -50, 50]], 48),  # beyond the image on every side
+        ([[3, 3, 9, 9]], 0), ([[2, 2]], 0), ([[1, 1, 5, 1, 3, 1]], 0),  # no area
+        ([[0, 0, 8, 0, 8, 6, 0, 6], [0, 0, 8, 0, 8, 6, 0, 6]], 48),  # parts are united, not cut out of each other
+        ([[0, 0], [8, 0], [8, 6], [0, 6]], 48),  # points, as LabelMe has them
+        ([{"x": 0, "y": 0}, {"x": 8, "y": 0}, {"x": 8, "y": 6}], 24),
+    ],
+)  # fmt: skip
+def test_polygons_cover_the_pixels_whose_centres_they_hold(polygon: Any, covered: int) -> None:
+    assert fill_polygons((HEIGHT, WIDTH), read_polygons(polygon, "a")).sum() == pytest.approx(covered, abs=4)
+
+
+@pytest.mark.parametrize(
+    "polygon", [[[1, 2, 3]], [[1, 2, 3, float("nan")]], [["1", 2, 3, 4]], [[1e9, 0, 1, 1, 2, 2]], "x"]
+)
+def test_what_is_no_polygon_is_refused(polygon: Any) -> None:
+    with pytest.raises(InvalidFeatures, match="of a polygon"):
+        read_polygons(polygon, "a")
+
+
+def test_boxes_without_a_mask_are_told_and_decide_nothing(tmp_path: Path) -> None:
+    folder = write(tmp_path, a=coco((0, 1, []), (0, 2, rle(BOWL)), (1, 1, MUG_POLYGON)))
+    found = prompt_views(folder)
+    box = [line[:1] + UNDECIDED * 3 + line[4:] for line in drawing(MUG & BOWL, BOWL)]
+    assert shown(found, "0") == [box[k] if 1 <= k < 4 else line for k, line in enumerate(drawing(MUG & BOWL, BOWL))]
+    assert any("1 annotations of a.json" in warning for warning in found.warnings)
+    with pytest.raises(InvalidFeatures, match=r"0 of 1 phrases; .*a box or less and no mask"):
+        prompt_views(write(tmp_path / "boxes", a=coco((0, 1, []), (1, 1, []))))
+
+
+@pytest.mark.parametrize("given", [".", "json_data"])
+@pytest.mark.parametrize("kind", ["npy", "npz", "png"])
+def test_tracked_objects_are_masks_of_their_class_names(given: str, kind: str, tmp_path: Path) -> None:
+    """Grounded SAM 2: two objects of one class are one phrase, and the view is the image, without ``mask_``."""
+    mug_parts = MUG.copy()
+    mug_parts[2:] = False
+    ids = (3 * BOWL + 1 * MUG + 1 * mug_parts).astype(np.uint16)
+    names = {1: "red mug", 2: "red mug", 3: "bowl"}
+    labels = {str(k): {"instance_id": k, "class_name": name, "logit": 0.0} for k, name in names.items()}
+    document = {"mask_name": "mask_7.npy", "mask_height": HEIGHT, "mask_width": WIDTH, "labels": labels}
+    empty = {**document, "mask_name": "mask_8.npy", "labels": {}}
+    files = {f"mask_data__mask_7_as_{kind}": ids, f"mask_data__mask_8_as_{kind}": 0 * ids}
+    folder = write(tmp_path, json_data__mask_7=document, json_data__mask_8=empty, **files)
+    found = prompt_views(folder / given)
+    assert [*found.views] == ["7", "8"] and found.table.words == ("bowl", "red mug")
+    assert (shown(found, "7"), shown(found, "8")) == (BOTH, NOTHING)
+
+
+def test_tracked_objects_of_several_cameras_keep_their_folders(tmp_path: Path) -> None:
+    for camera, mask in (("camA", MUG), ("camB", BOWL)):
+        labels = {"1": {"instance_id": 1, "class_name": "red mug"}}
+        document = {"mask_name": "mask_0.npy", "labels": labels}
+        files = {
+            f"{camera}__json_data__mask_0": document,
+            f"{camera}__mask_data__mask_0_as_npy": mask.astype(np.uint16),
+        }
+        write(tmp_path, **files)
+    found = prompt_views(tmp_path)
+    assert shown(found, "camA/0") == drawing(MUG, MUG & BOWL) and shown(found, "camB/0") == drawing(BOWL, MUG & BOWL)
+
+
+def test_ids_without_their_file_or_their_name_are_told(tmp_path: Path) -> None:
+    document = {"mask_name": "mask_0.npy", "labels": {"1": {"class_name": "red mug"}}}
+    with pytest.raises(InvalidFeatures, match=r"its ids in mask_0\.npy"):
+        prompt_views(write(tmp_path / "a", json_data__mask_0=document))
+    with pytest.raises(InvalidFeatures, match="the id 2"):
+        prompt_views(write(tmp_path / "b", mask_0=document, mask_0_as_npy=2 * MUG.astype(np.uint8)))
+    with pytest.raises(InvalidFeatures, match="json_data"):
+        prompt_views(write(tmp_path / "c", mask_0_as_npy=MUG.astype(np.uint8)))
+
+
+def test_segments_of_a_panoptic_picture_are_masks_of_their_categories(tmp_path: Path) -> None:
+    """COCO's panoptic, whose 0 nobody decided, and DEVA's, which needs the names of its categories."""
+    colours = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    colours[MUG], colours[BOWL] = (1, 2, 0), (0, 0, 3)  # 1 + 256 * 2, 65536 * 3
+    segments = [{"id": 513, "category_id": 1}, {"id": 196_608, "category_id": 2}]
+    annotations = [{"image_id": 5, "file_name": "a.png", "segments_info": segments}]
+    content = {"images": [{"id": 5, "file_name": "a.jpg"}], "categories": CATEGORIES, "annotations": annotations}
+    found = prompt_views(write(tmp_path / "coco", panoptic=content, panoptic__a_as_png=colours))
+    assert shown(found, "a") == drawing(MUG, BOWL, UNDECIDED)
+    content = {"annotations": [{"file_name": "a.jpg", "segments_info": segments}]}
+    folder = write(
+        tmp_path / "deva", pred=content, Annotations__a_as_png=colours, names={"1": "red mug", "2": "bowl"}
+    )
+    assert shown(prompt_views(folder, folder / "names.json"), "a") == BOTH
+    (folder / "names.json").unlink()
+    with pytest.raises(InvalidFeatures, match="--names"):
+        prompt_views(folder)
+
+
+def test_videos_are_data_sets_of_their_frames(tmp_path: Path) -> None:
+    """YouTube-VIS and SA-Co: a mask a frame, null where the object is not seen."""
+    video = {"id": 1, "file_names": ["v/00.jpg", "v/01.jpg"], "height": HEIGHT, "width": WIDTH}
+    annotations = [
+        {"video_id": 1, "category_id": 1, "segmentations": [rle(MUG), None]},
+        {"video_id": 1, "category_id": 2, "segmentations": [BOWL_POLYGON, None]},
+    ]
+    found = prompt_views(write(tmp_path, a={"videos": [video], "annotations": annotations, "categories": CATEGORIES}))
+    assert (shown(found, "v/00"), shown(found, "v/01")) == (BOTH, NOTHING)
+
+
+def of_image(path: str, mask: np.ndarray = MUG) -> dict[str, Any]:
+    annotations = [{"class_name": "red mug", "segmentation": rle(mask), "bbox": [1, 1, 4, 4]}]
+    return {"image_path": path, "annotations": annotations, "img_width": WIDTH, "img_height": HEIGHT}
+
+
+@pytest.mark.parametrize(
+    ("paths", "views"),
+    [
+        (["notebooks/images/IMG_0.jpg", "notebooks/images/IMG_1.jpg"], ["IMG_0", "IMG_1"]),
+        (["/data/scene/IMG_0.jpg", "/data/scene/IMG_1.PNG"], ["IMG_0", "IMG_1"]),
+        (["C:\\scene\\IMG_0.jpg", "C:\\scene\\IMG_1.jpg"], ["IMG_0", "IMG_1"]),
+        (["/data/camA/000.jpg", "/data/camB/000.jpg"], ["camA/000", "camB/000"]),
+        (["D:\\x\\camA\\000.jpg", "D:\\x\\camB\\000.jpg"], ["camA/000", "camB/000"]),
+        (["./a/000.jpg", "./b/c/000.jpg"], ["a/000", "b/c/000"]),
+        (["Ku\u0308che.jpg", "Bad.jpg"], ["Bad", "K\u00fcche"]),
+    ],
+)
+@pytest.mark.parametrize("name", ["grounded_sam2_local_image_demo_results", "grounded_sam2_hf_model_demo_results"])
+def test_a_document_of_an_image_is_of_the_view_that_it_names(
+    paths: list[str], views: list[str], name: str, tmp_path: Path
+) -> None:
+    folder = write(tmp_path, **{f"{number}__{name}": of_image(path) for number, path in enumerate(paths)})
+    assert {*prompt_views(folder).views} == {*views}
+
+
+def test_a_document_that_is_named_like_its_image_keeps_its_own_folder(tmp_path: Path) -> None:
+    documents = {"camA__000": of_image("/tmp/x/000.jpg"), "camB__000": of_image("/tmp/x/000.jpg", BOWL)}
+    found = prompt_views(write(tmp_path, **documents))
+    assert {*found.views} == {"camA/000", "camB/000"} and not found.warnings
+
+
+def test_masks_of_several_files_of_one_image_are_put_together_and_told(tmp_path: Path) -> None:
+    found = prompt_views(write(tmp_path, mug__out=of_image("in.jpg"), bowl__out=of_image("in.jpg", BOWL)))
+    assert shown(found, "in") == drawing(MUG | BOWL, MUG & BOWL)
+    assert any("2 files are of one image, 'in'" in warning for warning in found.warnings)
+
+
+def test_photos_beside_documents_that_name_them_are_no_masks(tmp_path: Path) -> None:
+    """As Roboflow exports them, under names of its own."""
+    named = "0_jpg.rf.0123456789abcdef0123456789abcdef.jpg"
+    content = coco((0, 1, MUG_POLYGON), images=1, image_0={"file_name": named})
+    photo = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
+    folder = write(tmp_path, train___annotations_coco=content, train__0_as_png=photo)
+    assert [*prompt_views(folder).views] == ["0"]
+    twice = coco((0, 1, MUG_POLYGON), (1, 1, MUG_POLYGON))
+    for image, end in zip(twice["images"], "ab", strict=True):
+        image["file_name"] = f"0_jpg.rf.{end * 32}.jpg"
+    with pytest.raises(InvalidFeatures, match=r"one image a photo.*augmentation"):
+        prompt_views(write(tmp_path / "twice", a=twice))
+
+
+def test_documents_of_annotation_tools_are_read(tmp_path: Path) -> None:
+    """LabelMe's shapes (a rectangle is a box), ISAT's objects, and Roboflow's predictions."""
+    square = [[1, 1], [4, 1], [4, 4], [1, 4]]
+    bowl = [[5, 2], [8, 2], [8, 5], [5, 5]]
+    label_me = {
+        "shapes": [
+            {"label": "red mug", "points": square, "shape_type": "polygon"},
+            {"label": "bowl", "points": [[5, 2], [8, 5]], "shape_type": "rectangle"},
+        ],
+        "imagePath": "..\\photos\\a.jpg", "imageHeight": HEIGHT, "imageWidth": WIDTH,
+    }  # fmt: skip
+    isat = {
+        "info": {"name": "b.jpg", "width": WIDTH, "height": HEIGHT},
+        "objects": [{"category": name, "segmentation": mask} for name, mask in (("red mug", square), ("bowl", bowl))],
+    }
+    points = [{"x": x, "y": y} for x, y in square]
+    roboflow = {"image": {"width": WIDTH, "height": HEIGHT}, "predictions": [{"class": "red mug", "points": points}]}
+    found = prompt_views(write(tmp_path, a=label_me, b=isat, c=roboflow))
+    assert shown(found, "b") == BOTH and shown(found, "c") == drawing(MUG, MUG & BOWL)
+    assert shown(found, "a") == [line.replace("b", UNDECIDED) for line in BOTH]
+
+
+def test_counts_in_pythons_text_of_bytes_are_counts(tmp_path: Path) -> None:
+    """``str`` of pycocotools' bytes; where counts have a backslash, that of the text is doubled."""
+    masks = [np.zeros((94, 60), bool) for _ in range(2)]
+    masks[0][30:50, 20:30], masks[1][44:64, 0] = True, True
+    texts = [str(rle(mask)["counts"].encode()) for mask in masks]
+    texts.append(f'b"{texts[0][2:-1]}"')
+    assert texts[1].startswith("b'\\\\")
+    for text, mask in zip(texts, [*masks, masks[0]], strict=True):
+        assert np.array_equal(mask_of_runs(*read_runs({"size": [94, 60], "counts": text}, "a")), mask)
+    assert read_runs({"size": [1, 47], "counts": "b'_1'"}, "a")[1].tolist() == [47]
+    with pytest.raises(InvalidFeatures, match="in number 0"):
+        read_runs({"size": [94, 60], "counts": "'aP'"}, "a")
+
+
+def test_pixels_that_nobody_decided_have_no_label(tmp_path: Path) -> None:
+    """The 255 of VOC and its kin, in pictures of numbers, palettes and binary pictures."""
+    void = np.zeros((HEIGHT, WIDTH), bool)
+    void[0] = True
+    drawn = drawing(MUG, BOWL)
+    drawn[0] = UNDECIDED * WIDTH
+    values = np.where(void, 255, 7 * MUG + 9 * BOWL).astype(np.uint8)
+    palette = Image.fromarray(values)
+    palette.putpalette([*range(256)] * 3)
+    for kind in ("grey", "palette", "wide"):
+        folder = tmp_path / kind
+        folder.mkdir()
+        marked = np.where(void, 65_535, values.astype(np.int32)).astype(np.uint16)
+        picture = palette if kind == "palette" else Image.fromarray(marked if kind == "wide" else values)
+        picture.save(folder / "a.png")
+        (folder / "names.json").write_text('{"7": "red mug", "9": "bowl"}', encoding="utf-8")
+        mark = 65_535 if kind == "wide" else 255
+        with pytest.raises(InvalidFeatures, match=f"got the value {mark}; .*--unlabelled {mark}"):
+            prompt_views(folder, folder / "names.json")
+        assert shown(prompt_views(folder, folder / "names.json", unlabelled=mark), "a") == drawn
+    mug = np.where(void, 255, MUG).astype(np.uint8)
+    folder = write(tmp_path / "binary", **{"red mug__a_as_png": mug})
+    assert shown(prompt_views(folder, unlabelled=255), "a") == [UNDECIDED * WIDTH, *drawing(MUG, MUG & BOWL)[1:]]
+    with pytest.raises(InvalidFeatures, match="--unlabelled"):
+        prompt_views(write(tmp_path / "json", a=coco((0, 1, MUG_POLYGON))), unlabelled=255)
+
+
+@pytest.mark.parametrize("kind", ["npy", "npz"])
+def test_binary_masks_may_be_arrays(kind: str, tmp_path: Path) -> None:
+    found = prompt_views(write(tmp_path, **{f"red mug__a_as_{kind}": MUG[None], f"bowl__a_as_{kind}": 255 * BOWL}))
+    assert shown(found, "a") == BOTH
+
+
+def test_masks_with_vectors_may_be_polygons_or_have_a_unit_axis(tmp_path: Path) -> None:
+    masks = np.stack([MUG, BOWL])
+    label_me = {"imageHeight": HEIGHT, "imageWidth": WIDTH, "shapes": [{"points": [[1, 1], [4, 1], [4, 4], [1, 4]]}]}
+    label_me["shapes"].append({"segmentation": rle(BOWL)})
+    kinds: list[dict[str, Any]] = [
+        {"a": label_me},
+        {"a_masks_as_npy": masks[:, None]},
+        {"a_masks_as_npz": masks[None]},
+        {"a_masks_as_npz": np.where(MUG, 0, np.where(BOWL, 1, -1))[None, None]},
+    ]
+    for number, files in enumerate(kinds):
+        folder = write(tmp_path / str(number), **files, a_as_npy=np.eye(2, 5, dtype=np.float32))
+        labels = mask_views(folder)["a"].labels[0].numpy()
+        assert np.array_equal(labels, np.where(MUG, 0, np.where(BOWL, 1, -1)))
