@@ -18,6 +18,7 @@ from service.jobs.process import JobLimits
 from service.jobs.supervisor import Supervisor
 from service.middleware import AnswerHead, RecordedApp, Turns
 from service.observe import Metrics, versions
+from service.photos import PhotoIndexes
 from service.queries.client import QueryClient, QueryLimits
 from service.requests import KnownParameters
 from service.routes import assets, jobs, operations, queries, results, scene, words
@@ -45,7 +46,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
         app.state.deps = deps = AppState(
             settings=settings, version=build, store=store, caller=STRANGER,
             runner=runner, devices=Devices(), queries=worker,
-            streams=streams, metrics=metrics, readiness=readiness,
+            streams=streams, photos=PhotoIndexes(), metrics=metrics, readiness=readiness,
             checks=threads(settings.parallel_checks),  # uploads that are validated at the same time
             writing=threads(8),  # uploads: a stalled disk stops them, and no other route
             parsing=threads(2),  # JSON bodies

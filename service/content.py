@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from starlette import responses
 from starlette.types import Receive, Scope, Send
 
 from liftcore.errors import NotFound
+from service import limits
 from service.errors import RangeNotSatisfiable
 from service.problems import PROBLEM
 from service.store.database import CURSOR, Page
@@ -38,9 +38,7 @@ FILE: dict[int | str, dict[str, Any]] = TAGGED | {
     416: {**PROBLEM, "description": "A range beyond the end"},
 }
 
-Limit = Annotated[
-    int | None, Query(ge=1, le=1000, description="how many to list; left out, all of them are, in one long answer")
-]
+Limit = Annotated[int, Query(ge=1, le=limits.PAGE, description="how many to list")]
 Cursor = Annotated[str | None, Query(pattern=CURSOR, description="the `next` of the page before")]
 
 
@@ -138,11 +136,11 @@ def listed(
     page: Callable[[int, str | None], Page[Any]],
     shape: Callable[[Any], BaseModel],
     *,
-    limit: int | None,
+    limit: int,
     cursor: str | None,
 ) -> Response:
-    """A list, newest first: so many with ``next``, the cursor of those after them or null; without a limit all that
-    follow. It is streamed, so that no list is ever in memory whole.
+    """A page of a list, newest first, with ``next``, the cursor of the page after it or null. It is streamed, so that
+    no page is ever in memory whole.
 
     Args:
         name: of the list in the JSON object.
@@ -150,10 +148,10 @@ def listed(
         shape: a record as clients get it.
         limit, cursor: as the client gave them.
     """
-    first = page(min(limit or STREAMED, STREAMED), cursor)  # before the answer begins: the cursor may be none
+    first = page(min(limit, STREAMED), cursor)  # before the answer begins: the cursor may be none
 
     def pieces() -> Iterator[str]:
-        found, left = first, sys.maxsize if limit is None else limit
+        found, left = first, limit
         yield f'{{"{name}":['
         while True:
             yield ",".join(shape(record).model_dump_json() for record in found.records)
@@ -162,7 +160,6 @@ def listed(
                 break
             found = page(min(left, STREAMED), found.cursor)
             yield "," if found.records else ""
-        yield "]" if limit is None else f'],"next":{json.dumps(found.cursor)}'
-        yield "}"
+        yield f'],"next":{json.dumps(found.cursor)}}}'
 
     return StreamingResponse(pieces(), media_type="application/json")

@@ -30,7 +30,7 @@ from typing import Any, NoReturn
 from service.child import die_with_parent, end_with_parent, line_of, memory_of
 from service.errors import Busy
 
-IMPORTED = ("service.uploads.check", "service.jobs.planning")  # by the template
+IMPORTED = ("service.uploads.check", "service.uploads.renaming", "service.jobs.planning")  # by the template
 TICK_SECONDS = 0.5  # how soon the end of the server is seen by who waits
 PATIENCE_SECONDS = 300.0  # for the template's imports and a fork
 PIECE = 1 << 16

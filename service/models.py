@@ -25,6 +25,7 @@ from pydantic_core import CoreSchema, PydanticCustomError
 
 from liftcore.scene.distortion import MAX_SIDE
 from liftcore.settings import LiftSettings
+from service import limits
 
 # How fields tell of what does not fit: one error, in words, whatever pydantic would make of it
 
@@ -58,6 +59,10 @@ def at_most(characters: int) -> AfterValidator:
         return texts
 
     return AfterValidator(check)
+
+
+def _once(texts: list[str]) -> list[str]:
+    return list(dict.fromkeys(texts))
 
 
 def _no_boolean(value: Any) -> Any:
@@ -105,8 +110,10 @@ def _bounded(given: Any) -> Any:
     """What is too much to be settings is refused before any of it is looked at."""
     if isinstance(given, dict):
         texts = (text for pair in given.items() for text in pair if isinstance(text, str))
-        if len(given) > MAX_SETTINGS or any(len(text) > SETTING_CHARACTERS for text in texts):
-            told = {"expected": f"at most {MAX_SETTINGS} settings of at most {SETTING_CHARACTERS} characters"}
+        if len(given) > limits.SETTINGS or any(len(text) > limits.SETTING_CHARACTERS for text in texts):
+            told = {
+                "expected": f"at most {limits.SETTINGS} settings of at most {limits.SETTING_CHARACTERS} characters"
+            }
             raise PydanticCustomError("too_many_settings", "{expected}", told)
     return given
 
@@ -119,16 +126,13 @@ Bounded = BeforeValidator(_bounded)
 ASSET_ID = r"^sha256:[0-9a-f]{64}$"
 JOB_ID = r"^[0-9a-f]{32}$"
 COMPARED = "speed"  # what only the runs of a trade-off set
-MAX_SETTINGS = 100
-SETTING_CHARACTERS = 1000  # of a name or a text among them
-VIEW_CHARACTERS = 500  # of a camera's name that can be asked for
-LIFT_NAME_CHARACTERS = 100
 PRINTABLE = r"^[^\x00-\x1f\x7f]*$"
 
 AssetId = Annotated[str, Field(pattern=ASSET_ID, description="sha256: and the digest of the bytes, in hex")]
 JobId = Annotated[str, Field(pattern=JOB_ID)]
-Text = Annotated[str, Field(min_length=1, max_length=1000)]
-Texts = Annotated[list[Text], Field(max_length=32), at_most(4000)]  # an encoder takes seconds for more
+Text = Annotated[str, Field(min_length=1, max_length=limits.WORD_CHARACTERS)]
+# The first thing that is wrong is all that is told: whoever sends a hundred thousand is not answered about each.
+Texts = Annotated[list[Text], Field(max_length=limits.ASKED, fail_fast=True), at_most(limits.ASKED_CHARACTERS)]
 Scalar = Annotated[bool | int | float | str, takes("a boolean, a number or a text")]
 
 
@@ -194,10 +198,10 @@ class Asset(BaseModel):
 
 
 class Assets(BaseModel):
-    """All assets, newest first."""
+    """Some of the assets, newest first."""
 
     assets: list[Asset]
-    next: str | None = Field(None, description="with limit: the cursor of the page after this one; null at the end")
+    next: str | None = Field(description="the cursor of the page after this one; null at the end")
 
 
 class Names(BaseModel):
@@ -212,7 +216,9 @@ class LiftRequest(Body):
 
     splats: AssetId
     cameras: AssetId
-    features: Annotated[list[AssetId], Field(min_length=1, max_length=10_000)]
+    features: Annotated[
+        list[AssetId], Field(min_length=1, fail_fast=True), AfterValidator(_once), Field(max_length=limits.PACKS)
+    ] = Field(description=f"feature packs, each counts once; at most {limits.PACKS}")
     settings: Annotated[dict[str, Scalar], Bounded, Published(LiftSettings)] = Field(
         default_factory=dict,
         description="preset and knobs of the lift; those left out take the values of the preset and the speed",
@@ -225,7 +231,7 @@ class Labels(Body):
 
     masks: AssetId
     table: AssetId
-    classes: Annotated[list[Text], Field(min_length=1, max_length=1000)] = Field(
+    classes: Annotated[list[Text], Field(min_length=1, max_length=1000, fail_fast=True)] = Field(
         description="words of the table; the first is what masks call 0"
     )
 
@@ -286,10 +292,10 @@ class Job(BaseModel):
 
 
 class Jobs(BaseModel):
-    """All jobs, newest first."""
+    """Some of the jobs, newest first."""
 
     jobs: list[Job]
-    next: str | None = Field(None, description="with limit: the cursor of the page after this one; null at the end")
+    next: str | None = Field(description="the cursor of the page after this one; null at the end")
 
 
 class JobStep(BaseModel):
@@ -333,7 +339,7 @@ class LiftResult(BaseModel):
     links: dict[str, str]
 
 
-Named = Annotated[str, Field(min_length=1, max_length=SETTING_CHARACTERS, pattern=PRINTABLE)]
+Named = Annotated[str, Field(min_length=1, max_length=limits.SETTING_CHARACTERS, pattern=PRINTABLE)]
 
 
 class PackChange(Body):
@@ -347,16 +353,17 @@ class LiftChange(Body):
     """What to change of a lift; what is left out stays."""
 
     name: (
-        Annotated[str, Field(max_length=LIFT_NAME_CHARACTERS, pattern=PRINTABLE), AfterValidator(str.strip)] | None
+        Annotated[str, Field(max_length=limits.LIFT_NAME_CHARACTERS, pattern=PRINTABLE), AfterValidator(str.strip)]
+        | None
     ) = Field(None, description="for people; null or an empty one takes the name away")
     photos: AssetId | None = Field(None, description="an asset of kind photos; null takes them away")
 
 
 class Lifts(BaseModel):
-    """All lifts, newest first."""
+    """Some of the lifts, newest first."""
 
     lifts: list[LiftResult]
-    next: str | None = Field(None, description="with limit: the cursor of the page after this one; null at the end")
+    next: str | None = Field(description="the cursor of the page after this one; null at the end")
 
 
 class View(BaseModel):
@@ -441,13 +448,15 @@ Notation = Annotated[
     str, Field(min_length=1, max_length=600, description="VIEW:x,y, region:VIEW:LEVEL:ID or splat:J")
 ]
 Vector = Annotated[
-    list[Annotated[float, Field(allow_inf_nan=False, strict=True)]], Field(min_length=1, max_length=65_536)
+    list[Annotated[float, Field(allow_inf_nan=False, strict=True)]],
+    Field(min_length=1, max_length=65_536, fail_fast=True),
 ]
 Example = Annotated[
     Notation | Vector,
     takes("VIEW:x,y, region:VIEW:LEVEL:ID, splat:J, or a vector of 1 to 65536 finite numbers"),
 ]
-ViewName = Annotated[str, Field(min_length=1, max_length=VIEW_CHARACTERS, description="the name of a camera")]
+Examples = Annotated[list[Example], Field(max_length=limits.ASKED, fail_fast=True)]
+ViewName = Annotated[str, Field(min_length=1, max_length=limits.VIEW_CHARACTERS, description="the name of a camera")]
 Coordinate = Annotated[float, Field(allow_inf_nan=False), NoBoolean]
 Pixels = Annotated[int, Field(ge=1, le=MAX_SIDE), NoBoolean]
 Score = Annotated[float, Field(ge=-1, le=1), NoBoolean]  # a cosine, which NaN is not
@@ -457,7 +466,6 @@ Count = Annotated[int, Field(ge=1, le=100), NoBoolean]
 Top = Annotated[int, Field(ge=0, le=1000), NoBoolean]
 
 
-MOST_WORDS = 4096  # that are asked at once
 Rendered = Literal["rgb", "depth", "pca", "cluster", "confidence"]
 RENDERED = (
     "the splats' colours, expected depth, three principal components of features, clusters, or how far views agree"
@@ -513,8 +521,8 @@ class Question(LiftQuestion):
 class Asked(Question):
     """A query in a URL."""
 
-    like: list[Notation] = Field([], max_length=32, description="an example of it; may be given several times")
-    unlike: list[Notation] = Field([], max_length=32, description="an example of what it is not, likewise")
+    like: list[Notation] = Field([], max_length=limits.ASKED, description="an example; may be given several times")
+    unlike: list[Notation] = Field([], max_length=limits.ASKED, description="one of what it is not, likewise")
 
 
 class AskedWhere(Asked):
@@ -539,8 +547,8 @@ class AskedForSplats(Asked):
 class AskedInBody(Question, Body):
     """A query in a body, where an example may also be a vector [F]."""
 
-    like: list[Example] = Field([], max_length=32, description="examples of it, or vectors")
-    unlike: list[Example] = Field([], max_length=32, description="examples of what it is not, likewise")
+    like: Examples = Field([], description="examples of it, or vectors")
+    unlike: Examples = Field([], description="examples of what it is not, likewise")
     view: ViewName | None = Field(None, description="for pictures, and for the links")
     camera: OwnCamera | None = Field(None, description="for pictures, in place of a view")
     top: Top = Field(10, description="how many of the best splats to list")
@@ -549,7 +557,7 @@ class AskedInBody(Question, Body):
 class Words(LiftQuestion, Body):
     """Many words at once."""
 
-    words: Annotated[list[Text], Field(max_length=MOST_WORDS)] | None = Field(
+    words: Annotated[list[Text], Field(max_length=limits.WORDS, fail_fast=True)] | None = Field(
         None, description="what may be there, each word once; all words of a table if left out"
     )
 

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import io
+import struct
+import threading
 import zipfile
 from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from liftcore.errors import InvalidCameras, InvalidPhotos, NotFound
 from liftcore.io.files import is_system_file
 from liftcore.scene.views import cameras_of_views, view_names
+from service import limits
 
-MOST = 10_000  # photos in a zip
+MOST = limits.PHOTOS
+KEPT_ZIPS = 4  # whose directories stay in memory
+LOCAL_HEADER = struct.Struct("<26x2H")  # before a member: the lengths of its name and its extra field
 LARGEST_BYTES = 64 << 20  # of a photo: 100 million pixels as a good JPEG
 SIDE = 20_000  # pixels: what browsers decode ends there
 SPARE_BYTES = 1 << 20  # beside twice the archive: photos hardly shrink in a zip, bombs grow a thousandfold out of it
@@ -31,6 +38,9 @@ def describe_photos(path: Path) -> dict[str, Any]:
     """
     try:
         with zipfile.ZipFile(path) as archive:
+            if (size := path.stat().st_size - archive.start_dir) > limits.DIRECTORY_BYTES:
+                expected = f"a zip with a directory of at most {limits.DIRECTORY_BYTES} bytes"
+                raise InvalidPhotos("photos", expected=expected, got=f"{size}", hint="shorter names, and no comments")
             entries = archive.infolist()
             members = _members(entries)
             _require_bounds(entries, members, path.stat().st_size)
@@ -94,30 +104,58 @@ def holds_photos(path: Path) -> bool:
     return any(map(_media_type, names)) and not any(name.lower().endswith(models) for name in names)
 
 
-def names_with_photo(path: Path, views: Collection[str]) -> set[str]:
-    """Which of these views a checked zip has a photo of."""
-    return set(cameras_of_views(_members_at(path), views).values())
+@dataclass(frozen=True)
+class PhotoIndex:
+    """Where the photos of a checked zip lie."""
+
+    path: Path
+    members: Mapping[str, zipfile.ZipInfo]  # by their views
+
+    def names(self, views: Collection[str]) -> set[str]:
+        """Which of these views it has a photo of."""
+        return set(cameras_of_views(self.members, views).values())
+
+    def open(self, view: str) -> tuple[str, int, Iterator[bytes]] | None:
+        """The media type, the size and the blocks of a view's photo; None when there is none."""
+        name = view if view in self.members else next(iter(cameras_of_views(self.members, [view])), None)
+        if name is None:
+            return None
+        member = self.members[name]
+        return _media_type(member.filename), member.file_size, self._blocks(member)
+
+    def _blocks(self, member: zipfile.ZipInfo) -> Iterator[bytes]:
+        # To open the zip would read its whole directory again.
+        with self.path.open("rb") as file:
+            file.seek(member.header_offset)
+            name, extra = LOCAL_HEADER.unpack(file.read(LOCAL_HEADER.size))
+            file.seek(name + extra, io.SEEK_CUR)
+            with zipfile.ZipExtFile(file, "r", member) as photo:
+                while block := photo.read(BLOCK_BYTES):
+                    yield block
 
 
-def _members_at(path: Path) -> dict[str, zipfile.ZipInfo]:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return _members(archive.infolist())
-    except (zipfile.BadZipFile, OSError) as error:
-        hint = "something else wrote there: upload them again"
-        raise NotFound("photos", expected="their zip in the data directory", got=str(error)[:80], hint=hint) from None
+class PhotoIndexes:
+    """Those of the zips that were asked for last, each read once, however many ask at the same time."""
+
+    def __init__(self) -> None:
+        self._turn = threading.Lock()
+        self._of = lru_cache(KEPT_ZIPS)(_index)
+
+    def of(self, path: Path) -> PhotoIndex:
+        """The index of a zip.
+
+        Raises:
+            NotFound: it is not there, or no longer one.
+        """
+        try:
+            with self._turn:
+                return self._of(path, path.stat().st_mtime_ns)  # an upload mends a damaged one in its place
+        except (zipfile.BadZipFile, OSError) as error:
+            hint = "something else wrote there: upload them again"
+            got = str(error)[:80] if isinstance(error, zipfile.BadZipFile) else f"{error.strerror}"
+            raise NotFound("photos", expected="their zip in the data directory", got=got, hint=hint) from None
 
 
-def open_photo(path: Path, view: str) -> tuple[str, int, Iterator[bytes]] | None:
-    """The media type, the size and the blocks of a view's photo in a checked zip; None when it has none."""
-    members = _members_at(path)
-    name = next(iter(cameras_of_views(members, [view])), None)
-    if name is None:
-        return None
-
-    def blocks() -> Iterator[bytes]:
-        with zipfile.ZipFile(path) as archive, archive.open(members[name]) as photo:
-            while block := photo.read(BLOCK_BYTES):
-                yield block
-
-    return _media_type(members[name].filename), members[name].file_size, blocks()
+def _index(path: Path, changed: int) -> PhotoIndex:
+    with zipfile.ZipFile(path) as archive:
+        return PhotoIndex(path, _members(archive.infolist()))

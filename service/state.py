@@ -21,6 +21,7 @@ from service.jobs.device import Devices
 from service.jobs.supervisor import Supervisor
 from service.models import Version
 from service.observe import Metrics
+from service.photos import PhotoIndexes
 from service.queries.client import QueryClient
 from service.settings import ServiceSettings
 from service.store.owners import Owner
@@ -144,6 +145,7 @@ class AppState:
     devices: Devices
     queries: QueryClient
     streams: EventStreams
+    photos: PhotoIndexes
     metrics: Metrics
     readiness: Readiness
     checks: anyio.CapacityLimiter  # threads of their own, so that who waits for them keeps nobody else waiting

@@ -300,7 +300,8 @@ class Answers:
         return made
 
     def _segment(self, request: dict[str, Any]) -> Frame:
-        return Frame(describe_words(self._named(request)))
+        told = describe_words(self._named(request))
+        return _json(request, {name: told[name] for name in ("words", "splats", "none")}, "found", told["found"])
 
     def _word_labels(self, request: dict[str, Any]) -> Frame:
         return _file(npy(self._named(request).values), request)
@@ -323,13 +324,14 @@ class Answers:
         found = self._cache.get(key, lambda: self._named_objects(request))
         assert isinstance(found, Catalogue)
         first, last = request["first"], request["first"] + request["count"]
-        things = [asdict(one) | {"box": _box(one.box), "feature": None} for one in found.objects[first:last]]
-        if request["means"]:
-            for thing, row in zip(things, found.features[first:last], strict=True):
-                thing["feature"] = row.tolist()
+        rows = found.features[first:last] if request["means"] else [None] * len(found.objects[first:last])
+        things = (
+            asdict(one) | {"box": _box(one.box), "feature": None if row is None else row.tolist()}
+            for one, row in zip(found.objects[first:last], rows, strict=True)
+        )
         after = last if last < len(found.objects) else None
         told = {"explanation": found.explanation, "count": len(found.objects), "next": after}
-        return Frame(told | {"objects": things})
+        return _json(request, told, "objects", things)
 
     def _regions(self, request: dict[str, Any]) -> Frame:
         found = regions_at(self._scene(request), request["view"], request["x"], request["y"])
@@ -354,6 +356,13 @@ def _file(content: bytes, request: dict[str, Any]) -> Frame:
         return Frame({}, content)
     write_draft([content], Path(request["draft"]))
     return Frame({})
+
+
+def _json(request: dict[str, Any], told: dict[str, Any], name: str, items: Iterable[dict[str, Any]]) -> Frame:
+    """A JSON object with a list of many, whole: the HTTP process passes it on, through the pipe or in the draft."""
+    dumps = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode
+    head = dumps(request["head"] | told).removesuffix("}")
+    return _file(f"{head},{dumps(name)}:[{','.join(map(dumps, items))}]}}".encode(), request)
 
 
 def write_draft(blocks: Iterable[bytes], draft: Path) -> None:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from itertools import accumulate
 from typing import Annotated, Any, TypeVar
 
 import anyio
 from fastapi import APIRouter, Path, Query, Request, Response
 
-from liftcore.io.safetensors_file import with_metadata
-from service import models
+from service import limits, models
 from service.content import FILE, Cursor, Limit, StoredFile, file_answer, listed
-from service.errand import ErrandLimits
+from service.errand import ErrandLimits, run_errand
+from service.errors import Crashed
 from service.requests import described_body, json_body
 from service.state import AppState, Deps
 from service.store.assets import SHOWN_CHARACTERS, AssetRecord
@@ -20,8 +21,8 @@ from service.uploads.intake import AssetIntake, Intake, Taken, coding_of, requir
 
 T = TypeVar("T")
 BATCH = 1 << 20  # bytes gathered before a thread writes them
+HEADER_LENGTH_BYTES = 8  # that a safetensors file begins with
 MAX_DIGITS = 20  # of a Content-Length: h11 takes no more
-NAMES = 1000  # a page of them, unless another number is asked for
 
 router = APIRouter(prefix="/assets", tags=["assets"])
 # By the name of the other routes' part: to OpenAPI, two templates that match the same paths are one path twice.
@@ -100,8 +101,8 @@ async def _receive(request: Request, feed: Callable[[bytes], Any]) -> None:
 
 
 @router.get("", response_model=models.Assets)
-def list_assets(deps: Deps, limit: Limit = None, cursor: Cursor = None) -> Response:
-    """All assets, newest first. Lists of names and words are told with each asset alone."""
+def list_assets(deps: Deps, limit: Limit = limits.PAGE, cursor: Cursor = None) -> Response:
+    """The assets, newest first, in pages. Lists of names and words are told with each asset alone."""
     return listed("assets", partial(deps.store.assets.page, deps.owner), shape, limit=limit, cursor=cursor)
 
 
@@ -112,10 +113,10 @@ def get_asset(asset: AssetId, deps: Deps) -> Response:
 
 
 @router.get("/{asset}/names", response_model=models.Names)
-def get_names(asset: AssetId, deps: Deps, limit: Limit = NAMES, cursor: NamesCursor = 0) -> models.Names:
-    """The names of views, or the words, that an asset holds, in pages."""
-    most = limit or NAMES
-    names = deps.store.assets.names(deps.owner, asset, cursor, most + 1)
+def get_names(asset: AssetId, deps: Deps, limit: Limit = limits.PAGE, cursor: NamesCursor = 0) -> models.Names:
+    """The names of views, or the words, that an asset holds, in pages: of long ones a page may have fewer."""
+    names = deps.store.assets.names(deps.owner, asset, cursor, limit + 1)
+    most = max(1, sum(total <= limits.PAGE_CHARACTERS for total in accumulate(map(len, names[:limit]))))
     return models.Names(names=names[:most], next=cursor + most if len(names) > most else None)
 
 
@@ -147,8 +148,18 @@ def _retagged(asset: str, change: models.PackChange, deps: AppState) -> tuple[As
     intake = AssetIntake(deps.store, deps.owner, models.AssetKind.FEATURES, limit, None)
     try:
         intake.open()
-        for block in with_metadata(found.path, change.model_dump(exclude_none=True)):
-            intake.feed(block)
+        with deps.store.files.scratch() as scratch, found.path.open("rb") as pack:
+            header = scratch / "header"
+            given = [str(found.path), change.model_dump_json(exclude_none=True), str(header)]
+            heard = run_errand("service.uploads.renaming", given, scratch, allowed)
+            if heard is None or heard.last["event"] != "valid":
+                raise Crashed(
+                    "asset", expected="a pack whose header is read", got="one that is not", hint="try again"
+                )
+            intake.feed(header.read_bytes())
+            pack.seek(HEADER_LENGTH_BYTES + int.from_bytes(pack.read(HEADER_LENGTH_BYTES), "little"))
+            while block := pack.read(BATCH):
+                intake.feed(block)
         known = intake.finish(None)
         return (known, False) if known is not None else intake.keep(intake.check(allowed))
     finally:

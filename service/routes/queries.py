@@ -13,7 +13,7 @@ from urllib.parse import urlencode
 from fastapi import APIRouter, Depends, Query, Request, Response
 
 from liftcore import __version__
-from service import models
+from service import limits, models
 from service.content import BINARY, TAGGED, Draft, kept, unchanged
 from service.encoders import encoder_file, encoder_label, encoder_spec, encoder_version
 from service.errors import InvalidRequest
@@ -29,11 +29,13 @@ Question = models.Asked | models.AskedInBody
 QUERY_BODY, RENDER_BODY = json_body(models.AskedInBody), json_body(models.AskedToRender)
 BODY = described_body(models.AskedInBody)
 ROW_BYTES, SCORE_BYTES = 32, 4  # of a splat in the .splat format, and in an array
+NUMBER_BYTES = 24  # of a number in JSON, at most
 NO_ENCODER: dict[str, Any] = {"encoder": None, "encoder_version": None}  # of a question without words
 REGION = "region:"  # what needs the lift's feature packs begins with it
 MEDIA_TYPES = {"scores": "application/x-npy", "mask": "image/png", "attention": "image/png", "render": "image/png"}
 MEDIA_TYPES["layer"] = MEDIA_TYPES["word_labels"] = MEDIA_TYPES["scores"]  # these are arrays
 MEDIA_TYPES["word_map"] = MEDIA_TYPES["word_picture"] = MEDIA_TYPES["region_mask"] = MEDIA_TYPES["mask"]
+MEDIA_TYPES["catalogue"] = MEDIA_TYPES["segment"] = "application/json"
 MEDIA_TYPES["splats"] = MEDIA_TYPES["scene"] = BINARY
 
 
@@ -47,7 +49,7 @@ PNG, NPY, PLY = bytes_of("image/png"), bytes_of("application/x-npy"), bytes_of("
 LiftParameter = Annotated[
     str | None, Query(pattern=models.JOB_ID, description="the lift; may be left out when there is exactly one")
 ]
-View = Annotated[str, Query(min_length=1, max_length=models.VIEW_CHARACTERS, description="the name of a camera")]
+View = Annotated[str, Query(min_length=1, max_length=limits.VIEW_CHARACTERS, description="the name of a camera")]
 
 
 # The body is read before this listens, as both listen to the client.
@@ -246,6 +248,8 @@ def made(deps: AppState, wanted: dict[str, Any], lift: LiftRecord, ask: Ask, hea
             name, size = f"scene-{lift.id}.splat", ROW_BYTES * lift.count
         case "scores" | "layer" | "word_labels" if SCORE_BYTES * lift.count > PIPE_BYTES:
             size = SCORE_BYTES * lift.count
+        case "catalogue" if wanted["means"]:
+            size = NUMBER_BYTES * lift.channels * wanted["count"]
     if size:
         files.require_room(size)
     media_type = MEDIA_TYPES[wanted["operation"]]

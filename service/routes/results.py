@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import JSONResponse
 
-from service import models
+from service import limits, models
 from service.content import FILE, TAGGED, Cursor, Limit, StoredFile, file_answer, kept, listed, unchanged
 from service.requests import described_body, json_body
 from service.routes.assets import RAW_BODY, Sha256, taken
@@ -33,8 +33,8 @@ router = APIRouter()
 
 
 @router.get("/lifts", response_model=models.Lifts, tags=["lifts"])
-def list_lifts(deps: Deps, limit: Limit = None, cursor: Cursor = None) -> Response:
-    """All lifts, newest first."""
+def list_lifts(deps: Deps, limit: Limit = limits.PAGE, cursor: Cursor = None) -> Response:
+    """The lifts, newest first, in pages."""
     return listed("lifts", partial(deps.store.lifts.page, deps.owner), shape_lift, limit=limit, cursor=cursor)
 
 

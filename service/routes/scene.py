@@ -9,10 +9,9 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
 from liftcore.errors import NotFound
-from service import models
+from service import limits, models
 from service.content import TAGGED, Limit, kept, unchanged
 from service.encoders import encoder_label
-from service.photos import names_with_photo, open_photo
 from service.routes.queries import (
     NO_ENCODER,
     NPY,
@@ -20,6 +19,7 @@ from service.routes.queries import (
     PNG,
     Ask,
     View,
+    made,
     scene_request,
     tagged_answer,
     with_encoder,
@@ -28,7 +28,6 @@ from service.routes.queries import (
 from service.state import AppState, Deps
 from service.store.lifts import LiftRecord
 
-VIEWS = 1000  # a page of them, unless another number is asked for
 _BYTES = {"schema": {"type": "string", "format": "binary"}}
 PHOTO: dict[int | str, dict[str, Any]] = {200: {"content": {"image/jpeg": _BYTES, "image/png": _BYTES}}}
 
@@ -65,7 +64,7 @@ def photo(lift: str, view: View, request: Request, deps: Deps) -> Response:
     """The photo of a view, as it was uploaded."""
     found = deps.store.lifts.get(deps.owner, lift)
     zipped = None if found.photos is None else deps.store.assets.get(deps.owner, found.photos)
-    opened = None if zipped is None else open_photo(zipped.path, view)
+    opened = None if zipped is None else deps.photos.of(zipped.path).open(view)
     if zipped is None or opened is None:
         got, hint = f"none of {view!r}"[:200], "PUT /assets/photos, then PATCH /lifts/{lift} with its id"
         raise NotFound("view", expected="a view of which the lift has a photo", got=got, hint=hint)
@@ -78,21 +77,20 @@ def photo(lift: str, view: View, request: Request, deps: Deps) -> Response:
 def _with_photo(deps: AppState, lift: LiftRecord, views: list[str]) -> set[str]:
     if lift.photos is None:
         return set()
-    return names_with_photo(deps.store.assets.get(deps.owner, lift.photos).path, views)
+    return deps.photos.of(deps.store.assets.get(deps.owner, lift.photos).path).names(views)
 
 
 @router.get("/views", response_model=models.Views)
-def views(lift: str, deps: Deps, ask: Ask, limit: Limit = VIEWS, cursor: ViewsCursor = 0) -> models.Views:
+def views(lift: str, deps: Deps, ask: Ask, limit: Limit = limits.PAGE, cursor: ViewsCursor = 0) -> models.Views:
     """The cameras of the scene with their poses, in pages; also those that were not lifted."""
-    most = limit or VIEWS
     found = deps.store.lifts.get(deps.owner, lift)
-    answer = ask(scene_request("views", found, deps) | {"first": cursor, "count": most}).header
+    answer = ask(scene_request("views", found, deps) | {"first": cursor, "count": limit}).header
     names = [view["name"] for view in answer["views"]]
     lifted, photos = deps.store.lifts.lifted(deps.owner, lift, names), _with_photo(deps, found, names)
     told = [
         models.View(lifted=view["name"] in lifted, photo=view["name"] in photos, **view) for view in answer["views"]
     ]
-    return models.Views(views=told, next=cursor + most if answer["more"] else None)
+    return models.Views(views=told, next=cursor + limit if answer["more"] else None)
 
 
 @router.get("/regions", response_model=models.CoveringRegions)
@@ -117,7 +115,7 @@ def region_mask(
 @router.get("/objects", response_model=models.SceneObjects)
 def scene_objects(
     lift: str, deps: Deps, ask: Ask, asked: Annotated[models.AskedForSceneObjects, Query()]
-) -> models.SceneObjects:
+) -> Response:
     """The things in the scene, found by masks alone when it was lifted; a vocabulary names them."""
     found = deps.store.lifts.get(deps.owner, lift)
     wanted: dict[str, Any] = scene_request("catalogue", found, deps) | NO_ENCODER | {"words": None}
@@ -125,7 +123,7 @@ def scene_objects(
         wanted = with_encoder(wanted, asked, found, deps)
     named = None if wanted["encoder"] is None else encoder_label(wanted["encoder"])
     wanted |= {"first": asked.cursor, "count": asked.limit, "means": asked.features}
-    return models.SceneObjects(lift=found.id, encoder=named, **ask(wanted).header)
+    return made(deps, wanted | {"head": {"lift": found.id, "encoder": named}}, found, ask, {})
 
 
 @router.get("/objects/{thing}/splats", responses=PLY | TAGGED, response_class=Response)

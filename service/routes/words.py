@@ -20,11 +20,12 @@ SEGMENT, WHAT = described_body(models.AskedToSegment), described_body(models.Ask
 
 
 @router.post("/segment", response_model=models.SegmentAnswer, openapi_extra=SEGMENT)
-def segment(deps: Deps, ask: Ask, asked: models.AskedToSegment = SEGMENT_BODY) -> models.SegmentAnswer:
+def segment(deps: Deps, ask: Ask, asked: models.AskedToSegment = SEGMENT_BODY) -> Response:
     """Which of many words are there, and where: to every splat the word that it is most like, or none."""
     lift = find_lift(asked.lift, deps)
     wanted = _wanted("segment", asked, lift, deps)
-    return models.SegmentAnswer(lift=lift.id, encoder=encoder_label(wanted["encoder"]), **ask(wanted).header)
+    head = {"lift": lift.id, "encoder": encoder_label(wanted["encoder"])}
+    return made(deps, wanted | {"head": head}, lift, ask, {})
 
 
 @router.post("/segment/labels", responses=NPY, response_class=Response, openapi_extra=SEGMENT)

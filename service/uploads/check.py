@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
+import tempfile
 import zipfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from liftcore.errors import InvalidCameras, InvalidInput, InvalidLift, InvalidSplats, SplatliftError
+from liftcore.errors import InvalidFeatures, InvalidInput, InvalidLift, InvalidSplats, SplatliftError
 from liftcore.features.pack import read_features
 from liftcore.io.class_masks import describe_masks
 from liftcore.io.inspect import describe_camera_file, describe_packs, describe_splat_file, describe_table
@@ -19,8 +20,9 @@ from liftcore.io.kinds import EXPORT_PLY, SUFFIX, SplatFormat, identify, wrong_k
 from liftcore.io.lift_file import has_poses, parse_metadata, read_lift
 from liftcore.io.splats import format_of
 from liftcore.query.text.table import TableEncoder
+from service import limits
 from service.child import fault_of
-from service.models import VIEW_CHARACTERS, AssetKind, UploadKind
+from service.models import AssetKind, UploadKind
 from service.photos import describe_photos
 from service.store.lifts import LONG, SHOWN_BYTES
 from service.uploads import INVALID, LIFT
@@ -38,26 +40,34 @@ def check_splats(path: Path) -> dict[str, Any]:
 
 
 def check_cameras(path: Path) -> dict[str, Any]:
-    """Read and describe every camera; each must have a name that a query can say."""
+    """Read and describe every camera."""
     found = describe_camera_file(path)
-    require_view_names(found["names"], InvalidCameras)
     return {"suffix": ".zip" if zipfile.is_zipfile(path) else ".json", "found": found}
 
 
-def require_view_names(names: Iterable[str], error: type[InvalidInput]) -> None:
-    """See that a query can say each of these names."""
-    for name in names:
-        if not 1 <= len(name) <= VIEW_CHARACTERS:
+def require_texts(argument: str, texts: Sequence[str], longest: int, error: type[InvalidInput]) -> None:
+    """See that a query can say each of these names or words, and that lists of them are not without end."""
+    for text in texts:
+        if len(text) > longest or not (text or argument == "word"):  # a table may keep a row for nothing
             raise error(
-                "camera name", expected=f"1 to {VIEW_CHARACTERS} characters",
-                got=f"{len(name)}: {name[:40]!r}..." if name else "an empty one",
-                hint="name each image, without folders where that is enough",
+                argument, expected=f"1 to {longest} characters",
+                got=f"{len(text)}: {text[:40]!r}..." if text else "an empty one",
+                hint="name each image, without folders where that is enough" if argument == "view name" else "",
             )  # fmt: skip
+    if (together := sum(map(len, texts))) > limits.FILE_CHARACTERS:
+        most = f"at most {limits.FILE_CHARACTERS} characters of all together"
+        raise error(argument, expected=most, got=f"{together} in {len(texts)}", hint="several files hold more")
 
 
 def check_features(path: Path) -> dict[str, Any]:
     """Read and describe every observation."""
-    return {"suffix": ".safetensors", "found": describe_packs(read_features(path))}
+    packs = read_features(path)
+    require_texts("word", packs.table.words if packs.table else (), limits.WORD_CHARACTERS, InvalidFeatures)
+    for name in ("encoder", "text_space"):
+        if len(told := getattr(packs, name)) > limits.WORD_CHARACTERS:
+            expected = f"at most {limits.WORD_CHARACTERS} characters"
+            raise InvalidFeatures(name, expected=expected, got=f"{len(told)}: {told[:40]!r}...")
+    return {"suffix": ".safetensors", "found": describe_packs(packs)}
 
 
 def check_masks(path: Path) -> dict[str, Any]:
@@ -94,7 +104,8 @@ def check_lift(path: Path, cameras: Path | None = None) -> dict[str, Any]:
         for first in range(0, len(values), BLOCK_ROWS):
             if not np.isfinite(values[first : first + BLOCK_ROWS]).all():
                 raise InvalidLift("lift", expected="finite numbers", got=f"others in {name!r} from row {first} on")
-    require_view_names(metadata["views"], InvalidLift)
+    require_texts("view name", metadata["views"], limits.VIEW_CHARACTERS, InvalidLift)
+    require_texts("word", metadata["words"], limits.WORD_CHARACTERS, InvalidLift)
     if None in metadata["timings"].values():  # as JSON has what is not finite
         raise InvalidLift("lift", expected="finite timings", got="others", hint="a list of lifts tells them")
     brief = len(json.dumps({name: value for name, value in metadata.items() if name not in LONG}))
@@ -127,6 +138,8 @@ def run(named: str, file: str, *more: str) -> dict[str, Any]:
     path = Path(file)
     try:
         checked = CHECKS[kind](path, *map(Path, more))
+        require_texts("view name", checked["found"].get("names", ()), limits.VIEW_CHARACTERS, INVALID[kind])
+        require_texts("word", checked["found"].get("words", ()), limits.WORD_CHARACTERS, INVALID[kind])
     except SplatliftError as error:
         return _invalid(_of_another_kind(kind, path) or error, kind, path)
     except MemoryError:
@@ -141,7 +154,8 @@ def run(named: str, file: str, *more: str) -> dict[str, Any]:
 
 
 def _invalid(error: SplatliftError, kind: UploadKind, path: Path) -> dict[str, Any]:
-    return {"event": "invalid", "fault": fault_of(error, {str(path): kind, f"text table {path.name}": kind})}
+    names = {str(path): kind, f"text table {path.name}": kind, tempfile.gettempdir(): "the server's temporary folder"}
+    return {"event": "invalid", "fault": fault_of(error, names)}
 
 
 def _of_another_kind(kind: UploadKind, path: Path) -> InvalidInput | None:

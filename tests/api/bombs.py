@@ -46,6 +46,7 @@ def cameras() -> dict[str, bytes]:
 def camera_documents() -> dict[str, bytes]:
     """Those in JSON."""
     document, plain = cameras_document(), cameras_json()
+    first = document["frames"][0]
     return {
         "deep array": b"[" * 100_000,
         "deep object": b'{"a":' * 100_000,
@@ -61,6 +62,9 @@ def camera_documents() -> dict[str, bytes]:
         "zero byte in a name": plain.replace(b"images/left", b"images/\\u0000left"),
         "half a surrogate pair as a key": b'{"\\ud800": 1, "frames": []}',
         "not UTF-8": b'{"a": "\xff\xfe"}',
+        "10,000 names in emoji": json.dumps(
+            document | {"frames": [first | {"file_path": f"{k}" + "\U0001f600" * 490} for k in range(10_000)]}
+        ).encode(),
         "a million numbers": b"[" + b"1," * 1_000_000 + b"1]",
     }
 
@@ -75,6 +79,7 @@ def camera_archives() -> dict[str, bytes]:
         "zip that says too large a size": patched(zipped(model), 24, 0xFFFFFFFE),
         "zip whose members overlap": patched(zipped(model), 42, 0),
         "zip of 110,000 members": zipped([(f"f{k}", b"") for k in range(110_000)]),
+        "member whose name no file system takes": zipped([(f"sparse/0/{'x' * 300}.txt", b"x"), *model]),
         "zip in a zip": zipped([("sparse/0/model.zip", zipped(model))]),
         "zip without its end": zipped(model)[:-30],
         "model of 2^63 cameras": zipped([("cameras.bin", count), ("images.bin", count)]),
@@ -133,6 +138,10 @@ def table() -> dict[str, bytes]:
         | {
             "no words": pack(row, 4),
             "zeros": pack({**row, "__metadata__": {"words": '["apple"]'}}, 4),
+            "a word of a megabyte": safetensors(
+                json.dumps(row | {"__metadata__": {"words": json.dumps(["x" * 10**6])}}).encode()
+            )
+            + struct.pack("<f", 1),
             "masks too": safetensors(json.dumps(both).encode()) + struct.pack("<ff", 1, 1),
             "a long word without a direction": pack({**row, "__metadata__": {"words": json.dumps(["x" * 10**6])}}, 4),
             "100,000 sides": pack(
@@ -165,6 +174,7 @@ def photos() -> dict[str, bytes]:
         "zeros": zip_of_zeros(("a.png", png(2)), "b.jpg", 200),
         "many": zipped([(f"{number}.jpg", b"") for number in range(10_001)]),
         "sides": zipped([("a.png", png(1_000_000))]),
+        "names of 9 MB": zipped([(f"{number}{'x' * 60_000}.png", b"") for number in range(150)]),
         "another format": zipped([("a.jpg", png(2))]),
         "cut": zipped([("a.png", png(2))])[:-9],
         "a name of two lines": zipped([("a\n.png", png(2))]),

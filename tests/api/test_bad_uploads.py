@@ -95,7 +95,7 @@ def test_names_of_cameras_are_as_long_as_a_query_may_say(tmp_path: Path) -> None
         assert told["event"] == ("valid" if said is None else "invalid")
         if said is not None:
             fault = told["fault"]
-            assert (fault["argument"], fault["expected"]) == ("camera name", "1 to 500 characters")
+            assert (fault["argument"], fault["expected"]) == ("view name", "1 to 500 characters")
             assert fault["got"].startswith(said) and len(fault["got"]) < 60
 
 

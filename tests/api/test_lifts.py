@@ -6,6 +6,7 @@ import io
 import json
 import zipfile
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from liftcore.io.scene_files import lift_files
 from liftcore.io.splat import ROW
 from liftcore.query.scene import QueryScene
 from liftcore.settings import LiftSettings
+from service.photos import PhotoIndexes
 from service.store.__main__ import main
 from service.store.database import DATABASE
 
@@ -84,6 +86,25 @@ def test_photos_are_shown_as_they_were_uploaded(client: TestClient, lift: dict[s
     assert assert_problem(client.patch(at, json={"photos": lift["splats"]}))["status"] == 404
     assert client.patch(at, json={"photos": None}).json()["photos"] is None
     assert client.delete(f"/assets/{asset['id']}").status_code == 204
+
+
+def test_directory_of_photos_is_read_once_for_all_that_ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "photos.zip"
+    path.write_bytes(b"before the zip" + photos(left=png(), right=png()))
+    opened: list[Path] = []
+    real = zipfile.ZipFile
+    monkeypatch.setattr(zipfile, "ZipFile", lambda of: (opened.append(of), real(of))[1])
+    indexes = PhotoIndexes()
+
+    def read(view: str) -> bytes:
+        found = indexes.of(path).open(view)
+        assert found is not None
+        return b"".join(found[2])
+
+    with ThreadPoolExecutor(8) as threads:
+        assert set(threads.map(read, ["left", "right", "images/left"] * 8)) == {png()}
+    assert opened == [path] and indexes.of(path).names(["left", "middle"]) == {"left"}
+    assert indexes.of(path).open("middle") is None
 
 
 def test_lift_file_from_elsewhere_becomes_a_lift(

@@ -15,7 +15,7 @@ from contextlib import closing, contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast
-from unittest.mock import Mock
+from unittest.mock import Mock, patch
 
 import anyio
 import pytest
@@ -23,13 +23,15 @@ import uvicorn
 from fastapi.testclient import TestClient
 from prometheus_client import REGISTRY
 from prometheus_client.parser import text_string_to_metric_families
+from pydantic import ValidationError
 
 from service import middleware
 from service.__main__ import AnnouncingServer
 from service.errand import ErrandLimits
 from service.errors import Busy, NoSpace
 from service.jobs.supervisor import Supervisor
-from service.models import MAX_SETTINGS, AssetKind
+from service.limits import BODY_BRACKETS, BODY_COMMAS, PACKS, SETTINGS
+from service.models import AskedInBody, AssetKind
 from service.observe import SAME_A_MINUTE, JsonLines, Sparing, TextLines, working_for
 from service.queries.client import Frame
 from service.state import Stopping
@@ -428,20 +430,63 @@ def test_few_requests_begin_at_a_time_and_none_waits_for_slow_ones(
 
 def test_settings_are_bounded_before_they_are_looked_at(client: TestClient, uploaded: Uploaded) -> None:
     for settings in (
-        {f"name{number}": 1 for number in range(MAX_SETTINGS + 1)},
+        {f"name{number}": 1 for number in range(SETTINGS + 1)},
         {"n" * 10_000: 1},
         {"preset": "x" * 10_000},
     ):
         for path in ("/lift", "/tradeoff"):
             told = assert_problem(client.post(path, json=uploaded.order() | {"settings": settings}))
             assert (told["status"], told["argument"]) == (422, "settings")
-            assert f"at most {MAX_SETTINGS} settings" in told["expected"]
+            assert f"at most {SETTINGS} settings" in told["expected"]
 
 
 # Lists
 
 
-def test_list_in_pages_is_the_list_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "wrong", [{"like": [{}] * 200_000}, {"like": ["x", *[3] * 30]}, {"text": [1] * 200_000}, {"like": [["x"] * 9000]}]
+)
+def test_body_is_refused_for_the_first_thing_that_is_wrong_and_not_for_all(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError) as told:
+        AskedInBody.model_validate({"text": ["apple"], **wrong})
+    assert told.value.error_count() == 1
+
+
+@pytest.mark.parametrize(
+    "body", ["[]," * (BODY_BRACKETS + 1), "0," * (BODY_COMMAS + 1), '{"a":' * (BODY_BRACKETS + 1)]
+)
+def test_body_of_more_values_than_any_question_has_is_not_parsed(client: TestClient, body: str) -> None:
+    with patch("service.requests.json", Mock(loads=Mock(side_effect=AssertionError("parsed")))):
+        reply = client.post("/query", content=body, headers={"Content-Type": "application/json"})
+    assert "at most" in assert_problem(reply)["expected"] and reply.status_code == 422
+
+
+def test_pack_counts_once_and_packs_are_bounded(tmp_path: Path) -> None:
+    with guarded(tmp_path / "data") as house:
+        body = house.body()
+        many = house.ask("alice", "POST", "/lift", json=body | {"features": body["features"] * 10_000})
+        assert many.status_code == 202 and many.json()["features"] == body["features"]
+        others = [f"sha256:{number:064x}" for number in range(PACKS + 1)]
+        told = assert_problem(house.ask("alice", "POST", "/lift", json=body | {"features": others}))
+        assert (told["argument"], told["status"]) == ("features", 422) and f"at most {PACKS}" in told["expected"]
+
+
+def test_page_of_long_names_is_no_longer_than_others(client: TestClient) -> None:
+    cameras = cameras_document()
+    names = [f"{number:03}" + "\U0001f600" * 490 for number in range(700)]
+    cameras["frames"] = [cameras["frames"][0] | {"file_path": f"{name}.png"} for name in names]
+    route = f"/assets/{put(client, AssetKind.CAMERAS, json.dumps(cameras).encode())}/names"
+    found: list[str] = []
+    cursor: int | None = 0
+    while cursor is not None:
+        reply = client.get(route, params={"cursor": cursor})
+        assert len(reply.content) < 2 << 20
+        found += reply.json()["names"]
+        cursor = reply.json()["next"]
+    assert found == names
+
+
+def test_small_pages_together_are_the_large_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.content.STREAMED", 2)
     with guarded(tmp_path / "data") as house:
         for _ in range(3):
@@ -454,7 +499,7 @@ def test_list_in_pages_is_the_list_whole(tmp_path: Path, monkeypatch: pytest.Mon
                 assert len(page[path]) <= 2
                 found += page[path]
                 cursor = None if page["next"] is None else {"cursor": page["next"]}
-            assert whole == {path: found} and len(found) == count
+            assert whole == {path: found, "next": None} and len(found) == count
             for wrong in ({"cursor": "x"}, {"limit": 0}):
                 assert house.ask("boss", "GET", f"/{path}", params=wrong).status_code == 422
 

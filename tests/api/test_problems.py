@@ -64,11 +64,9 @@ def test_bad_order_is_refused_before_it_is_a_job(
     assert len(client.get("/jobs").json()["jobs"]) == before
 
 
-def test_assets_in_a_wrong_place_and_one_pack_twice_are_refused(client: TestClient, uploaded: Uploaded) -> None:
+def test_assets_in_a_wrong_place_are_refused(client: TestClient, uploaded: Uploaded) -> None:
     body = assert_problem(client.post("/lift", json=uploaded.order() | {"splats": uploaded.cameras}))
     assert body["status"] == 404 and "cameras" in body["got"]
-    twice = uploaded.order() | {"features": [uploaded.features, uploaded.features]}
-    assert assert_problem(client.post("/lift", json=twice))["type"] == "/problems/invalid-features"
 
 
 @pytest.mark.parametrize(

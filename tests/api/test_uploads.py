@@ -16,12 +16,13 @@ from fastapi.testclient import TestClient
 from hypothesis import given
 from hypothesis import strategies as st
 
+from liftcore.io import safetensors_file
 from liftcore.io.inspect import inspect_file
 from service.scopes import parse_scopes
 from service.store.files import DataDirectory
 from service.store.keys import Quota
 from service.store.store import Store
-from service.uploads.intake import GZIP, ZSTD, Coding, Decoding, Intake
+from service.uploads.intake import GZIP, ZSTD, AssetIntake, Coding, Decoding, Intake
 from tests.crash.server import standing_in
 
 from .conftest import Uploaded
@@ -61,6 +62,22 @@ def test_packs_are_named_anew_as_assets_of_their_own(client: TestClient, uploade
     assert_problem(client.patch(f"/assets/{uploaded.splats}", json={"encoder": "x"}))
     for wrong in ({"encoder": ""}, {"text_space": "a\nb"}, {"words": "x"}):
         assert assert_problem(client.patch(at, json=wrong))["status"] == 422
+
+
+def test_long_header_of_a_pack_is_changed_outside_of_the_server(
+    client: TestClient, scene: TinyScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    length = int.from_bytes(scene.features[:8], "little")
+    header = scene.features[8 : 8 + length] + b" " * (16 << 20)
+    long = len(header).to_bytes(8, "little") + header + scene.features[8 + length :]
+    at = f"/assets/{client.put('/assets/features', content=long).json()['id']}"
+    fed: list[int] = []
+    feed = AssetIntake.feed
+    monkeypatch.setattr(AssetIntake, "feed", lambda intake, block: (fed.append(len(block)), feed(intake, block))[1])
+    monkeypatch.setattr(safetensors_file, "with_metadata", Mock(side_effect=AssertionError("in the server")))
+    made = client.patch(at, json={"encoder": "another"})
+    assert made.status_code == 201 and made.json()["counts"]["encoder"] == "another"
+    assert sum(fed) < 1 << 20  # what it begins with is padded no more
 
 
 def test_files_sent_as_another_kind_are_told_where_they_belong(client: TestClient, scene: TinyScene) -> None:
