@@ -42,11 +42,13 @@ def run(options: argparse.Namespace) -> int:
     photos = [path for path in options.others if path not in packs]
     begin = time.perf_counter()
     with progress_bars() as progress:
+        features = read_features(*packs) if packs else None
+        images = find_images(photos) if photos else {}
         found = check_scene(
             read_splats(options.splats),
-            read_cameras(options.cameras),
-            find_images(photos) if photos else None,
-            read_features(*packs) if packs else None,
+            read_cameras(options.cameras, views=features.views if features is not None else list(images)),
+            images,
+            features,
             progress,
         )
     document = {name: value for name, value in asdict(found).items() if name != "worst"}

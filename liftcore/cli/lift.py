@@ -91,13 +91,13 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def example_in(view: str, cameras: Path) -> str:
-    """The pixel in the middle of a view, as an example of what to look for."""
+def example_in(views: Sequence[str], cameras: Path) -> str:
+    """The pixel in the middle of the first of the lifted views, as an example of what to look for."""
     from liftcore.io.cameras import read_cameras
     from liftcore.scene.cameras import photo_size
 
-    width, height = photo_size(read_cameras(cameras, choosing=False)[view])
-    return f"{view}:{width // 2},{height // 2}"
+    width, height = photo_size(read_cameras(cameras, choosing=False, views=views)[views[0]])
+    return f"{views[0]}:{width // 2},{height // 2}"
 
 
 def checkpoint_in(folder: Path) -> Checkpoint:
@@ -238,5 +238,5 @@ def _verdict(document: dict[str, Any], cameras: Path) -> Iterable[str]:
     space = document["text_space"]
     if not space:
         yield "the packs' text space is not named: splatlift pack retag names it, or ask with --table FILE"
-    how = "WORD" if space not in ("", NO_WORDS) else f"--like {example_in(document['lifted'][0], cameras)}"
+    how = "WORD" if space not in ("", NO_WORDS) else f"--like {example_in(document['lifted'], cameras)}"
     yield f"next: splatlift query {document['out']} {how}  (--verbose shows all figures)"

@@ -2,30 +2,36 @@
 
 A folder or zip may hold COLMAP models, a transforms.json or cameras.json, and nerfstudio's ``FRAME_FILE``, which
 tells the frame of the splats. A zip is read as the folder that was zipped, under limits.
+
+COLMAP writes several models (``sparse/0``, ``sparse/1``, ...) where photos did not all hang together, each in a frame
+of its own. The one that has cameras for most views of the features is read, else the one with most images.
 """
 
 import errno
 import os
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path, PurePath, PurePosixPath
 from typing import TypeVar
 
 from liftcore.errors import InvalidCameras, Unavailable
-from liftcore.io.colmap import MODEL_FILES, has_model, is_whole, model_files, read_colmap
+from liftcore.io.colmap import MODEL_FILES, has_model, is_whole, model_files, read_colmap, read_image_names
 from liftcore.io.files import BROKEN_ZIP, is_system_file, open_regular, open_zip
 from liftcore.io.inria import parse_inria
 from liftcore.io.json_file import read_json
 from liftcore.io.kinds import wrong_kind
+from liftcore.io.photos import PhotosBeside
 from liftcore.io.remote import local_path
-from liftcore.io.transforms import FRAME_FILE, OF_NERFSTUDIO, parse_transforms, read_frame
+from liftcore.io.transforms import FRAME_FILE, OF_NERFSTUDIO, is_export, parse_export, parse_transforms, read_frame
 from liftcore.scene.cameras import Cameras, cameras_from
+from liftcore.scene.views import cameras_of_views
 
-TRANSFORMS = "transforms.json"
-JSON_FILES = (TRANSFORMS, "cameras.json")
+TRANSFORMS, TRAINED_ON = "transforms.json", "transforms_train.json"
+JSON_FILES = (TRANSFORMS, "cameras.json", TRAINED_ON)
 FORMATS = "a COLMAP sparse model (folder or .zip), a transforms.json or a cameras.json"
 # As trainers, COLMAP's reconstructor and its undistorter lay models out; the first that is there is read.
 MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "0", "dense/0/sparse", "dense/sparse")
@@ -34,6 +40,7 @@ MAX_FOLDERS = 10_000  # that are looked into for it
 MAX_UNZIPPED_BYTES = 512 * 1024 * 1024
 MAX_ZIP_MEMBERS = 100_000
 MOST_MODELS = 8  # of a zip that are looked at
+SHOWN = 3  # files or models in a warning
 ONE_RUN = "zip those of one run alone"
 P = TypeVar("P", bound=PurePath)
 
@@ -45,12 +52,15 @@ class CameraSource:
     model: Path | None = None  # a folder
     file: Path | None = None  # a JSON document or a zip
     frame: Path | None = None  # a FRAME_FILE
+    data: Path | None = None  # the transforms.json with the intrinsics of nerfstudio's camera export
+    photos: zipfile.Path | None = None  # the folder of the file in the zip that it is from; None: that on the disk
+    warnings: tuple[str, ...] = ()  # of what lies beside and is not read
 
     @property
     def files(self) -> list[Path]:
         """All files that are read."""
         cameras = [self.file] if self.file else model_files(self.model) if self.model else []
-        return cameras + ([self.frame] if self.frame else [])
+        return cameras + [path for path in (self.frame, self.data) if path]
 
     def read(self) -> Cameras:
         """The cameras, in the frame of the splats where a file tells it.
@@ -58,14 +68,18 @@ class CameraSource:
         Raises:
             InvalidCameras: a file is missing or malformed.
         """
+        cameras = self._moved()
+        cameras.warnings += self.warnings
+        return cameras
+
+    def _moved(self) -> Cameras:
         if self.model is not None:
             source, document, cameras = str(self.model), {}, read_colmap(self.model)
         else:
             assert self.file is not None
             source, document = str(self.file), read_json(self.file)
-            with cameras_from(source):
-                cameras = (parse_inria if isinstance(document, list) else parse_transforms)(document, source)
-        if self.frame is None:
+            cameras = self._parsed(document, source)
+        if self.frame is None or is_export(document):  # an export is in the frame of the splats
             return cameras
         if isinstance(document, list):
             expected, got = "cameras that are still to be moved", "Inria's, which are in the frame of their splats"
@@ -75,13 +89,24 @@ class CameraSource:
         with cameras_from(str(self.frame)):
             return similarity.moved(cameras)
 
+    def _parsed(self, document: object, source: str) -> Cameras:
+        assert self.file is not None
+        photos = PhotosBeside(self.photos or Path(os.path.abspath(self.file)).parent)
+        with cameras_from(source):
+            if is_export(document):
+                return parse_export(document, source, read_json(self.data) if self.data else None, photos)
+            if isinstance(document, list):
+                return parse_inria(document, source)
+            return parse_transforms(document, source, photos)
 
-def read_cameras(path: Path | str, *, choosing: bool = True) -> Cameras:
+
+def read_cameras(path: Path | str, *, choosing: bool = True, views: Collection[str] = ()) -> Cameras:
     """Read cameras from a folder, a JSON file or a zip, recognised by content (`camera_source`).
 
     Args:
         path: the folder or file.
         choosing: whether distorted cameras beside undistorted ones are refused, as somebody has to choose.
+        views: of features or a lift, by which one of several COLMAP models is chosen.
 
     Raises:
         InvalidInput: it lies elsewhere (`io.remote`), and does not come.
@@ -90,21 +115,21 @@ def read_cameras(path: Path | str, *, choosing: bool = True) -> Cameras:
     """
     path = local_path(path)
     try:
-        return _read(path, choosing=choosing)
+        return _read(path, choosing=choosing, views=views)
     except InvalidCameras as error:
         raise wrong_kind(path, "cameras", InvalidCameras, expected=FORMATS) or error from None
 
 
-def _read(path: Path, *, choosing: bool) -> Cameras:
+def _read(path: Path, *, choosing: bool, views: Collection[str]) -> Cameras:
     if path.is_dir():
-        return _from_folder(path, choosing=choosing)
+        return _from_folder(path, choosing=choosing, views=views)
     if not path.exists():
         raise InvalidCameras(str(path), expected=FORMATS, got="no such file or folder")
     try:
         with open_regular(path) as handle:
             start = handle.read(64).lstrip(b"\xef\xbb\xbf \t\r\n")
         if zipfile.is_zipfile(path):
-            return _from_zip(path, camera_source(path).frame, choosing=choosing)
+            return _from_zip(path, camera_source(path).frame, choosing=choosing, views=views)
     except OSError as error:
         got = f"a file that does not open ({error.strerror})"
         raise InvalidCameras(str(path), expected=FORMATS, got=got) from None
@@ -116,38 +141,80 @@ def _read(path: Path, *, choosing: bool) -> Cameras:
     return source.read()
 
 
-def camera_source(path: Path) -> CameraSource:
+def camera_source(path: Path, views: Collection[str] = ()) -> CameraSource:
     """The source of a path: of a folder a whole model, else a JSON file, else half a model; of a file itself.
 
     A ``FRAME_FILE`` counts in the folder, beside the file, and from a model's folder up to its scene's. In a folder
-    with one a transforms.json comes first: nerfstudio trains on its intrinsics.
+    with one a transforms.json comes first: nerfstudio trains on its intrinsics. Before all comes nerfstudio's camera
+    export, which is in the frame of the splats.
+
+    Args:
+        path: the folder or file. views: as `read_cameras` has them.
     """
-    if not path.is_dir():
-        if path.name in MODEL_FILES and has_model(path.parent):
-            return _of_model(path.parent)
-        return CameraSource(file=path, frame=_frame_in(path.parent))
-    frame, models = _frame_in(path), [path / name for name in MODEL_FOLDERS if has_model(path / name)]
+    if path.is_dir():
+        return _source_in_folder(path, views)
+    return _of_model(path.parent) if path.name in MODEL_FILES and has_model(path.parent) else _of_document(path)
+
+
+def _source_in_folder(path: Path, views: Collection[str]) -> CameraSource:
     documents = [path / name for name in JSON_FILES if (path / name).is_file()]
-    if frame and (path / TRANSFORMS).is_file():
-        return CameraSource(file=path / TRANSFORMS, frame=frame)
-    whole = [model for model in models if is_whole(model)]
-    if whole or (models and not documents):
-        return _of_model((whole + models)[0])
-    return CameraSource(file=next(iter(documents), None), frame=frame)
+    export = path / TRAINED_ON
+    if export in documents and _begins_a_list(export):
+        return _of_document(export, folder=path)
+    if (path / TRANSFORMS) in documents and _frame_in(path):
+        return _of_document(path / TRANSFORMS)
+    whole = _usual_models(path)
+    if whole:
+        model, warnings = choose_model(whole, path, views)
+        return replace(_of_model(model), warnings=warnings)
+    halves = [path / name for name in MODEL_FOLDERS if has_model(path / name)]
+    if halves and not documents:
+        return _of_model(halves[0])
+    return _of_document(documents[0], folder=path) if documents else CameraSource(frame=_frame_in(path))
 
 
 def other_models(path: Path) -> list[str]:
-    """COLMAP models in a folder or a zip beside the one that its cameras are read from, by their folders.
+    """COLMAP models in a folder or a zip, by their folders, beside those of which one is read.
 
-    COLMAP writes several where photos did not all hang together, each in a frame of its own.
+    Those are named in the warnings of the cameras (`choose_model`).
     """
     if path.is_dir():
         read = camera_source(path).model
-        return [] if read is None else [str(model) for model in _models_below(path) if path / model != read]
+        return (
+            [] if read is None else [str(model) for model in _models_below(path) if not _is_part(path / model, read)]
+        )
     if not zipfile.is_zipfile(path):
         return []
     with open_zip(path) as archive:
-        return [str(model) for model in _whole_models(_files(archive))[1:]]
+        first, *others = _whole_models(_files(archive)) or [PurePosixPath()]
+    return [str(model) for model in others if not _is_part(model, first)]
+
+
+def choose_model(models: Sequence[Path], scene: Path, views: Collection[str]) -> tuple[Path, tuple[str, ...]]:
+    """The one of COLMAP's several models to read, and a warning that names the others and how many images each has.
+
+    Args:
+        models: folders, in the order of COLMAP's numbers; of equal ones the first counts.
+        scene: the folder that they are named in. views: of features, which the model should have cameras for.
+    """
+    if len(models) == 1:
+        return models[0], ()
+    names: dict[Path, list[str]] = {model: [] for model in models}
+    for model in models:
+        with suppress(InvalidCameras):  # of the one that is read it is said when it is read
+            names[model] = read_image_names(model)
+    paired = {model: len(cameras_of_views(views, names[model])) for model in models}
+    best = max(models, key=lambda model: (paired[model], len(names[model])))
+
+    def told(model: Path) -> str:
+        cameras = f", cameras of {paired[model]} of the {len(views)} views" if views else ""
+        return f"{model.relative_to(scene).as_posix()} ({len(names[model])} images{cameras})"
+
+    others = [told(model) for model in models if model != best]
+    more = f" and {len(others) - SHOWN} more" if len(others) > SHOWN else ""
+    were = "was not" if len(others) == 1 else "were not"
+    frames = "COLMAP's models have a frame each, so the splats must be those of the one that was read"
+    return best, (f"{told(best)} was read, and {', '.join(others[:SHOWN])}{more} {were}: {frames}",)
 
 
 def has_nerfstudio_beside(path: Path) -> bool:
@@ -174,8 +241,8 @@ def _is_of_nerfstudio(document: Path) -> bool:
 # ---- folders
 
 
-def _from_folder(folder: Path, *, choosing: bool) -> Cameras:
-    source = camera_source(folder)
+def _from_folder(folder: Path, *, choosing: bool, views: Collection[str]) -> Cameras:
+    source = camera_source(folder, views)
     if source.model is None and source.file is None:
         others = [folder / model for model in _models_below(folder)] + sorted(folder.glob("transforms*.json"))
         hint = f"name what is meant, such as {' or '.join(map(str, others[:2]))}" if others else ""
@@ -183,7 +250,8 @@ def _from_folder(folder: Path, *, choosing: bool) -> Cameras:
         raise InvalidCameras(str(folder), expected=FORMATS, got=got, hint=hint)
     cameras = source.read()
     if choosing and source.model is not None and cameras.distorted:
-        straight = [str(folder / model) for model in other_models(folder) if _is_undistorted(folder / model)]
+        others = [folder / model for model in _models_below(folder) if folder / model != source.model]
+        straight = [str(model) for model in others if _is_undistorted(model)]
         _refuse_both(str(folder), str(source.model), straight, "name the one")
     return cameras
 
@@ -202,6 +270,66 @@ def _refuse_both(source: str, read: str, undistorted: list[str], choose: str) ->
         got = f"distorted ones in {read} and undistorted ones in {undistorted[0]}"
         hint = f"{choose} whose photos the features were made of"
         raise InvalidCameras(source, expected="distorted or undistorted cameras, not both", got=got, hint=hint)
+
+
+def _of_document(path: Path, folder: Path | None = None) -> CameraSource:
+    """The source of a JSON file, or of a zip; of one that nobody named, but its ``folder``, others are told."""
+    data = path.with_name(TRANSFORMS)
+    has_data = path != data and data.is_file() and _begins_a_list(path)
+    others = (
+        sorted(other.name for other in folder.glob("transforms*.json") if other not in (path, data)) if folder else []
+    )
+    read, *unread = [path.name, *others]
+    told = f"{read} was read, and {', '.join(unread)} not: name a file to read that one" if unread else ""
+    return CameraSource(
+        file=path,
+        frame=_frame_in(path.parent),
+        data=data if has_data else None,
+        warnings=(told,) if told and read != TRANSFORMS else (),
+    )
+
+
+def _begins_a_list(path: Path) -> bool:
+    """Whether a file begins as a JSON list, as camera exports do and a transforms.json does not."""
+    with suppress(OSError), path.open("rb") as handle:
+        return handle.read(64).lstrip(b"\xef\xbb\xbf \t\r\n")[:1] == b"["
+    return False
+
+
+def _usual_models(scene: Path) -> list[Path]:
+    """The whole models at the first of the usual places that has one: one, or COLMAP's several, by their numbers."""
+    for place in MODEL_FOLDERS:
+        numbered = _split_at_number(PurePosixPath(place))
+        if numbered is None:
+            found = [scene / place] if is_whole(scene / place) else []
+        else:
+            above, inner = numbered
+            folders = _numbered_in(scene / above) if above.parts or is_whole(scene / place) else []
+            found = [folder / inner for folder in folders if is_whole(folder / inner)]
+        if found:
+            return found
+    return []
+
+
+def _numbered_in(folder: Path) -> list[Path]:
+    """The folders of one whose names are numbers, by these."""
+    inner = [path for path in folder.iterdir() if path.name.isdecimal() and path.is_dir()] if folder.is_dir() else []
+    return sorted(inner, key=lambda path: int(path.name))
+
+
+def _split_at_number(model: P) -> tuple[P, P] | None:
+    """The folder with COLMAP's numbered models and where each lies in its number, of one of them; None of others."""
+    parts = model.parts
+    for last in (1, 2):  # sparse/0, dense/0/sparse
+        if len(parts) >= last and parts[-last].isdecimal() and (last == 1 or parts[-1] == "sparse"):
+            cut = len(parts) - last
+            return type(model)(*parts[:cut]), type(model)(*parts[cut + 1 :])
+    return None
+
+
+def _is_part(model: P, read: P) -> bool:
+    """Whether a model is the one that is read, or of the same reconstruction, by its number alone another."""
+    return model == read or (_split_at_number(model) or 0) == (_split_at_number(read) or 1)
 
 
 def _of_model(model: Path) -> CameraSource:
@@ -254,54 +382,80 @@ def _whole_models(names: Iterable[str]) -> list[PurePosixPath]:
     return sorted(found, key=_preference)
 
 
-def _preference(model: PurePosixPath) -> tuple[bool, int, str, int]:
+def _preference(model: PurePosixPath) -> tuple[bool, int, str, int, int]:
     """What models are sorted by: as if folders were opened as scenes one by one, the outermost first.
 
     So the first model of a zip is the one that is read from the same files in a folder. What lies in a folder
     ``distorted`` comes last: 3DGS's ``convert.py`` keeps there what it has undistorted.
     """
     scene = _scene_of(model)
-    place = MODEL_FOLDERS.index(str(model.relative_to(scene)))
-    return "distorted" in model.parts, len(scene.parts), str(scene), place
+    place = MODEL_FOLDERS.index(str(_at_nought(model).relative_to(scene)))
+    number = int("".join(filter(str.isdecimal, model.relative_to(scene).as_posix())) or 0)
+    return "distorted" in model.parts, len(scene.parts), str(scene), place, number
 
 
 def _scene_of(model: P) -> P:
     """The outermost folder in which a model has one of the usual places; its own folder at least."""
-    places = [PurePosixPath(place).parts for place in MODEL_FOLDERS]
-    cut = max(len(place) for place in places if model.parts[len(model.parts) - len(place) :] == place)
+    places, usual = [PurePosixPath(place).parts for place in MODEL_FOLDERS], _at_nought(model).parts
+    cut = max(len(place) for place in places if usual[len(usual) - len(place) :] == place)
     return type(model)(*model.parts[: len(model.parts) - cut])
+
+
+def _at_nought(model: P) -> P:
+    """The same with the number of one of COLMAP's several models as 0; a folder that is a mere number stays."""
+    above, inner = _split_at_number(model) or (None, None)
+    if above is None or inner is None or (above.name != "sparse" and not inner.parts):
+        return model
+    return above / "0" / inner
 
 
 # ---- zips
 
 
-def _from_zip(path: Path, beside: Path | None, *, choosing: bool) -> Cameras:
+def _from_zip(path: Path, beside: Path | None, *, choosing: bool, views: Collection[str]) -> Cameras:
     """The cameras of the preferred model in a zip; with a frame's file in it or ``beside`` it, a transforms first."""
     with tempfile.TemporaryDirectory(prefix="splatlift-") as folder:
         root = Path(folder)
         names = _unzip(path, root)
-        source = _source_in_zip(names, root, path, beside)
         try:
-            cameras = source.read()
+            with open_zip(path) as archive:
+                source = _source_in_zip(names, root, path, beside, views)
+                if source.file is not None:
+                    inner = source.file.parent.relative_to(root).as_posix()
+                    source = replace(source, photos=zipfile.Path(archive, "" if inner == "." else f"{inner}/"))
+                cameras = source.read()
         except InvalidCameras as error:
             argument, got, hint = (
                 text.replace(folder, str(path)) for text in (error.argument, error.got, error.hint)
             )
             raise InvalidCameras(argument, expected=error.expected, got=got, hint=hint) from None
         if choosing and source.model is not None and cameras.distorted:
-            read, *others = _whole_models(names)[:MOST_MODELS]
+            read = source.model.relative_to(root)
+            others = [model for model in _whole_models(names)[:MOST_MODELS] if root / model != source.model]
             straight = [str(model) for model in others if _is_undistorted(root / model)]
             _refuse_both(str(path), str(read), straight, "zip the one alone")
     return cameras
 
 
-def _source_in_zip(names: list[str], root: Path, path: Path, beside: Path | None) -> CameraSource:
+def _source_in_zip(
+    names: list[str], root: Path, path: Path, beside: Path | None, views: Collection[str]
+) -> CameraSource:
     """What is read of a zip whose camera files lie unzipped in ``root``, wherever they are there."""
     models, frames = _whole_models(names), _named(names, lambda name: name == FRAME_FILE)
-    documents = _named(names, lambda name: name == TRANSFORMS) or _named(names, _is_transforms)
+    written = _named(names, _is_transforms)
+    exports = [name for name in written if _begins_a_list(root / name)]
+    if exports:
+        return _of_document(root / _train_first(exports), folder=root / PurePosixPath(exports[0]).parent)
+    documents = [name for name in written if PurePosixPath(name).name == TRANSFORMS] or written
     if documents and (frames or beside):
         frame = root / _only(frames, FRAME_FILE, path) if frames else beside
         return CameraSource(file=root / _only(documents, TRANSFORMS, path), frame=frame)
+    if not models and documents:
+        first = _train_first(documents)
+        alike = [name for name in documents if PurePosixPath(name).parent == PurePosixPath(first).parent]
+        if len(alike) < len(documents):
+            _only(documents, TRANSFORMS, path)
+        return _of_document(root / first, folder=(root / first).parent)
     if not models:
         got, hint = _what_else(names)
         expected = "a COLMAP model (cameras and images, .bin or .txt) in the zip"
@@ -311,7 +465,15 @@ def _source_in_zip(names: list[str], root: Path, path: Path, beside: Path | None
         got = f"one of {PurePosixPath(frames[0]).parent} and the model {models[0]}"
         raise InvalidCameras(str(path), expected=f"the {FRAME_FILE} of the model", got=got, hint=ONE_RUN)
     frames = above[-1:] or frames
-    return CameraSource(model=root / models[0], frame=root / _only(frames, FRAME_FILE, path) if frames else beside)
+    frame = root / _only(frames, FRAME_FILE, path) if frames else beside
+    parts = [root / model for model in models if _is_part(model, models[0])]
+    model, warnings = choose_model(parts, root, views)
+    return CameraSource(model=model, frame=frame, warnings=warnings)
+
+
+def _train_first(documents: list[str]) -> str:
+    """The one of several documents of cameras that trainers train on."""
+    return next((name for name in documents if PurePosixPath(name).name == TRAINED_ON), documents[0])
 
 
 def _files(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
@@ -390,7 +552,6 @@ def _what_else(names: Iterable[str]) -> tuple[str, str]:
         if file in MODEL_FILES:
             parts = ("cameras", "images") if file.startswith("cameras") else ("images", "cameras")
             return f"{name!r} without {file.replace(*parts)!r}", "zip both files together"
-        if file == "cameras.json" or _is_transforms(file):
-            framed = "" if file == "cameras.json" else f", or zip it with its run's {FRAME_FILE}"
-            return f"{name!r}", f"give the JSON file itself{framed}"
+        if file == "cameras.json":
+            return f"{name!r}", "give the JSON file itself"
     return "none", "zip the folder that has cameras.bin and images.bin"

@@ -11,7 +11,16 @@ import numpy as np
 
 from liftcore.errors import InvalidCameras
 from liftcore.io.files import refuse_pointer
-from liftcore.scene.cameras import Camera, Cameras, behind_lens, cameras_from, check_count, faces_of
+from liftcore.scene.cameras import (
+    Camera,
+    Cameras,
+    InvalidPose,
+    behind_lens,
+    cameras_from,
+    check_count,
+    faces_of,
+    read_views,
+)
 from liftcore.scene.distortion import Brown, Distortion, Fisheye
 from liftcore.scene.quaternions import rotation_matrices
 from liftcore.scene.views import view_names
@@ -123,9 +132,24 @@ def read_colmap(folder: Path) -> Cameras:
         images = list(_counted(_text_images(image_file), image_file))
     with cameras_from(str(folder)):
         names = view_names([image.name for image in images])
-        pairs = zip(names, images, strict=True)
         files = camera_file, image_file
-        return Cameras([camera for name, image in pairs for camera in _cameras(name, image, sensors, files)])
+        pairs = zip(names, images, strict=True)
+        cameras, warnings = read_views(pairs, lambda name, image: _cameras(name, image, sensors, files))
+        return Cameras(cameras, warnings=warnings)
+
+
+def read_image_names(folder: Path) -> list[str]:
+    """The views of a sparse model by name; its cameras are not read.
+
+    Raises:
+        InvalidCameras: the file of its images is missing or malformed.
+    """
+    path = model_files(folder)[1]
+    if path.suffix == ".bin":
+        images: list[_Image] = _binary_images(path)
+    else:
+        images = list(_counted(_text_images(path), path))
+    return view_names([image.name for image in images])
 
 
 def _cameras(name: str, image: _Image, sensors: Mapping[int, _Sensor], files: tuple[Path, Path]) -> list[Camera]:
@@ -136,7 +160,7 @@ def _cameras(name: str, image: _Image, sensors: Mapping[int, _Sensor], files: tu
     pose = np.eye(4)
     if not np.isfinite(image.quaternion).all() or not any(image.quaternion):
         expected, got = "a finite quaternion that is not zero", str(list(image.quaternion))
-        raise InvalidCameras(f"{source} image {name!r}", expected=expected, got=got)
+        raise InvalidPose(f"{source} image {name!r}", expected=expected, got=got)
     pose[:3, :3] = rotation_matrices(np.array(image.quaternion))
     pose[:3, 3] = image.translation
     if sensor.model.name == PANORAMA:
@@ -201,8 +225,12 @@ class _Bytes:
 def _read_binary(camera_file: Path, image_file: Path) -> tuple[dict[int, _Sensor], list[_Image]]:
     cameras = _Bytes(camera_file)
     sensors = dict(_binary_sensor(cameras) for _ in cameras.views("cameras", 24 + 2 * 8))
-    images = _Bytes(image_file)
-    return sensors, [_binary_image(images) for _ in images.views("images", 64 + 1 + 8)]
+    return sensors, _binary_images(image_file)
+
+
+def _binary_images(path: Path) -> list[_Image]:
+    images = _Bytes(path)
+    return [_binary_image(images) for _ in images.views("images", 64 + 1 + 8)]
 
 
 def _binary_sensor(data: _Bytes) -> tuple[int, _Sensor]:

@@ -7,7 +7,7 @@ from typing import Any
 from liftcore.errors import InvalidCameras
 from liftcore.io.files import whole_file
 from liftcore.io.json_file import FORMATS, entry, matrix, number, pixels
-from liftcore.scene.cameras import Camera, Cameras, check_count, viewmat_of
+from liftcore.scene.cameras import Camera, Cameras, check_count, pose_from, read_views, viewmat_of
 from liftcore.scene.views import view_names
 
 CENTRE_TOLERANCE = 1e-6  # pixels
@@ -30,17 +30,19 @@ def parse_inria(document: Any, source: str) -> Cameras:
     check_count(len(document), source)
     images = [str(entry(record, "img_name", f"{source} camera {i}")) for i, record in enumerate(document)]
     views = zip(view_names(images), document, strict=True)
-    return Cameras(tuple(_camera(name, record, source) for name, record in views))
+    cameras, warnings = read_views(views, lambda name, record: _cameras(name, record, source))
+    return Cameras(cameras, warnings=warnings)
 
 
-def _camera(name: str, record: dict[str, Any], source: str) -> Camera:
+def _cameras(name: str, record: dict[str, Any], source: str) -> list[Camera]:
     where = f"{source} camera {name!r}"
     width, height = (pixels(entry(record, key, where), f"{where} {key}") for key in ("width", "height"))
     fx, fy = (number(entry(record, key, where), f"{where} {key}") for key in ("fx", "fy"))
-    rotation = matrix(entry(record, "rotation", where), (3,), 3, f"{where} rotation")
-    (position,) = matrix([entry(record, "position", where)], (1,), 3, f"{where} position")
+    with pose_from():
+        rotation = matrix(entry(record, "rotation", where), (3,), 3, f"{where} rotation")
+        (position,) = matrix([entry(record, "position", where)], (1,), 3, f"{where} position")
     pose = viewmat_of(rotation, position)
-    return Camera.pinhole(name, width, height, fx, fy, width / 2, height / 2, viewmat=pose)
+    return [Camera.pinhole(name, width, height, fx, fy, width / 2, height / 2, viewmat=pose)]
 
 
 def write_inria_cameras(cameras: Cameras, path: Path) -> None:

@@ -20,7 +20,7 @@ from liftcore.io.class_masks import describe_masks
 from liftcore.io.kinds import SplatFormat, identify
 from liftcore.io.ply import nearest_dialect
 from liftcore.io.splats import format_of, read_splats, splat_files
-from liftcore.io.transforms import FRAME_FILE, frame_warning
+from liftcore.io.transforms import FRAME_FILE
 from liftcore.query.text.table import plain
 from liftcore.raster.base import ALPHA_FLOOR
 from liftcore.scene.cameras import Cameras, distortion_warning, photo_size
@@ -207,7 +207,7 @@ def _camera_warnings(cameras: Cameras, centres: np.ndarray) -> list[str]:
         for name, photo in photos.items()
         if abs(photo.cx / photo.width - 0.5) > OFF_CENTRE or abs(photo.cy / photo.height - 0.5) > OFF_CENTRE
     ]
-    warnings = distortion_warning(list(cameras.values())) + frame_warning(cameras)
+    warnings = distortion_warning(list(cameras.values())) + list(cameras.warnings)
     if off:
         warnings.append(f"{len(off)} views have their principal point far off the centre, such as {off[0]!r}")
     places = len(np.unique(centres, axis=0))

@@ -27,7 +27,7 @@ from liftcore.io.safetensors_file import map_tensors
 from liftcore.io.shards import INDEX, SUFFIX, map_shards, write_shards
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Collection, Iterator, Sequence
 
     from liftcore.result import InputFile, LiftMetadata, LiftResult
     from liftcore.scene.cameras import Camera
@@ -152,9 +152,11 @@ def _check_shapes(arrays: dict[str, np.ndarray], path: Path | str) -> None:
             raise InvalidLift(str(path), expected=f"a {pair[0]} of -1 or a row of {pair[1]} for each splat", got=got)
 
 
-def input_files(splats: Path, cameras: Path, features: Sequence[Path]) -> list[InputFile]:
-    """The inputs of a lift with their digests: splats, cameras and feature packs."""
-    return [input_file(splats), camera_input(cameras), *(input_file(pack) for pack in features)]
+def input_files(
+    splats: Path, cameras: Path, features: Sequence[Path], views: Collection[str] = ()
+) -> list[InputFile]:
+    """The inputs of a lift with their digests: splats, cameras (as `camera_input` has them) and feature packs."""
+    return [input_file(splats), camera_input(cameras, views), *(input_file(pack) for pack in features)]
 
 
 def input_file(path: Path) -> InputFile:
@@ -173,16 +175,19 @@ def input_file(path: Path) -> InputFile:
     return InputFile(path=str(resolved), sha256=sha256_of(resolved))
 
 
-def camera_input(path: Path) -> InputFile:
+def camera_input(path: Path, views: Collection[str] = ()) -> InputFile:
     """Where cameras are, and the digest of their file or, of several, of the names and digests of all that are read.
 
     Photos, features and lifts that lie in the same folder do not count: they may come and go.
+
+    Args:
+        path: of the cameras. views: of the features, as `read_cameras` has them.
     """
     from liftcore.io.cameras import camera_source
     from liftcore.result import InputFile
 
     given = Path(os.path.abspath(path))  # links stay: other files count beside them than where they lead
-    files = camera_source(given).files
+    files = camera_source(given, views).files
     if files == [given]:
         return InputFile(path=str(given), sha256=sha256_of(given))
     return InputFile(path=str(given), sha256=_digest_of_several(files, given if given.is_dir() else given.parent))
@@ -205,11 +210,11 @@ def found_input(role: str, remembered: InputFile, metadata: LiftMetadata, lift: 
     """
     path = Path(remembered.path)
     places = [path] if lift is None else [path, *_beside(lift, path)]
-    of = camera_input if role == "cameras" else input_file
     for place in places:
         if place.exists():
             with suppress(InvalidInput, OSError):
-                if of(place).sha256 == remembered.sha256 or (role == "cameras" and has_poses(place, metadata)):
+                found = camera_input(place, metadata.views) if role == "cameras" else input_file(place)
+                if found.sha256 == remembered.sha256 or (role == "cameras" and has_poses(place, metadata)):
                     return place
     return None
 
@@ -235,7 +240,7 @@ def has_poses(place: Path, metadata: LiftMetadata) -> bool:
 
     if not metadata.poses:
         return False
-    cameras = read_cameras(place, choosing=False)
+    cameras = read_cameras(place, choosing=False, views=metadata.views)
     known = [cameras[view] for view in metadata.views if view in cameras]
     if len(known) != len(metadata.views):
         return False

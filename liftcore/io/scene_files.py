@@ -52,7 +52,7 @@ def lift_files(
     with timings.step("read"):
         sources = open_files(*paths, settings)
     with timings.step("digest"):
-        inputs = input_files(*paths)
+        inputs = input_files(*paths, views=sources[2].views)
     given = {"threads": threads, "progress": progress, "on_plan": on_plan, "checkpoint": checkpoint, "engine": engine}
     made = lift(*sources, settings, **given)
     own = {"splats": inputs[0], "cameras": inputs[1], "features": tuple(inputs[2:])}
@@ -70,7 +70,8 @@ def open_files(
     """
     scene = read_splats(splats, settings.kernel, colour=False)
     check_antialiased(scene.kernel, settings.antialiased)
-    return scene, read_cameras(cameras), read_features(*_checked(features))
+    packs = read_features(*_checked(features))
+    return scene, read_cameras(cameras, views=packs.views), packs
 
 
 def _checked(features: Sequence[Path | str]) -> list[Path]:

@@ -1,6 +1,10 @@
-"""nerfstudio's files: a transforms.json of cameras, and the frame in which a run trained its splats.
+"""nerfstudio's files: cameras of a transforms.json or of its export, and the frame in which a run trained its splats.
 
-The poses of a transforms.json are camera-to-world with OpenGL axes; its intrinsics are shared, or a frame's own.
+The poses of both are camera-to-world with OpenGL axes. The intrinsics of a transforms.json are shared, or a frame's
+own; where it has no size, that of each photo counts, as for Inria's code, nerfstudio and instant-ngp.
+
+``ns-export cameras`` writes a list of ``file_path`` and ``transform`` [3, 4] (``transforms_train.json``), in the
+frame of the exported splats; intrinsics are those of the transforms.json that the run was trained on.
 """
 
 import math
@@ -12,12 +16,23 @@ from typing import Any, Self
 
 import numpy as np
 
-from liftcore.errors import InvalidCameras
+from liftcore.errors import InvalidCameras, InvalidInput
 from liftcore.io.colmap import PANORAMA, Intrinsics, distortion_of
 from liftcore.io.json_file import FORMATS, entry, matrix, number, pixels, read_json
-from liftcore.scene.cameras import Camera, Cameras, behind_lens, check_count, faces_of, viewmat_of
+from liftcore.io.photos import PhotosBeside
+from liftcore.scene.cameras import (
+    Camera,
+    Cameras,
+    InvalidPose,
+    behind_lens,
+    check_count,
+    faces_of,
+    pose_from,
+    read_views,
+    viewmat_of,
+)
 from liftcore.scene.distortion import Distortion
-from liftcore.scene.views import view_names
+from liftcore.scene.views import cameras_of_views, view_names
 
 FRAME_FILE = "dataparser_transforms.json"  # as nerfstudio names it, in the folder of a run
 OWN_FRAME = (
@@ -47,14 +62,20 @@ UNDISTORT = (
 )
 LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])  # of a rigid pose
 OF_NERFSTUDIO = ("applied_transform", "ply_file_path")  # what its own converter writes, and others do not
+EXPORTED = ("file_path", "transform")  # of each camera of an export
+FOCALS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
 OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0])  # a camera's y up and z back become down and ahead
 
 
-def parse_transforms(document: Any, source: str) -> Cameras:
+def parse_transforms(document: Any, source: str, photos: PhotosBeside | None = None) -> Cameras:
     """The cameras of a transforms.json document, in the frame that its poses are in.
 
     A frame's own intrinsics come before the shared ones. A scene trained in another frame (nerfstudio
     normalises poses unless told not to) must be exported together with its cameras.
+
+    Args:
+        document: as JSON has it. source: its file, for errors.
+        photos: where the sizes of photos are looked up that the document does not have; None: nowhere.
 
     Raises:
         InvalidCameras: a key is missing or malformed, or a camera is distorted in a way that is not read.
@@ -64,14 +85,60 @@ def parse_transforms(document: Any, source: str) -> Cameras:
         raise InvalidCameras(
             source, expected=FORMATS, got=f"an object with {some}" if document else "an empty object"
         )
-    frames = document["frames"]
+    names, frames = _named_frames(document["frames"], f"{source} frames", f"{source} frame")
+    scoped = [ChainMap(frame, document) for frame in frames]
+    views = zip(names, scoped, strict=True)
+    cameras, warnings = read_views(views, lambda name, keys: _cameras(name, keys, source, photos))
+    of_nerfstudio = any(key in document for key in OF_NERFSTUDIO)
+    warnings += [OWN_FRAME] if of_nerfstudio else []
+    return Cameras(cameras, of_nerfstudio=of_nerfstudio, warnings=warnings)
+
+
+def is_export(document: Any) -> bool:
+    """Whether a document has the form of nerfstudio's camera export."""
+    records = document if isinstance(document, list) else []
+    return bool(records) and all(isinstance(record, dict) and {*EXPORTED} <= record.keys() for record in records[:1])
+
+
+def parse_export(records: Any, source: str, data: Any = None, photos: PhotosBeside | None = None) -> Cameras:
+    """The cameras of nerfstudio's camera export, in the frame of its splats.
+
+    Args:
+        records: as JSON has them. source: their file, for errors. photos: as `parse_transforms` has it.
+        data: the transforms.json of the data, whose intrinsics count by the photo's name; None: there is none.
+
+    Raises:
+        InvalidCameras: as `parse_transforms` has it, or neither has intrinsics.
+    """
+    names, poses = _named_frames(records, source, f"{source} camera")
+    shared = data if isinstance(data, dict) else {}
+    frames = {}
+    if isinstance(shared.get("frames"), list):
+        frames = dict(
+            zip(*_named_frames(shared["frames"], "transforms.json frames", "transforms.json frame"), strict=True)
+        )
+    pairs = cameras_of_views(names, frames)
+    scoped = []
+    for name, record in zip(names, poses, strict=True):
+        keys = ChainMap(
+            {"transform_matrix": record.get("transform")}, record, frames.get(pairs.get(name, ""), {}), shared
+        )
+        if not any(key in keys for key in FOCALS):
+            got = f"none of {name!r}: this is nerfstudio's camera export (ns-export cameras), which has poses alone"
+            hint = "put the transforms.json of the data that nerfstudio was trained on beside it"
+            raise InvalidCameras(source, expected="intrinsics in the file or beside it", got=got, hint=hint)
+        scoped.append(keys)
+    views = zip(names, scoped, strict=True)
+    cameras, warnings = read_views(views, lambda name, keys: _cameras(name, keys, source, photos))
+    return Cameras(cameras, warnings=warnings)
+
+
+def _named_frames(frames: Any, source: str, each: str) -> tuple[list[str], list[dict[str, Any]]]:
+    """The names of views, and their records."""
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
-        raise InvalidCameras(f"{source} frames", expected="a list of objects", got=repr(frames)[:60])
-    check_count(len(frames), f"{source} frames")
-    files = [str(entry(frame, "file_path", f"{source} frame {i}")) for i, frame in enumerate(frames)]
-    views = zip(view_names(files), frames, strict=True)
-    cameras = [one for name, frame in views for one in _cameras(name, ChainMap(frame, document), source)]
-    return Cameras(cameras, of_nerfstudio=any(key in document for key in OF_NERFSTUDIO))
+        raise InvalidCameras(source, expected="a list of objects", got=repr(frames)[:60])
+    check_count(len(frames), source)
+    return view_names([str(entry(frame, "file_path", f"{each} {i}")) for i, frame in enumerate(frames)]), frames
 
 
 def transforms_of(cameras: Mapping[str, Camera]) -> dict[str, Any]:
@@ -86,25 +153,41 @@ def transforms_of(cameras: Mapping[str, Camera]) -> dict[str, Any]:
     return {"frames": frames}
 
 
-def _cameras(name: str, keys: ChainMap[str, Any], source: str) -> list[Camera]:
+def _cameras(name: str, keys: ChainMap[str, Any], source: str, photos: PhotosBeside | None) -> list[Camera]:
     """The view of a frame, or the six of a panorama."""
     where = f"{source} frame {name!r}"
     panorama = keys.get("camera_model") == PANORAMA
     distortion = None if panorama else _distortion(keys, where)
-    if "w" not in keys or "h" not in keys:
-        hint = 'add the size of the photos as "w" and "h" at the top level of the file'
-        raise InvalidCameras(where, expected="an image size, w and h", got="none", hint=hint)
-    width, height = pixels(keys["w"], f"{where} w"), pixels(keys["h"], f"{where} h")
-    given = matrix(keys.get("transform_matrix"), (3, 4), 4, f"{where} transform_matrix")
+    width, height = _size(keys, where, photos)
+    with pose_from():
+        given = matrix(keys.get("transform_matrix"), (3, 4), 4, f"{where} transform_matrix")
     if len(given) == 4 and np.abs(given[3] - LAST_ROW).max() > 1e-6:
         got = " ".join(f"{value:g}" for value in given[3])
-        raise InvalidCameras(f"{where} transform_matrix", expected="0 0 0 1 as the last row", got=got)
+        raise InvalidPose(f"{where} transform_matrix", expected="0 0 0 1 as the last row", got=got)
     pose = viewmat_of(given[:3, :3] * OPENGL_TO_OPENCV, given[:3, 3])
     if panorama:
         return faces_of(name, width, height, pose)
     intrinsics = _intrinsics(keys, width, height, where)
     camera = Camera.pinhole(name, width, height, *intrinsics, viewmat=pose)
     return [camera if distortion is None else behind_lens(camera, distortion)]
+
+
+def _size(keys: Mapping[str, Any], where: str, photos: PhotosBeside | None) -> tuple[int, int]:
+    """Width and height in pixels, of the frame or else of its photo."""
+    if "w" in keys and "h" in keys:
+        return pixels(keys["w"], f"{where} w"), pixels(keys["h"], f"{where} h")
+    file_path = str(keys["file_path"])
+    try:
+        size = photos.size(file_path) if photos else None
+    except InvalidInput as error:
+        got, hint = f"{error.got} ({error.argument})", 'add "w" and "h" at the top level of the file'
+        raise InvalidCameras(where, expected="an image size, w and h, or a photo", got=got, hint=hint) from None
+    if size is not None:
+        return size
+    looked = f", and no photo {photos.missing(file_path)}" if photos else ""
+    hint = 'add the size of the photos as "w" and "h" at the top level of the file'
+    hint = f"put the photos where file_path has them, or {hint}" if photos else hint
+    raise InvalidCameras(where, expected="an image size, w and h", got=f"none{looked}", hint=hint)
 
 
 def _intrinsics(keys: Mapping[str, Any], width: int, height: int, where: str) -> Intrinsics:
@@ -218,7 +301,8 @@ class Similarity:
             pose[:3, :3] = camera.viewmat[:3, :3] @ self.rotation.T
             pose[:3, 3] = self.scale * camera.viewmat[:3, 3] - pose[:3, :3] @ self.translation
             views.append(replace(camera, viewmat=pose))
-        return Cameras(tuple(views), frame=FRAME_FILE)
+        warnings = [warning for warning in cameras.warnings if warning != OWN_FRAME]
+        return Cameras(tuple(views), frame=FRAME_FILE, warnings=warnings)
 
 
 def read_frame(path: Path, applied: Mapping[str, Any], source: str) -> Similarity:
@@ -245,11 +329,6 @@ def read_frame(path: Path, applied: Mapping[str, Any], source: str) -> Similarit
     left = moved @ np.linalg.inv(before)
     left[:3] *= scale / _scale(applied.get("applied_scale", 1.0), f"{source} applied_scale")
     return Similarity.of(left, f"{path} transform")
-
-
-def frame_warning(cameras: Cameras) -> list[str]:
-    """What is to be said of cameras that may not be in the frame of their splats."""
-    return [OWN_FRAME] if cameras.of_nerfstudio else []
 
 
 def _affine(value: Any, source: str) -> np.ndarray:

@@ -25,7 +25,6 @@ import torch
 
 from liftcore.errors import InvalidSettings
 from liftcore.features.views import Regions
-from liftcore.io.transforms import frame_warning
 from liftcore.one_thread import one_thread
 from liftcore.planning.contradictions import LEAST_IN_VIEW, LEAST_ROW_SUM, empty, unseen
 from liftcore.planning.views import SAMPLE, WELL_COVERED, greedy, spread
@@ -139,7 +138,7 @@ def plan_photos(
         shown=tuple(shown_by(seen, weight, order, seconds)),
         seen_share=seen_share,
         row_sum=row_sum,
-        warnings=(*splats.warnings, *frame_warning(known), *distortion_warning(views), *told),
+        warnings=(*splats.warnings, *known.warnings, *distortion_warning(views), *told),
     )
 
 

@@ -16,7 +16,6 @@ import numpy as np
 from liftcore.device import CPU, Device
 from liftcore.errors import Unavailable
 from liftcore.features.pack import Views
-from liftcore.io.transforms import frame_warning
 from liftcore.one_thread import one_thread
 from liftcore.planning.contradictions import contradictions
 from liftcore.planning.views import (
@@ -216,7 +215,7 @@ def plan_lift(
         warnings=(*short, *check_memory(parts, free), *check_weights(in_files)),
         told=(
             *splats.warnings,
-            *frame_warning(views.cameras),
+            *views.cameras.warnings,
             *distortion_warning(cameras),
             *shape_warnings(features, cameras),
             *wrong,

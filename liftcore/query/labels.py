@@ -136,5 +136,7 @@ def _frame(scene: QueryScene) -> str:
     except InvalidLift:
         return "file"
     moved = cameras.frame is not None or cameras.of_nerfstudio
-    is_colmap = bool(path.name) and (camera_source(path).model is not None or zipfile.is_zipfile(path))
+    is_colmap = bool(path.name) and (
+        camera_source(path, scene.metadata.views).model is not None or zipfile.is_zipfile(path)
+    )
     return "colmap" if is_colmap and not moved else "file"

@@ -216,7 +216,8 @@ class QueryScene:
         from liftcore.io.cameras import read_cameras
 
         # Which of several models was meant, the lift knew: its digest tells that the same is read.
-        return read_cameras(self._unchanged("cameras", self.metadata.cameras), choosing=False)
+        path = self._unchanged("cameras", self.metadata.cameras)
+        return read_cameras(path, choosing=False, views=self.metadata.views)
 
     @cached_property
     def packs(self) -> Views:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:  # torch is taken, and not loaded for it
 
     Matrix = np.ndarray | Tensor | Sequence[Sequence[float]]
 
+R = TypeVar("R")
 ROUNDING = 1e-6  # of the last row of a pose
 MIN_FOCAL, MAX_FOCAL = 1e-3, 1e9  # pixels; float64 squares of what they project stay finite
 MAX_OFF_CENTRE = 1e9  # pixels of the principal point
@@ -29,11 +30,16 @@ MAX_VIEWS = 100_000  # of a scene: many times what anybody lifts, and read and c
 NEAREST = 3  # views named when one is unknown
 NEARLY_ALL = 0.995  # a share that would be told as 100%
 SHOWN = 120  # characters of a name that is unknown
+SKIPPED = 3  # views named of those that were skipped
 SAME_NAMES = (
     "a view is known by its photo's name without the suffix: rename photos, or, where training and test photos share "
     "names (Blender's scenes; Inria's cameras.json has the test views first), take one of both out or put "
     "their folders before them (train/r_0)"
 )
+
+
+class InvalidPose(InvalidCameras):
+    """A pose is no rigid motion: a file of many views is read without the view (`read_views`)."""
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -122,22 +128,25 @@ class Camera:
 
     def _check_pose(self, pose: np.ndarray) -> None:
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
-            self._refuse("pose", "a finite 4x4 matrix", f"shape {list(pose.shape)}")
+            self._refuse_pose("a finite 4x4 matrix", f"shape {list(pose.shape)}")
         if np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > ROUNDING:
-            self._refuse("pose", "0 0 0 1 as the last row", " ".join(f"{value:g}" for value in pose[3]))
+            self._refuse_pose("0 0 0 1 as the last row", " ".join(f"{value:g}" for value in pose[3]))
         rotation = pose[:3, :3]
         # Large entries are refused before the product, which they could overflow.
         error = float(np.abs(rotation).max())
         if error <= 2:
             error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
         if error > 1e-3 or np.linalg.det(rotation) < 0:
-            self._refuse("pose", "a proper rotation", _what_it_is(rotation, error))
+            self._refuse_pose("a proper rotation", _what_it_is(rotation, error))
         reach = float(np.abs(pose[:3, 3]).max())
         if reach > MAX_REACH:
-            self._refuse("pose", f"a translation within {MAX_REACH:g}", f"{reach:.2g}")
+            self._refuse_pose(f"a translation within {MAX_REACH:g}", f"{reach:.2g}")
 
     def _refuse(self, part: str, expected: str, got: str) -> None:
         raise InvalidCameras(f"camera {self.name!r} {part}", expected=expected, got=got)
+
+    def _refuse_pose(self, expected: str, got: str) -> None:
+        raise InvalidPose(f"camera {self.name!r} pose", expected=expected, got=got)
 
     @property
     def fx(self) -> float:
@@ -199,6 +208,7 @@ class Cameras(Mapping[str, Camera]):
         views: a mapping of names to cameras, whose names win over those of the cameras; or named cameras.
         frame: the name of the file by which they were moved to the frame of the splats.
         of_nerfstudio: as nerfstudio's own converter writes them, and not moved.
+        warnings: of their reader, for whoever plans or lifts with them: what was skipped, or lies beside unread.
 
     Raises:
         InvalidCameras: there are none, more than MAX_VIEWS, two of one name, or something else than cameras.
@@ -210,9 +220,11 @@ class Cameras(Mapping[str, Camera]):
         *,
         frame: str | None = None,
         of_nerfstudio: bool = False,
+        warnings: Iterable[str] = (),
     ) -> None:
         self.frame = frame
         self.of_nerfstudio = of_nerfstudio
+        self.warnings = tuple(warnings)
         alone = _cameras_in(views)
         if isinstance(views, Mapping):
             named = [view if view.name == name else view.replace(name=name) for name, view in views.items()]
@@ -292,7 +304,44 @@ def cameras_from(source: str) -> Iterator[None]:
         if source in error.argument:
             raise
         argument = f"{source} {error.argument}"
-        raise InvalidCameras(argument, expected=error.expected, got=error.got, hint=error.hint) from None
+        raise type(error)(argument, expected=error.expected, got=error.got, hint=error.hint) from None
+
+
+@contextmanager
+def pose_from() -> Iterator[None]:
+    """Raise what is wrong with the numbers of a pose as an `InvalidPose`."""
+    try:
+        yield
+    except InvalidCameras as error:
+        raise InvalidPose(error.argument, expected=error.expected, got=error.got, hint=error.hint) from None
+
+
+def read_views(
+    views: Iterable[tuple[str, R]], cameras_of: Callable[[str, R], list[Camera]]
+) -> tuple[list[Camera], list[str]]:
+    """The cameras of a file's views, and a warning that names those that were skipped for a broken pose.
+
+    Args:
+        views: names and records. cameras_of: of a name and its record, its cameras.
+
+    Raises:
+        InvalidCameras: a record is malformed elsewhere, or no view has a pose.
+    """
+    cameras: list[Camera] = []
+    broken: dict[str, InvalidPose] = {}
+    for name, record in views:
+        try:
+            cameras += cameras_of(name, record)
+        except InvalidPose as error:
+            broken[name] = error
+    if not broken:
+        return cameras, []
+    first = next(iter(broken.values()))
+    if not cameras:
+        raise first
+    some = ", ".join(map(repr, list(broken)[:SKIPPED])) + (", ..." if len(broken) > SKIPPED else "")
+    count = f"{len(broken)} cameras were skipped for broken poses and {len(cameras)} read"
+    return cameras, [f"{count}: {some}, the first with {first.got} in place of {first.expected}"]
 
 
 def check_count(count: int, source: str) -> None:

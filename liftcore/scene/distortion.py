@@ -26,7 +26,9 @@ WIDEST = float(np.tan(np.radians(60)))  # of a pinhole's image from its axis, in
 GROWTH = 0.5  # of the photo's sides, by which a pinhole's image is larger on each side at most
 LEAST_SHARE = 0.1  # of the photo that its pinhole has to see: with less the calibration is broken
 ROUNDING = 1e-3  # pixels
-BORDER_PLACES = 33  # on each side of the photo
+BORDER_PLACES = 33  # on each side of the photo, and again between the two about its nearest or farthest one
+NARROWINGS = 3  # so often, which finds that one to 1e-6 pixels of any photo
+INWARDS = np.array([1.0, 1.0, -1.0, -1.0])  # from the left, top, right and bottom side
 BAND_PIXELS = 1 << 15  # carried at a time: what that takes stays in the cache
 
 
@@ -192,8 +194,7 @@ class Lens:
         Raises:
             ValueError: a pinhole sees hardly anything of the photo; the message says why.
         """
-        left, top, right, bottom = self._sides
-        found = self._within_reach([np.max(left), np.max(top), np.min(right), np.min(bottom)])
+        found = self._within_reach(self._ends_of_sides(INWARDS))
         if found.left >= found.right or found.top >= found.bottom:
             raise ValueError("one that leaves a pinhole nothing of the photo")
         share = self._share_of(found)
@@ -209,9 +210,8 @@ class Lens:
 
         Where the photo's border shows no ray, because the lens turns back before it, what has rays ends there.
         """
-        left, top, right, bottom = self._sides
-        first = (int(np.floor(side.min())) for side in (left, top))
-        return Rectangle(*first, *(int(np.ceil(side.max())) for side in (right, bottom)))
+        left, top, right, bottom = self._ends_of_sides(-INWARDS)
+        return Rectangle(math.floor(left), math.floor(top), math.ceil(right), math.ceil(bottom))
 
     @cached_property
     def share(self) -> float:
@@ -223,21 +223,38 @@ class Lens:
         """How far from the axis rays have places of their own, on the plane; infinity: all that pinholes may see."""
         return self.distortion.reach(2 * WIDEST)
 
-    @cached_property
-    def _sides(self) -> list[np.ndarray]:
-        """The photo's left, top, right and bottom side [BORDER_PLACES] in pixels of the pinhole, x or y.
+    def _ends_of_sides(self, towards: np.ndarray) -> list[float]:
+        """The farthest that the photo's left, top, right and bottom side reach, in pixels of the pinhole, x or y.
+
+        A side is curved, and where the principal point is off the centre its end lies anywhere between places that
+        are evenly spaced: it is looked for between its neighbours, again and again.
+
+        Args:
+            towards: [4], 1 or -1 a side: the direction that is far, growing or shrinking x or y.
+        """
+        sides, low, high = np.arange(4), np.zeros((4, 1)), np.ones((4, 1))
+        found, end = np.zeros((4, 1)), np.zeros(4, np.int64)
+        for _ in range(NARROWINGS):
+            places = low + (high - low) * np.linspace(0, 1, BORDER_PLACES)
+            found = self._sides(places)
+            end = np.argmax(found * towards[:, None], axis=1)
+            low, high = (places[sides, (end + step).clip(0, BORDER_PLACES - 1)][:, None] for step in (-1, 1))
+        return found[sides, end].tolist()
+
+    def _sides(self, places: np.ndarray) -> np.ndarray:
+        """Places [4, n] in 0..1 along the photo's left, top, right and bottom side -> pixels of the pinhole, x or y.
 
         Where a side shows no ray, the last one in its direction stands for it.
         """
-        across, down = np.linspace(0, self.width, BORDER_PLACES), np.linspace(0, self.height, BORDER_PLACES)
-        u = np.stack([0 * down, across, 0 * down + self.width, across])
-        v = np.stack([down, 0 * across, down, 0 * across + self.height])
+        down, across = places[::2] * self.height, places[1::2] * self.width
+        u = np.stack([0 * down[0], across[0], 0 * down[1] + self.width, across[1]])
+        v = np.stack([down[0], 0 * across[0], down[1], 0 * across[1] + self.height])
         x, y = self.on_plane(u, v)
         towards = np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy])
         last = min(self._reach, 2 * WIDEST) * towards / np.maximum(np.hypot(*towards), np.finfo(np.float32).tiny)
         x, y = np.where(np.isnan(x), last[0], x), np.where(np.isnan(y), last[1], y)
         of_x, of_y = (self.fx, self.cx, self.width), (self.fy, self.cy, self.height)
-        return [_pixels(x[0], *of_x), _pixels(y[1], *of_y), _pixels(x[2], *of_x), _pixels(y[3], *of_y)]
+        return np.stack([_pixels(x[0], *of_x), _pixels(y[1], *of_y), _pixels(x[2], *of_x), _pixels(y[3], *of_y)])
 
     def _within_reach(self, sides: list[float]) -> Rectangle:
         """The whole pixels within such sides, drawn towards the axis until rays at the corners have places."""

@@ -20,8 +20,13 @@ cluster's feature only where that explains what the views say of it at least as 
 p_jv, c and the weights W' of the reweighting (`liftcore.solve.reweight`), which asks other views for each word::
 
     sum_m W'_jm max(0, cos(e_m, e_cluster))  >=  sum_m W'_jm ((1 - p_jv) c_jm + p_jv c)
+
+**How it splits**, where masks make the clusters: a cluster's feature is a sum over splats, taken by pieces
+(`cluster_sums`); whether a splat takes it is a function of its row of W and its own feature (`guard`, `spread`).
+HDBSCAN's sample and the footprints of clusters need all features in one place.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -43,8 +48,10 @@ from liftcore.solve.codebook import TABLE_BYTES
 from liftcore.solve.directions import RegionDirections
 from liftcore.solve.geometry import LiftViews
 from liftcore.solve.objects import RegionObjects
+from liftcore.solve.sums import PieceSums, added, piece_sums
 from liftcore.solve.weights import RegionWeights, run_each
 
+MASKS_MADE = {"filter": "none: masks made the clusters"}
 LEAST_LIGHT = 0.5  # of a ray, that splats must take for it to show a cluster: as for masks of answers
 
 
@@ -111,25 +118,29 @@ def aggregate(
     if clustering.count == 0:
         merged, facts = torch.zeros(0, features.shape[1], dtype=features.dtype), {}
     elif things is not None:
-        merged, facts = evidence_means(features, evidence, clustering), {"filter": "none: masks made the clusters"}
+        merged, facts = evidence_means(features, evidence, clustering, threads), MASKS_MADE
     elif any(views.features.is_regions(name) for name in names):
         kept = filter_regions(clustering, features.shape[1], raster, views, settings, progress)
         merged, masks = kept_means(kept, features.dtype), kept.masks
         facts = {"filter": "iou", "regions": kept.regions, "kept_regions": int(kept.counts.sum())}
     else:
-        merged = evidence_means(features, evidence, clustering)
+        merged = evidence_means(features, evidence, clustering, threads)
         facts = {"filter": "none: grids have no regions"}
-    taken = with_feature(clustering.labels, merged)
+    taken, guarded = with_feature(clustering.labels, merged), None
     if judged is not None and clustering.count:
-        W, directions, own = judged
-        explained = explained_by(W, directions, clustering.labels, merged, threads)
-        guarded = taken & (explained < own - RESOLUTION)  # what differs by less is one vector in float16
-        taken &= ~guarded
-        facts |= {"guarded": float(guarded.float().mean())}
+        guarded = guard(taken, clustering.labels, merged, *judged, threads)
     spread(features, clustering.labels, merged, taken)
     progress("aggregate", len(names), len(names), "views")
-    facts = clustering_facts(clustering, merged) | facts | {"changed": float(taken.float().mean())}
+    facts = facts | aggregation_facts(clustering, merged, taken, guarded)
     return Aggregation(clustering.labels, merged, facts, ~taken, tuple(masks.get(name) for name in names))
+
+
+def aggregation_facts(
+    clustering: Clustering, merged: Tensor, taken: Tensor, guarded: Tensor | None
+) -> dict[str, Any]:
+    """What the certificate says of clusters, and of the splats that took a feature or were kept from it [P] bool."""
+    facts = clustering_facts(clustering, merged) | {"changed": float(taken.float().mean())}
+    return facts if guarded is None else facts | {"guarded": float(guarded.float().mean())}
 
 
 def clustering_facts(clustering: Clustering, merged: Tensor) -> dict[str, Any]:
@@ -140,6 +151,30 @@ def clustering_facts(clustering: Clustering, merged: Tensor) -> dict[str, Any]:
         "unclustered_share": float((clustering.labels == NO_CLUSTER).float().mean()),
         **clustering.facts,
     }
+
+
+def guard(
+    taken: Tensor,
+    labels: Tensor,
+    merged: Tensor,
+    W: RegionWeights,
+    directions: RegionDirections,
+    own: Tensor,
+    threads: int | None = None,
+) -> Tensor:
+    """Take from those that are to take a feature [n] bool what it would explain worse than their own, in place.
+
+    Args:
+        labels, merged: of `explained_by`. W: reweighted, of the same block of splats. own: [n] f32, what their own
+            features explain.
+
+    Returns:
+        [n] bool, the splats that were taken out.
+    """
+    explained = explained_by(W, directions, labels, merged, threads)
+    guarded = taken & (explained < own - RESOLUTION)  # what differs by less is one vector in float16
+    taken &= ~guarded
+    return guarded
 
 
 @one_thread()
@@ -219,18 +254,38 @@ def kept_means(kept: KeptRegions, dtype: torch.dtype) -> Tensor:
     return torch.from_numpy(means).to(dtype)
 
 
-def evidence_means(features: Tensor, evidence: np.ndarray, clustering: Clustering) -> Tensor:
+def evidence_means(
+    features: Tensor, evidence: np.ndarray, clustering: Clustering, threads: int | None = None
+) -> Tensor:
     """[K, F]: the mean of the features of each cluster's splats, weighted by their evidence."""
-    labels = clustering.labels.numpy()
-    sums, totals = np.zeros((clustering.count, features.shape[1])), np.zeros(clustering.count)
-    for first in range(0, labels.size, BLOCK):
-        own = np.flatnonzero(labels[first : first + BLOCK] >= 0)
-        clusters, weights = labels[first + own], evidence[first + own]
-        shares = csr_matrix((weights, (clusters, np.arange(own.size))), shape=(clustering.count, own.size))
-        sums += shares @ features[torch.from_numpy(first + own)].to(torch.float32).numpy()
-        totals += np.bincount(clusters, weights, minlength=clustering.count)
-    means = np.divide(sums, totals[:, None], out=sums, where=totals[:, None] > 0)
-    return torch.from_numpy(means).to(features.dtype)
+    sums = cluster_sums(features, evidence, clustering.labels.numpy(), clustering.count, threads)
+    return cluster_means(added(sums, (features.shape[1] + 1, clustering.count)), features.dtype)
+
+
+def cluster_sums(
+    features: Tensor, evidence: np.ndarray, labels: np.ndarray, count: int, threads: int | None = None
+) -> Iterator[PieceSums]:
+    """What a block of splats adds to its clusters, at every piece: [F + 1, K], features by evidence, and evidence.
+
+    Args:
+        features: [n, F] f16 or f32. evidence: [n]. labels: [n] i32 below the count, -1 for none.
+    """
+
+    def add(first: int, last: int, table: np.ndarray) -> None:
+        for begin in range(first, last, BLOCK):
+            own = begin + np.flatnonzero(labels[begin : min(begin + BLOCK, last)] >= 0)
+            clusters, weights = labels[own], evidence[own]
+            shares = csr_matrix((weights, (clusters, np.arange(own.size))), shape=(count, own.size))
+            table[:-1] += (shares @ features[torch.from_numpy(own)].to(torch.float32).numpy()).T
+            table[-1] += np.bincount(clusters, weights, minlength=count)
+
+    return piece_sums(add, labels.size, (features.shape[1] + 1, count), threads)
+
+
+def cluster_means(sums: np.ndarray, dtype: torch.dtype) -> Tensor:
+    """[K, F], from the sums [F + 1, K] f64 of all splats (`cluster_sums`)."""
+    means = np.divide(sums[:-1], sums[-1], out=np.zeros_like(sums[:-1]), where=sums[-1] > 0)
+    return torch.from_numpy(means.T).to(dtype).contiguous()
 
 
 def with_feature(labels: Tensor, merged: Tensor) -> Tensor:

@@ -7,21 +7,25 @@ The closed form is the smallest ``sum_jm W_jm |x_j - e_m|^2``. With Huber's loss
 which is convex. Its smallest is found by reweighting (IRLS; Huber, *Robust Statistics*, 1981): the closed form of
 ``W'_jm = W_jm min(1, delta / d_jm)``, with the distances d of the step before, never raises the sum. delta is the
 scene's mean distance at the first closed form, ``sum W d / sum W``, so that nothing depends on how long features are.
+
+**How it splits.** delta is a sum over splats, taken by pieces; all else is a function of a splat's row of W.
 """
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from liftcore.device import CPU
-from liftcore.jit import vectorised
+from liftcore.jit import kernel, vectorised
 from liftcore.one_thread import one_thread
 from liftcore.progress import Progress, silent
 from liftcore.solve.closed_form import morton_codes
 from liftcore.solve.codebook import Codebook
 from liftcore.solve.memory import zeros
+from liftcore.solve.sums import PieceSums, added, piece_sums
 from liftcore.solve.weights import BLOCK_ENTRIES, BLOCK_ROWS, MEMORY_LIMIT, RegionWeights, row_blocks, run_each
 
 STEPS = 3  # of reweighting, which hardly move features further
@@ -36,37 +40,78 @@ def huber_factors(
     *,
     means: Tensor | None = None,
     threads: int | None = None,
+    delta: float | None = None,
 ) -> Tensor:
     """What each entry of W is multiplied with, [nnz] f32 in 0..1, for its closed form to be that of Huber's loss.
 
     Args:
-        W: of all views by rows of codebooks, on the CPU. means: [P, 3] of the splats; neighbours go together.
+        W: of all views by rows of codebooks, on the CPU; of all splats, or of a block of them where delta is known.
+        means: [n, 3] of the splats; neighbours go together.
         threads: None takes the cores that this process may use. The number changes no bit.
+        delta: of the scene; None: of these splats.
     """
-    rows = torch.nonzero(W.indptr.diff())[:, 0]
-    rows = rows if means is None else rows[torch.argsort(morton_codes(means[rows]))]
-    blocks = row_blocks(W.indptr.diff()[rows].numpy(), BLOCK_ROWS, BLOCK_ENTRIES)
-    longest = max((float(own.max()) for own in codebook.lengths if own.numel()), default=0.0)
-    # Squares of very long and short rows have no place in float32, nor has the scale of what it hardly holds itself.
-    scale = 2.0 ** min(-round(math.log2(longest)), MOST_SCALE) if longest > 0 else 1.0
-    in_file = 8 * W.weight.shape[0] > MEMORY_LIMIT
-    factors, delta = zeros(tuple(W.weight.shape), torch.float32, name="weights", in_file=in_file), 0.0
+    distances = RegionDistances(W, codebook, means, threads)
+    factors = zeros(tuple(W.weight.shape), torch.float32, name="weights", in_file=distances.in_file)
     factors += 1.0
     for step in range(STEPS):
-        squares = zeros(tuple(W.weight.shape), torch.float32, name="weights", in_file=in_file)
-        for columns in codebook.slices():
-            table = codebook.values(columns, CPU.place).mul_(scale).numpy()
-            arrays = [part.numpy() for part in (W.indptr, W.region, W.weight, factors, squares)]
-            run_each(add_squares, [(rows[first:last].numpy(), *arrays, table) for first, last in blocks], threads)
-        distances = squares.sqrt_()
-        parts = [slice(first, first + BLOCK_ENTRIES) for first in range(0, squares.shape[0], BLOCK_ENTRIES)]
-        if step == 0:
-            moved = sum(float(W.weight[own].double() @ distances[own].double()) for own in parts)
-            delta = moved / (float(W.row_sums().sum()) or 1.0)
-        for own in parts:
-            factors[own] = torch.where(distances[own] > delta, delta / distances[own], 1.0)
+        found = distances.after(factors)
+        if delta is None:
+            delta = mean_distance(added(distances.sums(found), (2, 1)))
+        for first in range(0, found.shape[0], BLOCK_ENTRIES):
+            own = slice(first, first + BLOCK_ENTRIES)
+            factors[own] = torch.where(found[own] > delta, delta / found[own], 1.0)
         progress("loss", step + 1, STEPS, "steps")
     return factors
+
+
+def mean_distance(sums: np.ndarray) -> float:
+    """delta, from the sums [2, 1] f64 of all splats (`RegionDistances.sums`)."""
+    return float(sums[0, 0]) / (float(sums[1, 0]) or 1.0)
+
+
+class RegionDistances:
+    """``|x_j - e_m|`` of the entries of a block of splats, times a power of two that the codebook gives.
+
+    Args: as `huber_factors` has them.
+    """
+
+    def __init__(self, W: RegionWeights, codebook: Codebook, means: Tensor | None, threads: int | None) -> None:
+        self.W, self.codebook, self.threads = W, codebook, threads
+        self.in_file = 8 * W.weight.shape[0] > MEMORY_LIMIT
+        rows = torch.nonzero(W.indptr.diff())[:, 0]
+        self.rows = rows if means is None else rows[torch.argsort(morton_codes(means[rows]))]
+        self.blocks = row_blocks(W.indptr.diff()[self.rows].numpy(), BLOCK_ROWS, BLOCK_ENTRIES)
+        longest = max((float(own.max()) for own in codebook.lengths if own.numel()), default=0.0)
+        # Squares of very long and short rows have no place in float32, nor has the scale of what it hardly holds.
+        self.scale = 2.0 ** min(-round(math.log2(longest)), MOST_SCALE) if longest > 0 else 1.0
+
+    def after(self, factors: Tensor) -> Tensor:
+        """[nnz] f32, with x_j of the closed form of W times these factors [nnz] f32."""
+        W = self.W
+        squares = zeros(tuple(W.weight.shape), torch.float32, name="weights", in_file=self.in_file)
+        arrays = [part.numpy() for part in (W.indptr, W.region, W.weight, factors, squares)]
+        for columns in self.codebook.slices():
+            table = self.codebook.values(columns, CPU.place).mul_(self.scale).numpy()
+            blocks = [(self.rows[first:last].numpy(), *arrays, table) for first, last in self.blocks]
+            run_each(add_squares, blocks, self.threads)
+        return squares.sqrt_()
+
+    def sums(self, distances: Tensor) -> Iterator[PieceSums]:
+        """``W d`` and ``W`` at every piece of the block, [2, 1]."""
+        indptr, weight, moved = (part.numpy() for part in (self.W.indptr, self.W.weight, distances))
+
+        def add(first: int, last: int, table: np.ndarray) -> None:
+            add_distances(first, last, indptr, weight, moved, table)
+
+        return piece_sums(add, indptr.size - 1, (2, 1), self.threads)
+
+
+@kernel
+def add_distances(first, last, indptr, weight, distances, sums):
+    """Add ``W d`` and ``W`` of rows ``first..last``."""
+    for k in range(indptr[first], indptr[last]):
+        sums[0, 0] += weight[k] * np.float64(distances[k])
+        sums[1, 0] += weight[k]
 
 
 @vectorised

@@ -20,7 +20,7 @@ from liftcore.io import cameras, json_file
 from liftcore.io.cameras import MODEL_FOLDERS, other_models, read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.inspect import describe_camera_file, inspect_file
-from liftcore.io.lift_file import has_poses, poses_of
+from liftcore.io.lift_file import camera_input, has_poses, poses_of
 from liftcore.result import LiftMetadata
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.distortion import Brown, Fisheye, Lens
@@ -306,8 +306,8 @@ def test_what_is_whole_is_preferred_and_what_is_named_is_read(tmp_path: Path) ->
 
 
 def test_folder_without_a_usual_name_says_what_can_be_named(tmp_path: Path) -> None:
-    (tmp_path / "transforms_train.json").write_text("{}")
-    with pytest.raises(InvalidCameras, match=r"name what is meant, such as .*transforms_train\.json"):
+    (tmp_path / "transforms_test.json").write_text("{}")
+    with pytest.raises(InvalidCameras, match=r"name what is meant, such as .*transforms_test\.json"):
         read_cameras(tmp_path)
     with pytest.raises(InvalidCameras, match=r"a folder without any of them$"):
         read_cameras(write_files(tmp_path / "empty", {}))
@@ -329,7 +329,7 @@ def test_camera_that_no_image_uses_may_be_of_any_model(tmp_path: Path) -> None:
     [
         ("sparse/0/cameras.bin", r"got 'sparse/0/cameras\.bin' without 'images\.bin'; zip both"),
         ("images.txt", r"got 'images\.txt' without 'cameras\.txt'; zip both"),
-        ("data/transforms.json", r"got 'data/transforms\.json'; give the JSON file itself, or zip it with"),
+        ("data/cameras.json", r"got 'data/cameras\.json'; give the JSON file itself"),
         ("photo.jpg", "got photos; give the COLMAP model"),
     ],
 )
@@ -374,3 +374,99 @@ def test_lifts_that_remember_names_as_a_mac_wrote_them_know_their_cameras(tmp_pa
     assert old.views == tuple(found) and has_poses(path, old)
     assert has_poses(path, old.model_copy(update={"poses": poses_of(known)}))
     assert not has_poses(path, old.model_copy(update={"poses": poses_of(known[:1])}))
+
+
+def named_model(*names: str, shift: float = 0.0) -> dict[str, bytes]:
+    """A model of images of these names, whose places tell it from others."""
+    return binary_files(
+        images=[(1, (1.0, 0.0, 0.0, 0.0), (shift, 0.0, float(k)), name) for k, name in enumerate(names)]
+    )
+
+
+ALL = [f"IMG_{k}.jpg" for k in range(6)]
+
+
+@pytest.mark.parametrize("place", ["sparse/{}", "colmap/sparse/{}", "dense/{}/sparse", "{}"])
+@pytest.mark.parametrize("packed", [False, True])
+def test_of_several_models_the_one_of_the_views_is_read_and_else_the_largest(
+    place: str, packed: bool, tmp_path: Path
+) -> None:
+    scene = tmp_path / "scene"
+    for number, images in ((0, ALL[:2]), (1, ALL), (2, ["other.jpg", "IMG_0.jpg", "third.jpg"]), (10, ALL)):
+        write_files(scene / place.format(number), named_model(*images, shift=float(number)))
+    write_files(scene / place.format(3), {**binary_files(), "images.bin": b"cut"})
+    path = zipped(scene, ".") if packed else scene
+    for views, number in (
+        ((), 1),  # of 1 and 10, which are as large, the first
+        (["IMG_4", "IMG_5"], 1),
+        (["other", "third"], 2),
+        (["IMG_0", "other"], 2),
+        (["nowhere"], 1),
+    ):
+        cameras = read_cameras(path, views=views)
+        assert {camera.viewmat[0, 3] for camera in cameras.values()} == {float(number)}
+        [told] = cameras.warnings
+        assert told.startswith(f"{place.format(number)} ({len(cameras)} images")
+        assert re.search(rf"and {place.format(0)} \(2 images", told)
+        assert told in inspect_file(path)["warnings"] or views
+    assert other_models(path) == []
+    assert len(read_cameras(scene / place.format(0))) == 2  # what is named is read
+    assert read_cameras(scene / place.format(0)).warnings == ()
+
+
+def test_one_model_of_a_later_number_is_read_without_a_word(tmp_path: Path) -> None:
+    write_files(tmp_path / "scene/sparse/1", named_model(*ALL))
+    for path in (tmp_path / "scene", zipped(tmp_path / "scene", ".")):
+        assert len(read_cameras(path)) == 6 and read_cameras(path).warnings == ()
+
+
+def test_scenes_in_numbered_folders_are_no_models_of_one(tmp_path: Path) -> None:
+    for number in (24, 37):
+        write_files(tmp_path / "scans" / str(number), named_model(*ALL, shift=float(number)))
+    with pytest.raises(InvalidCameras, match=r"name what is meant, such as .*/24 or .*/37"):
+        read_cameras(tmp_path / "scans")
+
+
+def test_a_lift_of_one_of_several_models_is_asked_with_the_same(tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    write_files(scene / "sparse/0", named_model("a.jpg", "b.jpg"))
+    write_files(scene / "sparse/1", named_model(*ALL))
+    of_few, of_many = camera_input(scene, ["a", "b"]), camera_input(scene, ["IMG_0"])
+    assert of_few.path == of_many.path and of_few.sha256 != of_many.sha256
+    assert camera_input(scene).sha256 == of_many.sha256
+
+
+BROKEN_POSES = {
+    "a zero quaternion": binary_files(images=[*IMAGES, (1, (0.0,) * 4, (0.0,) * 3, "broken.jpg")]),
+    "a place that is no number": text_files(images=[*IMAGES, (1, IMAGES[0][1], (math.nan, 0.0, 0.0), "broken.jpg")]),
+}
+
+
+@pytest.mark.parametrize("what", BROKEN_POSES)
+def test_a_broken_pose_of_a_model_is_named_and_the_others_are_read(what: str, tmp_path: Path) -> None:
+    whole = read_cameras(write_files(tmp_path / "whole", binary_files()))
+    path = write_files(tmp_path / "model", BROKEN_POSES[what])
+    cameras = read_cameras(path)
+    assert_same(cameras, whole)
+    assert any("1 cameras were skipped" in text and "'broken'" in text for text in inspect_file(path)["warnings"])
+
+
+def test_broken_poses_of_json_are_named_and_the_others_are_read(tmp_path: Path) -> None:
+    good = {**TWICE, "img_name": "good.png"}
+    records = [
+        good,
+        {**good, "img_name": "a", "rotation": [[2, 0, 0]] * 3},
+        {**good, "img_name": "b", "position": None},
+    ]
+    frame = TRANSFORMS["frames"][0]
+    still = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    poses = {"a": [[2.0, 0, 0, 0], *frame["transform_matrix"][1:]], "b": None, "c": [[math.nan] * 4] * 3, "d": still}
+    frames = [{**frame, "file_path": "good.png"}]
+    frames += [{"file_path": name, "transform_matrix": pose} for name, pose in poses.items()]
+    for document, skipped in ((records, 2), ({**TRANSFORMS, "frames": frames}, 4)):
+        path = with_json(tmp_path, document)
+        assert names(path) == ["good"]
+        [told] = read_cameras(path).warnings
+        assert f"{skipped} cameras were skipped" in told and "'a', 'b'" in told
+    with pytest.raises(InvalidCameras, match="'fx'"):  # what is wrong elsewhere is refused
+        read_cameras(with_json(tmp_path, [good, {key: value for key, value in good.items() if key != "fx"}]))

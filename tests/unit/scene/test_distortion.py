@@ -207,6 +207,50 @@ def test_a_photo_whose_corners_show_no_ray_is_lifted_as_far_as_it_shows_some(
     assert drawn.width >= view.width and drawn.height >= view.height
 
 
+def turns_back(lens: Lens) -> bool:
+    """Whether two places of the photo show one ray, by the lens's slopes at dense places from its axis."""
+    angles = np.linspace(0, 2 * np.pi, 180, endpoint=False)[:, None]
+    radii = np.tan(np.linspace(0, np.arctan(2 * math.tan(math.radians(60))), 1500))
+    x, y, h = radii * np.cos(angles), radii * np.sin(angles), 1e-6
+    right, left, below, above = (lens.distortion.bent(x + a, y + b) for a, b in ((h, 0), (-h, 0), (0, h), (0, -h)))
+    slopes = [
+        (p - q) / (2 * h) for one, other in ((right, left), (below, above)) for p, q in zip(one, other, strict=True)
+    ]
+    back = ~((slopes[0] * slopes[3] - slopes[1] * slopes[2] > 0) & (slopes[0] + slopes[3] > 0))
+    u, v = lens.on_photo(x, y)
+    beside = (u < 0) | (u > lens.width) | (v < 0) | (v > lens.height)
+    ends = [np.where(found.any(axis=1), found.argmax(axis=1), radii.size) for found in (back, beside)]
+    return bool((ends[0] < ends[1]).any())
+
+
+def test_no_lens_is_refused_for_a_principal_point_off_the_centre() -> None:
+    rng = np.random.default_rng(7)
+    healthy = 0
+    for _ in range(60):
+        width, height = [(1752, 1168), (1920, 1080), (4000, 3000), (1080, 1920)][rng.integers(4)]
+        focal = width * rng.uniform(0.45, 0.9)
+        centre = width / 2 + width * rng.uniform(-0.02, 0.02), height / 2 + height * rng.uniform(-0.02, 0.02)
+        few = rng.uniform(-1, 1, size=5)
+        fisheye = Fisheye(-0.03 + 0.03 * few[0], 0.01 * few[1], 0.005 * few[2], 0.001 * few[3])
+        brown = Brown(k1=-0.12 + 0.2 * few[0], k2=0.08 + 0.02 * few[1], p1=0.002 * few[2], p2=0.002 * few[3])
+        for distortion in (fisheye, brown):
+            lens = Lens(width, height, focal, focal, *centre, distortion)
+            if turns_back(lens):
+                continue
+            healthy += 1
+            box = lens.inner  # which is refused by none
+            steps = np.linspace(0, 1, 2001)
+            u = np.concatenate(
+                [box.left + (box.right - box.left) * steps] * 2 + [0 * steps + box.left, 0 * steps + box.right]
+            )
+            v = np.concatenate(
+                [0 * steps + box.top, 0 * steps + box.bottom] + [box.top + (box.bottom - box.top) * steps] * 2
+            )
+            x, y = lens.on_photo((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy)
+            assert min(x.min(), y.min(), width - x.max(), height - y.max()) > -1e-3
+    assert healthy > 90
+
+
 def test_warning_tells_the_least_share_and_knows_no_hundred_percent_or_more() -> None:
     barrel, slight, plain = (
         camera(Brown(k1=-0.25)),

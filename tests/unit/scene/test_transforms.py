@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import math
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from camera_files import CAMERAS, assert_same, binary_files, with_json, write_files
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from liftcore.errors import InvalidCameras, Unavailable
@@ -370,3 +373,144 @@ def test_full_disk_is_no_broken_zip(run: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(cameras, "_unzip_one", full)
     with pytest.raises(Unavailable, match=r"expected room in .* for what is in the zip, got a full disk; make room"):
         read_cameras(zipped(run))
+
+
+def photo(path: Path, size: tuple[int, int], orientation: int = 1) -> None:
+    """A photo of stored pixels, most of which end early: the header alone can be read."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    content = io.BytesIO()
+    kind = {"jpg": "JPEG", "jpeg": "JPEG", "png": "PNG", "webp": "WEBP"}[path.suffix[1:].lower()]
+    Image.effect_noise(size, 90).convert("RGB").save(content, format=kind, exif=exif)
+    whole = content.getvalue()
+    path.write_bytes(whole if kind == "WEBP" else whole[: len(whole) * 2 // 3])
+
+
+def blender(*paths: str) -> dict[str, Any]:
+    frames = [{"file_path": path, "rotation": 0.01, "transform_matrix": np.eye(4).tolist()} for path in paths]
+    return {"camera_angle_x": math.pi / 2, "frames": frames}
+
+
+@pytest.mark.parametrize(
+    ("file_path", "file"),
+    [
+        ("./train/r_0", "train/r_0.png"),
+        ("train/r_0", "train/r_0.JPG"),
+        ("images/a.jpg", "images/a.jpg"),
+        ("images/a.jpg", "images/a.JPG"),  # from a system that makes no difference
+        ("images\\a.png", "images/a.png"),
+        ("images/frame.0001", "images/frame.0001.jpeg"),
+        ("../images/a.png", "../images/a.png"),  # colmap2nerf's, of a file in a folder of its own
+        ("/data/somewhere/images/a.png", "images/a.png"),  # of another machine
+        ("C:/data/images/a.png", "images/a.png"),
+        ("a", "a.webp"),
+    ],
+)
+def test_the_size_of_photos_is_in_their_headers(file_path: str, file: str, tmp_path: Path) -> None:
+    scene = tmp_path / "scene/nerf"
+    photo(scene / file, (30, 20), orientation=6)
+    photo(scene / "depth/a.png", (7, 7))
+    scene.mkdir(exist_ok=True)
+    (scene / "transforms_train.json").write_text(json.dumps(blender(file_path)))
+    paths = [scene / "transforms_train.json", scene]
+    if not file.startswith(".."):
+        paths.append(zipped(scene))
+    for path in paths:
+        [view] = read_cameras(path).values()
+        assert (view.width, view.height) == (30, 20)  # as it is stored: trainers do not turn it
+        assert (view.fx, view.fy, view.cx, view.cy) == (pytest.approx(15), pytest.approx(15), 15, 10)
+
+
+def test_each_frame_has_the_size_of_its_own_photo(tmp_path: Path) -> None:
+    for name, size in (("a", (30, 20)), ("b", (20, 30))):
+        photo(tmp_path / f"train/{name}.png", size)
+    path = with_json(tmp_path, blender("./train/a", "./train/b"))
+    assert [(view.width, view.height) for view in read_cameras(path).values()] == [(30, 20), (20, 30)]
+    path.write_text(json.dumps({**blender("./train/a", "./train/c"), "w": 9, "h": 8}))
+    assert {(view.width, view.height) for view in read_cameras(path).values()} == {(9, 8)}  # which come before
+
+
+def test_a_photo_that_is_not_there_is_named(tmp_path: Path) -> None:
+    path = with_json(tmp_path, blender("./train/a", "./train/c"))
+    photo(tmp_path / "train/a.png", (30, 20))
+    with pytest.raises(InvalidCameras, match=r"frame 'c'.*size, w and h, got none, and no photo \S*/train/c \(\.png"):
+        read_cameras(path)
+    (tmp_path / "train/c.jpg").write_bytes(b"no photo")
+    with pytest.raises(InvalidCameras, match=r"frame 'c'.*does not open as one \(\S*/train/c\.jpg\)"):
+        read_cameras(path)
+
+
+def test_photos_elsewhere_than_beside_the_file_are_not_looked_at(tmp_path: Path) -> None:
+    photo(tmp_path / "secret/a.png", (30, 20))
+    folder = tmp_path / "data/assets/one"
+    folder.mkdir(parents=True)
+    for outside in (str(tmp_path / "secret/a.png"), "../../../secret/a.png", "x/../../../../secret/a.png"):
+        with pytest.raises(InvalidCameras, match="no photo"):
+            read_cameras(with_json(folder, blender(outside)))
+
+
+def test_a_folder_of_train_and_test_reads_train_and_names_the_others(tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    for part in ("train", "test", "val"):
+        photo(scene / part / "r_0.png", (30, 20))
+        (scene / f"transforms_{part}.json").write_text(json.dumps(blender(f"./{part}/r_0")))
+    change(scene / "transforms_test.json", camera_angle_x=1.0)
+    for path in (scene, zipped(scene)):
+        cameras = read_cameras(path)
+        assert cameras["r_0"].fx == pytest.approx(15)
+        [told] = cameras.warnings
+        assert re.search("transforms_train.json was read, and transforms_test.json, transforms_val.json not", told)
+    assert read_cameras(scene / "transforms_test.json").warnings == ()
+
+
+def exported(cameras: Cameras, path: Path, **own: Any) -> Path:
+    """What ``ns-export cameras`` writes of cameras in the frame of the splats: camera to world, y up and z back."""
+    records = []
+    for camera in cameras.values():
+        pose = np.linalg.inv(camera.viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        records.append(
+            {"file_path": f"/data/scene/images_2/{camera.name}.jpg", "transform": pose[:3].tolist(), **own}
+        )
+    path.write_text(json.dumps(records))
+    return path
+
+
+def test_an_export_of_nerfstudio_has_poses_of_the_splats_and_intrinsics_of_the_data(
+    run: Path, expected: Cameras
+) -> None:
+    (run / FRAME_FILE).unlink()
+    path = exported(Cameras(list(expected.values())[:2]), run / "transforms_train.json")
+    exported(Cameras(list(expected.values())[2:]), run / "transforms_eval.json")
+    two = Cameras(list(expected.values())[:2])
+    for given in (path, run, zipped(run)):
+        cameras = read_cameras(given)
+        assert_same(cameras, two)
+        assert all("trains in another frame" not in text for text in cameras.warnings)
+    assert any("transforms_eval.json not" in text for text in read_cameras(run).warnings)
+    assert len(read_cameras(run / "transforms_eval.json")) == 1
+    before = camera_input(path)
+    change(run / "transforms.json", fl_x=7.0)
+    assert camera_input(path).sha256 != before.sha256
+
+
+def test_the_frame_of_a_run_does_not_move_its_export_again(run: Path, expected: Cameras) -> None:
+    path = exported(expected, run / "transforms_train.json")
+    for given in (path, run, zipped(run)):
+        assert_same(read_cameras(given), expected)
+
+
+def test_an_export_without_intrinsics_is_refused_as_what_it_is(run: Path, expected: Cameras, tmp_path: Path) -> None:
+    alone = exported(expected, tmp_path / "transforms_train.json")
+    with pytest.raises(
+        InvalidCameras, match=r"export \(ns-export cameras\), which has poses alone; put the transforms"
+    ):
+        read_cameras(alone)
+    own = {"fl_x": 50.0, "w": 64, "h": 48}
+    [view, *_] = read_cameras(exported(expected, alone, **own)).values()
+    assert (view.fx, view.fy, view.width, view.cx) == (50.0, 50.0, 64, 32.0)
+    of_another = {"frames": [{"file_path": "other.jpg", "fl_x": 5, "w": 9, "h": 9}]}
+    exported(expected, alone)
+    (tmp_path / "transforms.json").write_text(json.dumps(of_another))
+    with pytest.raises(InvalidCameras, match="got none of 'frame 1'"):
+        read_cameras(alone)

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from liftcore.solve import objects
+from liftcore.solve.aggregate import cluster_means, cluster_sums, guard, with_feature
 from liftcore.solve.codebook import Codebook
 from liftcore.solve.consensus import (
     SplatTuples,
@@ -21,6 +22,7 @@ from liftcore.solve.consensus import (
     with_mean,
 )
 from liftcore.solve.directions import RegionDirections, region_totals
+from liftcore.solve.loss import RegionDistances, huber_factors, mean_distance
 from liftcore.solve.membership import RegionGroups, memberships
 from liftcore.solve.reweight import SceneAgreement, ViewConsistency, agreement_factors
 from liftcore.solve.rows import SomeRows, gather_rows, take_rows
@@ -226,3 +228,40 @@ def test_objects_by_blocks_are_those_of_the_whole_scene(
     assert (got.labels >= 0).any() and len(got.views) > 1
     for name in ("labels", "views", "regions"):
         np.testing.assert_array_equal(getattr(got, name), getattr(whole, name))
+
+
+def test_hubers_loss_in_blocks_is_that_of_the_whole_scene(
+    W: RegionWeights, means: torch.Tensor, codebook: Codebook, blocks: list[tuple[int, int]]
+) -> None:
+    whole = huber_factors(W, codebook, means=means, threads=2)
+    parts = [(W.of_splats(first, last), means[first:last]) for first, last in blocks]
+    sums = []
+    for part, own in parts:
+        distances = RegionDistances(part, codebook, own, 1)
+        sums += distances.sums(distances.after(torch.ones_like(part.weight)))
+    delta = mean_distance(added(over_files(sums), (2, 1)))
+    factors = [huber_factors(part, codebook, means=own, threads=1, delta=delta) for part, own in parts]
+    assert torch.equal(torch.cat(factors), whole) and len(torch.unique(whole)) > 1000
+
+
+def test_clusters_of_blocks_have_the_features_of_the_whole_scene(
+    W: RegionWeights, codebook: Codebook, blocks: list[tuple[int, int]]
+) -> None:
+    rng = np.random.default_rng(5)
+    features = torch.from_numpy(rng.normal(size=(SPLATS, 9)).astype(np.float16))
+    labels, evidence = rng.integers(-1, 4, SPLATS).astype(np.int32), rng.random(SPLATS).astype(np.float32)
+    directions, own = RegionDirections.of_weights(W, codebook), torch.full((SPLATS,), 0.2)
+    whole = cluster_means(added(cluster_sums(features, evidence, labels, 4, 2), (10, 4)), torch.float32)
+    sums = [part for a, b in blocks for part in cluster_sums(features[a:b], evidence[a:b], labels[a:b], 4, 1)]
+    merged = cluster_means(added(over_files(sums), (10, 4)), torch.float32)
+    assert torch.equal(merged, whole)
+    weights = features.double().numpy() * evidence[:, None]
+    expected = [weights[labels == k].sum(axis=0) / evidence[labels == k].sum(dtype=np.float64) for k in range(4)]
+    np.testing.assert_allclose(merged.numpy(), expected, rtol=1e-5, atol=1e-7)
+    taken = with_feature(torch.from_numpy(labels), merged)
+    guarded = guard(taken, torch.from_numpy(labels), merged, W, directions, own, 2)
+    assert 0 < int(guarded.sum()) < int((labels >= 0).sum())
+    for a, b in blocks:
+        part = with_feature(torch.from_numpy(labels[a:b]), merged)
+        again = guard(part, torch.from_numpy(labels[a:b]), merged, W.of_splats(a, b), directions, own[a:b], 1)
+        assert torch.equal(again, guarded[a:b]) and torch.equal(part, taken[a:b])

@@ -1,0 +1,130 @@
+"""Photos as files: what their headers say of size and orientation, and which photo of a folder a camera is of."""
+
+from __future__ import annotations
+
+import posixpath
+import warnings
+import zipfile
+from collections import defaultdict
+from pathlib import Path, PurePosixPath
+from typing import IO, NamedTuple
+
+from liftcore.errors import InvalidInput
+from liftcore.scene.views import IMAGE_SUFFIXES, without_image_suffix
+
+ORIENTATION = 0x0112  # EXIF's tag
+UPRIGHT, LARGEST_TAG, LEAST_SIDEWAYS = 1, 8, 5  # its values; from 5 on, turning a photo swaps its sides
+FIRST_SUFFIXES = (".png", ".jpg", ".jpeg")  # of photos of one name, as Blender's scripts and trainers look for them
+
+
+class PhotoHeader(NamedTuple):
+    """What a photo's header says, before it is turned as its EXIF asks."""
+
+    width: int  # stored pixels
+    height: int  # stored pixels
+    orientation: int  # EXIF's, 1 to 8; 1: stored upright
+
+    @property
+    def stored(self) -> tuple[int, int]:
+        """Width and height as they lie in the file."""
+        return self.width, self.height
+
+    @property
+    def turned(self) -> tuple[int, int]:
+        """Width and height after the photo was turned as its EXIF asks."""
+        return (self.height, self.width) if self.orientation >= LEAST_SIDEWAYS else self.stored
+
+
+def read_header(photo: Path | IO[bytes], name: str = "") -> PhotoHeader:
+    """The size and the orientation of a photo; no pixel is decoded.
+
+    Raises:
+        InvalidInput: it is no image, or one of a kind that Pillow does not read.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    source = name or str(photo)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of large images, of which only the header is read, and of odd EXIF
+            with Image.open(photo) as image:
+                tag = image.getexif().get(ORIENTATION, UPRIGHT)
+                known = isinstance(tag, int) and UPRIGHT <= tag <= LARGEST_TAG
+                return PhotoHeader(*image.size, tag if known else UPRIGHT)
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError, EOFError):
+        raise InvalidInput(source, expected="an image", got="a file that does not open as one") from None
+
+
+class PhotosBeside:
+    """Photos in the folder of a camera file, or in the one above it, by the paths that the file has.
+
+    Nothing outside these two folders is looked at: where a path leads elsewhere, such as to another machine's disk,
+    its last parts are looked for here.
+
+    Args:
+        folder: of the camera file, on the disk or in a zip.
+    """
+
+    def __init__(self, folder: Path | zipfile.Path) -> None:
+        self._folder = folder
+        self._names: dict[str, dict[str, list[str]]] = {}
+
+    def size(self, file_path: str) -> tuple[int, int] | None:
+        """Width and height in stored pixels of the photo of such a path, with or without a suffix; None: not there.
+
+        Raises:
+            InvalidInput: it does not open as an image.
+        """
+        for folder, place in self._places(file_path):
+            if (photo := self._photo(folder, place)) is not None:
+                if isinstance(photo, Path):
+                    return read_header(photo).stored
+                with photo.open("rb") as packed:
+                    return read_header(packed, str(photo)).stored
+        return None
+
+    def missing(self, file_path: str) -> str:
+        """The first place where a photo of such a path was looked for, for an error."""
+        folder, place = self._places(file_path)[0]
+        without = "" if PurePosixPath(place).suffix.lower() in IMAGE_SUFFIXES else " (.png, .jpg, ...)"
+        return f"{folder / place}{without}"
+
+    def _places(self, file_path: str) -> list[tuple[Path | zipfile.Path, str]]:
+        """Folders and paths below them, the most likely first."""
+        folder, above = self._folder, self._folder.parent
+        path = posixpath.normpath(file_path.replace("\\", "/"))
+        parts = [part for part in path.split("/") if part not in ("", "..") and not part.endswith(":")] or [path]
+        ups = path.split("/").count("..")
+        if not ups and not path.startswith("/") and ":" not in path.split("/")[0]:
+            return [(folder, path)]
+        ends = ["/".join(parts[first:]) for first in range(len(parts))]
+        nearer = [above, folder] if ups == 1 else [folder, above]
+        return [(below, end) for end in ends for below in nearer]
+
+    def _photo(self, folder: Path | zipfile.Path, place: str) -> Path | zipfile.Path | None:
+        """The file of that path, or one of its name with the suffix of another image."""
+        inner, _, name = place.rpartition("/")
+        within = folder / inner if inner else folder
+        key = str(within)
+        if key not in self._names:
+            self._names[key] = _images_in(within)
+        names = self._names[key].get(without_image_suffix(name), [])
+        best = name if name in names else next(iter(names), None)
+        found = None if best is None else within / best
+        return found if found is not None and found.is_file() else None
+
+
+def _images_in(folder: Path | zipfile.Path) -> dict[str, list[str]]:
+    """Images in a folder by their names without suffixes, of several the likely one first; none where it is none."""
+    found: dict[str, list[str]] = defaultdict(list)
+    if folder.is_dir():
+        names = [entry.name for entry in folder.iterdir()]
+        for name in sorted(names, key=_likely):
+            if PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES:
+                found[without_image_suffix(name)].append(name)
+    return dict(found)
+
+
+def _likely(name: str) -> tuple[int, str]:
+    suffix = PurePosixPath(name).suffix.lower()
+    return (FIRST_SUFFIXES.index(suffix) if suffix in FIRST_SUFFIXES else len(FIRST_SUFFIXES)), name
