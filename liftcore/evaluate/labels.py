@@ -14,6 +14,8 @@ import numpy as np
 from PIL import Image, ImageDraw, UnidentifiedImageError
 
 from liftcore.errors import InvalidInput
+from liftcore.features.mask_files import read_polygons
+from liftcore.features.mask_json import ISAT_BACKGROUND
 from liftcore.io.files import is_system_file, visible_files
 from liftcore.scene.views import composed
 
@@ -51,9 +53,6 @@ class LabelledScene(Protocol):
         ...
 
 
-BACKGROUND = "__background__"  # ISAT's own category, which asks for nothing
-MAX_COORDINATE = 1e6  # pixels; what lies beyond is no place on an image
-
 Polygon = list[tuple[int, int]]  # x y, pixels
 
 
@@ -85,9 +84,9 @@ class LerfScene:
             category = entry.get("category") if isinstance(entry, dict) else None
             if not isinstance(category, str) or not category.strip():
                 raise InvalidInput(str(path), expected="a category in every object", got=repr(category))
-            if category != BACKGROUND:
-                points = _polygon(entry.get("segmentation"), scale, path)
-                polygons.setdefault(category, []).extend([points] if points else [])
+            if category != ISAT_BACKGROUND:
+                parts = _polygons(entry.get("segmentation"), scale, path)
+                polygons.setdefault(category, []).extend(part for part in parts if part)
         return [
             LabelledObject(category, _filled(parts, width, height), tuple(_box(part) for part in parts))
             for category, parts in polygons.items()
@@ -136,21 +135,10 @@ def _list(value: object, path: Path) -> list[Any]:
     return value
 
 
-def _polygon(points: object, scale: tuple[float, float], path: Path) -> Polygon:
-    corners = []
-    for point in _list(points, path):
-        if not _is_place(point):
-            raise InvalidInput(str(path), expected="points [x, y] in pixels", got=repr(point)[:80])
-        corners.append((math.floor(point[0] * scale[0]), math.floor(point[1] * scale[1])))
-    return corners
-
-
-def _is_place(point: Any) -> bool:
-    return (
-        isinstance(point, list)
-        and len(point) == 2
-        and all(isinstance(number, int | float) and abs(number) <= MAX_COORDINATE for number in point)
-    )
+def _polygons(segmentation: object, scale: tuple[float, float], path: Path) -> list[Polygon]:
+    """The parts of a polygon with points, in pixels of the camera."""
+    parts = read_polygons(segmentation, str(path))
+    return [[(math.floor(x * scale[0]), math.floor(y * scale[1])) for x, y in part.tolist()] for part in parts]
 
 
 def _filled(polygons: list[Polygon], width: int, height: int) -> np.ndarray:

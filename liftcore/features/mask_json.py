@@ -35,6 +35,8 @@ TRACKED_PREFIX = "mask_"  # of Grounded SAM 2, before the name of the image
 VOID = None  # in place of a phrase: nobody decided what is there
 # Roboflow's name of a photo: IMG_0000_jpg.rf.0123456789abcdef0123456789abcdef.jpg of IMG_0000.jpg.
 ROBOFLOW = re.compile(r"_(?:jpe?g|png|bmp|webp|tiff?|heic|avif|mpo|dng)\.rf\.[0-9A-Za-z_-]+(?=\.[a-z]+$)", re.I)
+# Label Studio's name of a photo: 1f2e3d4c-IMG_0000.jpg.
+LABEL_STUDIO = re.compile(r"^[0-9a-f]{8}-(?=.)")
 
 Masks = list[tuple[str | None, StoredMask]]
 
@@ -69,6 +71,10 @@ class MaskDocument:
     path: Path
     images: list[ImageMasks]
     boxes: int = 0  # records that have a box and no mask
+
+    def has_ids(self) -> bool:
+        """Return whether it speaks of objects by ids, which lie in other files."""
+        return any(image.ids is not None for image in self.images)
 
 
 def read_mask_document(path: Path, names: Mapping[int, str], *, unannotated_negative: bool = False) -> MaskDocument:
@@ -183,6 +189,7 @@ def _data_set(content: Mapping[str, Any], document: MaskDocument, *, unannotated
         number: ImageMasks(_image_name(image, path), listed=True, file=_file_of(image))
         for number, image in images.items()
     }
+    _drop_upload_prefixes([*found.values()])
     for number, record in enumerate(mask_records(content, path)):
         where = f"{path} mask {number}"
         if not isinstance(record, dict):
@@ -217,6 +224,15 @@ def _data_set(content: Mapping[str, Any], document: MaskDocument, *, unannotated
             one.decided = phrases - one.undecided if one.annotated else set()
         one.undecided = phrases - one.decided
     return [*found.values()]
+
+
+def _drop_upload_prefixes(images: Sequence[ImageMasks]) -> None:
+    """Take Label Studio's prefixes off the names, if all images have one and letters tell them from dates."""
+    paths = [PurePosixPath((image.image or "").replace("\\", "/")) for image in images]
+    prefixes = [LABEL_STUDIO.match(path.name) for path in paths]
+    if all(prefixes) and any(prefix and not prefix[0][:-1].isdecimal() for prefix in prefixes):
+        for image, path in zip(images, paths, strict=True):
+            image.image = str(path.with_name(LABEL_STUDIO.sub("", path.name)))
 
 
 def _asks(image: Mapping[str, Any]) -> bool:

@@ -366,10 +366,10 @@ def _add_documents(
     index: _MaskIndex, documents: Sequence[MaskDocument], folder: Path, ids: Sequence[Path]
 ) -> list[str]:
     """Add the masks of all documents; what a user should know of them."""
-    views = _document_views(documents, folder)
+    views, id_files = _document_views(documents, folder), _id_files(documents, folder, ids)
     own: dict[str, str] = {}  # view -> its file, of data sets
     for document, image in ((one, image) for one in documents for image in one.images):
-        id_file = None if image.ids is None else _id_file(image.ids, document.path, folder, ids)
+        id_file = None if image.ids is None else _id_file(image.ids, document.path, id_files)
         if id_file is not None and image.image is None:
             name = tracked_view(id_file, document.path, folder, image.ids.name if image.ids else "")
         else:
@@ -401,23 +401,25 @@ def _add_named_ids(index: _MaskIndex, view: _View, name: str, path: Path, object
     _add_ids(index, view, name, path, values, objects.phrases)
 
 
-def _id_file(objects: IdObjects, document: Path, folder: Path, ids: Sequence[Path]) -> Path:
-    """The file of a document's ids: below the folder, the one that lies nearest; or in ``mask_data`` beside it."""
+def _id_files(documents: Sequence[MaskDocument], folder: Path, files: Sequence[Path]) -> dict[str, list[Path]]:
+    """Name without suffix -> files that may hold ids of a document: below the folder, or in ``mask_data`` beside."""
+    beside = {document.path.parent.parent / MASK_DATA for document in documents if document.has_ids()}
+    outside = [path for path in sorted(beside) if path.is_dir() and not path.is_relative_to(folder)]
+    found: dict[str, list[Path]] = {}
+    for path in [*files, *(file for one in outside for file in visible_files(one))]:
+        if path.suffix.lower() in (*ARRAYS, PICTURE):
+            found.setdefault(composed(path.stem), []).append(path)
+    return found
+
+
+def _id_file(objects: IdObjects, document: Path, files: Mapping[str, Sequence[Path]]) -> Path:
+    """The file of a document's ids; of several of its name, the one that lies nearest."""
     stem = composed(PurePosixPath(objects.name.replace("\\", "/")).stem)
-    beside = document.parent.parent / MASK_DATA
-    others = visible_files(beside) if not beside.is_relative_to(folder) and beside.is_dir() else []
-    found = [
-        path for path in [*ids, *others] if composed(path.stem) == stem and path.suffix.lower() in (*ARRAYS, PICTURE)
-    ]
-    if not found:
+    if stem not in files:
         hint = f"give the folder that holds both, or keep {MASK_DATA} beside the folder of the JSON"
         expected = f"its ids in {stem}.npy, .npz or .png"
         raise InvalidFeatures(str(document), expected=expected, got="no such file", hint=hint)
-
-    def distance(path: Path) -> int:
-        return sum(not path.is_relative_to(parent) for parent in document.parents)
-
-    return min(found, key=distance)
+    return min(files[stem], key=lambda path: sum(not path.is_relative_to(parent) for parent in document.parents))
 
 
 def _document_views(documents: Sequence[MaskDocument], folder: Path) -> dict[tuple[Path, str | None], str]:

@@ -1,7 +1,6 @@
 """Arrays in files from strangers: NumPy's, mapped and never unpickled, and tensors of torch, read as tensors only."""
 
 import math
-import zipfile
 from pathlib import Path
 from tokenize import TokenError
 from typing import IO, TYPE_CHECKING, Any, TypeVar
@@ -9,7 +8,7 @@ from typing import IO, TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from liftcore.errors import InvalidFeatures
-from liftcore.io.files import BROKEN_ZIP, open_regular
+from liftcore.io.files import BROKEN_ZIP, open_regular, open_zip
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -85,7 +84,7 @@ def _unparsed(path: Path, expected: str, error: BaseException) -> InvalidFeature
 def _read_npz(path: Path, kinds: str) -> np.ndarray:
     expected = "a .npz file of one array"
     try:
-        with open_regular(path) as file, zipfile.ZipFile(file) as archive:
+        with open_zip(path) as archive:
             members = archive.infolist()
             if len(members) != 1:
                 some = ", ".join(repr(member.filename[:40]) for member in members[:3])

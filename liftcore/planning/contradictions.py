@@ -152,6 +152,9 @@ def _agreement_of(geometry: Geometry) -> float | None:
     if not bool(mass.any()):
         return None
     owner = torch.cat([torch.full((book.regions,), number) for number, book in enumerate(books)])
+    # Views that show one region alone tell nothing apart: theirs is the pack's fault, or nothing is there.
+    if int((torch.bincount(owner[mass > 0], minlength=len(books)) > 1).sum()) < FEWEST:
+        return None
     read = torch.nn.functional.normalize(torch.cat([book.means(book.rows.float()) for book in books]), dim=1)
     read = read - (mass / mass.sum()) @ read
     channels, rows = read.shape[1], torch.from_numpy(spread(len(W.indptr) - 1, min(SAMPLE, len(W.indptr) - 1)))

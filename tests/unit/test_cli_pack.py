@@ -102,3 +102,28 @@ def test_a_pack_is_named_anew_and_else_kept_to_the_byte(tmp_path: Path, capsys: 
         status, out, err = run(capsys, "pack", *wrong, "-o", tmp_path / "w.safetensors")
         assert (status, out) == (2, "") and not (tmp_path / "w.safetensors").exists()
         assert_one_line(err)
+
+
+def test_what_nobody_annotated_or_decided_is_told_and_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    images = [{"id": k, "file_name": f"{k}.jpg", "width": 4, "height": 3} for k in range(3)]
+    mug = {"image_id": 0, "category_id": 1, "segmentation": [[0, 0, 2, 0, 2, 3, 0, 3]]}
+    content = {"images": images, "annotations": [mug], "categories": [{"id": 1, "name": "mug"}]}
+    (tmp_path / "coco").mkdir()
+    (tmp_path / "coco" / "instances.json").write_text(json.dumps(content), encoding="utf-8")
+    pack = tmp_path / "p.safetensors"
+    status, out, _ = run(capsys, "pack", "prompts", tmp_path / "coco", "-o", pack)
+    assert status == 0 and "1 views" in out and "2 of 3 images of instances.json" in out and "camera" not in out
+    status, out, _ = run(capsys, "pack", "prompts", tmp_path / "coco", "-o", pack, "--unannotated", "negative")
+    assert status == 0 and "3 views" in out and "instances.json" not in out
+    (tmp_path / "labels").mkdir()
+    Image.fromarray(np.array([[0, 1], [1, 255]], np.uint8)).save(tmp_path / "labels" / "a.png")
+    (tmp_path / "names.txt").write_text("mug", encoding="utf-8")
+    arguments = ["pack", "prompts", tmp_path / "labels", "--names", tmp_path / "names.txt", "-o", pack]
+    status, out, err = run(capsys, *arguments)
+    assert (status, out) == (2, "") and "--unlabelled 255" in err
+    assert run(capsys, *arguments, "--unlabelled", 255)[0] == 0
+    regions = read_features(pack)["a"]
+    assert isinstance(regions, Regions)
+    assert regions.labels.tolist() == [[[1, 0], [0, -1]]]  # the last row is of what is no mug

@@ -24,6 +24,8 @@ from liftcore.query.text.table import TableEncoder
 from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Cameras
+from liftcore.settings import LiftSettings
+from liftcore.solve.geometry import LiftViews
 from tests.still_life.masks import Mistakes, observe
 from tests.still_life.scene import StillLife, still_life
 
@@ -161,3 +163,19 @@ def test_far_scales_are_left_out_where_both_near_ones_agree_less(
     told = contradictions.disagreement(nothing, nothing, nothing, 0.4)
     assert len(found) - len(list(asked)) == tried
     assert [text.partition(":")[0] for text in told] == (["cameras"] if tried == 5 else [])
+
+
+def test_views_that_show_one_region_alone_blame_no_camera(scene: StillLife) -> None:
+    """As packs of views in which nothing was annotated: such views tell nothing apart, whatever the cameras are."""
+    names = [*scene.cameras]
+    nothing = Regions(np.zeros((1, 1, 1), np.int32), np.eye(1, 3, 2, dtype=np.float32))
+    halves = Regions(np.repeat([[[0, 1]]], 4, axis=1).astype(np.int32), np.eye(2, 3, dtype=np.float32))
+    settings = LiftSettings.of()
+
+    def agreement(told: int) -> float | None:
+        views = {name: halves if number < told else nothing for number, name in enumerate(names)}
+        lifted = LiftViews.of(as_views(views), scene.cameras, settings)
+        return contradictions.agreement_of_views(CpuRaster(scene.splats), lifted, settings, rays=0).agreement
+
+    assert len(names) == contradictions.FEWEST
+    assert agreement(1) is None and agreement(2) is None and agreement(4) is not None
