@@ -20,7 +20,15 @@ from typing import Any
 import numpy as np
 
 from liftcore.errors import InvalidFeatures
-from liftcore.features.mask_files import PolygonMask, StoredMask, check_size, mask_records, read_mask, read_mask_json
+from liftcore.features.mask_files import (
+    MAX_COORDINATE,
+    PolygonMask,
+    StoredMask,
+    check_size,
+    mask_records,
+    read_mask,
+    read_mask_json,
+)
 from liftcore.query.text.table import plain
 from liftcore.scene.views import composed, without_image_suffix
 
@@ -175,10 +183,14 @@ def _box(sides: Any, *, corners: bool) -> Any:
     """[4, 2] f64, the corners of COCO's box (x, y, width, height) or of two of its corners; None of what is none."""
     try:
         numbers = np.array(sides, np.float64).reshape(2, 2)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return None
     (x, y), (right, bottom) = numbers if corners else (numbers[0], numbers.sum(axis=0))
-    return np.array([[x, y], [right, y], [right, bottom], [x, bottom]]) if np.isfinite(numbers).all() else None
+    return (
+        np.array([[x, y], [right, y], [right, bottom], [x, bottom]])
+        if (np.abs(numbers) <= MAX_COORDINATE).all()
+        else None
+    )
 
 
 def _data_set(content: Mapping[str, Any], document: MaskDocument, *, unannotated_negative: bool) -> list[ImageMasks]:
@@ -199,10 +211,10 @@ def _data_set(content: Mapping[str, Any], document: MaskDocument, *, unannotated
             raise InvalidFeatures(where, expected="an image_id of the file", got=repr(image)[:80])
         size, category = stated_size(images[image]), categories.get(_id(record, "category_id"), {})
         _add_record(found[image], record, size, document, where, category, images[image])
-    names = [category["name"] for category in categories.values() if isinstance(category.get("name"), str)]
+    named = {other: one["name"] for other, one in categories.items() if isinstance(one.get("name"), str)}
     questions = {number: image["text_input"] for number, image in images.items() if _asks(image)}
     masked = [phrase for one in found.values() for phrase in one.phrases]
-    phrases = {plain(phrase) for phrase in [*masked, *questions.values(), *([] if questions else names)]}
+    phrases = {plain(phrase) for phrase in [*masked, *questions.values(), *([] if questions else named.values())]}
     negatives = any(isinstance(image.get("neg_category_ids"), list) for image in images.values())
     for number, one in found.items():
         told = images[number]
@@ -210,11 +222,7 @@ def _data_set(content: Mapping[str, Any], document: MaskDocument, *, unannotated
             one.decided = {plain(questions[number])} - one.undecided
         elif negatives:
             absent, partial = (
-                {
-                    plain(categories[other]["name"])
-                    for other in _numbers(told, key)
-                    if "name" in categories.get(other, {})
-                }
+                {plain(named[other]) for other in _numbers(told, key) if other in named}
                 for key in ("neg_category_ids", "not_exhaustive_category_ids")
             )
             one.decided = (absent | {plain(phrase) for phrase in one.phrases}) - partial - one.undecided
