@@ -11,6 +11,8 @@ from liftcore.cli.reply import folders_of, free_output, progress_bars, reply, to
 from liftcore.errors import InvalidInput
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from liftcore.features.encoders import ImageEncoder
     from liftcore.features.encoders.encode import Encoded
 
@@ -28,6 +30,8 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--weights", type=Path, metavar="FILE", help="the file of its weights; the same as ENCODER@FILE"
     )
+    whose = "of the images: their sizes tell whether photos with an EXIF orientation are read as stored or turned"
+    parser.add_argument("--cameras", type=Path, metavar="PATH", help=whose)
     parser.add_argument("--size", type=count, metavar="PX", help="the images' shorter side; else the model's own")
     parser.add_argument("--batch", type=count, default=1, metavar="N", help="images that are encoded together")
     parser.add_argument("--device", default="cpu", metavar="NAME", help="where the model runs, as torch names it")
@@ -52,8 +56,9 @@ def run(options: argparse.Namespace) -> int:
         spec = f"{spec}@{options.weights}"
     encoder = open_image_encoder(spec, options.device)
     settings = EncodeSettings(options.size, options.batch, options.normalised)
+    sizes = _camera_sizes(options.cameras, images) if options.cameras else {}
     with progress_bars() as progress, writing(out):
-        encoded = encode_images(images, encoder, out, settings, progress)
+        encoded = encode_images(images, encoder, out, settings, progress, sizes)
     document = {
         "out": str(out),
         "bytes": out.stat().st_size,
@@ -73,13 +78,18 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
+def _camera_sizes(path: Path, images: Mapping[str, Path]) -> dict[str, tuple[int, int]]:
+    """Image name -> width and height of its camera's photo, of those that have one."""
+    from liftcore.io.cameras import read_cameras
+    from liftcore.scene.cameras import photo_sizes
+
+    return photo_sizes(images, read_cameras(path, views=list(images)))
+
+
 def _warnings(encoded: Encoded, encoder: ImageEncoder) -> list[str]:
-    found: list[Any] = []
-    if encoded.turned:
-        found.append(
-            f"{len(encoded.turned)} images were turned upright as their EXIF says ({encoded.turned[0]}): "
-            "their cameras must be of the upright images too"
-        )
+    from liftcore.io.photos import orientation_warnings
+
+    found: list[Any] = orientation_warnings(encoded.readings, "their cameras")
     if encoded.wide:
         found.append(f"{len(encoded.wide)} views have features beyond float16 and are stored as float32")
     if encoder.text_space == "none":

@@ -157,12 +157,16 @@ def _lines(document: dict[str, Any]) -> Iterator[str]:
     yield from (f"warning: {warning}" for warning in document["warnings"])
 
 
-def _encoded_masks(options: argparse.Namespace, progress: Progress) -> ViewFolder[Regions]:
-    """Masks with vectors of their crops; what the encoder tells of itself is noted where the caller names nothing."""
+def _encoded_masks(options: argparse.Namespace, progress: Progress) -> tuple[ViewFolder[Regions], list[str]]:
+    """Masks with vectors of their crops, and warnings.
+
+    What the encoder tells of itself is noted where the caller names nothing.
+    """
     from liftcore.features.encoders import device_named
     from liftcore.features.encoders.crops import CropEncoder, crop_vectors
     from liftcore.features.encoders.encode import find_images
     from liftcore.features.masks import mask_files, mask_views
+    from liftcore.io.photos import orientation_warnings
 
     if options.normalised is False:
         raise InvalidInput("--no-normalised", expected="unit vectors, which --encoder makes", got="--no-normalised")
@@ -171,11 +175,13 @@ def _encoded_masks(options: argparse.Namespace, progress: Progress) -> ViewFolde
     files, photos = mask_files(options.folder), find_images(options.photos)
     free_output(options.output, [*files.values(), *photos.values()])  # told before the work
     encoder = CropEncoder.open(options.encoder, device_named(options.device))
-    made = crop_vectors(files, photos, encoder, options.unlabelled, progress)
+    vectors, readings = crop_vectors(files, photos, encoder, options.unlabelled, progress)
     options.encoder_name = options.encoder_name or f"crops of masks, {encoder.name}"
     options.text_space = options.text_space or encoder.text_space
     options.normalised = True
-    return mask_views(options.folder, options.unlabelled, made)
+    return mask_views(options.folder, options.unlabelled, vectors), orientation_warnings(
+        readings, "masks and cameras"
+    )
 
 
 def _views(options: argparse.Namespace, progress: Progress) -> tuple[ViewFolder, TableEncoder | None, list[str]]:
@@ -190,7 +196,8 @@ def _views(options: argparse.Namespace, progress: Progress) -> tuple[ViewFolder,
         from liftcore.features.masks import mask_views
 
         if options.encoder is not None:
-            return _encoded_masks(options, progress), None, []
+            found, warnings = _encoded_masks(options, progress)
+            return found, None, warnings
         if options.photos:
             raise InvalidInput("--encoder", expected="what makes vectors of the masks in --photos", got="none")
         return mask_views(options.folder, options.unlabelled), None, []

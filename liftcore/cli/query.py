@@ -181,14 +181,17 @@ def _contents(
 
         contents |= {"mask": lambda: [mask_png(seen.mask)], "attention": lambda: [attention_png(seen)]}
         named = ", ".join(map(str, answer.query.positives))
-        contents["overlay"] = lambda: [overlay_png(scene, seen, view, named, _picture(options.photo))]
+        height, width = seen.mask.shape
+        contents["overlay"] = lambda: [
+            overlay_png(scene, seen, view, named, _picture(options.photo, (width, height)))
+        ]
     return contents
 
 
-def _picture(photo: Path | None) -> Image | None:
+def _picture(photo: Path | None, size: tuple[int, int]) -> Image | None:
     from liftcore.features.encoders.encode import read_image
 
-    return None if photo is None else read_image(photo)[0]
+    return None if photo is None else read_image(photo, size)[0]
 
 
 def made_from(scene: QueryScene) -> list[Path]:

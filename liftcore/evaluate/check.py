@@ -2,6 +2,11 @@
 
 Nothing here knows how good a scene is. Each measure has its own control: a render is held against other views' photos
 too, the edges of masks against the same masks mirrored, and features as `liftcore.planning.contradictions` has it.
+
+Photos of another shape than their cameras are told by their headers alone, and compared no further. Where renders are
+not like their photos, the causes that photos can show are tried: photos that are turned or mirrored, photos that are
+shifted (a principal point that is off), positions in another scale. One is named where it makes renders like their
+photos; where none does, nothing is blamed.
 """
 
 from __future__ import annotations
@@ -15,15 +20,17 @@ import numpy as np
 import torch
 from PIL import Image
 
-from liftcore.features.encoders.encode import read_image
+from liftcore.features.encoders.encode import TURNS, read_image, readings_of
 from liftcore.features.lens import photo_as_pinhole_sees
 from liftcore.features.pack import Views, pair
 from liftcore.features.smoothness import smoothness, unlike_maps
 from liftcore.features.views import FeatureGrid, Regions
+from liftcore.io.photos import PhotoHeader, orientation_warnings, read_header
 from liftcore.planning.contradictions import (
-    FRAME,
+    FAR_SCALES,
     LEAST_IN_VIEW,
     LEAST_ROW_SUM,
+    NEAR_SCALES,
     agreement_of_views,
     disagreement,
     empty,
@@ -40,12 +47,21 @@ from liftcore.scene.panorama import with_panoramas
 from liftcore.scene.splats import Splats
 from liftcore.scene.views import cameras_of_views, some_of
 from liftcore.settings import LiftSettings
+from liftcore.solve.diagnostics import is_stretched, shape_warnings
 from liftcore.solve.geometry import LiftViews
 
 VIEWS = 12  # that are looked at, evenly spread
 CONTROLS = 3  # other photos that a render is held against
 LEAST_GAIN = 3.0  # dB, of a render over other views' photos to its own
+LEAST_SHIFT = 2.0  # pixels, beyond what a pinhole's rounding and a lens leave
+SCALED_VIEWS = 4  # that are rendered anew for each scale
 LEAST_EDGES = 1.1  # of the photo's edges under masks, over those under mirrored ones
+
+
+HOW_TURNED = {  # by EXIF's orientation
+    2: "mirrored left to right", 3: "turned by 180 degrees", 4: "mirrored upside down", 5: "transposed",
+    6: "turned by 90 degrees clockwise", 7: "transposed across", 8: "turned by 90 degrees counterclockwise",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -89,26 +105,16 @@ def check_scene(
     wrong: list[str] = []
     notes = [f"splats: {warning}" for warning in splats.warnings]
     photos = photos or {}
-    paired = cameras_of_views(photos, with_panoramas(cameras))
-    taken = {name: photos[view] for view, name in paired.items()}
-    faces = {name: camera.face.photo for name, camera in cameras.items() if camera.face is not None}
-    files = {name: taken[photo] for name, photo in faces.items() if photo in taken and name not in taken}
-    panoramas = frozenset(files)  # of which a file is the panorama, and not the camera's own photo
-    files |= {name: file for name, file in taken.items() if name in cameras}
-    if not photos:
-        what = "so the features alone tell" if features is not None else "so nothing tells"
-        notes.append(f"photos: none were given, {what} whether these cameras are those of the splats")
-    elif not files:
-        named = f"{some_of(photos)}, but the cameras {some_of(cameras)}"
-        wrong.append(f"photos: none is named as a camera: the photos are {named}")
-    else:
-        bare, lost = [name for name in cameras if name not in files], [name for name in photos if name not in paired]
-        notes += [f"photos: {len(bare)} cameras have none: {some_of(bare)}"] if bare else []
-        notes += [f"photos: {len(lost)} have no camera: {some_of(lost)}"] if lost else []
-    names = _some(list(files) or list(cameras), VIEWS)
-    shown = [name for name in names if name in files]
-    whole = {name: cameras[name] if name in panoramas else None for name in files}
-    pictures = {name: _photo(files[name], photo_size(cameras[name]), whole[name]) for name in shown}
+    files, whole = _paired_photos(photos, cameras, features is not None, wrong, notes)
+    sizes = {name: _photo_of(cameras[name], whole[name]) for name in files}
+    headers = {name: read_header(file) for name, file in files.items()}
+    notes += [f"photos: {line}" for line in orientation_warnings(readings_of(headers, sizes), "their cameras")]
+    odd, told = _other_shapes(headers, sizes)
+    wrong += told
+    alike = {name: file for name, file in files.items() if name not in odd}
+    names = _some(list(alike) or list(cameras), VIEWS)
+    shown = [name for name in names if name in alike]
+    pictures = {name: _photo(files[name], sizes[name], photo_size(cameras[name]), whole[name]) for name in shown}
     raster, views, renders = CpuRaster(splats, threads=None), [], {}
     for number, name in enumerate(names):
         row_sum, renders[name] = _render(raster, splats, cameras[name])
@@ -116,9 +122,15 @@ def check_scene(
         progress("check", number + 1, len(names), "views")
     in_view = visibility(splats, list(cameras.values()), CompositingParams()).seen_share
     wrong += _wrong_cameras(views, in_view)
+    wrong += _unlike_photos(views, pictures, renders, headers, _Scaled(raster, splats, cameras))
     figures: dict[str, float] = {}
     if features is not None:
         figures, told = _check_features(features, cameras, files, whole)
+        paired_features = pair(features, cameras)[0]
+        notes += [
+            f"features: {text}"
+            for text in shape_warnings(paired_features, [cameras[v] for v in paired_features.views])
+        ]
         settings = LiftSettings.of()
         lifted = LiftViews.of(features, cameras, settings)
         agreement = agreement_of_views(raster, lifted, settings).agreement
@@ -131,6 +143,33 @@ def check_scene(
     worst = min(compared, key=lambda view: view.psnr or 0.0).view if compared else None
     side_by_side = _png(np.concatenate([pictures[worst], renders[worst]], axis=1)) if worst else None
     return CheckReport(tuple(views), in_view, figures, tuple(wrong), tuple(notes), side_by_side)
+
+
+def _paired_photos(
+    photos: Mapping[str, Path], cameras: Cameras, featured: bool, wrong: list[str], notes: list[str]
+) -> tuple[dict[str, Path], dict[str, Camera | None]]:
+    """Camera -> its photo, and the camera itself where it is a face of a panorama that the photo is; None elsewhere.
+
+    Args:
+        featured: whether there are features. wrong, notes: take what photos and cameras say of each other.
+    """
+    paired = cameras_of_views(photos, with_panoramas(cameras))
+    taken = {name: photos[view] for view, name in paired.items()}
+    faces = {name: camera.face.photo for name, camera in cameras.items() if camera.face is not None}
+    files = {name: taken[photo] for name, photo in faces.items() if photo in taken and name not in taken}
+    panoramas = frozenset(files)  # of which a file is the panorama, and not the camera's own photo
+    files |= {name: file for name, file in taken.items() if name in cameras}
+    if not photos:
+        what = "so the features alone tell" if featured else "so nothing tells"
+        notes.append(f"photos: none were given, {what} whether these cameras are those of the splats")
+    elif not files:
+        named = f"{some_of(photos)}, but the cameras {some_of(cameras)}"
+        wrong.append(f"photos: none is named as a camera: the photos are {named}")
+    else:
+        bare, lost = [name for name in cameras if name not in files], [name for name in photos if name not in paired]
+        notes += [f"photos: {len(bare)} cameras have none: {some_of(bare)}"] if bare else []
+        notes += [f"photos: {len(lost)} have no camera: {some_of(lost)}"] if lost else []
+    return files, {name: cameras[name] if name in panoramas else None for name in files}
 
 
 def _some(names: Sequence[str], count: int) -> list[str]:
@@ -146,9 +185,43 @@ def _render(raster: CpuRaster, splats: Splats, camera: Camera) -> tuple[float, n
     return float(image[..., 3].mean()), image[..., :3].clip(0.0, 1.0)
 
 
-def _photo(path: Path, size: tuple[int, int], panorama: Camera | None) -> np.ndarray:
-    """[H, W, 3] f32 in 0..1, a photo in a size (width, height); of a ``panorama`` what that camera, a face, sees."""
-    image = read_image(path)[0].convert("RGB")
+def _photo_of(camera: Camera, panorama: Camera | None) -> tuple[int, int]:
+    """Width and height of the photo that a camera is of; of a ``panorama`` that camera, a face, of the whole one."""
+    face = None if panorama is None else panorama.face
+    return photo_size(camera) if face is None else (face.width, face.height)
+
+
+def _other_shapes(
+    headers: Mapping[str, PhotoHeader], sizes: Mapping[str, tuple[int, int]]
+) -> tuple[set[str], list[str]]:
+    """The views whose photos no scale makes as large as their cameras say, and a sentence for each kind of them."""
+    across, others = [], []
+    for name, header in headers.items():
+        size = header.turned if header.turns_for(sizes[name]) else header.stored
+        if not is_stretched(size, sizes[name]):
+            continue
+        (across if not is_stretched((size[1], size[0]), sizes[name]) else others).append(name)
+    advice = {
+        "lie on their side ({}): take the photos as they were when their cameras were made": across,
+        "are of another shape than their cameras ({}): crops or other photos": others,
+    }
+    shapes = {
+        name: "{}x{} for a camera of {}x{}".format(*headers[name].stored, *sizes[name]) for name in across + others
+    }
+    return {*across, *others}, [
+        f"photos: {len(found)} of {len(headers)} {text.format(f'{found[0]} is {shapes[found[0]]}')}"
+        for text, found in advice.items()
+        if found
+    ]
+
+
+def _photo(path: Path, like: tuple[int, int], size: tuple[int, int], panorama: Camera | None) -> np.ndarray:
+    """[H, W, 3] f32 in 0..1, a photo in a size (width, height); of a ``panorama`` what that camera, a face, sees.
+
+    Args:
+        like: width and height of what tells the photo's orientation.
+    """
+    image = read_image(path, like)[0]
     if panorama is not None and panorama.face is not None:
         whole = image.resize((panorama.face.width, panorama.face.height), Image.Resampling.BOX)
         image = Image.fromarray(photo_as_pinhole_sees(np.asarray(whole), panorama))
@@ -173,12 +246,146 @@ def _wrong_cameras(views: Sequence[ViewCheck], in_view: float) -> list[str]:
         wrong.append(empty(row_sum))
     if in_view < LEAST_IN_VIEW:
         wrong.append(unseen(in_view))
-    gains = [view.psnr - view.others for view in views if view.psnr is not None and view.others is not None]
-    if gains and float(np.median(gains)) < LEAST_GAIN:
-        psnr = float(np.median([view.psnr for view in views if view.psnr is not None]))
-        told = f"renders are hardly more like their own photos ({psnr:.1f} dB) than like other views'"
-        wrong.append(f"photos: {told} ({np.median(gains):+.1f} dB); {FRAME}, and photos must be those of the cameras")
     return wrong
+
+
+@dataclass(frozen=True)
+class _Scaled:
+    """Renders of a scene with its cameras' positions times a factor."""
+
+    raster: CpuRaster
+    splats: Splats
+    cameras: Cameras
+
+    def render(self, view: str, factor: float) -> np.ndarray:
+        """[H, W, 3] f32 in 0..1, of a view."""
+        camera, scale = self.cameras[view], np.ones((4, 4))
+        scale[:3, 3] = factor
+        return _render(self.raster, self.splats, camera.replace(viewmat=camera.viewmat * scale))[1]
+
+
+def _unlike_photos(
+    views: Sequence[ViewCheck],
+    pictures: Mapping[str, np.ndarray],
+    renders: Mapping[str, np.ndarray],
+    headers: Mapping[str, PhotoHeader],
+    scaled: _Scaled,
+) -> list[str]:
+    """That renders are not like their photos, if so, and the cause that makes them alike, if one does."""
+    compared = {
+        view.view: (view.psnr, view.others) for view in views if view.psnr is not None and view.others is not None
+    }
+    if not compared or _median([own - other for own, other in compared.values()]) >= LEAST_GAIN:
+        return []
+    own = {name: psnr for name, (psnr, _) in compared.items()}
+    gain = _median([psnr - other for psnr, other in compared.values()])
+    told = f"photos: renders are hardly more like their own photos ({_median(list(own.values())):.1f} dB)"
+    told = f"{told} than like other views' ({gain:+.1f} dB)"
+    floor = {name: max(compared[name]) for name in own}
+    cause = (
+        _turned_photos(floor, pictures, renders, headers)
+        or _shifted_photos(floor, pictures, renders)
+        or _scaled_positions(floor, pictures, scaled)
+    )
+    unknown = "splats, cameras and photos are not of one scene in one frame, or photos and cameras not of each other"
+    return [f"{told}; {cause or unknown}"]
+
+
+def _turned_photos(
+    floor: Mapping[str, float],
+    pictures: Mapping[str, np.ndarray],
+    renders: Mapping[str, np.ndarray],
+    headers: Mapping[str, PhotoHeader],
+) -> str:
+    """The turn of the photos that makes renders like them; empty where none does."""
+    best, turn = 0.0, 0
+    for tag, way in TURNS.items():
+        turned = {name: np.asarray(_turn(pictures[name], way)) for name in floor}
+        found = [
+            _psnr(renders[name], turned[name]) - floor[name]
+            for name in floor
+            if turned[name].shape == renders[name].shape
+        ]
+        if found and _median(found) > best:
+            best, turn = _median(found), tag
+    if best < LEAST_GAIN:
+        return ""
+    how = f"with the photos {HOW_TURNED[turn]} they are {best:.1f} dB more so"
+    if _median([float(headers[name].orientation == turn) for name in floor]) > 0:
+        return f"{how}: cameras are of the photos as their EXIF turns them; save them turned, without the tag"
+    return f"{how}: photos and cameras are turned to each other; take the photos that cameras were made of"
+
+
+def _turn(picture: np.ndarray, way: Image.Transpose) -> np.ndarray:
+    """A picture [H, W, 3] turned as Pillow has it."""
+    flips = {
+        Image.Transpose.FLIP_LEFT_RIGHT: lambda image: image[:, ::-1],
+        Image.Transpose.FLIP_TOP_BOTTOM: lambda image: image[::-1],
+        Image.Transpose.ROTATE_180: lambda image: image[::-1, ::-1],
+        Image.Transpose.TRANSPOSE: lambda image: image.swapaxes(0, 1),
+        Image.Transpose.TRANSVERSE: lambda image: image[::-1, ::-1].swapaxes(0, 1),
+        Image.Transpose.ROTATE_90: np.rot90,
+        Image.Transpose.ROTATE_270: lambda image: np.rot90(image, 3),
+    }
+    return flips[way](picture)
+
+
+def _shifted_photos(
+    floor: Mapping[str, float], pictures: Mapping[str, np.ndarray], renders: Mapping[str, np.ndarray]
+) -> str:
+    """The shift of the photos by which renders are like them; empty where none is."""
+    shifts = np.array([_shift(pictures[name], renders[name]) for name in floor])
+    down, across = np.median(shifts, axis=0)
+    if max(abs(down), abs(across)) < LEAST_SHIFT:
+        return ""
+    gains = []
+    for name, least in floor.items():
+        photo, render = _overlap(pictures[name], renders[name], int(down), int(across))
+        gains.append(_psnr(photo, render) - least if photo.size else -np.inf)
+    if _median(gains) < LEAST_GAIN:
+        return ""
+    return (
+        f"with the photos shifted by about {across:g} pixels across and {down:g} down they are "
+        f"{_median(gains):.1f} dB more so: principal points (cx, cy) are off, or photos were cropped"
+    )
+
+
+def _shift(photo: np.ndarray, render: np.ndarray) -> tuple[int, int]:
+    """The shift (down, across) in pixels of a photo that lies best on a render, by phase correlation."""
+    one, other = (np.fft.rfft2(image.mean(axis=2) - image.mean()) for image in (render, photo))
+    cross = one * other.conj()
+    peaks = np.fft.irfft2(cross / np.maximum(np.abs(cross), 1e-12), s=render.shape[:2])
+    place = np.unravel_index(int(peaks.argmax()), peaks.shape)
+    down, across = (
+        int(at) - side if at > side // 2 else int(at) for at, side in zip(place, peaks.shape, strict=True)
+    )
+    return down, across
+
+
+def _overlap(photo: np.ndarray, render: np.ndarray, down: int, across: int) -> tuple[np.ndarray, np.ndarray]:
+    """What a photo that is shifted and a render both show."""
+    height, width = render.shape[:2]
+    here = np.s_[max(0, down) : height + min(0, down), max(0, across) : width + min(0, across)]
+    there = np.s_[max(0, -down) : height - max(0, down), max(0, -across) : width - max(0, across)]
+    return photo[there], render[here]
+
+
+def _scaled_positions(floor: Mapping[str, float], pictures: Mapping[str, np.ndarray], scaled: _Scaled) -> str:
+    """The scale of the cameras' positions by which renders are like the photos; empty where none is."""
+    names, best, scale = _some(list(floor), SCALED_VIEWS), 0.0, 1.0
+    for factor in (*NEAR_SCALES, *FAR_SCALES):
+        gain = _median([_psnr(scaled.render(name, factor), pictures[name]) - floor[name] for name in names])
+        if gain > best:
+            best, scale = gain, factor
+    if best < LEAST_GAIN:
+        return ""
+    return (
+        f"with positions times about {scale:g} they are {best:.1f} dB more so: cameras and splats are of other scales"
+    )
+
+
+def _median(values: Sequence[float]) -> float:
+    return float(np.median(values))
 
 
 def _check_features(
@@ -194,7 +401,8 @@ def _check_features(
             grids.append(observed.grid.float().numpy())
         elif isinstance(observed, Regions) and name in files:
             labels = observed.labels[-1].numpy()
-            photo = _photo(files[name], labels.shape[::-1], whole[name]).mean(axis=2)
+            size = (labels.shape[1], labels.shape[0])
+            photo = _photo(files[name], size, size, whole[name]).mean(axis=2)
             mirrored = max(_edges(labels[:, ::-1], photo), _edges(labels[::-1], photo))
             rows.append((_edges(labels, photo), mirrored))
     figures, wrong = {}, unlike_maps(grids)

@@ -1,4 +1,9 @@
-"""Photos as files: what their headers say of size and orientation, and which photo of a folder a camera is of."""
+"""Photos as files: what their headers say of size and orientation, and which photo of a folder a camera is of.
+
+**Orientation.** EXIF may ask viewers to turn a photo. COLMAP, nerfstudio and Inria's code calibrate and train on the
+pixels as they are stored, so a photo is read as stored, unless the size of its camera or of its masks fits the turned
+photo alone (`PhotoHeader.turns_for`).
+"""
 
 from __future__ import annotations
 
@@ -6,15 +11,29 @@ import posixpath
 import warnings
 import zipfile
 from collections import defaultdict
+from collections.abc import Mapping
+from enum import Enum
 from pathlib import Path, PurePosixPath
-from typing import IO, NamedTuple
+from typing import IO, TYPE_CHECKING, NamedTuple
 
 from liftcore.errors import InvalidInput
 from liftcore.scene.views import IMAGE_SUFFIXES, without_image_suffix
 
+if TYPE_CHECKING:
+    from PIL import Image
+
 ORIENTATION = 0x0112  # EXIF's tag
+NAMED = 3  # photos in a warning
 UPRIGHT, LARGEST_TAG, LEAST_SIDEWAYS = 1, 8, 5  # its values; from 5 on, turning a photo swaps its sides
 FIRST_SUFFIXES = (".png", ".jpg", ".jpeg")  # of photos of one name, as Blender's scripts and trainers look for them
+
+
+class Reading(Enum):
+    """How a photo was read, in view of its EXIF orientation."""
+
+    UPRIGHT = "without a turn to make"
+    STORED = "as stored"
+    TURNED = "turned as EXIF asks"
 
 
 class PhotoHeader(NamedTuple):
@@ -34,6 +53,33 @@ class PhotoHeader(NamedTuple):
         """Width and height after the photo was turned as its EXIF asks."""
         return (self.height, self.width) if self.orientation >= LEAST_SIDEWAYS else self.stored
 
+    def turns_for(self, size: tuple[int, int] | None) -> bool:
+        """Whether a map of a size (width, height), of any resolution, is of the photo as EXIF asks to turn it.
+
+        Where sizes do not tell, as of square photos and of those that are turned upside down, it is of stored pixels.
+        """
+        (width, height), (across, down) = self.stored, size or self.stored
+        return self.orientation >= LEAST_SIDEWAYS and (width - height) * (across - down) < 0
+
+
+def orientation_warnings(readings: Mapping[str, Reading], what: str) -> list[str]:
+    """Lines that say how photos with an EXIF orientation were read.
+
+    Args:
+        readings: by view, of all photos. what: made of the same pixels: their cameras, or masks.
+    """
+    advice = {
+        Reading.STORED: f"were read as stored, without the turn that their EXIF asks for: {what} must be of the "
+        "stored pixels too, as those of COLMAP are",
+        Reading.TURNED: f"were turned as their EXIF asks, as the sizes of {what} tell",
+    }
+    lines = []
+    for reading, text in advice.items():
+        if views := [view for view, found in readings.items() if found is reading]:
+            some = ", ".join(views[:NAMED]) + (", ..." if len(views) > NAMED else "")
+            lines.append(f"{len(views)} of {len(readings)} photos ({some}) {text}")
+    return lines
+
 
 def read_header(photo: Path | IO[bytes], name: str = "") -> PhotoHeader:
     """The size and the orientation of a photo; no pixel is decoded.
@@ -48,11 +94,19 @@ def read_header(photo: Path | IO[bytes], name: str = "") -> PhotoHeader:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of large images, of which only the header is read, and of odd EXIF
             with Image.open(photo) as image:
-                tag = image.getexif().get(ORIENTATION, UPRIGHT)
-                known = isinstance(tag, int) and UPRIGHT <= tag <= LARGEST_TAG
-                return PhotoHeader(*image.size, tag if known else UPRIGHT)
+                return header_of(image)
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError, EOFError):
         raise InvalidInput(source, expected="an image", got="a file that does not open as one") from None
+
+
+def header_of(image: Image.Image) -> PhotoHeader:
+    """The header of an image that Pillow has opened and not loaded."""
+    tag = image.getexif().get(ORIENTATION, UPRIGHT)
+    orientation = tag if isinstance(tag, int) and UPRIGHT <= tag <= LARGEST_TAG else UPRIGHT
+    header = PhotoHeader(*image.size, orientation)
+    if image.format == "TIFF":  # whose size Pillow gives as it is after the turn
+        header = PhotoHeader(*header.turned, orientation)
+    return header
 
 
 class PhotosBeside:

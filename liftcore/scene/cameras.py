@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -395,6 +395,16 @@ def photo_size(camera: Camera) -> tuple[int, int]:
     """Width and height in pixels of the photo that a camera stands for."""
     whole = camera.lens or camera
     return whole.width, whole.height
+
+
+def photo_sizes(photos: Collection[str], cameras: Cameras) -> dict[str, tuple[int, int]]:
+    """Photo's name -> width and height in pixels, as the camera or the panorama says that it is paired with."""
+    panoramas = {
+        camera.face.photo: (camera.face.width, camera.face.height) for camera in cameras.values() if camera.face
+    }
+    known = {name: photo_size(camera) for name, camera in cameras.items()}
+    paired = cameras_of_views(photos, [*known, *(name for name in panoramas if name not in known)])
+    return {photo: known.get(name) or panoramas[name] for photo, name in paired.items()}
 
 
 def drawn_by(camera: Camera) -> Camera:

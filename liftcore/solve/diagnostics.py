@@ -275,7 +275,7 @@ def shape_warnings(packs: Views, views: Sequence[Camera]) -> list[str]:
         photo = _photo(packs, camera)
         if _odd(size, photo):
             odd.append(camera)
-        elif _stretched(size, photo):
+        elif is_stretched(size, photo):
             stretched.append(camera)
     advice = {
         "of another shape than their images{}: see that they are [rows, columns], channels last": odd,
@@ -307,7 +307,7 @@ def _odd(size: tuple[int, int], photo: tuple[int, int]) -> bool:
     return off > FAR or off > TURNED * turned
 
 
-def _stretched(size: tuple[int, int], photo: tuple[int, int]) -> bool:
+def is_stretched(size: tuple[int, int], photo: tuple[int, int]) -> bool:
     """Whether no scale makes both sides of the image those of the map, to a cell, nor to a pixel of the image."""
     (width, height), (W, H) = size, photo
     wide = (width - CELL) * (H - CELL) > (height + CELL) * (W + CELL)

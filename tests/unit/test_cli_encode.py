@@ -54,7 +54,7 @@ def test_encoded_photos_are_lifted_and_asked_in_the_text_space_of_their_pack(
     assert (document["views"], document["channels"], document["patch"], document["size"]) == (4, 256, 32, 64)
     assert document["text_space"] == f"open_clip:ViT-S-32-alt@{weights}" and document["folders"] == ["camA"]
     (warning,) = document["warnings"]
-    assert warning.startswith("1 images were turned upright as their EXIF says (camA/turned)")
+    assert warning.startswith("1 of 4 photos (camA/turned) were read as stored")
     packs = read_features(pack)
     assert (packs.views, packs.normalised) == (("camA/turned", "left", "middle", "right"), True)
     assert packs.encoder == "maskclip:ViT-S-32-alt"
@@ -108,6 +108,16 @@ def test_masks_get_vectors_of_their_crops(
             vector = model.encode_image(prepare(ImageOps.pad(crop, (224, 224)))[None])[0]
         own = packs[view].codebook[number].float()
         assert torch.allclose(own, torch.nn.functional.normalize(vector, dim=0), atol=2e-3)
+    tagged, exif = tmp_path / "tagged", Image.Exif()
+    tagged.mkdir()
+    exif[ExifTags.Base.Orientation] = 6  # of photos whose masks and cameras are of stored pixels
+    for path in photos.iterdir():
+        with Image.open(path) as photo:
+            photo.save(tagged / f"{path.stem}.png", exif=exif)
+    status, out, _ = run(capsys, *asked[:4], tmp_path / "again.safetensors", *asked[5:], "--photos", tagged, "--json")
+    assert status == 0 and "3 of 3 photos (" in json.loads(out)["warnings"][0]
+    again = read_features(tmp_path / "again.safetensors")
+    assert all(torch.equal(again[view].codebook, packs[view].codebook) for view in ("left", "right"))
     for more, message in (
         (asked, "--photos"),
         ([*asked, "--photos", photos / "right.png"], "photo of each view"),

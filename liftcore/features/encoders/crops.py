@@ -24,6 +24,7 @@ from liftcore.features.encoders.clip import space_of, training_pixels
 from liftcore.features.encoders.encode import prepare, read_image
 from liftcore.features.masks import labels_alone
 from liftcore.features.views import check_finite
+from liftcore.io.photos import Reading
 from liftcore.progress import Progress, silent
 from liftcore.query.text.open_clip import OpenedModel, open_model
 
@@ -68,8 +69,8 @@ def crop_vectors(
     encoder: CropEncoder,
     unlabelled: int = 0,
     progress: Progress = silent,
-) -> dict[str, np.ndarray]:
-    """View -> [M, F] f16, a unit vector for each of its masks.
+) -> tuple[dict[str, np.ndarray], dict[str, Reading]]:
+    """View -> [M, F] f16, a unit vector for each of its masks; and view -> how its photo was read for them.
 
     Args:
         masks: view -> file, as `liftcore.features.masks.mask_files` gives them. photos: view -> image.
@@ -82,22 +83,22 @@ def crop_vectors(
     if lost:
         got = f"none of {len(lost)} views with masks, such as {lost[0]!r}"
         raise InvalidInput("--photos", expected="a photo of each view that has masks, named like it", got=got)
-    found = {}
+    found, readings = {}, {}
     for done, (view, path) in enumerate(masks.items(), start=1):
         labels, rows = labels_alone(path, unlabelled)
         side = encoder.pixels.shorter
-        crops = (prepare(crop, encoder.pixels, side) for crop in _crops(photos[view], labels, rows, side))
+        image, readings[view] = read_image(photos[view], labels.shape[:0:-1])
+        crops = (prepare(crop, encoder.pixels, side) for crop in _crops(np.asarray(image), labels, rows, side))
         batches = (torch.stack(list(islice(crops, BATCH))) for _ in range(0, rows, BATCH))
         whole = torch.cat([encoder.encode(batch) for batch in batches])
         check_finite(whole, f"vectors of the masks of {view!r}")
         found[view] = whole.half().numpy()
         progress("encode", done, len(masks), "views")
-    return found
+    return found, readings
 
 
-def _crops(photo: Path, labels: np.ndarray, rows: int, side: int) -> Iterator[Image.Image]:
-    """The square picture of each mask, in the order of their rows."""
-    image = np.asarray(read_image(photo)[0].convert("RGB"))
+def _crops(image: np.ndarray, labels: np.ndarray, rows: int, side: int) -> Iterator[Image.Image]:
+    """The square picture of each mask of an image [H, W, 3] u8, in the order of their rows."""
     (height, width), (h, w) = image.shape[:2], labels.shape[1:]
     down = (np.arange(height) * h) // height
     across = (np.arange(width) * w) // width

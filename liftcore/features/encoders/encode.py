@@ -1,4 +1,7 @@
-"""Photos to a feature pack: upright, in three colours, resized to whole patches, in batches of one size."""
+"""Photos to a feature pack: in three colours, resized to whole patches, in batches of one size.
+
+Photos are read in the orientation of their cameras (`liftcore.io.photos`).
+"""
 
 import tempfile
 import warnings
@@ -8,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from liftcore.errors import InvalidInput
@@ -16,13 +19,19 @@ from liftcore.features.encoders import ImageEncoder, Pixels
 from liftcore.features.folders import files_below, grids_of
 from liftcore.features.pack import write_pack
 from liftcore.features.views import check_finite
+from liftcore.io.photos import ORIENTATION, UPRIGHT, PhotoHeader, Reading, header_of
 from liftcore.progress import Progress, silent
 from liftcore.scene.views import IMAGE_SUFFIXES, without_image_suffix
 
 LARGEST_F16 = 65_504.0
 MAX_CELLS = 65_536  # of a grid: attention over more patches takes more memory than a photo is worth
 PAPER = (255, 255, 255)  # what shows through transparent pixels: white, as captures without a background have it
-ORIENTATION = 0x0112  # EXIF's tag; 1 = upright
+_TURN = Image.Transpose
+TURNS = {  # what EXIF's orientation asks for
+    2: _TURN.FLIP_LEFT_RIGHT, 3: _TURN.ROTATE_180, 4: _TURN.FLIP_TOP_BOTTOM, 5: _TURN.TRANSPOSE,
+    6: _TURN.ROTATE_270, 7: _TURN.TRANSVERSE, 8: _TURN.ROTATE_90,
+}  # fmt: skip
+BACK = {_TURN.ROTATE_90: _TURN.ROTATE_270, _TURN.ROTATE_270: _TURN.ROTATE_90}  # the others undo themselves
 _FILTERS = {
     "bicubic": Image.Resampling.BICUBIC,
     "bilinear": Image.Resampling.BILINEAR,
@@ -45,7 +54,7 @@ class Encoded:
     """What was written."""
 
     views: int
-    turned: tuple[str, ...]  # views whose photos were turned upright as their EXIF says
+    readings: Mapping[str, Reading]  # by view, how its photo was read
     wide: tuple[str, ...]  # views that float16 cannot hold, stored as float32
 
 
@@ -55,6 +64,7 @@ def encode_images(
     out: Path,
     settings: EncodeSettings,
     progress: Progress = silent,
+    sizes: Mapping[str, tuple[int, int]] | None = None,
 ) -> Encoded:
     """Encode images and write them as a feature pack, whole or not at all.
 
@@ -66,6 +76,7 @@ def encode_images(
         out: the pack to write.
         settings: of the resizing and the batches.
         progress: told about the stages "encode", "check" and "pack", in views.
+        sizes: view name -> width and height of its camera, which tell the orientation of photos.
 
     Raises:
         InvalidInput: a file is no image, the size is too large or too small, or a feature is not finite.
@@ -74,13 +85,13 @@ def encode_images(
     if settings.size is not None and settings.size < patch:
         got = f"{settings.size} pixels"
         raise InvalidInput("--size", expected=f"at least a patch, {patch} pixels", got=got)
-    turned: list[str] = []
+    readings: dict[str, Reading] = {}
     wide: list[str] = []
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as scratch:
         files = {name: Path(scratch, f"{number}.npy") for number, name in enumerate(images)}
         done = 0
-        for names, batch in _batches(images, encoder, settings, turned):
+        for names, batch in _batches(images, encoder, settings, sizes or {}, readings):
             for name, grid in zip(names, encoder.encode(batch), strict=True):
                 stored = _stored(grid, name, settings)
                 if stored.dtype == torch.float32:
@@ -94,20 +105,22 @@ def encode_images(
             "normalised": "true" if settings.normalised else "false",
         }
         write_pack(out, grids_of(files), metadata, progress)
-    return Encoded(len(images), tuple(turned), tuple(wide))
+    return Encoded(len(images), readings, tuple(wide))
 
 
 def _batches(
-    images: Mapping[str, Path], encoder: ImageEncoder, settings: EncodeSettings, turned: list[str]
+    images: Mapping[str, Path],
+    encoder: ImageEncoder,
+    settings: EncodeSettings,
+    sizes: Mapping[str, tuple[int, int]],
+    readings: dict[str, Reading],
 ) -> Iterator[tuple[list[str], Tensor]]:
-    """Names and images [n, 3, H, W] of neighbours that share a size; ``turned`` takes the names of turned ones."""
+    """Names and images [n, 3, H, W] of neighbours that share a size; ``readings`` takes how each was read."""
     shorter = settings.size or encoder.pixels.shorter
     names: list[str] = []
     waiting: list[Tensor] = []
     for name, path in images.items():
-        image, was_turned = read_image(path)
-        if was_turned:
-            turned.append(name)
+        image, readings[name] = read_image(path, sizes.get(name))
         ready = prepare(image, encoder.pixels, shorter)
         if waiting and (len(waiting) == settings.batch or ready.shape != waiting[0].shape):
             yield names, torch.stack(waiting)
@@ -157,10 +170,13 @@ def _images_of(path: Path) -> list[Path]:
     return images
 
 
-def read_image(path: Path) -> tuple[Image.Image, bool]:
-    """An image in red, green and blue, upright as its EXIF says, and whether it had to be turned for that.
+def read_image(path: Path, size: tuple[int, int] | None = None) -> tuple[Image.Image, Reading]:
+    """An image in red, green and blue, as it is stored or as its EXIF turns it (`liftcore.io.photos`), and which.
 
     Grey images have three equal colours, of 16 bits the upper 8 count, and transparent pixels show white.
+
+    Args:
+        path: of the image. size: width and height of its camera or masks, of any resolution; None: nothing tells.
 
     Raises:
         InvalidInput: the file is no image, is cut off, or has more pixels than Pillow opens.
@@ -169,8 +185,9 @@ def read_image(path: Path) -> tuple[Image.Image, bool]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of images between one and two times Pillow's limit, and of odd EXIF
             with Image.open(path) as image:
-                turned = image.getexif().get(ORIENTATION, 1) not in (0, 1)
-                return _colours(ImageOps.exif_transpose(image)), turned
+                header = header_of(image)
+                image.load()
+                return _colours(_turned(image, header, size)), _reading(header, size)
     except Image.DecompressionBombError:
         most = 2 * (Image.MAX_IMAGE_PIXELS or 0)
         raise InvalidInput(str(path), expected=f"an image of at most {most} pixels", got="a larger one") from None
@@ -178,6 +195,29 @@ def read_image(path: Path) -> tuple[Image.Image, bool]:
         raise InvalidInput(str(path), expected="an image", got="a file that Pillow does not know") from None
     except (OSError, SyntaxError, ValueError, EOFError) as error:  # Pillow's kinds for files that are cut or broken
         raise InvalidInput(str(path), expected="a whole image", got=str(error)[:160]) from None
+
+
+def readings_of(headers: Mapping[str, PhotoHeader], sizes: Mapping[str, tuple[int, int]]) -> dict[str, Reading]:
+    """How photos are read whose cameras have these sizes, by view."""
+    return {view: _reading(header, sizes.get(view)) for view, header in headers.items()}
+
+
+def _reading(header: PhotoHeader, size: tuple[int, int] | None) -> Reading:
+    if header.orientation == UPRIGHT:
+        return Reading.UPRIGHT
+    return Reading.TURNED if header.turns_for(size) else Reading.STORED
+
+
+def _turned(image: Image.Image, header: PhotoHeader, size: tuple[int, int] | None) -> Image.Image:
+    """A loaded image with the pixels that a map of that size is of."""
+    if header.orientation == UPRIGHT:
+        return image
+    # Pillow turns TIFFs itself as it loads them, and then takes the tag away.
+    is_turned = image.getexif().get(ORIENTATION, UPRIGHT) == UPRIGHT
+    if is_turned == header.turns_for(size):
+        return image
+    turn = TURNS[header.orientation]
+    return image.transpose(BACK.get(turn, turn) if is_turned else turn)
 
 
 def _colours(image: Image.Image) -> Image.Image:

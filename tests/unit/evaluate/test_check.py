@@ -74,6 +74,92 @@ def test_cameras_of_another_scale_are_told_by_the_photos(scene: StillLife, photo
     assert told.startswith("photos: renders are hardly more like their own photos")
 
 
+def saved(photos, folder: Path, change, orientation: int = 1) -> dict[str, Path]:
+    """The photos, changed as arrays, with an EXIF orientation."""
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    folder.mkdir()
+    for name, path in photos.items():
+        with Image.open(path) as image:
+            pixels = np.ascontiguousarray(change(np.asarray(image)))
+        Image.fromarray(pixels).save(folder / f"{name}.png", exif=exif)
+    return {name: folder / f"{name}.png" for name in photos}
+
+
+SHAPES = {
+    "crops of a video": (lambda image: image[image.shape[0] // 8 : -image.shape[0] // 8], "another shape than their"),
+    "centre squares": (lambda image: image[:, : image.shape[0]], "another shape than their cameras"),
+    "on their side": (np.rot90, "lie on their side"),
+}
+
+
+@pytest.mark.parametrize("what", SHAPES)
+def test_photos_of_another_shape_are_told_before_any_render(what: str, scene: StillLife, photos, tmp_path) -> None:
+    change, message = SHAPES[what]
+    found = check_scene(scene.splats, scene.cameras, saved(photos, tmp_path / "changed", change))
+    (told,) = found.wrong
+    assert message in told and "4 of 4" in told
+    assert all(view.psnr is None for view in found.views)
+
+
+def test_photos_of_the_same_shape_in_another_size_are_healthy(scene: StillLife, photos, tmp_path) -> None:
+    half = saved(photos, tmp_path / "half", lambda image: image[::2, ::2])
+    double = saved(photos, tmp_path / "double", lambda image: image.repeat(2, 0).repeat(2, 1))
+    for others in (half, double):
+        found = check_scene(scene.splats, scene.cameras, others)
+        assert found.wrong == () and found.notes == ()
+
+
+@pytest.mark.parametrize("tag", [2, 3, 6])
+def test_photos_are_read_as_cameras_have_them_whatever_their_exif(
+    tag: int, scene: StillLife, photos, tmp_path
+) -> None:
+    found = check_scene(scene.splats, scene.cameras, saved(photos, tmp_path / "tagged", lambda image: image, tag))
+    assert found.wrong == ()
+    assert "4 of 4 photos" in found.notes[0] and "EXIF" in found.notes[0]
+
+
+def test_photos_whose_exif_is_applied_in_their_cameras_are_turned_where_sizes_tell(
+    scene: StillLife, photos, tmp_path
+) -> None:
+    found = check_scene(scene.splats, scene.cameras, saved(photos, tmp_path / "tagged", np.rot90, 6))
+    assert found.wrong == () and "were turned as their EXIF asks" in found.notes[0]
+
+
+CAUSES = {  # what is done to photos, and their orientation -> the cause that is named
+    "EXIF that cameras have applied": (lambda image: image[::-1, ::-1], 3, "as their EXIF turns them"),
+    "turned": (lambda image: image[::-1, ::-1], 1, "photos and cameras are turned to each other"),
+    "mirrored": (lambda image: image[:, ::-1], 1, "mirrored left to right"),
+    "upside down": (lambda image: image[::-1], 1, "mirrored upside down"),
+    "shifted": (lambda image: np.roll(image, (-30, 40), axis=(0, 1)), 1, "principal points"),
+}
+
+
+@pytest.mark.parametrize("what", CAUSES)
+def test_the_cause_of_photos_unlike_their_renders_is_named(what: str, scene: StillLife, photos, tmp_path) -> None:
+    change, tag, cause = CAUSES[what]
+    (told,) = check_scene(scene.splats, scene.cameras, saved(photos, tmp_path / "changed", change, tag)).wrong
+    assert cause in told
+    assert "positions times" not in told and "frame" not in told
+
+
+def test_photos_of_another_scene_blame_no_scale_and_no_turn(scene: StillLife, photos, tmp_path) -> None:
+    names, rng = list(photos), np.random.default_rng(3)
+    others = {name: photos[names[(k + 1) % len(names)]] for k, name in enumerate(names)}
+    noise = saved(photos, tmp_path / "noise", lambda image: rng.integers(0, 255, image.shape).astype(np.uint8))
+    for wrong in (others, noise):
+        (told,) = check_scene(scene.splats, scene.cameras, wrong).wrong
+        assert "not of each other" in told and "times about" not in told and "EXIF" not in told
+
+
+def test_cameras_of_half_the_scale_are_told_with_the_scale(scene: StillLife, photos) -> None:
+    scale = np.ones((4, 4))
+    scale[:3, 3] = 0.5
+    moved = Cameras([camera.replace(viewmat=camera.viewmat * scale) for camera in scene.cameras.values()])
+    (told,) = check_scene(scene.splats, moved, photos).wrong
+    assert "with positions times about 2 " in told
+
+
 def test_cameras_of_another_scale_are_told_by_features_alone() -> None:
     scene = still_life(seed=7, views=12, density=0.1)
     words = TableEncoder("words", [*scene.things, *scene.parts], np.eye(len(scene.things) + len(scene.parts)))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageOps
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
@@ -30,6 +30,7 @@ from liftcore.features.encoders.encode import (
 from liftcore.features.encoders.timm_backbone import TimmEncoder, cell_shift
 from liftcore.features.pack import read_features
 from liftcore.features.views import FeatureGrid
+from liftcore.io.photos import Reading, read_header
 from liftcore.query.text import weights
 from liftcore.query.text.open_clip import OpenedModel, library
 
@@ -58,10 +59,15 @@ Encode = Callable[..., tuple[Encoded, dict[str, Tensor]]]
 
 @pytest.fixture
 def encode(tmp_path: Path) -> Encode:
-    def run(folder: Path, encoder: MeanColour | None = None, **settings: Any) -> tuple[Encoded, dict[str, Tensor]]:
+    def run(
+        folder: Path,
+        encoder: MeanColour | None = None,
+        sizes: dict[str, tuple[int, int]] | None = None,
+        **settings: Any,
+    ) -> tuple[Encoded, dict[str, Tensor]]:
         out = tmp_path / "out" / "pack.safetensors"
         chosen = EncodeSettings(**{"normalised": False, **settings})
-        done = encode_images(find_images([folder]), encoder or MeanColour(), out, chosen)
+        done = encode_images(find_images([folder]), encoder or MeanColour(), out, chosen, sizes=sizes)
         assert [path.name for path in out.parent.iterdir()] == [out.name]
         packs = read_features(out)
         grids = {}
@@ -87,17 +93,73 @@ def blob(width: int, height: int, box: tuple[int, int, int, int]) -> Image.Image
     return image
 
 
-def test_a_blob_lights_the_cell_that_it_lies_in_when_the_photo_is_upright(photos: Path, encode: Encode) -> None:
+def test_a_blob_lights_the_cell_that_it_lies_in_as_the_photo_is_stored(photos: Path, encode: Encode) -> None:
     upright = blob(60, 40, (50, 0, 60, 10))  # the right upper corner
     upright.save(photos / "a.png")
     exif = Image.Exif()
     exif[ORIENTATION] = 6
-    upright.transpose(Image.Transpose.ROTATE_90).save(photos / "turned.png", exif=exif)
+    upright.save(photos / "tagged.png", exif=exif)
     done, grids = encode(photos)
-    assert done.turned == ("turned",)
+    assert done.readings == {"a": Reading.UPRIGHT, "tagged": Reading.STORED}
     for grid in grids.values():
         assert grid.shape == (2, 3, 3) and grid.dtype == torch.float16
         assert int(grid.sum(dim=-1).argmax()) == 2 and grid[1].max() == 0
+
+
+TURNS = {  # what a stored photo is, of the one that EXIF's orientation shows
+    1: lambda image: image,
+    2: lambda image: image[:, ::-1],
+    3: lambda image: image[::-1, ::-1],
+    4: lambda image: image[::-1],
+    5: lambda image: image.swapaxes(0, 1),
+    6: np.rot90,
+    7: lambda image: image[::-1, ::-1].swapaxes(0, 1),
+    8: lambda image: np.rot90(image, 3),
+}
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".webp"])
+@pytest.mark.parametrize("tag", TURNS)
+def test_a_photo_is_read_in_the_orientation_of_its_camera(tag: int, suffix: str, tmp_path: Path) -> None:
+    shown = np.zeros((48, 64, 3), np.uint8)
+    shown[:16, :16], shown[:16, -16:] = (255, 0, 0), (0, 255, 0)  # two corners tell each of eight ways
+    stored, path, exif = np.ascontiguousarray(TURNS[tag](shown)), tmp_path / f"a{suffix}", Image.Exif()
+    exif[ORIENTATION] = tag
+    how: dict[str, Any] = (
+        {"quality": 95, "subsampling": 0} if suffix == ".jpg" else {"lossless": True} if suffix == ".webp" else {}
+    )
+    Image.fromarray(stored).save(path, exif=exif, **how)
+    across = stored.shape[0] > stored.shape[1]
+    for size, expected in ((None, stored), (stored.shape[1::-1], stored), ((640, 480), shown if across else stored)):
+        image, reading = read_image(path, size)
+        assert np.abs(np.asarray(image).astype(int) - expected).max() < 20
+        assert reading is (
+            Reading.UPRIGHT if tag == 1 else Reading.TURNED if expected is shown and across else Reading.STORED
+        )
+    assert read_header(path).turned == (64, 48)
+    with Image.open(path) as image:
+        assert np.abs(np.asarray(ImageOps.exif_transpose(image)).astype(int) - shown).max() < 20
+
+
+@pytest.mark.parametrize("tag", TURNS)
+def test_a_square_photo_is_read_as_it_is_stored(tag: int, tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[ORIENTATION] = tag
+    stored = np.random.default_rng(0).integers(0, 255, (16, 16, 3)).astype(np.uint8)
+    Image.fromarray(stored).save(tmp_path / "a.png", exif=exif)
+    for size in (None, (16, 16), (30, 20)):
+        assert np.array_equal(np.asarray(read_image(tmp_path / "a.png", size)[0]), stored)
+
+
+def test_sizes_of_cameras_turn_the_photos_that_are_encoded(photos: Path, encode: Encode) -> None:
+    upright = blob(60, 40, (50, 0, 60, 10))
+    exif = Image.Exif()
+    exif[ORIENTATION] = 6
+    upright.transpose(Image.Transpose.ROTATE_90).save(photos / "a.png", exif=exif)
+    sizes = {"a": (600, 400)}
+    done, grids = encode(photos, sizes=sizes)
+    assert done.readings == {"a": Reading.TURNED}
+    assert grids["a"].shape == (2, 3, 3) and int(grids["a"].sum(dim=-1).argmax()) == 2
 
 
 def test_every_kind_of_picture_has_its_colours(photos: Path, encode: Encode) -> None:
