@@ -48,6 +48,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
             runner=runner, devices=Devices(), queries=worker,
             streams=streams, photos=PhotoIndexes(), metrics=metrics, readiness=readiness,
             checks=threads(settings.parallel_checks),  # uploads that are validated at the same time
+            planning=threads(1),  # plans, for which no upload waits
             writing=threads(8),  # uploads: a stalled disk stops them, and no other route
             parsing=threads(2),  # JSON bodies
             ordering=threads(2),  # orders, which are compared with all names in their assets: these take memory

@@ -40,7 +40,7 @@ CALLER = "caller"  # of the scope's state
 LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
 BEARER = re.compile(r"bearer +([A-Za-z0-9._~+/-]+=*)", re.ASCII | re.IGNORECASE)  # RFC 6750, 2.1
 LOOKUPS = 4  # threads that look keys up, so that slow routes cannot keep anyone waiting at the gate
-UPLOADS = re.compile("PUT /assets/.*|POST /lifts")
+CHECKED = re.compile("PUT /assets/.*|POST /lifts|PATCH /assets/.*|POST (/lift/plan)")  # by a process each
 WORKLESS = frozenset({"GET", "HEAD", "OPTIONS"})  # methods that start nothing: a stop refuses the others
 SCHEMES = {
     "key": {
@@ -76,7 +76,7 @@ class Gate:
         self._settings = settings
         self._hosts = Hosts(settings.host, settings.allowed_hosts)
         self._stopping = stopping
-        self._uploads: Counter[str] = Counter()  # by key, those that are on their way
+        self._uploads: Counter[str] = Counter()  # by key, those that are on their way, and plans
         self._lookups = anyio.CapacityLimiter(LOOKUPS)
 
     async def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
@@ -100,11 +100,12 @@ class Gate:
             busy.headers |= CLOSE
             raise busy
         scope.setdefault("state", {})[CALLER] = caller
-        if UPLOADS.fullmatch(f"{method} {scope['path']}") is None:
+        checked = CHECKED.fullmatch(f"{method} {scope['path']}")
+        if checked is None:
             await self._app(scope, receive, send)
             return
         own, most = caller.owner.key, caller.max_uploads
-        require_share("upload", self._uploads[own], most)
+        require_share("plan" if checked[1] else "upload", self._uploads[own], most)
         self._uploads[own] += 1
         try:
             await self._app(scope, receive, send)

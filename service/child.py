@@ -70,6 +70,13 @@ def memory_of(process: int | str, field: str) -> int:
     return 0
 
 
+def is_stopped(process: int) -> bool:
+    """Whether a process is stopped (SIGSTOP), as far as Linux tells: it lives, and answers nobody."""
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] in ("T", "t")
+    return False
+
+
 def fault_of(error: SplatliftError, names: Mapping[str, str] | None = None) -> dict[str, str]:
     """The error as flat JSON: kind, argument, expected, got, hint.
 

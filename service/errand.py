@@ -27,12 +27,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NoReturn
 
-from service.child import die_with_parent, end_with_parent, line_of, memory_of
+from service.child import die_with_parent, end_with_parent, is_stopped, line_of, memory_of
 from service.errors import Busy
 
 IMPORTED = ("service.uploads.check", "service.uploads.renaming", "service.jobs.planning")  # by the template
 TICK_SECONDS = 0.5  # how soon the end of the server is seen by who waits
-PATIENCE_SECONDS = 300.0  # for the template's imports and a fork
+PATIENCE_SECONDS = 300.0  # for the template's imports
+FORK_SECONDS = 30.0  # for a fork, once it has made them; a template that takes longer is ended
 PIECE = 1 << 16
 PRINTED = "printed"  # the file for what a task prints, beside its temporary ones
 
@@ -91,7 +92,7 @@ class _Template:
             except OSError:
                 ours.close()
                 raise
-        ours.settimeout(PATIENCE_SECONDS)
+        ours.settimeout(PATIENCE_SECONDS)  # until it has made its imports
         self._line = ours
         return ours
 
@@ -99,6 +100,16 @@ class _Template:
         """Have it import what tasks need, so that the first one need not wait for that."""
         with self._turn, contextlib.suppress(OSError):  # without room for a process: whoever has a task tries again
             self.start()
+
+    def revive(self) -> bool:
+        """Whether it lives, and is not stopped; when it is not so, it is ended, and a new one starts."""
+        process = self._process
+        if process is not None and process.poll() is None and not is_stopped(process.pid):
+            return True
+        if process is not None:
+            process.kill()  # whoever waits for it, and has the turn, then sees its end
+        self.get_ready()
+        return False
 
     def end(self) -> None:
         """End it, and all tasks."""
@@ -143,6 +154,7 @@ class _Template:
             line = self.start()
             socket.send_fds(line, [json.dumps(request).encode() + b"\n"], files)
             reply = line.recv(64)
+            line.settimeout(FORK_SECONDS)
         except OSError:
             reply = b""
         if not reply:
@@ -152,7 +164,7 @@ class _Template:
 
 _TEMPLATE = _Template()
 atexit.register(_TEMPLATE.end)
-get_ready = _TEMPLATE.get_ready
+get_ready, revive = _TEMPLATE.get_ready, _TEMPLATE.revive
 
 
 def run_errand(module: str, arguments: Sequence[str], scratch: Path, limits: ErrandLimits) -> Heard | None:

@@ -41,7 +41,7 @@ class ServiceSettings(BaseSettings):
         100 * GiB, ge=0, description="bytes of assets and results that a key may store; more get 403"
     )
     key_queued: int = Field(20, ge=0, description="jobs of a key that may wait in line; more are answered 429")
-    key_uploads: int = Field(4, ge=0, description="uploads of a key at the same time; more are answered 429")
+    key_uploads: int = Field(4, ge=0, description="uploads and plans of a key at the same time; more get 429")
     key_queries: int = Field(8, ge=1, description="queries of a key that may wait or run; more are answered 429")
     key_streams: int = Field(8, ge=1, description="streams of events of a key at the same time; more get 429")
 

@@ -15,6 +15,7 @@ import anyio
 from fastapi import Depends, Request
 
 from liftcore.errors import SplatliftError
+from service import errand
 from service.auth import CALLER, Caller
 from service.errors import NotReady
 from service.jobs.device import Devices
@@ -32,7 +33,7 @@ PATIENCE_SECONDS = 2.0  # for all checks of readiness; a disk that takes longer 
 FRESH_SECONDS = 1.0  # a look counts for so long: however many ask, the disk is written once a second
 HURRY_SECONDS = 0.1  # between two looks at whether somebody is in a hurry
 PROBE_BYTES = 4096
-CHECKS = ("database", "disk", "supervisor", "queries")
+CHECKS = ("database", "disk", "supervisor", "queries", "uploads")
 
 log = logging.getLogger(__name__)
 
@@ -74,7 +75,12 @@ class Readiness:
             "database": lambda: _complaint(store.database.prove_usable),
             "disk": lambda: _complaint(lambda: _prove_disk(store)),
             "supervisor": lambda: None if runner.alive() else "a thread of the supervisor has died",
-            "queries": lambda: None if queries.revive() else "the query worker has died; a new one starts",
+            "queries": lambda: (
+                None if queries.revive() else "the query worker has died or was stopped; a new one starts"
+            ),
+            "uploads": lambda: (
+                None if errand.revive() else "what checks uploads has died or was stopped; a new one starts"
+            ),
         }
         self._turn = anyio.CapacityLimiter(1)
         self._looked = -FRESH_SECONDS
@@ -149,6 +155,7 @@ class AppState:
     metrics: Metrics
     readiness: Readiness
     checks: anyio.CapacityLimiter  # threads of their own, so that who waits for them keeps nobody else waiting
+    planning: anyio.CapacityLimiter
     writing: anyio.CapacityLimiter
     parsing: anyio.CapacityLimiter
     ordering: anyio.CapacityLimiter

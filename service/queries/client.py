@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from typing import IO, Any
 
 from liftcore.errors import SplatliftError
-from service.child import error_of
+from service.child import error_of, is_stopped
 from service.errors import Busy, ClientLeft, Crashed, TimedOut, require_share
 
 # Without these each array of a query is mapped anew and its pages are faulted in one by one: a fifth of its time.
@@ -132,9 +132,9 @@ class QueryClient:
         return len(self._line)
 
     def alive(self) -> bool:
-        """Whether the process lives."""
+        """Whether the process lives, and is not stopped."""
         process = self._process
-        return process is not None and process.poll() is None
+        return process is not None and process.poll() is None and not is_stopped(process.pid)
 
     def revive(self) -> bool:
         """Whether the process lives; when it does not, a new one starts."""

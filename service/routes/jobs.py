@@ -82,7 +82,7 @@ async def submit(deps: Deps, order: models.LiftRequest = LIFT_BODY, key: Key = N
 )
 async def plan(deps: Deps, order: models.LiftRequest = LIFT_BODY) -> models.Plan:
     """What a lift would do and need, without doing it: the views that it takes, and the memory."""
-    return await anyio.to_thread.run_sync(_planned, order, deps, limiter=deps.checks)
+    return await anyio.to_thread.run_sync(_planned, order, deps, limiter=deps.planning)
 
 
 @router.post(

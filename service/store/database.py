@@ -9,6 +9,7 @@ import queue
 import re
 import sqlite3
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, fields
@@ -26,6 +27,8 @@ KEYS_REQUIRED = "keys.required"  # there when a key was ever made
 RESERVE = "reserve"  # room for the transaction of a deletion on a full disk
 RESERVE_BYTES = 1 << 20
 BUSY_SECONDS = 10.0  # that a write waits for others, of this process and of others, and a read for other reads
+LOOK_SECONDS = 0.3  # that a look at the pages may take: of two hundred megabytes or so
+LOOK_STEPS = 1000  # of SQLite's machine, between two looks at the clock
 READERS = 4  # at once: more threads in SQLite and with what it gave only keep the event loop from its turn
 CURSOR = r"^[0-9.e+-]{1,30}~[0-9a-z:]{1,80}$"  # when the last one of a page was made, and its id
 
@@ -183,14 +186,26 @@ class Database:
         if not same:
             raise _error("another file, or none, is in the place of the database", "SQLITE_READONLY_DBMOVED")
 
-    def _require_readable(self) -> None:
+    def _require_readable(self, seconds: float = 0.0) -> None:
         """See that who comes anew finds a database, which an open connection does not notice.
+
+        Args:
+            seconds: how long its pages are looked through; 0 = not at all.
 
         Only SQLite may open the file: a process that closes it in any other way gives up all of SQLite's locks on it
         (POSIX), and the next program that closes the database takes the WAL for its own and removes it.
         """
         with closing(open_to_read(self._path)) as connection:
             connection.execute("PRAGMA schema_version").fetchone()
+            if seconds:
+                deadline = time.monotonic() + seconds
+                connection.set_progress_handler(lambda: time.monotonic() > deadline, LOOK_STEPS)
+                try:
+                    found = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
+                except sqlite3.OperationalError as error:
+                    found = "ok" if error.sqlite_errorcode == sqlite3.SQLITE_INTERRUPT else str(error)
+                if found != "ok":
+                    raise _error(f"the database is damaged: {found}", "SQLITE_CORRUPT")
 
     def _next_generation(self) -> int:
         return self._writer.execute("UPDATE generation SET number = number + 1 RETURNING number").fetchone()[0]
@@ -237,7 +252,7 @@ class Database:
             sqlite3.Error, OSError: it is not so.
         """
         self.require_same_file()
-        self._require_readable()
+        self._require_readable(LOOK_SECONDS)
         with self.write() as connection:
             version = connection.execute("PRAGMA user_version").fetchone()[0]
             connection.execute(f"PRAGMA user_version = {version}")

@@ -174,7 +174,7 @@ def test_no_work_is_taken_below_the_disk_floor_and_the_service_lives(
             client.post("/lift", json=body),
         ):
             assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/no-space", 507)
-        assert client.get("/jobs").json() == {"jobs": []} and len(client.get("/assets").json()["assets"]) == 3
+        assert client.get("/jobs").json()["jobs"] == [] and len(client.get("/assets").json()["assets"]) == 3
         monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=1000))
         assert ended(client, client.post("/lift", json=body).headers["location"])["state"] == "succeeded"
 

@@ -25,7 +25,7 @@ from prometheus_client import REGISTRY
 from prometheus_client.parser import text_string_to_metric_families
 from pydantic import ValidationError
 
-from service import middleware
+from service import errand, middleware
 from service.__main__ import AnnouncingServer
 from service.errand import ErrandLimits
 from service.errors import Busy, NoSpace
@@ -89,7 +89,7 @@ def test_readyz_names_what_fails_until_it_works_again(start: Start, tmp_path: Pa
     with start() as client:
         until(lambda: client.get("/readyz").status_code == 200)
         found = client.get("/readyz").json()
-        assert found == {"status": "ready", "checks": ["database", "disk", "supervisor", "queries"]}
+        assert found == {"status": "ready", "checks": ["database", "disk", "supervisor", "queries", "uploads"]}
         with monkeypatch.context() as full:
             full.setattr(DataDirectory, "free_bytes", lambda files: 0)
             fails(client, "disk")
@@ -105,12 +105,19 @@ def test_readyz_names_what_fails_until_it_works_again(start: Start, tmp_path: Pa
             fails(client, "database")  # and the look that still waits holds up nobody but the next one
             other.execute("ROLLBACK")
         until(lambda: client.get("/readyz").status_code == 200)
-        process = parts_of(client).queries._process
-        assert process is not None
-        process.kill()
-        fails(client, "queries")
-        until(lambda: client.get("/readyz").status_code == 200)
-        assert counted(samples(client), "splatlift_query_worker_restarts_total") == 1
+        for restarts, ends in enumerate((signal.SIGKILL, signal.SIGSTOP), 1):
+            process = parts_of(client).queries._process
+            assert process is not None
+            process.send_signal(ends)
+            fails(client, "queries")
+            until(lambda: client.get("/readyz").status_code == 200)
+            assert counted(samples(client), "splatlift_query_worker_restarts_total") == restarts
+            template = errand._TEMPLATE._process
+            assert template is not None
+            template.send_signal(ends)
+            fails(client, "uploads")
+            until(lambda: client.get("/readyz").status_code == 200)
+            assert client.put("/assets/cameras", content=b"{}").status_code == 422
         parts_of(client).runner.stop()
         fails(client, "supervisor")
 

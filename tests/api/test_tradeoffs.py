@@ -67,7 +67,7 @@ def test_what_was_found_is_no_lift_and_goes_when_that_is_said(quick: Quick) -> N
         assert client.get(links["chart"], headers=tag).status_code == 304
         assert client.get(found.json()["links"]["table"]).text == "a table"
         job = found.json()["id"]
-        assert client.get("/lifts").json() == {"lifts": []}
+        assert client.get("/lifts").json()["lifts"] == []
         lift = ended(client, client.post("/lift", json=body).headers["location"])["id"]
         for path in (f"/lifts/{job}", f"/lifts/{job}/features", f"/tradeoffs/{lift}", f"/tradeoffs/{lift}/chart"):
             assert assert_problem(client.get(path))["type"] == "/problems/not-found"
@@ -99,7 +99,7 @@ def test_bad_order_is_a_problem_that_names_what_is_wrong(quick: Quick, wrong: di
         reply = client.post("/tradeoff", content=content, headers={"Content-Type": "application/json"})
         problem = assert_problem(reply)
         assert problem["status"] == (404 if told == "splats" else 422) and told in problem["detail"]
-        assert client.get("/jobs").json() == {"jobs": []}
+        assert client.get("/jobs").json()["jobs"] == []
 
 
 def test_room_for_the_exact_features_is_asked_for_beforehand(

@@ -27,7 +27,7 @@ from service.store.keys import any_key
 from service.store.owners import SERVICE
 from service.store.store import Store
 
-from .conftest import ended, order
+from .conftest import ended, order, until
 from .server import standing_in
 
 
@@ -129,6 +129,14 @@ def malformed(path: Path) -> None:
     path.write_bytes(b"this is a letter to nobody. " * 1000)
 
 
+def overwritten(path: Path) -> None:
+    """All pages but the first two."""
+    with path.open("r+b") as file:
+        size = path.stat().st_size
+        file.seek(8192)
+        file.write(b"\xa5" * (size - 8192))
+
+
 def replaced(path: Path) -> None:
     other = path.with_name("other.sqlite")  # made aside: beside the WAL of the one in use, locks would meet
     Database(other, rebuilding=True).close()
@@ -154,6 +162,16 @@ def test_broken_database_is_told_by_readyz_and_takes_no_order(broken: Callable[[
         if broken is replaced:
             assert left.execute("SELECT count(*) FROM jobs").fetchone()[0] == 0  # nothing goes to a stranger
         left.close()
+
+
+def test_readyz_tells_of_pages_that_somebody_overwrote(tmp_path: Path) -> None:
+    with serving(tmp_path / "data") as (store, client, _):
+        assert client.get("/readyz").status_code == 200
+        with store.database.read() as connection:
+            connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        overwritten(tmp_path / "data" / DATABASE)
+        until(lambda: client.get("/readyz").status_code == 503)
+        assert client.get("/readyz").json()["argument"] == "database"
 
 
 def test_another_database_in_its_place_costs_no_file(tmp_path: Path) -> None:
