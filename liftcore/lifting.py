@@ -36,8 +36,8 @@ from liftcore.solve.diagnostics import certify, lift_warnings, measure_samples
 from liftcore.solve.geometry import Geometry, Given, LiftViews, as_read, weigh_views
 from liftcore.solve.least_squares import AllRays, reference, refine
 from liftcore.solve.loss import huber_factors
-from liftcore.solve.objects import RegionObjects, region_objects
-from liftcore.solve.reweight import Agreement, agreement_factors, reweighted
+from liftcore.solve.objects import RegionObjects, object_facts, region_objects
+from liftcore.solve.reweight import Agreement, agreement_factors, agreement_facts, reweighted, whole_regions
 from liftcore.solve.weights import RegionWeights
 from liftcore.torch_modes import usual_modes
 from liftcore.warm_up import warm_up_lift
@@ -75,7 +75,7 @@ def lift(
         checkpoint: a folder that keeps the weights of finished views. The same lift goes on from there, identical to
             the bit, and so does one that differs in features alone (another encoder's of the same regions).
         engine: who works on the lift in blocks of views and of splats, for scenes whose W or X is more than a machine
-            should hold: `LocalEngine` or `RayEngine`, with the same bits. The closed form alone; the checkpoint is
+            should hold: `LocalEngine` or `RayEngine`, with the same bits; the checkpoint is
             then the folder of the blocks, which all workers share. None: the whole lift in this process's memory.
         settings: fields of `LiftSettings` that differ from the preset's.
 
@@ -111,9 +111,11 @@ def lift(
         sums = geometry.weights.row_sums().cpu().numpy()
         X, notes = work.refine(found, geometry, solution.features, sums > 0)
         clusters = work.aggregate(found, geometry, W, X, sums, notes, agreement, things)
-        notes |= _reweighting(agreement, geometry) if agreement else {}
+        if agreement:
+            facts = agreement_facts(geometry.levels, agreement.reliability, agreement.confidence)
+            notes["reweighting"] = facts
         things = things if chosen.objects else None
-        notes |= _objects(things) if things else {}
+        notes |= {"objects": object_facts(things)} if things else {}
         diagnostics = work.diagnose(found, geometry, X, sums, plan, notes)
     warn.of(diagnostics["warnings"] if on_plan is None else ())
     table = found.features.table
@@ -166,23 +168,6 @@ def plan(
     splats = check_given(splats, chosen.antialiased, threads)
     found = LiftViews.of(views, cameras, chosen)
     return plan_lift(splats, found, chosen, choose_device(chosen.device), threads, look=True)
-
-
-def _reweighting(found: Agreement, geometry: Geometry) -> dict[str, Any]:
-    """What reweighting tells of the scene's features, for the diagnostics."""
-    confident = found.confidence
-    facts: dict[str, Any] = {"masks": int((geometry.levels >= 0).sum())}
-    if found.reliability is not None:
-        facts["reliability_median"] = found.reliability
-    if confident is not None:
-        facts["confidence_mean"] = float(confident.mean())
-    return {"reweighting": facts}
-
-
-def _objects(found: RegionObjects) -> dict[str, Any]:
-    """What the graph of regions held together, for the diagnostics."""
-    share = float((found.labels >= 0).mean())
-    return {"objects": {"found": len(found.views), "splats_share": share, "regions": int((found.regions >= 0).sum())}}
 
 
 def log_warnings(plan: Plan) -> None:
@@ -279,13 +264,7 @@ class _Lift:
                 views,
                 self.settings,
                 self.progress,
-                by_rows=bool(
-                    self.settings.robust_steps
-                    or self.settings.loss == "huber"
-                    or self.settings.aggregation_resolve
-                    or self.settings.objects is True
-                    or self._by_masks
-                ),
+                by_rows=self.settings.weighs_rows,
                 checkpoint=checkpoint.of(self.splats, self.device.facts()) if checkpoint else None,
                 device_bytes=plan.kept_on_card,
                 threads=self.threads,
@@ -294,26 +273,13 @@ class _Lift:
             )
         return geometry, plans[-1]
 
-    @property
-    def _by_masks(self) -> bool:
-        """Whether masks, where there are any, make the clusters of the aggregation; then no region is dropped."""
-        settings = self.settings
-        chosen = settings.aggregation_clusters == "auto" and not settings.aggregation_resolve
-        return settings.aggregation and (chosen or settings.aggregation_clusters == "graph")
-
     def find_objects(self, geometry: Geometry) -> RegionObjects | None:
         """What masks of many views keep together, or None where they are not looked for.
 
         Raises:
             InvalidSettings: objects are asked for, or clusters that masks make, and no view has masks.
         """
-        masks = bool((geometry.levels >= 0).any())
-        graph = self.settings.aggregation and self.settings.aggregation_clusters == "graph"
-        for name, asked in (("objects", self.settings.objects is True), ("aggregation_clusters", graph)):
-            if asked and not masks:
-                expected = "views with masks: objects are what masks of several views keep together"
-                raise InvalidSettings(name, expected=expected, got="grids, or maps without a label", hint="take auto")
-        if not masks or not (self.settings.objects or self._by_masks):
+        if not self.settings.finds_objects(bool((geometry.levels >= 0).any())):
             return None
         with self.timings.stage("objects"):
             return region_objects(geometry.weights.cpu(), geometry.levels, geometry.evidence().numpy(), self.threads)
@@ -325,12 +291,7 @@ class _Lift:
             InvalidSettings: consensus is asked for, and no view has masks.
         """
         W, settings, consensus = geometry.weights, self.settings, None
-        masks = bool((geometry.levels >= 0).any())
-        if settings.consensus is True and not masks:
-            expected = "views with masks: cells of a grid say nothing of what they show"
-            got = "grids, or maps without a label"
-            raise InvalidSettings("consensus", expected=expected, got=got, hint="leave it at auto")
-        if settings.consensus and masks:
+        if settings.asks_consensus(bool((geometry.levels >= 0).any())):
             with self.timings.stage("consensus"):
                 W = W.cpu()
                 found = mask_consensus(W, geometry.levels, self.threads, means=self.splats.means)
@@ -346,7 +307,7 @@ class _Lift:
                     self.progress,
                     means=self.splats.means,
                     threads=self.threads,
-                    reliability=self._whole_regions(geometry.levels),
+                    reliability=whole_regions(settings.reliability, geometry.levels),
                     consensus=consensus,
                 )
                 W = reweighted(W, agreement.factors)
@@ -355,13 +316,6 @@ class _Lift:
                 W, how = W.cpu(), {"means": self.splats.means, "threads": self.threads}
                 W = reweighted(W, huber_factors(W, geometry.codebook, self.progress, **how))
         return W, agreement
-
-    def _whole_regions(self, levels: np.ndarray) -> Tensor | None:
-        """The regions that are weighted as a whole, [M] bool: with ``auto`` those of masks; None where none is."""
-        chosen = (
-            levels >= 0 if self.settings.reliability == "auto" else np.full(levels.shape, self.settings.reliability)
-        )
-        return torch.from_numpy(chosen) if chosen.any() else None
 
     def solve(self, W: RegionWeights, geometry: Geometry, plan: Plan) -> Solution:
         """The closed form."""
@@ -430,7 +384,7 @@ class _Lift:
                 settings,
                 self.progress,
                 self.threads,
-                things=things if self._by_masks else None,
+                things=things if self.settings.clusters_by_masks else None,
                 judged=judged,
             )
         notes["aggregation"] = found.facts

@@ -20,6 +20,7 @@ from liftcore.raster.base import MOST_OF_A_RAY, CompositingParams, Selection, We
 TIKHONOV_GAIN = 1.2  # lambda of the paper's Tikhonov Guidance (App. Tikhonov, lambda sweep)
 LARGEST_ALPHA = 0.9999999  # nearer to one, float32 says one, and the ray has no light left to go on with
 VISIBLE_WEIGHT = 0.05  # a splat that weighs less at its centre is hidden there, or hardly there at all
+NO_MASKS = "grids, or maps without a label"
 _SHOWN = 80  # characters of a wrong value in an error
 NEAREST = 3  # settings that are named where one is unknown
 
@@ -220,6 +221,42 @@ class LiftSettings(BaseModel):
     def weighting(self) -> Weighting:
         """What counts as a weight while lifting."""
         return Weighting(self.power, self.selection, self.k, self.mass, self.weight_floor)
+
+    @property
+    def clusters_by_masks(self) -> bool:
+        """Whether masks, where there are any, make the clusters of the aggregation; then no region is dropped."""
+        chosen = self.aggregation_clusters == "auto" and not self.aggregation_resolve
+        return self.aggregation and (chosen or self.aggregation_clusters == "graph")
+
+    @property
+    def weighs_rows(self) -> bool:
+        """Whether each row of a codebook needs weights of its own: what reads them counts no tuples of rows."""
+        named = self.robust_steps or self.loss == "huber" or self.aggregation_resolve or self.objects is True
+        return bool(named or self.clusters_by_masks)
+
+    def finds_objects(self, masks: bool) -> bool:
+        """Whether objects are looked for, where views have masks or not.
+
+        Raises:
+            InvalidSettings: objects, or clusters that masks make, are asked for, and no view has masks.
+        """
+        graph = self.aggregation and self.aggregation_clusters == "graph"
+        for name, asked in (("objects", self.objects is True), ("aggregation_clusters", graph)):
+            if asked and not masks:
+                expected = "views with masks: objects are what masks of several views keep together"
+                raise InvalidSettings(name, expected=expected, got=NO_MASKS, hint="take auto")
+        return masks and bool(self.objects or self.clusters_by_masks)
+
+    def asks_consensus(self, masks: bool) -> bool:
+        """Whether masks are compared with one another, where views have masks or not.
+
+        Raises:
+            InvalidSettings: consensus is asked for, and no view has masks.
+        """
+        if self.consensus is True and not masks:
+            expected = "views with masks: cells of a grid say nothing of what they show"
+            raise InvalidSettings("consensus", expected=expected, got=NO_MASKS, hint="leave it at auto")
+        return masks and bool(self.consensus)
 
     def _compositing(self, opacity_logit_scale: float) -> CompositingParams:
         return CompositingParams(opacity_logit_scale, self.alpha_cap, self.transmittance_stop, self.antialiased)

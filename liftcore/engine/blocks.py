@@ -1,11 +1,9 @@
-"""The pieces of a lift in blocks: W of a few views, X of a range of splats. Files in, files out.
+"""A lift in blocks: the job that all workers know, and its first step, W of a few views. Files in, files out.
 
 **Weighing** (`weigh`) reads WEIGHED views and writes a file each: its ``W = A'^T S`` (`RegionWeights`), the codebook
 E of its regions, and its sampled rays. It holds the splats that its views can see, and no others.
 
-**Solving** (`solve`) takes ROWS splats and adds up ``X = D^-1 sum_g W_g E_g`` over groups g of SUMMED views, in the
-order of their names: D first, from W alone, then the groups, of which one is in memory at a time. Where a cut falls
-decides the order of sums, so these numbers are part of the answer; who did which piece is not.
+What follows on the views' files are the steps of `liftcore.engine.steps`, whose pieces are views or blocks of splats.
 """
 
 from __future__ import annotations
@@ -24,7 +22,7 @@ from torch import Tensor
 from liftcore.device import choose_device
 from liftcore.features.pack import pair, read_features
 from liftcore.io.safetensors_file import map_tensors, write_tensors
-from liftcore.io.shards import ROWS, features_file, write_rows
+from liftcore.io.shards import ROWS, features_file
 from liftcore.one_thread import one_thread
 from liftcore.raster import open_raster
 from liftcore.raster.base import RayRows, ViewWeights
@@ -33,14 +31,12 @@ from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings
-from liftcore.solve.closed_form import solve_rows
-from liftcore.solve.codebook import Codebook, ViewCodebook
+from liftcore.solve.codebook import ViewCodebook
 from liftcore.solve.geometry import LiftViews, Question, Readout, SampledRays, question_of
-from liftcore.solve.weights import RegionWeights, run_each, stacked
+from liftcore.solve.weights import RegionWeights, run_each
 from liftcore.warm_up import warm_up_lift
 
 WEIGHED = 8  # views of a piece: some seconds of work, which is what a worker that dies loses
-SUMMED = 64  # views of a group, whose W and E of some splats are in memory together
 SELECTED = 1 << 22  # splats beyond which a worker holds only those that its views see: 1 GB as the raster has them
 STEP = 1 << 18  # splats that are looked at together for it
 SCENE = "scene.safetensors"
@@ -60,7 +56,14 @@ class Job:
     channels: int  # F
     dtype: torch.dtype = torch.float16  # of X
     selected: int = SELECTED
-    rows: int = ROWS
+    rows: int = ROWS  # of a block of splats: pieces of sums, and whole pages of X
+    step: int = 0  # of those that are taken several times
+    related: bool = False  # whether tuples of masks are needed
+    usual_share: float | None = None  # the mean share of mask consensus; None where there is none
+    by_region: bool = False  # whether regions are weighted as a whole
+    delta: float | None = None  # of Huber's loss
+    clusters: int = 0  # whose features splats may take
+    guarded: bool = False  # whether they do where it explains them
 
     @property
     def weighings(self) -> int:
@@ -75,6 +78,18 @@ class Job:
     def view_file(self, number: int) -> Path:
         """What was found of the view of that number."""
         return self.folder / f"view-{number:05}.safetensors"
+
+    def views_of(self, piece: int) -> range:
+        """The numbers of the views of a piece."""
+        return range(WEIGHED * piece, min(WEIGHED * (piece + 1), len(self.names)))
+
+    def piece_file(self, step: str, number: int) -> Path:
+        """What a step wrote of a piece."""
+        return self.folder / f"{step}-{number:05}.safetensors"
+
+    def solved_file(self, number: int) -> Path:
+        """X of a range of splats as it is solved; splats may take other features then."""
+        return self.piece_file("solved", number) if self.clusters else self.features_file(number)
 
     def features_file(self, number: int) -> Path:
         """X of a range of splats."""
@@ -91,6 +106,7 @@ class FoundView(NamedTuple):
     weights: RegionWeights
     codebook: ViewCodebook
     sample: SampledRays
+    levels: np.ndarray  # [M] i8, as `Geometry` has them
 
 
 # ---- weighing
@@ -103,8 +119,7 @@ def weigh(job: Job, piece: int, threads: int | None) -> None:
     Raises:
         InvalidFeatures: a view is malformed.
     """
-    numbers = range(WEIGHED * piece, min(WEIGHED * (piece + 1), len(job.names)))
-    numbers = [number for number in numbers if not job.view_file(number).exists()]
+    numbers = [number for number in job.views_of(piece) if not job.view_file(number).exists()]
     if not numbers:
         return
     device = choose_device(job.settings.device)
@@ -117,7 +132,7 @@ def weigh(job: Job, piece: int, threads: int | None) -> None:
 
     def requests():
         for number in numbers:
-            waiting.append(question_of(views, number, job.settings, by_rows=False))
+            waiting.append(question_of(views, number, job.settings, by_rows=job.settings.weighs_rows))
             yield waiting[-1].request
 
     with closing(raster.iterate_views(requests())) as found:
@@ -135,7 +150,7 @@ def seen_splats(job: Job, cameras: list[Camera], threads: int | None) -> tuple[S
     All of them where they are few, and the first alone where none is in sight. Their order stays, so rays meet the
     same splats one after the other as in the whole scene.
     """
-    scene = _scene(job.folder / SCENE, job.kernel)
+    scene = scene_of(job)
     if job.splats <= job.selected:
         return scene, torch.arange(job.splats, dtype=torch.int32)
     params, seen = job.settings.lift_params, np.zeros(job.splats, bool)
@@ -162,8 +177,20 @@ def write_scene(splats: Splats, path: Path) -> None:
     write_tensors(path, {name: tensor.cpu() for name, tensor in tensors.items() if tensor is not None}, {})
 
 
+def scene_of(job: Job) -> Splats:
+    """The geometry of all splats, mapped."""
+    path = job.folder / SCENE
+    return _scene(path, file_version(path), job.kernel)
+
+
+def file_version(path: Path) -> tuple[int, int]:
+    """What tells a file from one that was in its place before."""
+    found = path.stat()
+    return found.st_mtime_ns, found.st_ino
+
+
 @lru_cache(maxsize=1)
-def _scene(path: Path, kernel: Kernel) -> Splats:
+def _scene(path: Path, _version: tuple[int, int], kernel: Kernel) -> Splats:
     found = {name: torch.from_numpy(array) for name, array in map_tensors(path)[0].items()}
     means, quats, log_scales, logits = (found[name] for name in ("means", "quats", "log_scales", "opacity_logits"))
     return Splats(means, quats, log_scales, logits, kernel, beta=found.get("beta"))
@@ -193,7 +220,7 @@ def _write_view(path: Path, weights: RegionWeights, asked: Question, rows: RayRo
     readout, tuples = asked.readout, asked.codebook.tuples
     others = {f"rays/{name}": getattr(rows, name) for name in ("indptr", "splats", "weights")}
     others |= {f"read/{name}": torch.from_numpy(getattr(readout, name)) for name in ("rays", "columns", "shares")}
-    others["codebook"] = asked.codebook.rows
+    others |= {"codebook": asked.codebook.rows, "levels": torch.from_numpy(asked.levels)}
     weights.save(path, others | ({} if tuples is None else {"tuples": tuples}))
 
 
@@ -202,55 +229,5 @@ def read_view(path: Path) -> FoundView:
     weights, others = RegionWeights.load_with_others(path)
     rows = RayRows(**{name: others[f"rays/{name}"] for name in ("indptr", "splats", "weights")})
     readout = Readout(**{name: others[f"read/{name}"].numpy() for name in ("rays", "columns", "shares")})
-    return FoundView(weights, ViewCodebook(others["codebook"], others.get("tuples")), SampledRays(rows, readout))
-
-
-# ---- solving
-
-
-@one_thread()
-def solve(job: Job, piece: int, threads: int | None) -> None:
-    """Write X of a range of splats, and what supports it: evidence, agreement, and the sums of W."""
-    if job.columns_file(piece).exists() and job.features_file(piece).exists():
-        return
-    first, last = piece * job.rows, min((piece + 1) * job.rows, job.splats)
-    sums = torch.zeros(last - first, dtype=torch.float64)
-    evidence = torch.zeros(last - first, dtype=torch.float64)
-    for number in range(len(job.names)):
-        own = read_view(job.view_file(number)).weights.of_splats(first, last)
-        sums[own.splats.long()] += own.row_sums()
-        evidence[own.evidence_splats.long()] += own.evidence.double()
-    X, unit = _summed(job, (first, last), sums, threads)
-    write_rows(job.features_file(piece), X.to(job.dtype))
-    agreement = torch.linalg.vector_norm(unit, dim=1).clamp(0.0, 1.0)
-    columns = {"evidence": evidence.float(), "agreement": agreement, "seen": sums > 0, "sums": sums}
-    write_tensors(job.columns_file(piece), columns, {})
-
-
-def _summed(job: Job, bounds: tuple[int, int], sums: Tensor, threads: int | None) -> tuple[Tensor, Tensor]:
-    """The weighted means [n, F] f32 of what the splats' regions say, and of the unit vectors of it."""
-    first, last = bounds
-    device = choose_device(job.settings.device)
-    means = _scene(job.folder / SCENE, job.kernel).means[first:last]
-    X = torch.zeros(last - first, job.channels)
-    unit = None  # the same as X for as long as all codebooks are of unit vectors
-    for begin in range(0, len(job.names), SUMMED):
-        parts, books = [], []
-        for number in range(begin, min(begin + SUMMED, len(job.names))):
-            found = read_view(job.view_file(number))
-            own = found.weights.of_splats(first, last)
-            if own.splats.numel():
-                parts.append(own)
-                books.append(found.codebook)
-        if not parts:
-            continue
-        W, codebook = stacked(parts, last - first, threads), Codebook(tuple(books))
-        rows = torch.nonzero(W.indptr.diff())[:, 0]
-        if not codebook.unit and unit is None:
-            unit = X.clone()
-        part, unit_part = torch.zeros_like(X), None if unit is None else torch.zeros_like(X)
-        solve_rows(part, rows, W, codebook, means=means, threads=threads, device=device, sums=sums, unit=unit_part)
-        X += part
-        if unit is not None and unit_part is not None:
-            unit += unit_part
-    return X, X if unit is None else unit
+    codebook, sample = ViewCodebook(others["codebook"], others.get("tuples")), SampledRays(rows, readout)
+    return FoundView(weights, codebook, sample, others["levels"].numpy())

@@ -35,6 +35,8 @@ TYPES = {
     "torch.int32": "I32",
     "torch.float16": "F16",
     "torch.int16": "I16",
+    "torch.int8": "I8",
+    "torch.uint8": "U8",
     "torch.bool": "BOOL",
 }
 COPIED_BYTES = 1 << 20

@@ -12,11 +12,13 @@ codebook, of the size of M.
 """
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from liftcore.io.safetensors_file import map_tensors, write_tensors
 from liftcore.jit import kernel
 from liftcore.solve.codebook import LEAST_CHANNELS, TABLE_BYTES, Codebook
 from liftcore.solve.sums import PieceSums, added, piece_sums
@@ -26,6 +28,7 @@ CPU = torch.device("cpu")
 ROWS = 1 << 14  # of a table in float64 at a time
 DIRECTIONS = 256  # principal ones, in which cosines are taken where regions are few beside entries
 SAMPLE = 1 << 14  # regions that say which directions are principal
+FILE = "directions.safetensors"
 NO_DIRECTION = 1e-6  # a unit vector nearer to the mean than that is the mean
 
 
@@ -54,11 +57,11 @@ class RegionDirections:
     @property
     def width(self) -> int:
         """D, how many numbers a direction has."""
-        return self._codebook.channels if self._axes is None else DIRECTIONS
+        return self.mean.shape[0] if self._axes is None else DIRECTIONS
 
     def slices(self) -> Iterator[slice]:
         """The columns that `table` gives at a time, so that it takes TABLE_BYTES."""
-        step = max(LEAST_CHANNELS, TABLE_BYTES // (4 * max(self._codebook.regions, 1)))
+        step = max(LEAST_CHANNELS, TABLE_BYTES // (4 * max(self.totals.shape[0], 1)))
         return (slice(begin, min(begin + step, self.width)) for begin in range(0, self.width, step))
 
     def table(self, columns: slice) -> Tensor:
@@ -69,6 +72,13 @@ class RegionDirections:
         for own in self._codebook.slices():
             table += self._centred(self._codebook.unit_values(own, CPU), own) @ self._axes[own, columns]
         return table
+
+    def save(self, folder: Path) -> None:
+        """Write them for `StoredDirections`: a file a table, of which each is made once."""
+        for number, columns in enumerate(self.slices()):
+            write_tensors(folder / _table_file(number), {"e": self.table(columns)}, {})
+        axes = {} if self._axes is None else {"axes": self._axes}
+        write_tensors(folder / FILE, {"mean": self.mean, "totals": self.totals, **axes}, {})
 
     def of(self, vectors: Tensor) -> Tensor:
         """Directions [K, D] f32 of other vectors [K, F], of length one in these columns; zeros for none."""
@@ -120,6 +130,24 @@ class RegionDirections:
         for part, own in zip(unit.split(ROWS), inverse.split(ROWS), strict=True):
             part.copy_((part.double() - self.mean[channels]) * own[:, None])
         return unit
+
+
+class StoredDirections(RegionDirections):
+    """Those that `RegionDirections.save` wrote into a folder, mapped: whoever compares regions makes no table."""
+
+    def __init__(self, folder: Path) -> None:
+        arrays = {name: torch.from_numpy(array) for name, array in map_tensors(folder / FILE)[0].items()}
+        self.mean, self.totals, self._axes = arrays["mean"], arrays["totals"], arrays.get("axes")
+        self._folder = folder
+
+    def table(self, columns: slice) -> Tensor:
+        """See `RegionDirections`; the columns are one of the slices."""
+        number = [own.start for own in self.slices()].index(columns.start)
+        return torch.from_numpy(map_tensors(self._folder / _table_file(number))[0]["e"])
+
+
+def _table_file(number: int) -> str:
+    return f"directions-{number:05}.safetensors"
 
 
 def region_totals(W: RegionWeights, threads: int | None = None) -> Iterator[PieceSums]:

@@ -27,6 +27,7 @@ splats, taken by pieces (`object_shares`, `view_shares`).
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -106,7 +107,8 @@ def region_objects(
         join(clusters, others, object_shares(W, labels, number, others, threads), number)
         labels = object_labels(W, clusters, number, threads)
     shown = added(view_shares(W, groups, labels, number, threads), (1, number * groups.views))
-    return numbered(labels, clusters, evidence, shown.reshape(number, groups.views))
+    place = object_numbers(labels, evidence, number)
+    return numbered(labels, clusters, place, shown.reshape(number, groups.views))
 
 
 def choose_nodes(groups: RegionGroups, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -338,19 +340,35 @@ def view_shares(
     return piece_sums(add, labels.size, (1, number * groups.views), threads)
 
 
-def numbered(labels: np.ndarray, clusters: np.ndarray, evidence: np.ndarray, shown: np.ndarray) -> RegionObjects:
-    """The objects of a scene, the most evidence first.
+def object_numbers(labels: np.ndarray, evidence: np.ndarray, number: int) -> np.ndarray:
+    """[K + 1] i32: the number of each cluster as an object, the most evidence first; -1 without a splat, and last.
 
     Args:
-        labels: [P] i32, the cluster of each splat. clusters: [M] i32, of each region. evidence: [P].
+        labels: [P] i32, the cluster of each splat. evidence: [P]. number: K.
+    """
+    own = labels >= 0
+    order = np.argsort(-np.bincount(labels[own], evidence[own], number), kind="stable")
+    order = order[np.bincount(labels[own], minlength=number)[order] > 0]
+    place = np.full(number + 1, NO_OBJECT, np.int32)
+    place[order] = np.arange(order.size)
+    return place
+
+
+def numbered(labels: np.ndarray, clusters: np.ndarray, place: np.ndarray, shown: np.ndarray) -> RegionObjects:
+    """The objects of a scene.
+
+    Args:
+        labels: [P] i32, the cluster of each splat. clusters: [M] i32, of each region. place: of `object_numbers`.
         shown: [K, V] f64, the weight of each cluster in each view.
     """
-    own, number = labels >= 0, len(shown)
-    order = np.argsort(-np.bincount(labels[own], evidence[own], number), kind="stable")
-    order = order[np.bincount(labels[own], minlength=number)[order] > 0]  # without a splat it is none
-    place = np.full(number + 1, NO_OBJECT, np.int32)  # the last is of -1
-    place[order] = np.arange(order.size)
+    order = np.argsort(place[:-1], kind="stable")[int((place[:-1] < 0).sum()) :]
     return RegionObjects(place[labels], _best_views(shown[order]), place[clusters])
+
+
+def object_facts(found: RegionObjects) -> dict[str, Any]:
+    """What the graph of regions held together, for the diagnostics."""
+    share = float((found.labels >= 0).mean())
+    return {"found": len(found.views), "splats_share": share, "regions": int((found.regions >= 0).sum())}
 
 
 def _best_views(shown: np.ndarray) -> np.ndarray:

@@ -45,6 +45,7 @@ block of splats). Of the scene they take c, r and the r_m: sums over all splats,
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -75,6 +76,30 @@ class Agreement:
     confidence: Tensor | None  # [P] f32 in 0..1; None after no step
     explained: Tensor | None  # [P] f32 in 0..1, how well a splat's own feature explains what views say; None likewise
     reliability: float | None = None  # r, the median over regions; None where it was not asked for
+
+
+def whole_regions(reliability: bool | str, levels: np.ndarray) -> Tensor | None:
+    """The regions that are weighted as a whole, [M] bool: with ``auto`` those of masks; None where none is.
+
+    Args:
+        reliability: the setting. levels: [M] i8, -1 for cells of grids.
+    """
+    chosen = levels >= 0 if reliability == "auto" else np.full(levels.shape, bool(reliability))
+    return torch.from_numpy(chosen) if chosen.any() else None
+
+
+def agreement_facts(levels: np.ndarray, reliability: float | None, confidence: Tensor | None) -> dict[str, Any]:
+    """What reweighting tells of the scene's features, for the diagnostics.
+
+    Args:
+        levels: [M] i8, -1 for cells of grids. confidence: [P] f32.
+    """
+    facts: dict[str, Any] = {"masks": int((levels >= 0).sum())}
+    if reliability is not None:
+        facts["reliability_median"] = reliability
+    if confidence is not None:
+        facts["confidence_mean"] = float(confidence.numpy().mean(dtype=np.float64))
+    return facts
 
 
 def reweighted(W: RegionWeights, factors: Tensor) -> RegionWeights:

@@ -30,7 +30,7 @@ import numpy as np
 import torch
 
 import liftcore as lc
-from liftcore.engine.blocks import SUMMED, WEIGHED
+from liftcore.engine.blocks import WEIGHED
 from liftcore.features.views import ViewFeatures
 from liftcore.io.shards import ROWS
 from tests.benchmarks.base import read_pack, read_scene
@@ -145,8 +145,7 @@ def tell_large(splats: int, channels: int, views: int) -> None:
         rounds = -(-parts // workers) * WEIGHED * view + -(-blocks // workers) * solve / blocks
         sent = traffic / workers / GIB
         print(f"  {workers:>3} workers: {rounds / 3600:.2f} h, {sent:.1f} GiB read and written by each")
-    print(f"  first to break: {goal_views * blocks} openings of files ({goal_views} views x {blocks} blocks, "
-          f"{SUMMED} at a time)")  # fmt: skip
+    print(f"  first to break: {goal_views * blocks} openings of files ({goal_views} views x {blocks} blocks)")
     print(f"  sums without waiting: {walk / 3600:.2f} h geometry, {solve / 3600:.2f} h solution")
 
 

@@ -483,11 +483,12 @@ def test_job_in_blocks_that_is_killed_goes_on_from_them(tmp_path: Path) -> None:
     assert torch.equal(lc.load_lift(order["output"]).features, whole.features)
 
 
-def test_job_that_needs_all_regions_is_lifted_whole_whatever_the_engine(tmp_path: Path) -> None:
+def test_job_of_an_engine_is_lifted_in_blocks_by_the_default_too(tmp_path: Path) -> None:
     order = order_of(tmp_path, preset="default")
     (tmp_path / "work").mkdir()
     lift_as_ordered(order, Reporter(io.BytesIO()))
     assert lc.load_lift(order["output"]).confidence is not None
+    assert list((tmp_path / "work").glob("rows-*.safetensors"))
 
 
 def test_lift_in_a_data_directory_behind_a_link_names_its_inputs_as_clients_do(tmp_path: Path) -> None:

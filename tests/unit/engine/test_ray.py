@@ -98,11 +98,12 @@ class Deadly(RayEngine):
 def test_workers_and_nodes_may_die(
     cluster: Any, stored: dict[str, Any], scene: dict[str, Any], tmp_path: Path
 ) -> None:
-    settings = LiftSettings.of(preset="row-sum", certificate_rays=100)
+    settings = LiftSettings.of(preset="default", certificate_rays=100)
     expected = in_blocks(LocalEngine(1), stored, settings)
     folder = tmp_path / "killed"
     assert_same(in_blocks(Deadly("auto"), stored, settings, folder=folder), expected)
-    assert sorted(path.name for path in folder.glob("*.died")) == ["solve-1.died", "weigh-1.died"]
+    steps = ("compare", "contain", "gather", "label", "relate", "share", "solve", "weigh")
+    assert sorted(path.name for path in folder.glob("*.died")) == [f"{step}-1.died" for step in steps]
     third = cluster.add_node(num_cpus=1, object_store_memory=80_000_000)
 
     def remove(stage: str, done: int, total: int, unit: str) -> None:

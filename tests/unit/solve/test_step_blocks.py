@@ -224,7 +224,8 @@ def test_objects_by_blocks_are_those_of_the_whole_scene(
         for sums in objects.view_shares(part, groups, own, number, 1)
     ]
     shown = added(over_files(sums), (1, number * VIEWS)).reshape(number, VIEWS)
-    got = objects.numbered(np.concatenate(labels), clusters, evidence, shown)
+    every = np.concatenate(labels)
+    got = objects.numbered(every, clusters, objects.object_numbers(every, evidence, number), shown)
     assert (got.labels >= 0).any() and len(got.views) > 1
     for name in ("labels", "views", "regions"):
         np.testing.assert_array_equal(getattr(got, name), getattr(whole, name))
