@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from enum import StrEnum
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
 from liftcore.errors import InvalidSettings
@@ -179,17 +179,19 @@ class LiftSettings(BaseModel):
         "auto", description="what walks and solves: auto takes a card where torch and Triton can use one"
     )
 
-    @model_validator(mode="before")
+    @model_validator(mode="wrap")
     @classmethod
-    def _fill_from_preset_and_speed(cls, values: Any) -> Any:
+    def _fill_from_preset_and_speed(cls, values: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
         if not isinstance(values, dict):
-            return values
+            return handler(values)
         preset, speed = values.get("preset", Preset.DEFAULT), values.get("speed", Speed.EXACT)
         weights = _PRESETS[Preset(preset)] if isinstance(preset, str) and preset in set(Preset) else {}
         effort = _SPEEDS[Speed(speed)] if isinstance(speed, str) and speed in set(Speed) else {}
         if values.get("robust_steps") in (0, "0"):  # what comes in with a step goes with it, unless it is asked for
             weights = {name: value for name, value in weights.items() if name not in _REWEIGHTED}
-        return {**weights, **effort, **values}
+        settings = handler({**weights, **effort, **values})
+        settings.model_fields_set.intersection_update(values)  # what a caller set, which stays when a preset changes
+        return settings
 
     @model_validator(mode="after")
     def _resolves_whole_regions(self) -> Self:
@@ -282,8 +284,10 @@ class LiftSettings(BaseModel):
         if not others:
             return preset
         chosen = {"preset": preset.preset, "speed": preset.speed}
-        filled = set(cls.of(**chosen).model_dump().items())
-        own = dict(set(preset.model_dump().items()) - filled)
+        values, filled = preset.model_dump(), cls.of(**chosen).model_dump()
+        given = preset.model_fields_set
+        given = given if len(given) < len(values) else set()  # all of them: settings of a file
+        own = {name: value for name, value in values.items() if name in given or value != filled[name]}
         return cls.of(**chosen | own | dict(others))
 
     @classmethod

@@ -10,7 +10,7 @@ from statistics import median
 from typing import TYPE_CHECKING
 
 from liftcore.cli.options import BAD_INPUT, Parser, add_verbose
-from liftcore.cli.reply import free_output, progress_bars, reply, writing
+from liftcore.cli.reply import PNG, free_output, progress_bars, reply, writing
 from liftcore.io.remote import place
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def run(options: argparse.Namespace) -> int:
     from liftcore.io.splats import read_splats
 
     if options.worst:
-        free_output(options.worst, [options.splats])
+        free_output(options.worst, [options.splats], PNG)
     packs = [path for path in options.others if path.suffix == ".safetensors"]
     photos = [path for path in options.others if path not in packs]
     begin = time.perf_counter()

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.cli.options import Parser, count
-from liftcore.cli.reply import folders_of, free_output, progress_bars, reply, told_folders, writing
+from liftcore.cli.reply import PACK, folders_of, free_output, progress_bars, reply, told_folders, writing
 from liftcore.errors import InvalidInput
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> int:
     from liftcore.features.encoders.encode import EncodeSettings, encode_images, find_images
 
     images = find_images(options.images)
-    out = free_output(options.output, list(images.values()))
+    out = free_output(options.output, list(images.values()), PACK)
     spec = options.encoder
     if options.weights:
         kind, _, named = spec.partition(":")

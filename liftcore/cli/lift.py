@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.cli.options import Parser, add_settings, add_sources, add_verbose, count
-from liftcore.cli.reply import free_output, progress_bars, reply, shown, writing
+from liftcore.cli.reply import JSON, LIFT, free_output, progress_bars, reply, shown, writing
 from liftcore.engine import ENGINES, engine_named
 from liftcore.errors import InvalidInput, InvalidSettings
 from liftcore.io.remote import is_remote, place, require_storage
@@ -56,7 +56,7 @@ def run(options: argparse.Namespace) -> int:
     if is_remote(out):
         require_storage(str(out))
     else:
-        out = free_output(out / INDEX if out.suffix == SUFFIX else out, inputs)
+        out = free_output(out / INDEX, inputs, JSON) if out.suffix == SUFFIX else free_output(out, inputs, LIFT)
     engine = engine_named(options.engine, options.address, options.threads)
     checkpoint = checkpoint_in(options.checkpoint) if options.checkpoint else None
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from liftcore.cli.options import Parser, add_encoder, text_encoder
 from liftcore.cli.query import made_from, place_of, write_files
-from liftcore.cli.reply import free_output, free_outputs, reply
+from liftcore.cli.reply import PLY, free_output, free_outputs, reply
 from liftcore.cli.segment import read_words
 from liftcore.io.remote import place
 
@@ -51,7 +51,7 @@ def run(options: argparse.Namespace) -> int:
     if options.splats:
         for one in found.objects:
             name = f"object-{one.id}"
-            files[name] = free_output(options.splats / f"{name}.ply", [*given, *made_from(scene)])
+            files[name] = free_output(options.splats / f"{name}.ply", [*given, *made_from(scene)], PLY)
             contents[name] = lambda number=one.id: one_object_ply(scene, number)
     document["files"] = write_files(files, contents)
     reply(document, as_json=options.json, lines=_lines(document))

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.cli.options import Parser
-from liftcore.cli.reply import folders_of, free_output, progress_bars, reply, shown, told_folders, writing
+from liftcore.cli.reply import PACK, folders_of, free_output, progress_bars, reply, shown, told_folders, writing
 from liftcore.errors import InvalidInput
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def run(options: argparse.Namespace) -> int:
         return _retag(options)
     with progress_bars() as progress:
         views, table, warnings = _views(options, progress)
-        out = free_output(options.output, views.inputs)
+        out = free_output(options.output, views.inputs, PACK)
         with writing(out):
             write_pack(out, views, _metadata(options), progress, table)
     packs = read_features(out)
@@ -127,7 +127,7 @@ def _retag(options: argparse.Namespace) -> int:
     names = {name: value for name, value in given.items() if value}
     if not names:
         raise InvalidInput("retag", expected="--text-space NAME or --encoder-name NAME", got="neither")
-    out = free_output(options.output, [options.pack])
+    out = free_output(options.output, [options.pack], PACK)
     read_features(options.pack)  # what is no pack leaves no file
     with writing(out), whole_file(out) as handle:
         handle.writelines(with_metadata(options.pack, names))
@@ -173,7 +173,7 @@ def _encoded_masks(options: argparse.Namespace, progress: Progress) -> tuple[Vie
     if not options.photos:
         raise InvalidInput("--photos", expected="the photos that the masks are of, for --encoder", got="none")
     files, photos = mask_files(options.folder), find_images(options.photos)
-    free_output(options.output, [*files.values(), *photos.values()])  # told before the work
+    free_output(options.output, [*files.values(), *photos.values()], PACK)  # told before the work
     encoder = CropEncoder.open(options.encoder, device_named(options.device))
     vectors, readings = crop_vectors(files, photos, encoder, options.unlabelled, progress)
     options.encoder_name = options.encoder_name or f"crops of masks, {encoder.name}"

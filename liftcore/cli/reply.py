@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,19 +29,50 @@ def reply(document: Mapping[str, Any], *, as_json: bool, lines: Iterable[str] | 
         print(line)
 
 
-def free_output(path: Path, inputs: Sequence[Path]) -> Path:
-    """An output path that can be written, and is no folder and none of the inputs.
+@dataclass(frozen=True)
+class OutputType:
+    """What an option writes."""
 
-    Checked before the work, so that an hour of it is not lost over a misspelt name.
+    name: str  # as errors have it
+    suffixes: tuple[str, ...]
+    kind: str | None  # of `liftcore.io.kinds`, that a file may have which is replaced
+    told: str = ""  # of a file without a kind, what the name of its kind begins with; empty: of a text
+
+
+SPLATS = OutputType("splats", (".ply", ".splat", ".spz"), "splats")
+PLY = OutputType("a PLY", (".ply",), "splats")
+PNG = OutputType("a picture", (".png",), None, "a picture")
+NPY = OutputType("an array", (".npy",), None, "a NumPy array")
+LIFT = OutputType("a lift", (".safetensors", ".shards"), "lift")
+PACK = OutputType("a feature pack", (".safetensors",), "features")
+CSV = OutputType("a table", (".csv",), None)
+JSON = OutputType("JSON", (".json",), None)
+OUTPUTS = {
+    "object": SPLATS, "coloured": PLY, "labelled": PLY, "names": JSON, "scores": NPY, "splat_labels": NPY, "csv": CSV,
+    **dict.fromkeys(("mask", "attention", "overlay", "labels", "picture", "output", "worst"), PNG),
+}  # by the options that name files  # fmt: skip
+CONVERTED = (".sog", ".glb", ".html", ".csv", ".compressed.ply", ".splat", ".spz")  # which splat-transform writes
+
+
+def free_output(path: Path, inputs: Sequence[Path], written: OutputType) -> Path:
+    """An output path that can be written, and is no folder, none of the inputs and no file of another kind.
+
+    Checked before the work, so that an hour of it is not lost over a misspelt name. A file of the kind that is
+    written is replaced.
+
+    Args:
+        path: as the user gave it. inputs: of the command. written: what goes there.
 
     Raises:
-        InvalidInput: it is one of these, or no file can be made there.
+        InvalidInput: it is one of these, its suffix is not written, or no file can be made there.
     """
     with writing(path):
         if path.is_dir():
             raise InvalidInput("output", expected="a file to write", got=f"the folder {path}")
         if any(path.exists() and source.exists() and path.samefile(source) for source in inputs):
             raise InvalidInput("output", expected="another file than the inputs", got=str(path))
+        _require_suffix(path, written)
+        _require_same_kind(path, written)
         folder = next(parent for parent in path.absolute().parents if os.path.lexists(parent))
         if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
             raise InvalidInput("output", expected="a folder that can be written", got=str(folder))
@@ -56,8 +88,33 @@ def free_outputs(files: Mapping[str, Path], inputs: Sequence[Path]) -> None:
     if len({path.absolute() for path in files.values()}) < len(files):
         named = " and ".join(f"--{name.replace('_', '-')}" for name in files)
         raise InvalidInput(named, expected="a file each", got="the same file twice")
-    for path in files.values():
-        free_output(path, inputs)
+    for name, path in files.items():
+        free_output(path, inputs, OUTPUTS[name])
+
+
+def _require_suffix(path: Path, written: OutputType) -> None:
+    name = path.name.lower()
+    if name.endswith(written.suffixes) and not name.endswith(".compressed.ply"):
+        return
+    hint = ""
+    if ".ply" in written.suffixes and name.endswith(CONVERTED):
+        stem = path.name[: -len(next(suffix for suffix in CONVERTED if name.endswith(suffix)))]
+        hint = f"write {stem}.ply, and convert it: npx @playcanvas/splat-transform {stem}.ply {path.name}"
+    ends = " or ".join(written.suffixes)
+    raise InvalidInput("output", expected=f"a name of {written.name}, ending in {ends}", got=str(path), hint=hint)
+
+
+def _require_same_kind(path: Path, written: OutputType) -> None:
+    from liftcore.io.kinds import identify
+
+    if not path.is_file() or path.stat().st_size == 0:
+        return
+    found = identify(path)
+    fits = found.kind == written.kind if written.kind else found.kind is None and found.name.startswith(written.told)
+    if not fits:
+        expected = f"a new file, or one of {written.name} to replace"
+        hint = "name another file, or remove that one first"
+        raise InvalidInput("output", expected=expected, got=f"{path}, which is {found.name}", hint=hint)
 
 
 @contextmanager

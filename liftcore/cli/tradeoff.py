@@ -8,7 +8,7 @@ from pathlib import Path
 
 from liftcore.cli.lift import pairs_of
 from liftcore.cli.options import Parser, add_sources, count
-from liftcore.cli.reply import free_output, progress_bars, reply, writing
+from liftcore.cli.reply import JSON, free_output, progress_bars, reply, writing
 from liftcore.errors import InvalidSettings
 
 
@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> int:
     from liftcore.evaluate.tradeoff import Scene, compare
     from liftcore.evaluate.tradeoff_report import page_of, save
 
-    free_output(options.out / "tradeoff.json", [])
+    free_output(options.out / "tradeoff.json", [], JSON)
     scene = Scene(
         options.splats,
         options.cameras,

@@ -72,6 +72,9 @@ def _array(tensors: dict[str, Any], name: str, path: Path) -> np.ndarray:
     import torch
 
     found = tensors.get(name)
+    if isinstance(found, torch.Tensor) and not _is_stored(found):
+        got = f"{list(found.shape)} that the file does not hold"
+        raise InvalidSplats(f"{path} {name}", expected="floats, a row a splat", got=got[:160], hint=EXPORT_PLY)
     if not isinstance(found, torch.Tensor) or not found.is_floating_point() or not found.ndim or not len(found):
         got = (
             f"{str(found.dtype).removeprefix('torch.')} {list(found.shape)}"
@@ -80,3 +83,12 @@ def _array(tensors: dict[str, Any], name: str, path: Path) -> np.ndarray:
         )
         raise InvalidSplats(f"{path} {name}", expected="floats, a row a splat", got=got, hint=EXPORT_PLY)
     return found.detach().to(torch.float32).numpy()
+
+
+def _is_stored(tensor: Any) -> bool:
+    """Whether the file holds every number of a tensor: none is repeated by strides, sparse, or without a place."""
+    import torch
+
+    if tensor.layout is not torch.strided or tensor.device.type != "cpu" or tensor.is_quantized:
+        return False
+    return tensor.numel() * tensor.element_size() <= tensor.untyped_storage().nbytes()

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from liftcore.io.files import whole_file
+from liftcore.io.files import open_regular, whole_file
 from liftcore.io.safetensors_file import DTYPES, map_tensors, safetensors_header, tensor_bytes, write_tensors
 
 if TYPE_CHECKING:
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 SUFFIX = ".shards"  # of the folder's name
 INDEX = "lift.safetensors.index.json"
 COLUMNS = "columns.safetensors"
+MAX_INDEX_BYTES = 64 << 20
 ROWS = 1 << 17  # splats of a shard: with 512 channels of float16, 128 MiB
 PAGE = 1 << 16  # bytes: the largest page of the machines that run this
 NO_RESERVE = 0x4000 if sys.platform == "linux" else 0  # flags of mmap, which Python does not name
@@ -96,11 +97,15 @@ def map_shards(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     Raises:
         SafetensorError, OSError, ValueError: a file is missing, is none, or does not fit the others.
     """
-    told = json.loads((folder / INDEX).read_bytes())
+    with open_regular(folder / INDEX) as handle:
+        content = handle.read(MAX_INDEX_BYTES + 1)
+    if len(content) > MAX_INDEX_BYTES:
+        raise ValueError(f"an index of more than {MAX_INDEX_BYTES} bytes")
     try:
-        metadata, named = told["metadata"], dict(told["weight_map"])
+        told = json.loads(content)
+        metadata, named = dict(told["metadata"]), dict(told["weight_map"])
         files = sorted({str(file) for file in named.values()} - {COLUMNS})
-    except (TypeError, KeyError, ValueError):
+    except (TypeError, KeyError, ValueError, RecursionError):
         raise ValueError("an index without metadata and weight_map") from None
     strangers = [file for file in files if Path(file).name != file]
     if strangers or files != [features_file(number) for number in range(len(files))] or not files:
@@ -115,13 +120,18 @@ def shard_at(path: Path) -> Shard:
     Raises:
         OSError, ValueError: there is no whole shard.
     """
-    with path.open("rb") as handle:
+    with open_regular(path) as handle:
         begin = 8 + int.from_bytes(handle.read(8), "little")
         if begin % PAGE or begin > 2 * PAGE:
             raise ValueError(f"{path.name} is no shard: its rows begin at byte {begin}")
-        told = json.loads(handle.read(begin - 8))[path.name.partition(".")[0]]
         size = os.fstat(handle.fileno()).st_size
-    dtype, shape = np.dtype(DTYPES[told["dtype"]]), tuple(told["shape"])
+        try:
+            told = json.loads(handle.read(begin - 8))[path.name.partition(".")[0]]
+            dtype, shape = np.dtype(DTYPES[told["dtype"]]), tuple(told["shape"])
+        except (TypeError, KeyError, ValueError, RecursionError):
+            raise ValueError(f"{path.name} is no shard: its header does not describe its rows") from None
+    if not all(type(side) is int and side > 0 for side in shape):
+        raise ValueError(f"{path.name} is no shard of rows: {shape}"[:160])
     if len(shape) != 2 or size != begin + shape[0] * shape[1] * dtype.itemsize:
         raise ValueError(f"{path.name} has {size} bytes, which are not {list(shape)} of {dtype}")
     return Shard(path, begin, shape, dtype)

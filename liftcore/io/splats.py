@@ -39,7 +39,11 @@ _READERS: dict[SplatFormat, Callable[..., Fields]] = {
     SplatFormat.SOG: read_sog,
     SplatFormat.CHECKPOINT: read_checkpoint,
 }
-_WRITERS: dict[str, Callable[[Splats], Iterator[bytes]]] = {".splat": splat_blocks, ".spz": spz_blocks}
+_WRITERS: dict[str, Callable[[Splats], Iterator[bytes]]] = {
+    ".ply": ply.ply_blocks,
+    ".splat": splat_blocks,
+    ".spz": spz_blocks,
+}
 
 
 def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool = True) -> Splats:
@@ -99,6 +103,15 @@ def format_of(path: Path) -> SplatFormat:
     raise InvalidSplats(str(path), expected=EXPECTED, got=found.name, hint=hint)
 
 
+def splat_count(path: Path) -> int | None:
+    """P of a PLY by its header alone; None of another format, which is counted when it is read.
+
+    Raises:
+        InvalidSplats: the header is malformed, or it is of no format of splats.
+    """
+    return ply.read_header(path).count if format_of(path) is SplatFormat.PLY else None
+
+
 def splat_files(path: Path) -> list[Path]:
     """The files that splats are read from: one, or the several of a SOG that is not bundled.
 
@@ -128,12 +141,16 @@ def some_rows(path: Path, kept: np.ndarray, suffix: str = ".ply") -> Iterator[by
     A PLY gives its own bytes to one (`liftcore.io.ply.some_rows`); of another format comes a PLY of 3DGS.
 
     Args:
-        path: the file. kept: [P] bool, the rows to keep. suffix: of what is written; a PLY where it is unknown.
+        path: the file. kept: [P] bool, the rows to keep. suffix: of what is written.
 
     Raises:
         InvalidSplats: the file is malformed, or has another number of splats.
     """
-    write = _WRITERS.get(suffix, ply.ply_blocks)
+    if suffix not in _WRITERS:
+        hint = "write a .ply, and convert it: npx @playcanvas/splat-transform IN.ply OUT"
+        expected = f"one of {', '.join(_WRITERS)}"
+        raise InvalidSplats("suffix", expected=expected, got=repr(suffix)[:40], hint=hint)
+    write = _WRITERS[suffix]
     if write is ply.ply_blocks and format_of(path) is SplatFormat.PLY:
         return ply.some_rows(path, kept)
     splats = _of_count(path, len(kept))

@@ -11,6 +11,7 @@ import numpy as np
 
 from liftcore.errors import InvalidLift, InvalidQuery, InvalidSplats
 from liftcore.io.lift_file import read_lift
+from liftcore.io.splats import splat_count
 from liftcore.query.scores import mean_direction, norms_of
 from liftcore.query.text.table import TableEncoder, own_words
 
@@ -182,9 +183,23 @@ class QueryScene:
         """The file of the splats that were lifted.
 
         Raises:
-            InvalidLift: it moved, or is another than the one that was lifted.
+            InvalidLift: it moved, is another than the one that was lifted, or has another number of splats.
         """
-        return self._unchanged("splats", self.metadata.splats)
+        path = self._unchanged("splats", self.metadata.splats)
+        self._require_rows(splat_count(path))
+        return path
+
+    def _require_rows(self, splats: int | None) -> None:
+        """Refuse a lift whose rows are not those of its splats: each answer would name others.
+
+        Args:
+            splats: how many there are; None where that is not known yet.
+        """
+        if splats not in (None, len(self.features)):
+            raise InvalidLift(
+                str(self.path), expected=f"a row for each of its {splats} splats", got=f"{len(self.features)} rows",
+                hint="crop the splats with their lift, or lift the cropped splats again",
+            )  # fmt: skip
 
     @cached_property
     def splats(self) -> Splats:
@@ -195,7 +210,9 @@ class QueryScene:
         """
         from liftcore.io.splats import read_splats
 
-        return read_splats(self.splat_file, self.metadata.settings.kernel)
+        splats = read_splats(self.splat_file, self.metadata.settings.kernel)
+        self._require_rows(splats.count)
+        return splats
 
     @cached_property
     def axes(self) -> np.ndarray:
@@ -204,7 +221,9 @@ class QueryScene:
             return np.ascontiguousarray(as_numpy(self.splats.means).T)
         from liftcore.io.splats import read_places
 
-        return np.ascontiguousarray(read_places(self.splat_file).T)
+        places = read_places(self.splat_file)
+        self._require_rows(len(places))
+        return np.ascontiguousarray(places.T)
 
     @cached_property
     def cameras(self) -> Cameras:

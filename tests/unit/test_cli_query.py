@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from safetensors.numpy import save_file
 
 from liftcore import cli
+from liftcore.errors import InvalidInput
 from liftcore.io.lift_file import load_lift, save_lift
 from liftcore.io.splats import read_splats
+from liftcore.query.scene import QueryScene
 from liftcore.query.text import BUILT_IN, open_encoder
 
 from .command_line import assert_one_line, lift_arguments, run, write_toy_scene
@@ -160,7 +163,7 @@ def test_what_was_found_is_written_as_splats_and_over_no_input(
     question = ["query", scene / "lift.safetensors", "--like", "splat:1"]
     for name in ("splats.ply", "cameras.json", "pack.safetensors", "lift.safetensors"):
         status, _, err = run(capsys, *question, "--object", scene / name)
-        assert status == 2 and "another file than the inputs" in err
+        assert status == 2 and ("another file than the inputs" in err or "ending in" in err)
     nothing = ["--unlike", "splat:1", "--threshold", "1", "--scores", scene / "s.npy", "--object", scene / "o.ply"]
     status, out, err = run(capsys, *question, *nothing)
     assert (status, out) == (2, "")
@@ -175,3 +178,73 @@ def test_what_was_found_is_written_as_splats_and_over_no_input(
     whole = read_splats(scene / "splats.ply")
     assert torch.equal(read_splats(files["object"]).means, whole.means[1:])
     assert torch.equal(read_splats(files["coloured"]).means, whole.means)
+
+
+OPTIONS = [
+    ("query", "--object", ".sog"),
+    ("query", "--object", ".compressed.ply"),
+    ("query", "--coloured", ".glb"),
+    ("query", "--scores", ".csv"),
+    ("query", "--mask", ".jpg"),
+    ("query", "--attention", ".webp"),
+    ("query", "--overlay", ".jpg"),
+    ("segment", "--labels", ".tif"),
+    ("segment", "--picture", ".jpg"),
+    ("segment", "--coloured", ".splat"),
+    ("segment", "--splat-labels", ".txt"),
+    ("segment", "--labelled", ".spz"),
+    ("objects", "--csv", ".xlsx"),
+    ("render", "-o", ".jpg"),
+]
+
+
+@pytest.mark.parametrize(("command", "option", "suffix"), OPTIONS)
+def test_a_suffix_that_is_not_written_is_refused_before_the_work(
+    command: str, option: str, suffix: str, scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = scene / f"mug{suffix}"
+    more = ["--like", "splat:1"] if command == "query" else []
+    view = [] if command == "objects" else ["--view", load_lift(scene / "lift.safetensors").metadata.views[0]]
+    status, out, err = run(capsys, command, scene / "lift.safetensors", *more, *view, option, path)
+    assert (status, out) == (2, "") and not path.exists() and suffix in err and "ending in ." in err
+    if suffix in (".sog", ".glb"):
+        assert f"splat-transform mug.ply mug{suffix}" in err
+    assert_one_line(err)
+
+
+def test_a_file_of_another_kind_is_never_replaced(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names = ("splats.ply", "cameras.json", "pack.safetensors")
+    lift = ["lift", *(scene / name for name in names), "-o"]
+    save_file({"embeddings": np.eye(2, 4, dtype="f4")}, scene / "words.safetensors", {"words": '["a", "b"]'})
+    save_file({"weight": np.zeros(3, "f4")}, scene / "weights.safetensors")
+    before = {path: path.read_bytes() for path in scene.iterdir()}
+    for name, what in (("words", "table"), ("weights", "a safetensors file")):
+        status, _, err = run(capsys, *lift, scene / f"{name}.safetensors")
+        assert status == 2 and what in err
+    assert run(capsys, *lift, scene / "lift.sog")[0] == 2
+    question = ["query", scene / "lift.safetensors", "--like", "splat:1", "--object", scene / "mug.ply"]
+    (scene / "mug.ply").write_bytes(b"\x89PNG\r\n\x1a\n0123")
+    status, _, err = run(capsys, *question)
+    assert status == 2 and "a picture" in err
+    (scene / "mug.ply").unlink()
+    assert {path: path.read_bytes() for path in scene.iterdir()} == before
+    assert run(capsys, *question)[0] == 0 and run(capsys, *question)[0] == 0  # one of its own kind is
+    assert run(capsys, *lift, scene / "lift.safetensors")[0] == 0
+
+
+def test_rows_of_another_number_of_splats_are_refused_wherever_a_lift_is_asked(
+    scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lift = load_lift(scene / "lift.safetensors")
+    rows = ("features", "evidence", "agreement", "seen", "confidence", "cluster", "object")
+    cut = {name: getattr(lift, name)[:-1] for name in rows if getattr(lift, name) is not None}
+    cropped = replace(lift, **cut)
+    save_lift(cropped, scene / "cropped.safetensors")
+    question = ["query", scene / "cropped.safetensors", "--like", "splat:0", "--threshold", "-1"]
+    for more in (["--objects"], ["--top", "1"], ["--object", scene / "o.ply"], ["--coloured", scene / "c.ply"]):
+        status, out, err = run(capsys, *question, *more)
+        assert (status, out) == (2, "") and "row" in err and str(len(cropped.features)) in err
+    with pytest.raises(InvalidInput, match="row"):
+        QueryScene(cropped).axes  # noqa: B018
+    with pytest.raises(InvalidInput, match="row"):
+        QueryScene(cropped).splats  # noqa: B018

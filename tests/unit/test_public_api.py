@@ -357,3 +357,14 @@ def test_results_are_shown_in_a_line(scene):
     for result in shown:
         assert repr(result).startswith(type(result).__name__) and len(repr(result)) < 120
         assert str(splats.count) in repr(result)
+
+
+def test_what_a_caller_set_stays_when_a_call_names_another_speed_or_preset() -> None:
+    settings = lc.LiftSettings.of(speed="fast", stride=3, preset="default")
+    assert lc.LiftSettings.chosen(settings, {"speed": "balanced"}) == lc.LiftSettings.of(speed="balanced", stride=3)
+    fast = lc.LiftSettings.of(speed="fast")
+    same = lc.LiftSettings.of(speed="fast", stride=fast.stride)  # the speed's own value, but asked for
+    assert lc.LiftSettings.chosen(same, {"speed": "exact"}).stride == fast.stride
+    assert lc.LiftSettings.chosen(fast, {"speed": "exact"}) == lc.LiftSettings.of(speed="exact")
+    loaded = lc.LiftSettings.model_validate_json(same.model_dump_json())
+    assert loaded == same

@@ -171,7 +171,8 @@ def test_best_words_of_an_example_come_first(clear: QueryScene) -> None:
 def test_command_names_splats_and_examples(tiny_lift: Path, tmp_path: Path, capsys) -> None:
     (tmp_path / "table.safetensors").write_bytes(text_table())
     (tmp_path / "words.txt").write_text("apple\nlamp\n\napple\n")
-    files = {kind: tmp_path / f"{kind}.out" for kind in ("labels", "picture", "coloured", "splat_labels")}
+    ends = {"labels": "png", "picture": "png", "coloured": "ply", "splat_labels": "npy"}
+    files = {kind: tmp_path / f"{kind}.{end}" for kind, end in ends.items()}
     written = [part for kind, path in files.items() for part in (f"--{kind.replace('_', '-')}", str(path))]
     command = ["segment", str(tiny_lift), "--table", str(tmp_path / "table.safetensors")]
     assert cli.main([*command, "--view", "middle", *written, "--json"]) == 0
