@@ -172,6 +172,17 @@ def test_cameras_of_another_scale_are_told_by_features_alone() -> None:
     assert "with positions times about" in told
 
 
+def test_a_principal_point_that_is_off_is_no_scale() -> None:
+    scene = still_life(seed=7, views=12, density=0.1)
+    words = TableEncoder("words", [*scene.things, *scene.parts], np.eye(len(scene.things) + len(scene.parts)))
+    masks = as_views(observe(scene, CpuRaster(scene.splats), words, Mistakes(), 7))
+    scrambled = {name: Regions(masks[name].labels, masks[name].codebook.roll(k, 0)) for k, name in enumerate(masks)}
+    off = [camera.replace(cx=camera.cx + 0.15 * camera.width) for camera in scene.cameras.values()]
+    for cameras, features in ((Cameras(off), masks), (scene.cameras, as_views(scrambled))):
+        for text in check_scene(scene.splats, cameras, features=features).wrong:
+            assert "positions times" not in text and "share a frame" not in text
+
+
 def test_cameras_that_see_nothing_are_told_without_photos(scene: StillLife) -> None:
     away = replace(scene.splats, means=scene.splats.means + 1000)
     found = check_scene(away, scene.cameras)
