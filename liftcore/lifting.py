@@ -92,7 +92,8 @@ def lift(
     Source: Splat Feature Solver, Eq. 3 and 6.
     """
     chosen = LiftSettings.chosen(preset, settings)
-    splats = check_given(splats, chosen.antialiased, threads)
+    splats = check_given(splats, threads)
+    chosen = chosen.for_splats(splats)
     kept, warn = _checkpoint(checkpoint), _WarnOnce()
     if engine is not None:
         known = cameras if isinstance(cameras, Cameras) else Cameras(cameras)
@@ -165,7 +166,8 @@ def plan(
         InvalidFeatures, InvalidSettings, Unavailable: as `lift` has it.
     """
     chosen = LiftSettings.chosen(preset, settings)
-    splats = check_given(splats, chosen.antialiased, threads)
+    splats = check_given(splats, threads)
+    chosen = chosen.for_splats(splats)
     found = LiftViews.of(views, cameras, chosen)
     return plan_lift(splats, found, chosen, choose_device(chosen.device), threads, look=True)
 

@@ -13,7 +13,7 @@ from liftcore.device import choose_device
 from liftcore.errors import InvalidCameras, InvalidSettings
 from liftcore.progress import Progress, silent
 from liftcore.raster import check_given, open_raster
-from liftcore.raster.base import CompositingParams
+from liftcore.raster.base import CompositingParams, check_antialiased
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats, shared_tensor
 from liftcore.settings import LiftSettings, Preset
@@ -21,15 +21,13 @@ from liftcore.solve.geometry import Given, LiftViews, weigh_views
 from liftcore.solve.weights import RegionWeights
 from liftcore.torch_modes import usual_modes
 
-DEFAULT = CompositingParams()
-
 
 @usual_modes()
 def render(
     splats: Splats,
     camera: Camera,
     values: Tensor | np.ndarray,
-    params: CompositingParams = DEFAULT,
+    params: CompositingParams | None = None,
     *,
     normalise: bool = False,
     device: str = "auto",
@@ -39,7 +37,8 @@ def render(
 
     Args:
         values: [P] or [P, F] of any numbers or booleans, a row a splat, in the splats' order.
-        params: how rays meet splats. The scale of the opacity logits is 1; the background is zero.
+        params: how rays meet splats; None: as they were trained (`Splats.antialiased`), with the field's other
+            constants. The scale of the opacity logits is 1; the background is zero.
         normalise: whether pixels are divided by the sum of their weights, where that is not zero.
         device: ``auto``, ``cpu`` or ``cuda``. threads: of the CPU; the number changes no bit.
 
@@ -51,9 +50,11 @@ def render(
         InvalidSettings: values have another number of rows than there are splats, or threads are no number.
         Unavailable: there is no such device.
     """
+    splats = check_given(splats, threads)
+    params = CompositingParams(antialiased=splats.antialiased) if params is None else params
     if not isinstance(params, CompositingParams):
-        raise InvalidSettings("params", expected="CompositingParams", got=repr(params)[:80])
-    splats = check_given(splats, params.antialiased, threads)
+        raise InvalidSettings("params", expected="CompositingParams, or None", got=repr(params)[:80])
+    check_antialiased(splats.kernel, params.antialiased)
     if not isinstance(camera, Camera):
         got, hint = repr(camera)[:80], "cameras[name] is the camera of a view"
         raise InvalidCameras("camera", expected="a Camera", got=got, hint=hint)
@@ -99,7 +100,8 @@ def region_weights(
         InvalidFeatures, InvalidSettings, Unavailable: as `lift` has it.
     """
     chosen = LiftSettings.chosen(preset, settings)
-    splats = check_given(splats, chosen.antialiased, threads)
+    splats = check_given(splats, threads)
+    chosen = chosen.for_splats(splats)
     found = LiftViews.of(views, cameras, chosen)
     own = chosen.model_copy(update={"certificate_rays": 0})
     raster = open_raster(splats, choose_device(chosen.device), threads)

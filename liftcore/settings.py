@@ -8,14 +8,17 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Mapping
 from enum import StrEnum
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
 from liftcore.errors import InvalidSettings
 from liftcore.nearest import nearest
-from liftcore.raster.base import MOST_OF_A_RAY, CompositingParams, Selection, Weighting
+from liftcore.raster.base import MOST_OF_A_RAY, CompositingParams, Selection, Weighting, check_antialiased
+
+if TYPE_CHECKING:  # it loads torch
+    from liftcore.scene.splats import Splats
 
 TIKHONOV_GAIN = 1.2  # lambda of the paper's Tikhonov Guidance (App. Tikhonov, lambda sweep)
 LARGEST_ALPHA = 0.9999999  # nearer to one, float32 says one, and the ray has no light left to go on with
@@ -99,7 +102,11 @@ class LiftSettings(BaseModel):
     render_gain: float = Field(1.0, gt=0, le=16, description="lambda on the opacity logits, rendering")
     alpha_cap: float = Field(0.99, gt=0, le=LARGEST_ALPHA, description="the largest alpha of a splat on a ray")
     transmittance_stop: float = Field(1e-4, ge=0, lt=1, description="a ray ends before T falls to this")
-    antialiased: bool = Field(False, description="opacities compensated for the low-pass (mip filter), 3DGS only")
+    antialiased: bool | Literal["auto"] = Field(
+        "auto",
+        description="opacities compensated for the low-pass (mip filter), 3DGS only; auto: where the file of the "
+        "splats says that they were trained so",
+    )
     stride: int = Field(1, ge=1, le=64, description="lift from every n-th pixel in x and in y")
     view_stride: int = Field(1, ge=1, description="lift from every n-th view, from the first on")
     coverage: int = Field(
@@ -173,7 +180,7 @@ class LiftSettings(BaseModel):
     )
     kernel: Literal["auto", "3dgs", "2dgs", "dbs"] = Field(
         "auto",
-        description="what the splats are: auto tells by their properties; name 2dgs where discs have three scales",
+        description="what the splats are; auto: by their properties, else by what the file says of its training",
     )
     device: Literal["auto", "cpu", "cuda"] = Field(
         "auto", description="what walks and solves: auto takes a card where torch and Triton can use one"
@@ -219,6 +226,16 @@ class LiftSettings(BaseModel):
         """How rays meet splats when attention maps and masks are rendered."""
         return self._compositing(self.render_gain)
 
+    def for_splats(self, splats: Splats) -> Self:
+        """The same with ``antialiased`` as true or false: what auto means for these splats.
+
+        Raises:
+            InvalidSettings: it is true, and the splats are no 3D Gaussians.
+        """
+        antialiased = splats.antialiased if self.antialiased == "auto" else self.antialiased
+        check_antialiased(splats.kernel, antialiased)
+        return self if antialiased == self.antialiased else self.model_copy(update={"antialiased": antialiased})
+
     @property
     def weighting(self) -> Weighting:
         """What counts as a weight while lifting."""
@@ -261,7 +278,8 @@ class LiftSettings(BaseModel):
         return masks and bool(self.consensus)
 
     def _compositing(self, opacity_logit_scale: float) -> CompositingParams:
-        return CompositingParams(opacity_logit_scale, self.alpha_cap, self.transmittance_stop, self.antialiased)
+        antialiased = self.antialiased is True  # auto stands for splats that say nothing, before `for_splats`
+        return CompositingParams(opacity_logit_scale, self.alpha_cap, self.transmittance_stop, antialiased)
 
     @classmethod
     def of(cls, /, **values: Any) -> Self:

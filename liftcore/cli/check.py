@@ -9,6 +9,7 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING
 
+from liftcore.cli.lift import pairs_of
 from liftcore.cli.options import BAD_INPUT, Parser, add_verbose
 from liftcore.cli.reply import PNG, free_output, progress_bars, reply, writing
 from liftcore.io.remote import place
@@ -25,6 +26,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("cameras", type=place, help="COLMAP folder or .zip, transforms.json or cameras.json")
     parser.add_argument("others", type=place, nargs="*", help="folders of photos, and feature packs (.safetensors)")
     parser.add_argument("--worst", type=Path, metavar="PNG", help="write the worst view: its photo and the render")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="one setting of the lift")
     add_verbose(parser)
 
 
@@ -35,7 +37,9 @@ def run(options: argparse.Namespace) -> int:
     from liftcore.features.pack import read_features
     from liftcore.io.cameras import read_cameras
     from liftcore.io.splats import read_splats
+    from liftcore.settings import LiftSettings
 
+    settings = LiftSettings.of(**pairs_of(options.set))
     if options.worst:
         free_output(options.worst, [options.splats], PNG)
     packs = [path for path in options.others if path.suffix == ".safetensors"]
@@ -45,11 +49,12 @@ def run(options: argparse.Namespace) -> int:
         features = read_features(*packs) if packs else None
         images = find_images(photos) if photos else {}
         found = check_scene(
-            read_splats(options.splats),
+            read_splats(options.splats, settings.kernel),
             read_cameras(options.cameras, views=features.views if features is not None else list(images)),
             images,
             features,
             progress,
+            settings,
         )
     document = {name: value for name, value in asdict(found).items() if name != "worst"}
     document |= {"healthy": not found.wrong, "seconds": time.perf_counter() - begin}

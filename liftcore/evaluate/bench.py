@@ -78,7 +78,7 @@ def time_lift(work: Workload, preset: Preset, device: Device, threads: int | Non
 
     ``geometry_s_per_view_min`` is that of the shortest pass.
     """
-    settings, count = LiftSettings.of(preset=preset), work.splats.count
+    settings, count = LiftSettings.of(preset=preset).for_splats(work.splats), work.splats.count
     looking, raster = (settings.lift_params, settings.weighting), open_raster(work.splats, device, threads)
     weigh_regions(raster, work.views[:1], looking, count, threads)  # for the caches alone
     geometry, solution, entries = [], [], 0

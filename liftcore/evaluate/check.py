@@ -44,6 +44,7 @@ from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Camera, Cameras, photo_size
 from liftcore.scene.panorama import with_panoramas
+from liftcore.scene.render_mode import rendering_reason, rendering_warnings
 from liftcore.scene.splats import Splats
 from liftcore.scene.views import cameras_of_views, some_of
 from liftcore.settings import LiftSettings
@@ -92,18 +93,25 @@ def check_scene(
     photos: Mapping[str, Path] | None = None,
     features: Views | None = None,
     progress: Progress = silent,
+    settings: LiftSettings | None = None,
 ) -> CheckReport:
     """Render some views and hold them against what is known of them.
 
     Args:
         photos: view -> image (`liftcore.features.encoders.encode.find_images`). features: of the views.
         progress: told about a stage "check", in views.
+        settings: of the lift that is to come; its ``antialiased`` counts. None: the default ones.
 
     Raises:
         InvalidInput: an image that cannot be read. InvalidFeatures: features that cannot be read.
     """
+    settings = (settings or LiftSettings.of()).for_splats(splats)
+    trained = CompositingParams(antialiased=settings.antialiased is True)
     wrong: list[str] = []
-    notes = [f"splats: {warning}" for warning in splats.warnings]
+    contradicting = rendering_warnings(splats.render_mode, trained.antialiased, splats.kernel)
+    notes = [f"splats: {text}" for text in (*contradicting, *splats.warnings)]
+    if trained.antialiased:
+        notes.append(f"splats: rendered antialiased: {rendering_reason(splats.render_mode, True)}")
     photos = photos or {}
     files, whole = _paired_photos(photos, cameras, features is not None, wrong, notes)
     sizes = {name: _photo_of(cameras[name], whole[name]) for name in files}
@@ -117,12 +125,12 @@ def check_scene(
     pictures = {name: _photo(files[name], sizes[name], photo_size(cameras[name]), whole[name]) for name in shown}
     raster, views, renders = CpuRaster(splats, threads=None), [], {}
     for number, name in enumerate(names):
-        row_sum, renders[name] = _render(raster, splats, cameras[name])
+        row_sum, renders[name] = _render(raster, splats, cameras[name], trained)
         views.append(_against(name, row_sum, renders[name] if splats.sh is not None else None, pictures))
         progress("check", number + 1, len(names), "views")
-    in_view = visibility(splats, list(cameras.values()), CompositingParams()).seen_share
+    in_view = visibility(splats, list(cameras.values()), trained).seen_share
     wrong += _wrong_cameras(views, in_view)
-    wrong += _unlike_photos(views, pictures, renders, headers, _Scaled(raster, splats, cameras))
+    wrong += _unlike_photos(views, pictures, renders, headers, _Scaled(raster, splats, cameras, trained))
     figures: dict[str, float] = {}
     if features is not None:
         figures, told = _check_features(features, cameras, files, whole)
@@ -131,7 +139,6 @@ def check_scene(
             f"features: {text}"
             for text in shape_warnings(paired_features, [cameras[v] for v in paired_features.views])
         ]
-        settings = LiftSettings.of()
         lifted = LiftViews.of(features, cameras, settings)
         agreement = agreement_of_views(raster, lifted, settings).agreement
         if agreement is not None:
@@ -178,10 +185,10 @@ def _some(names: Sequence[str], count: int) -> list[str]:
     return [names[int(place)] for place in places]
 
 
-def _render(raster: CpuRaster, splats: Splats, camera: Camera) -> tuple[float, np.ndarray]:
+def _render(raster: CpuRaster, splats: Splats, camera: Camera, params: CompositingParams) -> tuple[float, np.ndarray]:
     """The mean row sum of a view and its colours [H, W, 3] f32 in 0..1, in the pixels of its photo."""
     values = torch.cat([seen_colours(splats, camera), torch.ones(splats.count, 1)], dim=1)
-    image = in_photo(camera, lambda of: raster.render(of, values, CompositingParams())).numpy()
+    image = in_photo(camera, lambda of: raster.render(of, values, params)).numpy()
     return float(image[..., 3].mean()), image[..., :3].clip(0.0, 1.0)
 
 
@@ -256,12 +263,13 @@ class _Scaled:
     raster: CpuRaster
     splats: Splats
     cameras: Cameras
+    params: CompositingParams
 
     def render(self, view: str, factor: float) -> np.ndarray:
         """[H, W, 3] f32 in 0..1, of a view."""
         camera, scale = self.cameras[view], np.ones((4, 4))
         scale[:3, 3] = factor
-        return _render(self.raster, self.splats, camera.replace(viewmat=camera.viewmat * scale))[1]
+        return _render(self.raster, self.splats, camera.replace(viewmat=camera.viewmat * scale), self.params)[1]
 
 
 def _unlike_photos(

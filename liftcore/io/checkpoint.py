@@ -12,6 +12,7 @@ import numpy as np
 from liftcore.errors import InvalidSplats
 from liftcore.io.kinds import EXPORT_PLY
 from liftcore.io.quantised import Fields
+from liftcore.scene.render_mode import mode_beside
 
 # Our fields by what the two trainers call them.
 GSPLAT = {"means": "means", "quats": "quats", "log_scales": "scales", "opacity_logits": "opacities"}
@@ -39,7 +40,7 @@ def read_checkpoint(path: Path, *, colour: bool = True) -> Fields:
         got = f"one that holds more than tensors, or is damaged ({str(error).splitlines()[0][:100]})"
         raise InvalidSplats(str(path), expected="a checkpoint of tensors", got=got, hint=EXPORT_PLY) from None
     tensors, names = _splats(stored, path)
-    fields = {field: _array(tensors, name, path) for field, name in GSPLAT.items()}
+    fields: Fields = {field: _array(tensors, name, path) for field, name in GSPLAT.items()}
     fields["opacity_logits"] = fields["opacity_logits"].reshape(len(fields["opacity_logits"]), -1)[:, 0]
     if colour and names[0] in tensors:
         first, rest = (_array(tensors, name, path) for name in names)
@@ -49,7 +50,7 @@ def read_checkpoint(path: Path, *, colour: bool = True) -> Fields:
             got = f"{list(first.shape)} and {list(rest.shape)}"
             argument = f"{path} {' and '.join(names)}"
             raise InvalidSplats(argument, expected="shapes [P, 1, 3] and [P, K, 3]", got=got) from None
-    return fields
+    return fields | {"render_mode": mode_beside(path)}
 
 
 def _splats(stored: Any, path: Path) -> tuple[dict[str, Any], tuple[str, str]]:

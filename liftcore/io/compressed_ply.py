@@ -14,6 +14,7 @@ from liftcore.errors import InvalidSplats
 from liftcore.io.ply import EXPORT, padding_bytes, parse_elements, read_head, tail_warnings
 from liftcore.io.quantised import Fields, decoded, field_shapes, logits, smallest_three
 from liftcore.scene.harmonics import constant_terms
+from liftcore.scene.render_mode import mode_of_comments
 
 CHUNK_ROWS = 256
 AXES = ("x", "y", "z")
@@ -29,7 +30,8 @@ def read_compressed_ply(path: Path, *, colour: bool = True) -> Fields:
         InvalidSplats: an element or a column is missing or of another type, or the file's size is another.
     """
     head, size = read_head(path)
-    _, elements, offset = parse_elements(head, str(path))
+    lines, elements, offset = parse_elements(head, str(path))
+    mode, warnings = mode_of_comments(lines)
     tables: dict[str, np.ndarray] = {}
     total = offset + sum(element.count * element.dtype.itemsize for element in elements)
     if total > size or any(element.list_column for element in elements):
@@ -69,7 +71,7 @@ def read_compressed_ply(path: Path, *, colour: bool = True) -> Fields:
         return fields
 
     fields = decoded(len(vertices), field_shapes(1 + higher if colour else 0), decode)
-    return fields | {"warnings": tail_warnings(tail)}
+    return fields | {"render_mode": mode, "warnings": (*warnings, *tail_warnings(tail))}
 
 
 def _checked(tables: dict[str, np.ndarray], path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:

@@ -46,7 +46,6 @@ OTHER_FRAME = (
 )
 SHOWN = 3  # names in a warning
 MANY = 100  # splats: what all of so many have in common is no accident
-MOVING = ("motion_", "trbf_", "omega_")  # what spacetime splats add
 FLAT = 100  # times thinner than wide: what converters make of discs
 NARROW = 4  # times longer than wide, or wider: photos are not
 UNIT_TOLERANCE = 0.01  # a float16 unit vector of 512 channels is within it
@@ -113,6 +112,8 @@ def describe_splats(splats: Splats) -> dict[str, Any]:
         "splats": splats.count,
         "kernel": splats.kernel.value,
         "dialect": nearest_dialect(splats.layout),
+        "render_mode": None if splats.render_mode is None else splats.render_mode.model.value,
+        "render_mode_source": None if splats.render_mode is None else splats.render_mode.source,
         "sh_degree": splats.sh_degree,
         "extras": sorted(splats.extras),
         "box": [low.tolist(), high.tolist()],
@@ -194,9 +195,6 @@ def _reading_warnings(splats: Splats) -> list[str]:
         )
     if many and bool((splats.log_scales > 0).all()):
         warnings.append("all scales are above 0, as if they were no logarithms: exp makes them larger than 1")
-    moving = sorted(name for name in splats.extras if name.startswith(MOVING))
-    if moving:
-        warnings.append(f"properties of moving splats ({moving[0]}, ...) are not read: the scene stands still")
     return warnings
 
 

@@ -23,6 +23,7 @@ import numpy as np
 from liftcore.errors import InvalidSplats
 from liftcore.io.files import open_regular, whole_file
 from liftcore.scene.kernel import DARK_LOBE, LOBE_COLOURS, Kernel, kernel_named, scale_count
+from liftcore.scene.render_mode import RenderMode, RenderModel, kernel_of_mode, mode_beside, mode_of_comments
 
 if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
@@ -34,11 +35,22 @@ MAX_SH_DEGREE = 4
 LOBE_CHANNELS = 6  # of a spherical beta lobe: r g b theta phi beta
 COLOUR = ("sh", "sb_params")  # fields that a lift has no use for, and most of a file
 FILTER = "filter_3D"  # of Mip-Splatting, the column of its smoothing filter
+MIP_SPLATTING = f"the column {FILTER!r} of Mip-Splatting"  # which also trains with compensated opacities
+UNREAD = {  # columns that change what is rendered and are not read: what the splats are, and a pattern of names
+    "move, and are lifted as they stand": r"(motion|trbf|omega|velocity|rot_r|rotation_r|scale_t|scaling_t)(_.*)?|"
+    r"t|t_.*|time",
+    "have a footprint of their own, and are lifted with the kernel's": r"(shape|gamma|nu|nu_degree|beta|kernel)"
+    r"(_\d+)?",
+    "have opacities that depend on more, and are lifted with the plain ones": r"(opacity_.+|compensation|filter_2D)",
+    "have colours that depend on more, and are rendered with the harmonics alone": r"(sb_params|f?_?asg|sg|f_app|"
+    r"app|appearance|albedo|base_color|roughness|metallic|specular|transient|embedding)(_.*)?",
+}
 NORMALS = ("nx", "ny", "nz")
 SPLAT_PROPERTIES = ("opacity", "scale_0", "rot_0", "f_dc_0", "sh0_0", "packed_position")  # one at least
 SCAFFOLD = ("f_anchor_feat_0", "f_offset_0")  # of Scaffold-GS, whose networks turn anchors into splats
 SPELLING = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"}
 SPELLING |= {"f4": "float", "f8": "double"}
+WRITTEN_MODE = {RenderModel.ANTIALIASED: "mip", RenderModel.DISCS: "2dgs"}  # as editors read it
 EXPORT = "export the splats again as binary little-endian PLY"
 REWRITE = (
     "rewrite it with Python: from plyfile import PlyData; p = PlyData.read('IN.ply'); p.text = False; "
@@ -66,10 +78,11 @@ _SIGNATURES = {
 def read_ply(path: Path, kernel: Kernel | str = "auto", *, colour: bool = True) -> Splats:
     """Read trained splats from a binary little-endian PLY of any dialect.
 
-    With the kernel ``auto`` it is recognised from the properties. Columns that the model does not know are kept as
-    extras in their own type; ``double`` columns of the model become float32. Without ``colour`` neither colours nor
-    extras are read or allocated, and what comes cannot be written back. A ``filter_3D`` becomes part of scales and
-    opacities, which are then written as plain splats; elements behind the vertices are neither read nor written.
+    With the kernel ``auto`` it is recognised from the properties, and where these leave it open from what the file
+    says (`liftcore.scene.render_mode`). Columns that the model does not know are kept as extras in their own type;
+    ``double`` columns of the model become float32. Without ``colour`` neither colours nor extras are read or
+    allocated, and what comes cannot be written back. A ``filter_3D`` becomes part of scales and opacities, which are
+    then written as plain splats; elements behind the vertices are neither read nor written.
 
     Raises:
         InvalidSplats: the file is malformed, lacks a property of the kernel, or holds no splat of finite numbers.
@@ -79,8 +92,12 @@ def read_ply(path: Path, kernel: Kernel | str = "auto", *, colour: bool = True) 
     from liftcore.scene.splats import Splats
 
     header = read_header(path)
-    kernel = recognise_kernel(header.names) if kernel == "auto" else kernel_named(kernel)
+    mode, warnings = mode_of_comments(header.lines)
+    if mode is None:
+        mode = RenderMode(RenderModel.ANTIALIASED, MIP_SPLATTING) if FILTER in header.names else mode_beside(path)
+    kernel = recognise_kernel(header.names, mode) if kernel == "auto" else kernel_named(kernel)
     slots = model_slots(header.names, kernel, str(path))
+    warnings += (*tail_warnings(header.tail), *unread_warnings(header.names, slots))
     for name in slots:
         code = header.dtype[name].str[1:]
         if code not in ("f4", "f8"):
@@ -99,8 +116,8 @@ def read_ply(path: Path, kernel: Kernel | str = "auto", *, colour: bool = True) 
         lines, layout = (), tuple(name for name in layout if name != FILTER)
         fields |= _filtered(fields["log_scales"], fields["opacity_logits"], extras.pop(FILTER))
     tensors = {name: torch.from_numpy(values) for name, values in extras.items()}
-    warnings = tail_warnings(header.tail)
-    return Splats(**fields, kernel=kernel, extras=tensors, layout=layout, header=lines, warnings=warnings)
+    own = {"layout": layout, "header": lines, "render_mode": mode, "warnings": warnings}
+    return Splats(**fields, kernel=kernel, extras=tensors, **own)
 
 
 def read_places(path: Path) -> np.ndarray:
@@ -131,7 +148,10 @@ def ply_blocks(splats: Splats) -> Iterator[bytes]:
         source = header if header.names == splats.layout else None
     codes = {name: source.dtype[name].str[1:] if source else "f4" for name in layout}
     codes |= {name: columns[name].dtype.str[1:] for name in layout if name in splats.extras}
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {splats.count}"]
+    lines = ["ply", "format binary_little_endian 1.0"]
+    if splats.render_mode is not None and (mode := WRITTEN_MODE.get(splats.render_mode.model)):
+        lines.append(f"comment SplatRenderMode: {mode}")
+    lines.append(f"element vertex {splats.count}")
     lines += [*(f"property {SPELLING[code]} {name}" for name, code in codes.items()), "end_header"]
     dtype = np.dtype([(name, "<" + code) for name, code in codes.items()])
     if source is not None and source.dtype == dtype:
@@ -320,13 +340,24 @@ class Slot:
     index: tuple[int, ...]
 
 
-def recognise_kernel(names: Collection[str]) -> Kernel:
-    """The kernel that the columns speak of."""
+def unread_warnings(names: Sequence[str], slots: Mapping[str, Slot]) -> list[str]:
+    """A warning of each kind of columns that would change what is rendered, if they were read."""
+    others = [name for name in names if name not in slots and name != FILTER]
+    warnings = []
+    for what, pattern in UNREAD.items():
+        unread = [name for name in others if re.fullmatch(pattern, name, re.I)]
+        some = ", ".join(unread[:3]) + (", ..." if len(unread) > 3 else "")
+        warnings += [f"the properties {some} are not read: these splats {what}"] if unread else []
+    return warnings
+
+
+def recognise_kernel(names: Collection[str], mode: RenderMode | None = None) -> Kernel:
+    """The kernel that the columns speak of; where they leave it open, the one that the file says."""
     if "beta" in names or "sb_params_0" in names or "sh0_0" in names:
         return Kernel.BETA
     if "scale_1" in names and "scale_2" not in names:
         return Kernel.GAUSSIAN_2D
-    return Kernel.GAUSSIAN_3D
+    return kernel_of_mode(mode)
 
 
 def nearest_dialect(names: Collection[str]) -> str:

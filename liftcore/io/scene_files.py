@@ -17,7 +17,6 @@ from liftcore.io.splats import read_splats
 from liftcore.lifting import lift
 from liftcore.planning.plan import Plan
 from liftcore.progress import Progress, Timings
-from liftcore.raster.base import check_antialiased
 from liftcore.result import LiftResult
 from liftcore.scene.cameras import Cameras
 from liftcore.scene.splats import Splats
@@ -69,7 +68,7 @@ def open_files(
         InvalidInput: a file is malformed.
     """
     scene = read_splats(splats, settings.kernel, colour=False)
-    check_antialiased(scene.kernel, settings.antialiased)
+    settings.for_splats(scene)  # refuses what does not suit them before gigabytes are read
     packs = read_features(*_checked(features))
     return scene, read_cameras(cameras, views=packs.views), packs
 

@@ -22,6 +22,7 @@ import numpy as np
 from liftcore.errors import InvalidSplats
 from liftcore.io.files import BROKEN_ZIP, open_regular, open_zip
 from liftcore.io.quantised import MOST_GROWTH, Fields, decoded, field_shapes, logits, smallest_three
+from liftcore.scene.render_mode import mode_of_word
 
 META = "meta.json"
 MAX_META_BYTES = 1 << 20
@@ -173,7 +174,11 @@ class _Pictures:
                 fields["sh"] = np.concatenate([colour_book[colours[rows, None, :3]], higher], axis=1)
             return fields
 
-        return decoded(self.count, field_shapes(1 + palette.shape[1] if colour else 0), decode)
+        mode, warnings = None, ()
+        if (model := self.meta.get("model")) is not None:
+            mode, warnings = mode_of_word(model, f"'model' {repr(model)[:60]} in {META}")
+        fields = decoded(self.count, field_shapes(1 + palette.shape[1] if colour else 0), decode)
+        return fields | {"render_mode": mode, "warnings": warnings}
 
     def _harmonics(self) -> tuple[np.ndarray, np.ndarray]:
         """The palette [n, K - 1, 3], and each splat's row in it [P]."""

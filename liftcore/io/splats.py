@@ -26,6 +26,7 @@ from liftcore.io.splat import read_splat, splat_blocks
 from liftcore.io.spz import read_spz, spz_blocks
 from liftcore.scene.harmonics import constant_terms
 from liftcore.scene.kernel import Kernel, kernel_named
+from liftcore.scene.render_mode import kernel_of_mode
 
 if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
@@ -49,7 +50,8 @@ _WRITERS: dict[str, Callable[[Splats], Iterator[bytes]]] = {
 def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool = True) -> Splats:
     """Read trained splats from a file of any `SplatFormat`, recognised by content.
 
-    With the kernel ``auto`` the columns of a PLY tell it, and what else there is are 3D Gaussians. Without ``colour``
+    With the kernel ``auto`` the columns of a PLY tell it, or what the file says of its training
+    (`liftcore.scene.render_mode`); what says nothing is of 3D Gaussians. Without ``colour``
     neither colours nor what else a lift has no use for are read or allocated, and what comes cannot be written back.
     More of PLYs is in `liftcore.io.ply.read_ply`. Checkpoints are opened for tensors alone: no code of theirs runs.
 
@@ -63,11 +65,12 @@ def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool
     with _naming(path):
         if found is SplatFormat.PLY:
             return ply.read_ply(path, kernel, colour=colour)
-        chosen = Kernel.GAUSSIAN_3D if kernel == "auto" else kernel_named(kernel)
-        require_kernel(path, chosen, str(path))
+        if kernel != "auto":
+            require_kernel(path, kernel_named(kernel), str(path))
         from liftcore.scene.splats import Splats
 
         fields = _READERS[found](path, colour=colour)
+        chosen = kernel_of_mode(fields.get("render_mode")) if kernel == "auto" else kernel_named(kernel)
         if chosen is Kernel.GAUSSIAN_2D:
             fields["log_scales"] = np.ascontiguousarray(fields["log_scales"][:, :2])
         return Splats(**fields, kernel=chosen)

@@ -6,9 +6,9 @@ magnitude, behind two bits for the largest of x y z w) and higher harmonics u8, 
 3 all is one gzip stream with a header of 16 bytes. Version 4 has a plain header of 32, then extensions, then the
 sizes of the sections' zstd streams, then these.
 
-The frame is right, up, back (RUB) unless an extension declares another. PLYs and cameras are in right, down, front
-(RDF): axes are turned, and quaternions and harmonics with them. The format is of nianticlabs/spz. What is written has
-version 3.
+The frame is right, up, back (RUB) unless an extension declares another of 16. PLYs and cameras are in right, down,
+front (RDF): axes are turned, and quaternions and harmonics with them. A flag says that the splats were trained
+antialiased. The format is of nianticlabs/spz. What is written has version 3.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ from liftcore.io.quantised import (
     logits,
     smallest_three,
 )
-from liftcore.scene.harmonics import SH_C0
+from liftcore.scene.harmonics import SH_C0, band_rotation
+from liftcore.scene.render_mode import RenderMode, RenderModel
 
 if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
@@ -48,7 +49,29 @@ MAX_DEGREE = 4
 MAX_FRACTIONAL_BITS = 24
 COLOUR_SCALE = 0.15  # of the constant term
 FRAME_EXTENSION = 0xADBE0003
-RUB, RDF = 4, 6  # frames as spz numbers them: 1 + (x is right) + 2 (y is up) + 4 (z is front), up to 8
+# Frames as spz numbers them, by what x, y and z point to: left or right, down or up, back or front.
+FRAMES = (
+    "LDB",
+    "RDB",
+    "LUB",
+    "RUB",
+    "LDF",
+    "RDF",
+    "LUF",
+    "RUF",
+    "LFD",
+    "RFD",
+    "LFU",
+    "RFU",
+    "LBD",
+    "RBD",
+    "LBU",
+    "RBU",
+)
+RUB, RDF = FRAMES.index("RUB") + 1, FRAMES.index("RDF") + 1
+ANTIALIASED, HAS_EXTENSIONS = 0x1, 0x2  # flags
+FLAG = "the flag 'antialiased' of the .spz"
+QUARTER_TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # about x: y to z
 WRITTEN_VERSION, WRITTEN_DEGREE = 3, 3  # and the highest degree of harmonics, as of 3DGS
 WRITTEN_BITS = 20  # fractional bits of means at most: a millionth of a scene unit
 LARGEST_MEAN = (1 << 23) - 1  # of 24 bits with their sign
@@ -81,7 +104,7 @@ def read_spz(path: Path, *, colour: bool = True) -> Fields:
     content = path.read_bytes()
     is_plain, unpacking = content[:4] == MAGIC, zlib.decompressobj(31)
     start = content[:STREAMS_HEADER_BYTES] if is_plain else _inflated(unpacking, content, HEADER_BYTES, path)
-    version, count, degree, bits, streams = _header(start, path)
+    version, count, degree, bits, flags, streams = _header(start, path)
     if is_plain != (version >= 4):
         raise _broken(path, "gzip for versions 1 to 3 and a plain header for 4", f"the other for {version}")
     sizes = _section_bytes(version, count, degree)
@@ -90,12 +113,15 @@ def read_spz(path: Path, *, colour: bool = True) -> Fields:
         raise InvalidSplats(str(path), expected="as many splats as the file's size can be of", got=got, hint=HINT)
     if is_plain:
         (table,) = struct.unpack_from("<I", start, HEADER_BYTES)
-        frame, sections = _declared_frame(content, table, path), _streams(content, table, streams, sizes, path)
+        zone = content[STREAMS_HEADER_BYTES : max(table, STREAMS_HEADER_BYTES)]
+        frame, sections = _declared_frame(zone, path), _streams(content, table, streams, sizes, path)
     else:
         body = np.frombuffer(_inflated(unpacking, unpacking.unconsumed_tail, sum(sizes), path), np.uint8)
-        _inflated(unpacking, unpacking.unconsumed_tail, 0, path)
-        frame, sections = RUB, np.split(body, np.cumsum(sizes)[:-1])
-    return _decoded(sections, version, degree if colour else 0, 2.0**-bits, frame, colour=colour)
+        behind = _inflated(unpacking, unpacking.unconsumed_tail, 0, path)
+        frame = _declared_frame(behind, path) if flags & HAS_EXTENSIONS else RUB
+        sections = np.split(body, np.cumsum(sizes)[:-1])
+    fields = _decoded(sections, version, degree if colour else 0, 2.0**-bits, frame, colour=colour)
+    return fields | {"render_mode": RenderMode(RenderModel.ANTIALIASED, FLAG) if flags & ANTIALIASED else None}
 
 
 def spz_blocks(splats: Splats) -> Iterator[bytes]:
@@ -117,7 +143,8 @@ def spz_blocks(splats: Splats) -> Iterator[bytes]:
         for section, part in zip(sections, _encoded(some, bits, (degree + 1) ** 2 - 1), strict=True):
             section.append(part.tobytes())
     packing = zlib.compressobj(wbits=31)
-    header = struct.pack(HEADER, MAGIC, WRITTEN_VERSION, splats.count, degree, bits, 0, 0)
+    flags = ANTIALIASED if splats.antialiased else 0
+    header = struct.pack(HEADER, MAGIC, WRITTEN_VERSION, splats.count, degree, bits, flags, 0)
     for part in (header, *(part for section in sections for part in section)):
         yield packing.compress(part)
     yield packing.flush()
@@ -155,11 +182,11 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
     return (largest.astype(np.uint32) << 30 | words[:, 0] << 20 | words[:, 1] << 10 | words[:, 2]).astype("<u4")
 
 
-def _header(start: bytes, path: Path) -> tuple[int, int, int, int, int]:
-    """Version, number of splats, degree of the harmonics, fractional bits of means, number of streams."""
+def _header(start: bytes, path: Path) -> tuple[int, int, int, int, int, int]:
+    """Version, number of splats, degree of the harmonics, fractional bits of means, flags, number of streams."""
     if len(start) < HEADER_BYTES or (start[4:8] == b"\4\0\0\0" and len(start) < STREAMS_HEADER_BYTES):
         raise _broken(path, "a whole header", f"{len(start)} bytes")
-    magic, version, count, degree, bits, _, streams = struct.unpack_from(HEADER, start)
+    magic, version, count, degree, bits, flags, streams = struct.unpack_from(HEADER, start)
     if magic != MAGIC or version not in VERSIONS:
         got = f"version {version}" if magic == MAGIC else repr(magic)
         raise InvalidSplats(str(path), expected="an .spz of version 1 to 4", got=got, hint=HINT)
@@ -168,7 +195,7 @@ def _header(start: bytes, path: Path) -> tuple[int, int, int, int, int]:
         raise _broken(path, expected, f"{degree} and {bits}")
     if count == 0:
         raise InvalidSplats(str(path), expected="at least one splat", got="an empty scene")
-    return version, count, degree, bits, streams
+    return version, count, degree, bits, flags, streams
 
 
 def _section_bytes(version: int, count: int, degree: int) -> list[int]:
@@ -215,18 +242,32 @@ def _streams(content: bytes, table: int, streams: int, sizes: list[int], path: P
     return sections + [np.empty(0, np.uint8)] * (len(sizes) - len(filled))
 
 
-def _declared_frame(content: bytes, table: int, path: Path) -> int:
-    """The frame that an extension of version 4 declares; RUB if none does."""
-    at = STREAMS_HEADER_BYTES
-    while at + 8 <= min(table, len(content)):
-        kind, size = struct.unpack_from("<II", content, at)
-        if kind == FRAME_EXTENSION and size == 4 and at + 12 <= len(content):
-            (frame,) = struct.unpack_from("<I", content, at + 8)
-            if frame > 8:
-                raise InvalidSplats(str(path), expected="a frame with y up or down", got=f"frame {frame}", hint=HINT)
+def _declared_frame(extensions: bytes, path: Path) -> int:
+    """The frame that one of these extensions declares; RUB if none does."""
+    at = 0
+    while at + 8 <= len(extensions):
+        kind, size = struct.unpack_from("<II", extensions, at)
+        if kind == FRAME_EXTENSION and size == 4 and at + 12 <= len(extensions):
+            (frame,) = struct.unpack_from("<I", extensions, at + 8)
+            if frame > len(FRAMES):
+                expected = f"one of the {len(FRAMES)} frames of the format"
+                raise InvalidSplats(str(path), expected=expected, got=f"frame {frame}", hint=HINT)
             return frame or RUB
         at += 8 + size
     return RUB
+
+
+def _turn_to_rdf(frame: int) -> tuple[np.ndarray, bool]:
+    """What turns a frame into RDF: the signs [3] of its axes, and whether a quarter turn about x follows.
+
+    The letters of a frame are all that is meant: x' is x where that points right, y' is the axis that points down
+    (or minus the one that points up), z' the one that points to the front. Frames with y up or down need signs
+    alone; where z is up or down, ``(x, y, z)`` with its signs becomes ``(x, -z, y)``. Scales stay as they are, which
+    an exchange of axes would not leave so.
+    """
+    x, second, third = (1.0 if letter in "RDF" else -1.0 for letter in FRAMES[frame - 1])
+    has_z_up = FRAMES[frame - 1][1] in "FB"
+    return np.array([x, second, -third if has_z_up else third]), has_z_up
 
 
 def _decoded(
@@ -234,9 +275,14 @@ def _decoded(
 ) -> Fields:
     means, opacities, colours, scales, quats, harmonics = sections
     count, higher = len(opacities), (degree + 1) ** 2 - 1
-    x, y, z = (1.0 if (frame - 1) >> axis & 1 == (RDF - 1) >> axis & 1 else -1.0 for axis in range(3))
+    flips, turns = _turn_to_rdf(frame)
+    x, y, z = flips
     signs = {"x": x, "y": y, "z": z}
-    sh_signs = np.array([np.prod([signs.get(axis, 1.0) for axis in axes]) for axes in SH_AXES[:higher]])
+    sh_turn = np.diag([np.prod([signs[axis] for axis in axes]) for axes in SH_AXES[:higher]])
+    if turns:
+        for band in range(1, degree + 1):
+            own = slice(band**2 - 1, (band + 1) ** 2 - 1)
+            sh_turn[own] = band_rotation(band, QUARTER_TURN) @ sh_turn[own]
     stored = harmonics.reshape(count, -1, 3)
 
     def decode(rows: slice) -> Fields:
@@ -246,19 +292,31 @@ def _decoded(
             low, middle, high = (means.reshape(count, 3, 3)[rows, :, i].astype(np.int32) for i in range(3))
             places = (low | middle << 8 | high << 16).astype(np.float64)
             places = np.where(places >= 1 << 23, places - (1 << 24), places) * step
+        places, rotations = places * flips, _quats(quats.reshape(count, -1)[rows]) * (1, y * z, x * z, x * y)
+        if turns:
+            places, rotations = places @ QUARTER_TURN.T, _quarter_turned(rotations)
         fields = {
-            "means": places * (x, y, z),
+            "means": places,
             "log_scales": scales.reshape(count, 3)[rows] / 16.0 - 10,
-            "quats": _quats(quats.reshape(count, -1)[rows]) * (1, y * z, x * z, x * y),
+            "quats": rotations,
             "opacity_logits": logits(opacities[rows] / 255.0),
         }
         if colour:
             fields["sh"] = np.empty((len(places), 1 + higher, 3))
             fields["sh"][:, 0] = (colours.reshape(count, 3)[rows] / 255.0 - 0.5) / COLOUR_SCALE
-            fields["sh"][:, 1:] = (stored[rows] / 128.0 - 1) * sh_signs[:, None] if higher else 0
+            if higher:
+                terms = stored[rows] / 128.0 - 1
+                diagonal = np.diagonal(sh_turn)[:, None]
+                fields["sh"][:, 1:] = np.einsum("ij,njc->nic", sh_turn, terms) if turns else terms * diagonal
         return fields
 
     return decoded(count, field_shapes(1 + higher if colour else 0), decode)
+
+
+def _quarter_turned(quats: np.ndarray) -> np.ndarray:
+    """Quaternions [n, 4] w x y z of splats that are turned by QUARTER_TURN."""
+    w, x, y, z = quats.T * np.sqrt(0.5)
+    return np.stack([w - x, x + w, y - z, z + y], axis=1)
 
 
 def _quats(stored: np.ndarray) -> np.ndarray:

@@ -33,6 +33,7 @@ from liftcore.raster import check_given
 from liftcore.raster.base import CompositingParams, ViewRequest
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Camera, Cameras, distortion_warning
+from liftcore.scene.render_mode import rendering_reason, rendering_warnings
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings
 from liftcore.solve.geometry import strided
@@ -62,6 +63,8 @@ class PhotoPlan:
     """Which photos to encode first. Plain values; but for the seconds, the same inputs give the same plan."""
 
     kernel: str
+    antialiased: bool  # opacities are compensated for the low-pass
+    rendering: str  # why: what says so, or who
     splats: int  # P
     order: tuple[str, ...]  # all photos, the one to encode first at first
     spare: tuple[str, ...]  # of those: what they see, WELL_COVERED before them in the order see too
@@ -81,7 +84,8 @@ class PhotoPlan:
             verbose: all names, not the first ones.
         """
         most = None if verbose else SHOWN_PHOTOS
-        yield f"plan: {self.splats} splats ({self.kernel}), {len(self.order)} photos, no features yet"
+        how = f"{self.kernel}, antialiased: {self.rendering}" if self.antialiased else self.kernel
+        yield f"plan: {self.splats} splats ({how}), {len(self.order)} photos, no features yet"
         yield "  photos  see of the weight  twice or more  to look through"
         for row in self.shown:
             seconds = f"about {max(row.seconds, 1):.0f} s"
@@ -116,7 +120,8 @@ def plan_photos(
     settings = LiftSettings.of() if settings is None else settings
     if not isinstance(settings, LiftSettings):
         raise InvalidSettings("settings", expected="LiftSettings, or None", got=repr(settings)[:80])
-    splats = check_given(splats, settings.antialiased, threads)
+    splats = check_given(splats, threads)
+    settings = settings.for_splats(splats)
     known = cameras if isinstance(cameras, Cameras) else Cameras(cameras)
     views = list(known.values())[:: settings.view_stride]
     rows = spread(splats.count, min(SAMPLE, splats.count))
@@ -132,13 +137,21 @@ def plan_photos(
         told.append(empty(row_sum))
     return PhotoPlan(
         kernel=str(splats.kernel),
+        antialiased=settings.lift_params.antialiased,
+        rendering=rendering_reason(splats.render_mode, settings.lift_params.antialiased),
         splats=splats.count,
         order=tuple(views[k].name for k in order),
         spare=tuple(views[k].name for k in spare_photos(seen, weight, order)),
         shown=tuple(shown_by(seen, weight, order, seconds)),
         seen_share=seen_share,
         row_sum=row_sum,
-        warnings=(*splats.warnings, *known.warnings, *distortion_warning(views), *told),
+        warnings=(
+            *splats.warnings,
+            *rendering_warnings(splats.render_mode, settings.lift_params.antialiased, splats.kernel),
+            *known.warnings,
+            *distortion_warning(views),
+            *told,
+        ),
     )
 
 

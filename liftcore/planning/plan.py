@@ -32,6 +32,7 @@ from liftcore.progress import silent
 from liftcore.raster import open_raster
 from liftcore.raster.base import TILE, Raster
 from liftcore.scene.cameras import Camera, distortion_warning
+from liftcore.scene.render_mode import rendering_reason, rendering_warnings
 from liftcore.scene.splats import Splats
 from liftcore.settings import LiftSettings
 from liftcore.solve.codebook import TABLE_BYTES
@@ -71,6 +72,8 @@ class Plan:
     """What a lift is about to do. Plain values: the same inputs and settings give the same plan."""
 
     kernel: str
+    antialiased: bool  # opacities are compensated for the low-pass
+    rendering: str  # why: what says so, or who
     splats: int  # P
     views: tuple[str, ...]  # that will be lifted, in the order of the sums
     left_out: tuple[str, ...]  # that the settings' coverage or view_cosine leaves out
@@ -104,6 +107,8 @@ class Plan:
         """Plain numbers for the certificate, without what only this machine has to do with."""
         return {
             "kernel": self.kernel,
+            "antialiased": self.antialiased,
+            "rendering": self.rendering,
             "splats": self.splats,
             "seen_share": self.seen_share,
             "splats_a_view": self.splats_a_view,
@@ -123,7 +128,8 @@ class Plan:
         """The plan in short, for people: what is lifted, what it is made of, and what that takes."""
         seen = f"{self.seen_share:.1%} in some view's field"
         spare = f", {len(self.spare)} of them see nothing that {WELL_COVERED} others do not" if self.spare else ""
-        yield f"{self.splats} splats ({self.kernel}), {seen}; {len(self.views)} of {self.there} views{spare}"
+        how = f"{self.kernel}, antialiased: {self.rendering}" if self.antialiased else self.kernel
+        yield f"{self.splats} splats ({how}), {seen}; {len(self.views)} of {self.there} views{spare}"
         yield f"{self.channels} channels, stored as {self.dtype}"
         files = f", {self.in_files / MIB:.0f} MiB of region weights in files" if self.in_files else ""
         yield f"about {self.memory_bytes / MIB:.0f} MiB at the peak{files}, on {self.device.name}"
@@ -196,6 +202,8 @@ def plan_lift(
     lifted = set(names)
     return Plan(
         kernel=str(splats.kernel),
+        antialiased=settings.lift_params.antialiased,
+        rendering=rendering_reason(splats.render_mode, settings.lift_params.antialiased),
         splats=splats.count,
         views=tuple(names),
         left_out=tuple(name for name in views.names if name not in lifted),
@@ -215,6 +223,7 @@ def plan_lift(
         warnings=(*short, *check_memory(parts, free), *check_weights(in_files)),
         told=(
             *splats.warnings,
+            *rendering_warnings(splats.render_mode, settings.lift_params.antialiased, splats.kernel),
             *views.cameras.warnings,
             *distortion_warning(cameras),
             *shape_warnings(features, cameras),

@@ -14,6 +14,7 @@ from liftcore.io.lift_file import read_lift
 from liftcore.io.splats import splat_count
 from liftcore.query.scores import mean_direction, norms_of
 from liftcore.query.text.table import TableEncoder, own_words
+from liftcore.scene.kernel import Kernel
 
 if TYPE_CHECKING:  # these load torch or pydantic, which scores do without
     from torch import Tensor
@@ -210,9 +211,17 @@ class QueryScene:
         """
         from liftcore.io.splats import read_splats
 
-        splats = read_splats(self.splat_file, self.metadata.settings.kernel)
+        splats = read_splats(self.splat_file, self.kernel)
         self._require_rows(splats.count)
         return splats
+
+    @property
+    def kernel(self) -> str:
+        """The kernel that was lifted with; ``auto`` where the lift does not say what that was."""
+        chosen = self.metadata.settings.kernel
+        plan = self.metadata.certificate.get("plan")
+        lifted = plan.get("kernel") if chosen == "auto" and isinstance(plan, dict) else chosen
+        return str(lifted) if lifted in set(Kernel) else chosen
 
     @cached_property
     def axes(self) -> np.ndarray:

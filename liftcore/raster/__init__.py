@@ -6,7 +6,6 @@ from numbers import Integral
 from typing import TYPE_CHECKING
 
 from liftcore.errors import InvalidSettings, InvalidSplats
-from liftcore.raster.base import check_antialiased
 
 if TYPE_CHECKING:
     from liftcore.device import Device
@@ -30,19 +29,18 @@ def open_raster(splats: Splats, device: Device, threads: int | None = None, kept
     return GpuRaster(splats, device.place, stays=kept > 0)
 
 
-def check_given(splats: Splats, antialiased: bool, threads: int | None) -> Splats:
+def check_given(splats: Splats, threads: int | None) -> Splats:
     """What callers of the library give to every call that rasterizes; the splats come back on the CPU.
 
     Raises:
         InvalidSplats: the splats are something else, such as a path.
-        InvalidSettings: `check_antialiased`; or threads that are no whole number of one or more, and not None.
+        InvalidSettings: threads are no whole number of one or more, and not None.
     """
     from liftcore.scene.splats import Splats  # loads torch
 
     if not isinstance(splats, Splats):
         got, hint = f"{type(splats).__name__} {splats!r}"[:80], "read_splats(path) makes them of a file"
         raise InvalidSplats("splats", expected="Splats", got=got, hint=hint)
-    check_antialiased(splats.kernel, antialiased)
     if threads is not None and (isinstance(threads, bool) or not isinstance(threads, Integral) or threads < 1):
         got = repr(threads)[:80]
         raise InvalidSettings("threads", expected="a whole number of one or more, or None for all cores", got=got)

@@ -16,6 +16,7 @@ import torch
 
 from liftcore.errors import InvalidSplats
 from liftcore.scene.kernel import DARK_LOBE, LOBE_COLOURS, Kernel, kernel_named, scale_count
+from liftcore.scene.render_mode import RenderMode, RenderModel, render_mode_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -40,6 +41,8 @@ class Splats:
     are not finite are unseen: their opacity becomes 0 (a logit of minus infinity), and a place, size or turn that is
     no number becomes the first one that is. Colours that are not finite become grey.
 
+    ``render_mode`` decides the setting ``antialiased`` of lifts and renders where that is left at auto.
+
     ``layout``, ``extras`` and ``header`` keep what the file had beyond the model (normals, SAGA's ``mask``,
     comments), so that writing gives back what was read.
 
@@ -58,9 +61,10 @@ class Splats:
     extras: Mapping[str, Tensor]  # name -> [P], columns we do not model
     layout: tuple[str, ...]  # the file's property names in order; () = the kernel's usual layout
     header: tuple[str, ...]  # the file's header lines verbatim; () = made from the layout
+    render_mode: RenderMode | None  # how they were trained, where that is said; of a str, the model's name
     warnings: tuple[str, ...]  # of what in these splats, or in their file, is not as it should be
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - a field each
         self,
         means: Array,
         quats: Array,
@@ -74,6 +78,7 @@ class Splats:
         extras: Mapping[str, Tensor] | None = None,
         layout: tuple[str, ...] = (),
         header: tuple[str, ...] = (),
+        render_mode: RenderMode | str | None = None,
         warnings: tuple[str, ...] = (),
     ) -> None:
         kernel = kernel_named(kernel)
@@ -99,7 +104,9 @@ class Splats:
         for name in shapes:
             object.__setattr__(self, name, columns.get(name))
         fixed = {"kernel": kernel, "extras": dict(extras or {}), "layout": tuple(layout), "header": tuple(header)}
-        fixed["warnings"] = tuple(dict.fromkeys((*warnings, *repairs)))
+        mode = render_mode_of(render_mode)
+        doubts = _doubts(mode, kernel)
+        fixed |= {"render_mode": mode, "warnings": tuple(dict.fromkeys((*warnings, *repairs, *doubts)))}
         for name, value in fixed.items():
             object.__setattr__(self, name, value)
         if self.sh is not None and self.sh.shape[1] not in SH_ROWS:
@@ -121,9 +128,24 @@ class Splats:
         return self.means.shape[0]
 
     @property
+    def antialiased(self) -> bool:
+        """Whether they were trained with the mip filter's opacity compensation, as far as is said."""
+        model = None if self.render_mode is None else self.render_mode.model
+        return model is RenderModel.ANTIALIASED and self.kernel is Kernel.GAUSSIAN_3D
+
+    @property
     def sh_degree(self) -> int | None:
         """The degree of the spherical harmonics, None without colour."""
         return None if self.sh is None else int(self.sh.shape[1] ** 0.5) - 1
+
+
+def _doubts(mode: RenderMode | None, kernel: Kernel) -> list[str]:
+    """A warning where the kernel is not what is said of the training."""
+    if mode is None or mode.model is RenderModel.CLASSIC:
+        return []
+    meant = Kernel.GAUSSIAN_2D if mode.model is RenderModel.DISCS else Kernel.GAUSSIAN_3D
+    source = mode.source or f"render_mode={str(mode.model)!r}"
+    return [] if meant is kernel else [f"{source} says {mode.model}, but the splats are taken for {kernel}"]
 
 
 def shared_tensor(values: object) -> Tensor:

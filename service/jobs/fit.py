@@ -48,7 +48,7 @@ def check_kernel(splats: AssetRecord, settings: Mapping[str, Any]) -> None:
         InvalidSettings: ``kernel`` or ``antialiased`` does not fit the file, of which the header is read.
     """
     own, kernel = kernel_of(splats, {}), kernel_of(splats, settings)
-    check_antialiased(Kernel(kernel), LiftSettings.of(**settings).antialiased)
+    check_antialiased(Kernel(kernel), LiftSettings.of(**settings).antialiased is True)
     if kernel == own:
         return
     try:

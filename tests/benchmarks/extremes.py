@@ -452,9 +452,9 @@ MAPS: tuple[Extreme, ...] = (
 
 # fmt: off
 REFUSALS: tuple[Extreme, ...] = (
-    refused("an opacity logit of nan", lambda: splats_at(MIDDLE, logits=math.nan), "finite values"),
-    refused("a log scale of inf", lambda: splats_at(MIDDLE, math.inf), "finite values"),
-    refused("a place of inf", lambda: splats_at([(0.0, math.inf, 2.0)]), "finite values"),
+    refused("an opacity logit of nan", lambda: splats_at(MIDDLE, logits=math.nan), "finite numbers"),
+    refused("a log scale of inf", lambda: splats_at(MIDDLE, math.inf), "finite numbers"),
+    refused("a place of inf", lambda: splats_at([(0.0, math.inf, 2.0)]), "finite numbers"),
     refused("no splats (P = 0)", lambda: splats_at(np.zeros((0, 3))), "empty scene"),
     refused("no views", lambda: lc.Cameras(()), "at least one view"),
     refused("values of 1e30", lambda: run({"v0": checkerboard(scale=1e30)}, cloud()), "finite values within"),

@@ -22,7 +22,7 @@ def test_extreme_is_survived_with_the_stated_error(extreme: Extreme, kernel: Ker
 def test_a_row_says_what_was_measured() -> None:
     (row,) = rows_of(TABLES["Refused"][:1])
     assert (row["float32 gives"], row["error"]) == ("refused", None)
-    assert row["told"].startswith("opacity_logits: expected finite values")
+    assert row["told"].startswith("splats: expected at least one splat of finite numbers")
 
 
 @pytest.mark.parametrize("kernel", list(Kernel))

@@ -7,6 +7,7 @@ that splat-transform makes of it.
 
 from __future__ import annotations
 
+import gzip
 import json
 import struct
 import zipfile
@@ -31,8 +32,9 @@ from liftcore.io.splats import (
     require_kernel,
     some_rows,
 )
-from liftcore.io.spz import FRAME_EXTENSION, RDF, spz_blocks
-from liftcore.scene.harmonics import constant_terms
+from liftcore.io.spz import FRAME_EXTENSION, FRAMES, RDF, spz_blocks
+from liftcore.query.splat_colours import _sh_basis
+from liftcore.scene.harmonics import band_rotation, band_values, constant_terms
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
 from tests.scenes import random_splats
@@ -243,6 +245,77 @@ def test_the_frame_that_an_spz_declares_is_its_own(tmp_path: Path) -> None:
     assert torch.allclose(turned.quats, plain.quats * torch.tensor([1.0, 1.0, -1.0, -1.0]))
     assert turned.sh is not None and plain.sh is not None
     assert torch.allclose(turned.sh[:, 1:4], plain.sh[:, 1:4] * torch.tensor([-1.0, -1.0, 1.0])[:, None])
+
+
+LETTERS = {"R": (0, 1), "L": (0, -1), "D": (1, 1), "U": (1, -1), "F": (2, 1), "B": (2, -1)}  # axis and sign in RDF
+
+
+@pytest.mark.parametrize("version", [3, 4])
+@pytest.mark.parametrize("number", range(1, 17))
+def test_every_frame_that_an_spz_may_declare_is_turned_by_its_letters(
+    number: int, version: int, tmp_path: Path
+) -> None:
+    """Places, covariances and colours from all around are those of the file in the axes that its letters name."""
+    content, extension = (FILES / f"degree3.v{version}.spz").read_bytes(), struct.pack("<III", FRAME_EXTENSION, 4, 0)
+    declared = extension[:8] + struct.pack("<I", number)
+    if version == 4:
+        place = struct.pack("<I", 32 + len(declared))
+        content = content[:16] + place + content[20:32] + declared + content[32:]
+    else:
+        plain = gzip.decompress(content)
+        content = gzip.compress(plain[:14] + b"\x02" + plain[15:] + declared)
+    (tmp_path / "a.spz").write_bytes(content)
+    found, stored = read_splats(tmp_path / "a.spz"), read_splats(FILES / f"degree3.v{version}.spz")
+    axes = np.zeros((3, 3))  # from the frame to RDF
+    for column, letter in enumerate(FRAMES[number - 1]):
+        axis, sign = LETTERS[letter]
+        axes[axis, column] = sign
+    axes = axes @ np.diag([1.0, -1.0, -1.0])  # from RDF as that is read from RUB, which stands for the stored numbers
+    np.testing.assert_allclose(found.means.numpy(), stored.means.numpy() @ axes.T, atol=1e-5)
+    assert torch.equal(found.log_scales, stored.log_scales)
+    np.testing.assert_allclose(covariances(found), axes @ covariances(stored) @ axes.T, atol=1e-5)
+    directions = np.random.default_rng(0).normal(size=(20, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    np.testing.assert_allclose(radiance(found, directions), radiance(stored, directions @ axes), atol=1e-4)
+
+
+def covariances(splats: Splats) -> np.ndarray:
+    w, x, y, z = torch.nn.functional.normalize(splats.quats.double(), dim=1).numpy().T
+    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
+    rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
+    rows += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
+    half = np.stack(rows, axis=1).reshape(-1, 3, 3) * np.exp(splats.log_scales.double().numpy())[:, None]
+    return half @ half.transpose(0, 2, 1)
+
+
+def radiance(splats: Splats, directions: np.ndarray) -> np.ndarray:
+    """[n, P, 3], the harmonics of all splats along directions, by the renderer's own basis."""
+    assert splats.sh is not None
+    basis = _sh_basis(torch.from_numpy(directions).float(), 3)
+    return torch.einsum("nk,pkc->npc", basis, splats.sh).numpy()
+
+
+@pytest.mark.parametrize("band", range(5))
+def test_rotations_of_a_band_turn_what_it_shows(band: int) -> None:
+    generator = np.random.default_rng(band)
+    rotation = np.linalg.qr(generator.normal(size=(3, 3)))[0]
+    rotation *= np.linalg.det(rotation)
+    directions = generator.normal(size=(30, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    terms = generator.normal(size=2 * band + 1)
+    turned = band_values(band, directions) @ band_rotation(band, rotation) @ terms
+    np.testing.assert_allclose(turned, band_values(band, directions @ rotation) @ terms, atol=1e-9)
+    if band < 4:
+        own = _sh_basis(torch.from_numpy(directions), 3)[:, band**2 : (band + 1) ** 2]
+        np.testing.assert_allclose(band_values(band, directions), own, atol=1e-6)
+
+
+def test_a_frame_beyond_those_is_refused(tmp_path: Path) -> None:
+    content = gzip.decompress((FILES / "degree3.v3.spz").read_bytes())
+    content = content[:14] + b"\x02" + content[15:] + struct.pack("<III", FRAME_EXTENSION, 4, 17)
+    (tmp_path / "a.spz").write_bytes(gzip.compress(content))
+    with pytest.raises(InvalidSplats, match="one of the 16 frames of the format, got frame 17"):
+        read_splats(tmp_path / "a.spz")
 
 
 def trained() -> Splats:

@@ -18,7 +18,7 @@ LEVELS = "'rows' or 'composite' or a valid integer"
         ("stride", 2.5, "a valid integer"),
         ("power", True, "a valid integer"),
         ("power", 3, "less than or equal to 2"),
-        ("antialiased", 1, "a valid boolean"),
+        ("antialiased", 1, "a valid boolean or 'auto'"),
         ("lift_gain", "1.2", "a valid number"),
         ("lift_gain", float("nan"), "less than or equal to 16"),
         ("levels", True, LEVELS),

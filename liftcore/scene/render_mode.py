@@ -1,0 +1,147 @@
+"""How splats were trained, as their files say it, and so how they are to be rendered.
+
+Trainers and editors say it in four places: comments of a PLY (``SplatRenderMode: default | mip | 2dgs`` of Brush,
+gsplat, nerfstudio and splat-transform, ``antialiased 0 | 1`` of Postshot), a flag of an SPZ, ``model`` in the
+``meta.json`` of a SOG, and the configuration that a trainer leaves beside its checkpoints. Files that say nothing are
+classic ones, as nearly all were before.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+from liftcore.errors import InvalidSplats
+from liftcore.scene.kernel import Kernel
+
+
+class RenderModel(StrEnum):
+    """What a renderer has to do with splats."""
+
+    CLASSIC = "classic"  # Gaussians with the low-pass alone
+    ANTIALIASED = "antialiased"  # and their opacity lowered as the low-pass widens them (the mip filter)
+    DISCS = "2dgs"  # discs, whatever their third scale says
+
+
+@dataclass(frozen=True)
+class RenderMode:
+    """A model, and what says so."""
+
+    model: RenderModel
+    source: str  # what says so, in words that go before "says"; "" of values in memory
+
+
+_BY_NAME = {  # as comments and ``meta.json`` spell them
+    "default": RenderModel.CLASSIC,
+    "classic": RenderModel.CLASSIC,
+    "mip": RenderModel.ANTIALIASED,
+    "antialiased": RenderModel.ANTIALIASED,
+    "2dgs": RenderModel.DISCS,
+}
+_COMMENT = re.compile(
+    r"comment\s+(splatrendermode:\s*(?P<mode>.*)|antialiased:?\s+(?P<flag>[01]|true|false))\s*", re.I
+)
+CONFIGS = ("cfg.yml", "config.yml")  # of gsplat's simple_trainer and of nerfstudio, beside or above what they train
+MAX_CONFIG_BYTES = 1 << 18
+_SHOWN = 60  # characters of a file's words
+_OF_GSPLAT = re.compile(r"^antialiased: *(true|false) *$", re.M)
+_GSPLAT_DISCS = re.compile(r"^model_type: *2dgs *$", re.M)
+_OF_NERFSTUDIO = re.compile(r"^ +rasterize_mode: *(classic|antialiased) *$", re.M)
+
+
+def render_mode_of(mode: RenderMode | str | None) -> RenderMode | None:
+    """The mode of a name: ``classic``, ``antialiased`` or ``2dgs``; None stays None.
+
+    Raises:
+        InvalidSplats: there is none of that name.
+    """
+    if mode is None or isinstance(mode, RenderMode):
+        return mode
+    if not isinstance(mode, str) or mode not in set(RenderModel):
+        raise InvalidSplats("render_mode", expected=" or ".join(RenderModel), got=repr(mode)[:_SHOWN])
+    return RenderMode(RenderModel(mode), "")
+
+
+def kernel_of_mode(mode: RenderMode | None) -> Kernel:
+    """The kernel of splats whose numbers may be of several."""
+    return Kernel.GAUSSIAN_2D if mode is not None and mode.model is RenderModel.DISCS else Kernel.GAUSSIAN_3D
+
+
+def mode_of_word(word: object, source: str) -> tuple[RenderMode | None, tuple[str, ...]]:
+    """The mode that a word of a file names, and a warning where it names none.
+
+    Args:
+        source: where the word stands, such as ``'model' in meta.json``.
+    """
+    model = _BY_NAME.get(word.strip().lower()) if isinstance(word, str) else None
+    if model is None:
+        return None, (f"{source} names a way to render that is not known: taken for classic",)
+    return RenderMode(model, source), ()
+
+
+def mode_of_comments(lines: Iterable[str]) -> tuple[RenderMode | None, tuple[str, ...]]:
+    """What the header lines of a PLY say, the last of them if several do, and warnings of what contradicts itself."""
+    modes: list[RenderMode] = []
+    warnings: list[str] = []
+    for line in lines:
+        match = _COMMENT.fullmatch(line.strip())
+        if match is None:
+            continue
+        source = f"the comment {line.strip()[8:].strip()[:_SHOWN]!r}"
+        word = (
+            match["mode"]
+            if match["mode"] is not None
+            else ("mip" if match["flag"].lower() in ("1", "true") else "default")
+        )
+        mode, told = mode_of_word(word, source)
+        modes += [mode] if mode else []
+        warnings += told
+    if len({mode.model for mode in modes}) > 1:
+        first, last = modes[0], modes[-1]
+        warnings.append(f"{first.source} and {last.source} contradict each other: the last one is believed")
+    return (modes[-1] if modes else None), tuple(warnings)
+
+
+def mode_beside(path: Path) -> RenderMode | None:
+    """What the configuration of gsplat or nerfstudio says, in the folder of a file that they trained or above it."""
+    folder = path.resolve().parent
+    for place in (folder, folder.parent):
+        for name in CONFIGS:
+            config = place / name
+            if not config.is_file():
+                continue
+            try:
+                with config.open("rb") as handle:
+                    text = handle.read(MAX_CONFIG_BYTES).decode("latin-1").replace("\r\n", "\n")
+            except OSError:
+                continue
+            if name == "cfg.yml" and _GSPLAT_DISCS.search(text):
+                return RenderMode(RenderModel.DISCS, f"'model_type: 2dgs' in {name}")
+            match = (_OF_GSPLAT if name == "cfg.yml" else _OF_NERFSTUDIO).search(text)
+            if match:
+                model = RenderModel.ANTIALIASED if match[1] in ("true", "antialiased") else RenderModel.CLASSIC
+                return RenderMode(model, f"{match[0].strip()!r} in {name}")
+    return None
+
+
+def rendering_reason(mode: RenderMode | None, antialiased: bool) -> str:
+    """Why splats are rendered as they are, in words; ``antialiased`` is what the settings came to."""
+    if mode is None:
+        return "set by hand" if antialiased else "nothing says otherwise"
+    source = mode.source or "render_mode of the splats"
+    if (mode.model is RenderModel.ANTIALIASED) is antialiased:
+        return f"{source} says so"
+    return f"against {source}"
+
+
+def rendering_warnings(mode: RenderMode | None, antialiased: bool, kernel: Kernel) -> list[str]:
+    """A warning where 3D Gaussians are rendered otherwise than is said of their training."""
+    if mode is None or kernel is not Kernel.GAUSSIAN_3D or mode.model is RenderModel.DISCS:
+        return []
+    if (mode.model is RenderModel.ANTIALIASED) is antialiased:
+        return []
+    source = mode.source or "render_mode of the splats"
+    return [f"antialiased={str(antialiased).lower()} is set by hand, and {source} says {mode.model}"]

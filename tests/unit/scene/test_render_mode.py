@@ -1,0 +1,284 @@
+"""How splats were trained is read where their file says it, decides how they are lifted, and is told."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import liftcore as lc
+from liftcore.errors import InvalidSettings, InvalidSplats
+from liftcore.io.inspect import inspect_file
+from liftcore.io.ply import write_splats
+from liftcore.io.scene_files import lift_files
+from liftcore.io.splats import read_splats, some_rows, with_columns
+from liftcore.query.render import _as_trained as params_of_renders
+from liftcore.query.scene import QueryScene
+from liftcore.scene.kernel import Kernel
+from liftcore.scene.splats import Splats
+from liftcore.settings import LiftSettings
+from tests.scenes import observed, random_camera, random_splats, write_scene
+from tests.unit.command_line import run
+
+FILES = Path(__file__).parents[2] / "data" / "splats"
+CLASSIC, MIP, DISCS = (Kernel.GAUSSIAN_3D, False), (Kernel.GAUSSIAN_3D, True), (Kernel.GAUSSIAN_2D, False)
+
+
+def ply_saying(folder: Path, *lines: str, splats: Splats | None = None) -> Path:
+    path = folder / "s.ply"
+    write_splats(splats or random_splats(3), path)
+    said = "".join(f"{line}\n" for line in lines).encode()
+    path.write_bytes(path.read_bytes().replace(b"element vertex", said + b"element vertex"))
+    return path
+
+
+def compressed_saying(folder: Path, line: str) -> Path:
+    content = (FILES / "degree1.compressed.ply").read_bytes()
+    (folder / "s.ply").write_bytes(content.replace(b"element chunk", f"{line}\nelement chunk".encode(), 1))
+    return folder / "s.ply"
+
+
+def spz_saying(folder: Path, version: int, flags: int) -> Path:
+    content = bytearray((FILES / f"degree3.v{version}.spz").read_bytes())
+    if version == 4:
+        content[14] = flags
+        (folder / "s.spz").write_bytes(content)
+        return folder / "s.spz"
+    import gzip
+
+    plain = bytearray(gzip.decompress(bytes(content)))
+    plain[14] = flags
+    (folder / "s.spz").write_bytes(gzip.compress(bytes(plain)))
+    return folder / "s.spz"
+
+
+def sog_saying(folder: Path, model: Any) -> Path:
+    with zipfile.ZipFile(FILES / "degree1.sog") as source, zipfile.ZipFile(folder / "s.sog", "w") as copy:
+        for name in source.namelist():
+            content = source.read(name)
+            if name == "meta.json":
+                content = json.dumps(json.loads(content) | {"model": model}).encode()
+            copy.writestr(name, content)
+    return folder / "s.sog"
+
+
+def checkpoint_beside(folder: Path, name: str, text: str) -> Path:
+    splats = random_splats(3)
+    own = {"means": splats.means, "quats": splats.quats, "scales": splats.log_scales}
+    (folder / "ckpts").mkdir()
+    torch.save({"splats": own | {"opacities": splats.opacity_logits}}, folder / "ckpts" / "c.pt")
+    (folder / name).write_text(text)
+    return folder / "ckpts" / "c.pt"
+
+
+GSPLAT = "absgrad: false\nantialiased: {}\napp_opt: false\nresult_dir: results\nstrategy: !!python/object:gsplat.X\n"
+NERFSTUDIO = "!!python/object:T\npipeline: !!python/object:V\n  model: !!python/object:S\n    rasterize_mode: {}\n"
+SAYING: dict[str, tuple[Callable[[Path], Path], tuple[Kernel, bool], str | None]] = {
+    "nothing": (ply_saying, CLASSIC, None),
+    "Brush's mip": (lambda f: ply_saying(f, "comment SplatRenderMode: mip"), MIP, "SplatRenderMode: mip"),
+    "Brush's default": (lambda f: ply_saying(f, "comment SplatRenderMode: default"), CLASSIC, "default"),
+    "2dgs of three scales": (lambda f: ply_saying(f, "comment SplatRenderMode: 2dgs"), DISCS, "2dgs"),
+    "in capitals, CRLF": (lambda f: ply_saying(f, "comment  splatrendermode:MIP\r"), MIP, "MIP"),
+    "Postshot's 1": (lambda f: ply_saying(f, "comment antialiased 1"), MIP, "antialiased 1"),
+    "Postshot's 0": (lambda f: ply_saying(f, "comment antialiased 0"), CLASSIC, "antialiased 0"),
+    "the last of two": (
+        lambda f: ply_saying(f, "comment antialiased 0", "comment SplatRenderMode: mip"), MIP, "mip"
+    ),
+    "a comment on it": (lambda f: ply_saying(f, "comment not antialiased 1 at all"), CLASSIC, None),
+    "compressed PLY": (lambda f: compressed_saying(f, "comment SplatRenderMode: mip"), MIP, "mip"),
+    "compressed PLY of discs": (lambda f: compressed_saying(f, "comment SplatRenderMode: 2dgs"), DISCS, "2dgs"),
+    **{f"SPZ {v}": (lambda f, v=v: spz_saying(f, v, 1), MIP, "flag") for v in (1, 2, 3, 4)},
+    "SPZ with another flag": (lambda f: spz_saying(f, 3, 4), CLASSIC, None),
+    "SOG": (lambda f: sog_saying(f, "antialiased"), MIP, "model"),
+    "SOG of discs": (lambda f: sog_saying(f, "2dgs"), DISCS, "model"),
+    "SOG default": (lambda f: sog_saying(f, "default"), CLASSIC, "model"),
+    "gsplat's configuration": (lambda f: checkpoint_beside(f, "cfg.yml", GSPLAT.format("true")), MIP, "cfg.yml"),
+    "gsplat's classic": (lambda f: checkpoint_beside(f, "cfg.yml", GSPLAT.format("false")), CLASSIC, "cfg.yml"),
+    "gsplat's discs": (lambda f: checkpoint_beside(f, "cfg.yml", "model_type: 2dgs\n"), DISCS, "cfg.yml"),
+    "nerfstudio's": (
+        lambda f: checkpoint_beside(f, "config.yml", NERFSTUDIO.format("antialiased")), MIP, "config.yml"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", SAYING)
+def test_a_file_is_taken_at_its_word(case: str, tmp_path: Path) -> None:
+    make, (kernel, antialiased), source = SAYING[case]
+    path = make(tmp_path)
+    for colour in (True, False):
+        splats = read_splats(path, colour=colour)
+        assert (splats.kernel, splats.antialiased) == (kernel, antialiased)
+        assert LiftSettings.of().for_splats(splats).lift_params.antialiased is antialiased
+    found = inspect_file(path)
+    assert found["kernel"] == str(kernel)
+    if source is None:
+        assert found["render_mode"] is None
+    else:
+        assert found["render_mode"] == ("antialiased" if antialiased else "2dgs" if kernel is DISCS[0] else "classic")
+        assert source in found["render_mode_source"]
+
+
+def test_what_a_file_says_is_contradicted_aloud(tmp_path: Path) -> None:
+    def warned(path: Path, **kernel: Any) -> str:
+        return " | ".join(read_splats(path, **kernel).warnings)
+
+    assert "contradict each other" in warned(
+        ply_saying(tmp_path, "comment antialiased 1", "comment SplatRenderMode: 2dgs")
+    )
+    assert "not known" in warned(ply_saying(tmp_path, "comment SplatRenderMode: wavelets"))
+    assert "not known" in warned(sog_saying(tmp_path, ["mip"]))
+    beta = ply_saying(tmp_path, "comment SplatRenderMode: 2dgs", splats=random_splats(3, kernel=Kernel.BETA))
+    assert read_splats(beta).kernel is Kernel.BETA and "taken for dbs" in warned(beta)
+    discs = ply_saying(tmp_path, "comment antialiased 1", splats=random_splats(3, kernel=Kernel.GAUSSIAN_2D))
+    assert not read_splats(discs).antialiased and "taken for 2dgs" in warned(discs)
+    forced = ply_saying(tmp_path, "comment SplatRenderMode: 2dgs")
+    assert read_splats(forced, "3dgs").kernel is Kernel.GAUSSIAN_3D and "taken for 3dgs" in warned(
+        forced, kernel="3dgs"
+    )
+
+
+def test_mip_splattings_filter_says_that_opacities_are_compensated(tmp_path: Path) -> None:
+    splats = replace(random_splats(3), extras={"filter_3D": torch.full((40,), 0.01)})
+    path = ply_saying(tmp_path, splats=splats)
+    assert read_splats(path).antialiased
+    assert not read_splats(ply_saying(tmp_path, "comment antialiased 0", splats=splats)).antialiased
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (["motion_0", "trbf_center", "omega_3"], "motion_0, trbf_center, omega_3 are not read: these splats move"),
+        (["t", "scale_t", "rot_r_0"], "t, scale_t, rot_r_0 are not read: these splats move"),
+        (["shape"], "shape are not read: these splats have a footprint"),
+        (["gamma_0"], "footprint"),
+        (["f_asg_0", "roughness"], "f_asg_0, roughness are not read: these splats have colours"),
+        (["opacity_compensation"], "have opacities"),
+        (["mask", "class_id", "instance_id", "confidence", "nx"], ""),
+    ],
+)
+@pytest.mark.parametrize("colour", [True, False])
+def test_properties_that_change_what_is_rendered_and_are_not_read_are_named(
+    names: list[str], words: str, colour: bool, tmp_path: Path
+) -> None:
+    path = ply_saying(tmp_path, splats=replace(random_splats(3), extras={name: torch.ones(40) for name in names}))
+    warnings = read_splats(path, colour=colour).warnings
+    assert bool(warnings) is bool(words) and words in " | ".join(warnings)
+
+
+def test_exports_say_how_their_splats_were_trained(tmp_path: Path) -> None:
+    mip = spz_saying(tmp_path, 4, 1)
+    every = np.ones(40, bool)
+    for suffix in (".ply", ".spz"):
+        (tmp_path / f"copy{suffix}").write_bytes(b"".join(some_rows(mip, every, suffix)))
+        assert read_splats(tmp_path / f"copy{suffix}").antialiased
+    (tmp_path / "c.ply").write_bytes(b"".join(with_columns(mip, {"score": np.ones(40, np.float32)})))
+    assert read_splats(tmp_path / "c.ply").antialiased
+    plain = ply_saying(tmp_path, "comment SplatRenderMode: mip")
+    (tmp_path / "c.ply").write_bytes(b"".join(some_rows(plain, every)))
+    assert read_splats(tmp_path / "c.ply").antialiased
+    discs = sog_saying(tmp_path, "2dgs")
+    (tmp_path / "c.ply").write_bytes(b"".join(some_rows(discs, np.ones(300, bool))))
+    assert read_splats(tmp_path / "c.ply").kernel is Kernel.GAUSSIAN_2D
+
+
+def test_values_in_memory_carry_their_mode_into_every_call() -> None:
+    plain = random_splats(3)
+    mip = replace(plain, render_mode="antialiased")
+    camera, values = random_camera(0), torch.ones(40)
+    given = lc.CompositingParams(antialiased=True)
+    assert torch.equal(lc.render(mip, camera, values), lc.render(plain, camera, values, given))
+    assert not torch.equal(lc.render(mip, camera, values), lc.render(plain, camera, values))
+    assert torch.equal(lc.render(mip, camera, values, lc.CompositingParams()), lc.render(plain, camera, values))
+    with pytest.raises(InvalidSplats, match="render_mode: expected classic or antialiased or 2dgs, got 'mip'"):
+        replace(plain, render_mode="mip")
+    cameras = {f"v{number}": random_camera(number, name=f"v{number}") for number in range(3)}
+    views = {name: observed(number, 0) for number, name in enumerate(cameras)}
+    lifted = lc.lift(mip, cameras, views, "row-sum", device="cpu")
+    by_hand = lc.lift(plain, cameras, views, "row-sum", device="cpu", antialiased=True)
+    assert torch.equal(lifted.features, by_hand.features) and lifted.settings.antialiased is True
+    assert lifted.diagnostics["plan"]["antialiased"] is True
+    assert lifted.diagnostics["plan"]["rendering"] == "render_mode of the splats says so"
+    assert by_hand.diagnostics["plan"]["rendering"] == "set by hand"
+    engine = lc.lift(mip, cameras, views, "row-sum", device="cpu", engine=lc.LocalEngine())
+    assert torch.equal(engine.features, lifted.features) and engine.settings == lifted.settings
+    assert engine.diagnostics["plan"]["rendering"] == lifted.diagnostics["plan"]["rendering"]
+    weights = lc.region_weights(mip, cameras, views, "row-sum", device="cpu")
+    other = lc.region_weights(plain, cameras, views, "row-sum", device="cpu", antialiased=True)
+    assert torch.equal(weights.weight, other.weight)
+    assert (
+        lc.plan(mip, cameras, views).antialiased and not lc.plan(mip, cameras, views, antialiased=False).antialiased
+    )
+    against = lc.lift(mip, cameras, views, "row-sum", device="cpu", antialiased=False)
+    assert torch.equal(against.features, lc.lift(plain, cameras, views, "row-sum", device="cpu").features)
+    assert any("antialiased=false is set by hand" in text for text in against.diagnostics["warnings"])
+    with pytest.raises(InvalidSettings, match="antialiased"):
+        lc.lift(random_splats(3, kernel=Kernel.BETA), cameras, views, antialiased=True)
+
+
+def test_commands_follow_the_file_tell_it_and_take_a_setting_by_hand(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    splats, cameras, packs = write_scene(tmp_path, 7)
+    content = splats.read_bytes()
+    splats.write_bytes(content.replace(b"element", b"comment SplatRenderMode: mip\nelement", 1))
+    out = tmp_path / "l.safetensors"
+    status, text, _ = run(capsys, "plan", splats, cameras, packs)
+    assert status == 0 and "antialiased: the comment 'SplatRenderMode: mip' says so" in text
+    assert "antialiased: the comment" in run(capsys, "plan", splats, cameras)[1]
+    assert "SplatRenderMode: mip" in run(capsys, "check", splats, cameras)[1]
+    assert "set by hand" in run(capsys, "check", splats, cameras, "--set", "antialiased=false")[1]
+    assert "set by hand" in run(capsys, "plan", splats, cameras, "--set", "antialiased=false")[1]
+    assert "render mode" in run(capsys, "inspect", splats)[1]
+    assert run(capsys, "lift", splats, cameras, packs, "-o", out, "--set", "preset=row-sum")[0] == 0
+    scene = QueryScene.open(out)
+    assert scene.compositing.antialiased and params_of_renders(scene).antialiased
+    found = inspect_file(out)
+    assert found["settings"]["antialiased"] is True
+    assert "says so" in found["certificate"]["plan"]["rendering"]
+    assert run(capsys, "lift", splats, cameras, packs, "-o", out, "--set", "antialiased=false")[0] == 0
+    assert not QueryScene.open(out).compositing.antialiased
+
+
+def test_a_lift_from_before_keeps_the_kernel_that_it_was_lifted_with(tmp_path: Path) -> None:
+    splats, cameras, packs = write_scene(tmp_path, 7)
+    splats.write_bytes(splats.read_bytes().replace(b"element", b"comment SplatRenderMode: 2dgs\nelement", 1))
+    result = lift_files(splats, cameras, [packs], LiftSettings.of(preset="row-sum", kernel="3dgs"))
+    settings = result.settings.model_copy(update={"kernel": "auto", "antialiased": False})
+    metadata = result.metadata.model_copy(update={"settings": settings})
+    replace(result, metadata=metadata).save(tmp_path / "old.safetensors")
+    scene = QueryScene.open(tmp_path / "old.safetensors")
+    assert scene.splats.kernel is Kernel.GAUSSIAN_3D and not scene.compositing.antialiased
+
+
+def splats_of(splats: Splats, row: int) -> Splats:
+    """One splat of a scene."""
+    names = ("means", "quats", "log_scales", "opacity_logits")
+    return Splats(*(getattr(splats, name)[row : row + 1] for name in names))
+
+
+def test_a_splat_below_a_pixel_is_lifted_as_it_was_trained(tmp_path: Path) -> None:
+    """A veil of splats below a pixel, as an antialiased trainer leaves them, hides next to nothing."""
+    generator = torch.Generator().manual_seed(0)
+    veil = torch.rand(400, 3, generator=generator) * torch.tensor([2.0, 1.5, 0.2]) + torch.tensor([-1.0, -0.75, 1.0])
+    ball = torch.tensor([[0.0, 0.0, 4.0]])
+    splats = Splats(
+        torch.cat([veil, ball]), torch.tensor([[1.0, 0, 0, 0]]).repeat(401, 1),
+        torch.cat([torch.full((400, 3), -7.0), torch.zeros(1, 3)]), torch.full((401,), 4.0),
+    )  # fmt: skip
+    write_splats(splats, tmp_path / "classic.ply")
+    path = ply_saying(tmp_path, "comment SplatRenderMode: mip", splats=splats)
+    camera = lc.Camera(np.eye(4), [[32.0, 0, 32], [0, 32, 24], [0, 0, 1]], 64, 48, name="v")
+    whole = float(lc.render(splats_of(splats, 400), camera, torch.ones(1))[20:28, 28:36].mean())
+    shares = []
+    for file in (tmp_path / "classic.ply", path):
+        ball_alone = torch.zeros(401)
+        ball_alone[400] = 1.0
+        shares.append(float(lc.render(read_splats(file), camera, ball_alone)[20:28, 28:36].mean()))
+    assert shares[0] < 0.8 * whole and shares[1] > 0.99 * whole
