@@ -1,5 +1,8 @@
 """Checkpoints of trainers: gsplat's ``.pt`` and nerfstudio's ``.ckpt``, of which the splats are plain tensors.
 
+gsplat on several GPUs writes one a rank, ``ckpt_29999_rank0.pt`` and so on, with splats of its own. Their folder is
+the whole scene: the files of the last step, rank after rank (`liftcore.io.ranks`).
+
 They are pickles. Torch's reader for weights alone opens them, which builds tensors and runs no code of the file; what
 it refuses is refused. They are for files of one's own all the same: nobody sends them over HTTP.
 """
@@ -12,6 +15,7 @@ import numpy as np
 from liftcore.errors import InvalidSplats
 from liftcore.io.kinds import EXPORT_PLY
 from liftcore.io.quantised import Fields
+from liftcore.io.ranks import missing_ranks, rank_files
 from liftcore.scene.render_mode import mode_beside
 
 # Our fields by what the two trainers call them.
@@ -21,8 +25,39 @@ NERFSTUDIO_COLOUR = ("features_dc", "features_rest")
 NERFSTUDIO = ("_model.gauss_params.", "_model.")  # before the names, in newer and older versions
 
 
+def _rank_warnings(path: Path) -> tuple[str, ...]:
+    """A warning of splats of the same step that were not read."""
+    files = rank_files(path)
+    others = [file.name for file in files if file.name != path.name]
+    if not path.is_dir() and others:
+        some = ", ".join(others[:3]) + (", ..." if len(others) > 3 else "")
+        return (f"{some} beside {path.name} holds further splats of the same step: give their folder to take all",)
+    missing = missing_ranks(files) if path.is_dir() else []
+    return (f"the checkpoint of rank {missing[0]} is missing, and its splats with it",) if missing else ()
+
+
 def read_checkpoint(path: Path, *, colour: bool = True) -> Fields:
-    """The fields of a checkpoint's splats, in the frame that they were trained in.
+    """The fields of a checkpoint's splats, or of those of all ranks in a folder, in the frame of their training.
+
+    Raises:
+        InvalidSplats: a file holds more than tensors and plain values, or no splats of either trainer.
+    """
+    files = rank_files(path) if path.is_dir() else [path]
+    parts = [_read_one(file, colour=colour) for file in files]
+    fields: Fields = parts[0]
+    if len(parts) > 1:
+        shapes = [{name: values.shape[1:] for name, values in part.items()} for part in parts]
+        if any(shape != shapes[0] for shape in shapes):
+            got = f"other tensors in {files[0].name} and in others"
+            raise InvalidSplats(
+                str(path), expected="ranks of one training", got=got, hint="keep one run in the folder"
+            )
+        fields = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return fields | {"render_mode": mode_beside(files[0]), "warnings": _rank_warnings(path)}
+
+
+def _read_one(path: Path, *, colour: bool) -> dict[str, np.ndarray]:
+    """The fields of one checkpoint.
 
     Raises:
         InvalidSplats: the file holds more than tensors and plain values, or no splats of either trainer.
@@ -40,7 +75,7 @@ def read_checkpoint(path: Path, *, colour: bool = True) -> Fields:
         got = f"one that holds more than tensors, or is damaged ({str(error).splitlines()[0][:100]})"
         raise InvalidSplats(str(path), expected="a checkpoint of tensors", got=got, hint=EXPORT_PLY) from None
     tensors, names = _splats(stored, path)
-    fields: Fields = {field: _array(tensors, name, path) for field, name in GSPLAT.items()}
+    fields = {field: _array(tensors, name, path) for field, name in GSPLAT.items()}
     fields["opacity_logits"] = fields["opacity_logits"].reshape(len(fields["opacity_logits"]), -1)[:, 0]
     if colour and names[0] in tensors:
         first, rest = (_array(tensors, name, path) for name in names)
@@ -50,7 +85,7 @@ def read_checkpoint(path: Path, *, colour: bool = True) -> Fields:
             got = f"{list(first.shape)} and {list(rest.shape)}"
             argument = f"{path} {' and '.join(names)}"
             raise InvalidSplats(argument, expected="shapes [P, 1, 3] and [P, K, 3]", got=got) from None
-    return fields | {"render_mode": mode_beside(path)}
+    return fields
 
 
 def _splats(stored: Any, path: Path) -> tuple[dict[str, Any], tuple[str, str]]:

@@ -25,6 +25,7 @@ from liftcore.errors import InvalidInput
 from liftcore.io.colmap import MODEL_FILES
 from liftcore.io.files import BROKEN_ZIP, LFS_HINT, LFS_POINTER, is_system_file, open_regular, open_zip
 from liftcore.io.ply import MAX_HEADER_BYTES, cloud_without_splats
+from liftcore.io.ranks import rank_files
 from liftcore.io.shards import INDEX
 from liftcore.io.sog import META, is_sog_document, sog_folder
 from liftcore.io.splat import looks_like_splat
@@ -565,6 +566,7 @@ def _folder(path: Path) -> FileKind:
 def _folder_rules(path: Path) -> Iterator[FileKind | None]:
     yield _splats_as(SplatFormat.SOG) if (path / META).is_file() and _is_sog(path / META) else None
     yield FileKind("lift", "lift") if (path / INDEX).is_file() else None
+    yield _splats_as(SplatFormat.CHECKPOINT) if len(rank_files(path)) > 1 else None
     is_streamed = (path / LOD_META).is_file()
     yield _streamed(f"a folder of a streamed SOG ({LOD_META})", path / LOD_META) if is_streamed else None
     names = _names_below(path)

@@ -20,6 +20,7 @@ from liftcore.io.checkpoint import read_checkpoint
 from liftcore.io.compressed_ply import read_compressed_ply
 from liftcore.io.kinds import CONVERT, SplatFormat, identify, wrong_kind
 from liftcore.io.quantised import Fields
+from liftcore.io.ranks import rank_files
 from liftcore.io.remote import local_path
 from liftcore.io.sog import is_bundled, read_sog, sog_files
 from liftcore.io.splat import read_splat, splat_blocks
@@ -121,6 +122,8 @@ def splat_files(path: Path) -> list[Path]:
     Raises:
         OSError: there is none.
     """
+    if path.is_dir() and format_of(path) is SplatFormat.CHECKPOINT:
+        return rank_files(path)
     is_one = format_of(path) is not SplatFormat.SOG or is_bundled(path)
     return [path] if is_one else sog_files(path)
 
