@@ -62,6 +62,7 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/basedpyright
 	$(BIN)/lint-imports
+	$(BIN)/lint-imports --config service/imports.toml
 
 format: $(READY)
 	$(BIN)/ruff check --fix .

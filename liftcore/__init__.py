@@ -19,9 +19,9 @@ torch nor numba.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from liftcore.runtime.version import __version__ as __version__
+
 if TYPE_CHECKING:
-    from liftcore.engine.base import LocalEngine as LocalEngine
-    from liftcore.engine.ray import RayEngine as RayEngine
     from liftcore.errors import InvalidCameras as InvalidCameras
     from liftcore.errors import InvalidFeatures as InvalidFeatures
     from liftcore.errors import InvalidInput as InvalidInput
@@ -32,59 +32,60 @@ if TYPE_CHECKING:
     from liftcore.errors import NotFound as NotFound
     from liftcore.errors import SplatliftError as SplatliftError
     from liftcore.errors import Unavailable as Unavailable
-    from liftcore.features.pack import read_features as read_features
-    from liftcore.features.views import FeatureGrid as FeatureGrid
-    from liftcore.features.views import Regions as Regions
     from liftcore.io.cameras import read_cameras as read_cameras
-    from liftcore.io.lift_file import load_lift as load_lift
     from liftcore.io.splats import read_splats as read_splats
-    from liftcore.lifting import lift as lift
-    from liftcore.lifting import plan as plan
-    from liftcore.operators import region_weights as region_weights
-    from liftcore.operators import render as render
-    from liftcore.planning.photos import PhotoPlan as PhotoPlan
-    from liftcore.planning.photos import plan_photos as plan_photos
-    from liftcore.planning.plan import Plan as Plan
+    from liftcore.lifting.engines.base import LocalEngine as LocalEngine
+    from liftcore.lifting.engines.ray import RayEngine as RayEngine
+    from liftcore.lifting.operators import region_weights as region_weights
+    from liftcore.lifting.operators import render as render
+    from liftcore.lifting.pipeline import lift as lift
+    from liftcore.lifting.pipeline import plan as plan
+    from liftcore.lifting.planning.photos import PhotoPlan as PhotoPlan
+    from liftcore.lifting.planning.photos import plan_photos as plan_photos
+    from liftcore.lifting.planning.plan import Plan as Plan
     from liftcore.query.ask import VectorAnswer as VectorAnswer
     from liftcore.query.catalogue import Catalogue as Catalogue
     from liftcore.query.catalogue import SceneObject as SceneObject
     from liftcore.query.objects import FoundObject as FoundObject
     from liftcore.query.objects import Objects as Objects
+    from liftcore.query.result import LiftResult as LiftResult
+    from liftcore.query.result import load_lift as load_lift
     from liftcore.query.segment import NamedSplats as NamedSplats
     from liftcore.query.segment import Segmentation as Segmentation
-    from liftcore.query.text import TextEncoder as TextEncoder
-    from liftcore.query.text import open_encoder as open_encoder
-    from liftcore.raster.base import CompositingParams as CompositingParams
-    from liftcore.result import LiftResult as LiftResult
     from liftcore.scene.cameras import Camera as Camera
     from liftcore.scene.cameras import Cameras as Cameras
+    from liftcore.scene.compositing import CompositingParams as CompositingParams
     from liftcore.scene.splats import Splats as Splats
-    from liftcore.settings import LiftSettings as LiftSettings
-    from liftcore.solve.weights import RegionWeights as RegionWeights
+    from liftcore.text import TextEncoder as TextEncoder
+    from liftcore.text import open_encoder as open_encoder
+    from liftcore.values.pack import read_features as read_features
+    from liftcore.values.region_weights import RegionWeights as RegionWeights
+    from liftcore.values.settings import LiftSettings as LiftSettings
+    from liftcore.values.views import FeatureGrid as FeatureGrid
+    from liftcore.values.views import Regions as Regions
 
-__version__ = "0.4.0"
 
 _PUBLIC = {  # name -> the module that defines it
     "read_splats": "liftcore.io.splats",
     "read_cameras": "liftcore.io.cameras",
-    "read_features": "liftcore.features.pack",
+    "read_features": "liftcore.values.pack",
     "Splats": "liftcore.scene.splats",
     "Camera": "liftcore.scene.cameras",
     "Cameras": "liftcore.scene.cameras",
-    "Regions": "liftcore.features.views",
-    "FeatureGrid": "liftcore.features.views",
-    "LiftSettings": "liftcore.settings",
-    "lift": "liftcore.lifting",
-    "plan": "liftcore.lifting",
-    "Plan": "liftcore.planning.plan",
-    "plan_photos": "liftcore.planning.photos",
-    "PhotoPlan": "liftcore.planning.photos",
-    "LocalEngine": "liftcore.engine.base",
-    "RayEngine": "liftcore.engine.ray",
-    "LiftResult": "liftcore.result",
-    "load_lift": "liftcore.io.lift_file",
-    "open_encoder": "liftcore.query.text",
-    "TextEncoder": "liftcore.query.text",
+    "Regions": "liftcore.values.views",
+    "FeatureGrid": "liftcore.values.views",
+    "LiftSettings": "liftcore.values.settings",
+    "lift": "liftcore.lifting.pipeline",
+    "plan": "liftcore.lifting.pipeline",
+    "Plan": "liftcore.lifting.planning.plan",
+    "plan_photos": "liftcore.lifting.planning.photos",
+    "PhotoPlan": "liftcore.lifting.planning.photos",
+    "LocalEngine": "liftcore.lifting.engines.base",
+    "RayEngine": "liftcore.lifting.engines.ray",
+    "LiftResult": "liftcore.query.result",
+    "load_lift": "liftcore.query.result",
+    "open_encoder": "liftcore.text",
+    "TextEncoder": "liftcore.text",
     "VectorAnswer": "liftcore.query.ask",
     "Segmentation": "liftcore.query.segment",
     "NamedSplats": "liftcore.query.segment",
@@ -92,10 +93,10 @@ _PUBLIC = {  # name -> the module that defines it
     "SceneObject": "liftcore.query.catalogue",
     "Objects": "liftcore.query.objects",
     "FoundObject": "liftcore.query.objects",
-    "region_weights": "liftcore.operators",
-    "RegionWeights": "liftcore.solve.weights",
-    "render": "liftcore.operators",
-    "CompositingParams": "liftcore.raster.base",
+    "region_weights": "liftcore.lifting.operators",
+    "RegionWeights": "liftcore.values.region_weights",
+    "render": "liftcore.lifting.operators",
+    "CompositingParams": "liftcore.scene.compositing",
     "SplatliftError": "liftcore.errors",
     "InvalidInput": "liftcore.errors",
     "InvalidSplats": "liftcore.errors",

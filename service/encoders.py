@@ -14,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 
 from liftcore.errors import InvalidInput
 from liftcore.io.safetensors_file import check_header
-from liftcore.query.text import BUILT_IN, ENCODER_SPECS, NO_WORDS, OWN_WORDS, without_templates
+from liftcore.text import BUILT_IN, ENCODER_SPECS, NO_WORDS, OWN_WORDS, without_templates
 from service.errors import InvalidRequest, Misconfigured
 from service.settings import ServiceSettings
 

@@ -24,7 +24,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError
 
 from liftcore.scene.distortion import MAX_SIDE
-from liftcore.settings import LiftSettings
+from liftcore.values.settings import LiftSettings
 from service import limits
 
 # How fields tell of what does not fit: one error, in words, whatever pydantic would make of it

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from liftcore.errors import InvalidLift, SplatliftError
-from liftcore.query.text import BUILT_IN, NO_WORDS, OWN_WORDS
+from liftcore.text import BUILT_IN, NO_WORDS, OWN_WORDS
 from service.__main__ import bind, server_of
 from service.app import assemble
 from service.encoders import require_encoder_files

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from liftcore.features.pack import write_pack
-from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
 from liftcore.io.ply import write_splats
 from liftcore.scene.distortion import Brown, Distortion, Fisheye, Lens
 from liftcore.scene.splats import Splats
+from liftcore.values.pack import write_pack
+from liftcore.values.views import FeatureGrid, Regions, ViewFeatures
 
 AWAY, MEETING = 4.0, (1.9, -1.3)  # of the wall, and of its quarters
 WIDTH, HEIGHT, FX, FY, CX, CY = 160, 120, 110.0, 112.0, 83.0, 57.0

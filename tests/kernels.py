@@ -10,10 +10,10 @@ import sys
 import tempfile
 from pathlib import Path
 
-from liftcore.io.scene_files import lift_files
+from liftcore.lifting.files import lift_files
 from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.scene.splats import Kernel
-from liftcore.settings import LiftSettings
+from liftcore.values.settings import LiftSettings
 from tests.api.tiny_scene import make_scene
 
 

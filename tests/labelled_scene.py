@@ -15,12 +15,13 @@ from PIL import Image
 from safetensors.torch import save_file
 
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.lift_file import input_file, save_lift
 from liftcore.io.ply import write_splats
-from liftcore.result import LiftMetadata, LiftResult
+from liftcore.query.result import LiftResult
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
-from liftcore.settings import LiftSettings
+from liftcore.values.lift import LiftMetadata
+from liftcore.values.lift_file import input_file, save_lift
+from liftcore.values.settings import LiftSettings
 
 WIDTH, HEIGHT, FOCAL, DISTANCE = 160, 120, 100.0, 4.0
 SPACING = 0.08  # units between splats: 2 pixels

@@ -63,7 +63,7 @@ def lay(monkeypatch: pytest.MonkeyPatch) -> None:
     }  # fmt: skip
     for name, answer in answers.items():
         monkeypatch.setattr(torch.cuda, name, lambda *_, answer=answer: answer)
-    monkeypatch.setattr("liftcore.device._missing", lambda: None)
+    monkeypatch.setattr("liftcore.runtime.device._missing", lambda: None)
     for module in ("render", "tiles", "weights"):
         monkeypatch.setattr(f"liftcore.raster.gpu.{module}.launch", _launch)
 

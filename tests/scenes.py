@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from liftcore.features.pack import write_pack
-from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Kernel, Splats
+from liftcore.values.pack import write_pack
+from liftcore.values.views import FeatureGrid, Regions, ViewFeatures
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 TURNED = (0.9, 0.1, 0.3, 0.2)

@@ -10,10 +10,10 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
-from liftcore import __version__
 from liftcore.cli.options import BAD_INPUT, Parser, misplaced, shared_options
 from liftcore.errors import SplatliftError
 from liftcore.io.remote import Elsewhere, local_path
+from liftcore.runtime.version import __version__
 
 COMMANDS = {
     "demo": "the whole job, through the real service",

@@ -34,10 +34,10 @@ def run(options: argparse.Namespace) -> int:
     """Look, and say what is wrong; the exit status is 2 if something is."""
     from liftcore.evaluate.check import check_scene
     from liftcore.features.encoders.encode import find_images
-    from liftcore.features.pack import read_features
     from liftcore.io.cameras import read_cameras
     from liftcore.io.splats import read_splats
-    from liftcore.settings import LiftSettings
+    from liftcore.values.pack import read_features
+    from liftcore.values.settings import LiftSettings
 
     settings = LiftSettings.of(**pairs_of(options.set))
     if options.worst:

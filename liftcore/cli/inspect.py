@@ -16,7 +16,7 @@ def add_arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Describe a file of any kind."""
-    from liftcore.io.inspect import inspect_file
+    from liftcore.evaluate.inspect import inspect_file
 
     document = {"file": str(options.file), **inspect_file(options.file)}
     unnamed = {name: "not named" for name in ("encoder", "text_space") if document.get(name) == ""}

@@ -10,21 +10,21 @@ from typing import TYPE_CHECKING, Any
 
 from liftcore.cli.options import Parser, add_settings, add_sources, add_verbose, count
 from liftcore.cli.reply import JSON, LIFT, free_output, progress_bars, reply, shown, writing
-from liftcore.engine import ENGINES, engine_named
 from liftcore.errors import InvalidInput, InvalidSettings
 from liftcore.io.remote import is_remote, place, require_storage
-from liftcore.nearest import nearest
-from liftcore.progress import one_step
+from liftcore.lifting.engines import ENGINES, engine_named
+from liftcore.runtime.nearest import nearest
+from liftcore.runtime.progress import one_step
 
 FILLED = 0.9  # of a ray, in a scene that was trained with its background
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from liftcore.planning.plan import Plan
-    from liftcore.result import LiftResult
-    from liftcore.settings import LiftSettings
-    from liftcore.solve.checkpoint import Checkpoint
+    from liftcore.lifting.checkpoint import Checkpoint
+    from liftcore.lifting.planning.plan import Plan
+    from liftcore.query.result import LiftResult
+    from liftcore.values.settings import LiftSettings
 
 
 def add_arguments(parser: Parser) -> None:
@@ -46,9 +46,9 @@ def run(options: argparse.Namespace) -> int:
     """Lift, write the lift whole or not at all, and say what came of it."""
     settings = settings_of(options)
     from liftcore.io.cameras import camera_source
-    from liftcore.io.lift_file import save_lift
-    from liftcore.io.scene_files import lift_files
     from liftcore.io.shards import INDEX, SUFFIX
+    from liftcore.lifting.files import lift_files
+    from liftcore.values.lift_file import save_lift
 
     views = camera_source(options.cameras).files
     inputs = [options.splats, *views, *options.features]
@@ -106,7 +106,7 @@ def checkpoint_in(folder: Path) -> Checkpoint:
     Raises:
         InvalidInput: it is no folder, or nothing can be written there.
     """
-    from liftcore.solve.checkpoint import Checkpoint
+    from liftcore.lifting.checkpoint import Checkpoint
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -123,7 +123,7 @@ def settings_of(options: argparse.Namespace) -> LiftSettings:
     Raises:
         InvalidSettings: a pair without ``=``, an unknown name, one with two values or a value out of range.
     """
-    from liftcore.settings import LiftSettings
+    from liftcore.values.settings import LiftSettings
 
     named = {"preset": options.preset, "speed": options.speed, "device": options.device}
     values = pairs_of(options.set)
@@ -139,7 +139,7 @@ def pairs_of(pairs: Sequence[str]) -> dict[str, Any]:
     Raises:
         InvalidSettings: a pair without ``=``, an unknown name or one with two values.
     """
-    from liftcore.settings import LiftSettings
+    from liftcore.values.settings import LiftSettings
 
     values: dict[str, Any] = {}
     for pair in pairs:
@@ -170,8 +170,8 @@ def _contradiction(name: str, one: str, other: str) -> InvalidSettings:
 
 def plan_of(options: argparse.Namespace, settings: LiftSettings) -> Plan:
     """The plan of the lift that the options describe."""
-    from liftcore.io.scene_files import open_files
-    from liftcore.lifting import plan
+    from liftcore.lifting.files import open_files
+    from liftcore.lifting.pipeline import plan
 
     return plan(
         *open_files(options.splats, options.cameras, options.features, settings), settings, threads=options.threads
@@ -226,7 +226,7 @@ def _lines(document: dict[str, Any], cameras: Path, verbose: bool) -> Iterable[s
 
 def _verdict(document: dict[str, Any], cameras: Path) -> Iterable[str]:
     """What is healthy, what to look at, and what to do."""
-    from liftcore.query.text import NO_WORDS
+    from liftcore.text import NO_WORDS
 
     certificate = document["certificate"]
     filled = certificate["row_sum_mean"]

@@ -63,7 +63,7 @@ def _vocabulary(options: argparse.Namespace, scene: QueryScene) -> tuple[str | N
     if options.vocabulary is None and not options.table and not options.encoder and scene.table is None:
         return None, [], None
     if options.vocabulary is not None and options.vocabulary.suffix == ".safetensors":
-        from liftcore.query.text import open_encoder
+        from liftcore.text import open_encoder
 
         encoder, file = open_encoder(f"table:{options.vocabulary}"), None
     else:

@@ -11,7 +11,7 @@ from liftcore.io.remote import place
 
 if TYPE_CHECKING:
     from liftcore.query.scene import QueryScene
-    from liftcore.query.text import TextEncoder
+    from liftcore.text import TextEncoder
 
 BAD_INPUT = 2
 ROLES = {  # of arguments that name files: what belongs there
@@ -199,7 +199,7 @@ def text_encoder(
     Raises:
         InvalidQuery, Unavailable: as `encoder_of_space` has it.
     """
-    from liftcore.query.text import encoder_of_space, open_encoder
+    from liftcore.text import encoder_of_space, open_encoder
 
     if options.table:
         return open_encoder(f"table:{options.table}")

@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from liftcore.features.folders import ViewFolder
-    from liftcore.features.views import Regions
-    from liftcore.progress import Progress
-    from liftcore.query.text.table import TableEncoder
+    from liftcore.runtime.progress import Progress
+    from liftcore.text.table import TableEncoder
+    from liftcore.values.views import Regions
 
 
 LARGEST_GREY = 65_535  # of a picture of 16 bits
@@ -87,8 +87,8 @@ def _grey(text: str) -> int:
 
 def run(options: argparse.Namespace) -> int:
     """Write the pack whole or not at all, and say what is in it."""
-    from liftcore.features.pack import read_features, write_pack
-    from liftcore.io.inspect import describe_packs
+    from liftcore.evaluate.inspect import describe_packs
+    from liftcore.values.pack import read_features, write_pack
 
     if options.format == "retag":
         return _retag(options)
@@ -119,9 +119,9 @@ def run(options: argparse.Namespace) -> int:
 
 def _retag(options: argparse.Namespace) -> int:
     """Write the pack under its new names, and say them."""
-    from liftcore.features.pack import read_features
     from liftcore.io.files import whole_file
     from liftcore.io.safetensors_file import with_metadata
+    from liftcore.values.pack import read_features
 
     given = {"encoder": options.encoder_name, "text_space": options.text_space}
     names = {name: value for name, value in given.items() if value}
@@ -216,7 +216,7 @@ def _views(options: argparse.Namespace, progress: Progress) -> tuple[ViewFolder,
 
 
 def _metadata(options: argparse.Namespace) -> dict[str, str]:
-    from liftcore.query.text import OWN_WORDS
+    from liftcore.text import OWN_WORDS
 
     told = {"source": options.format}
     if options.format == "prompts":

@@ -10,7 +10,7 @@ from liftcore.cli.options import Parser, add_settings, add_sources, add_verbose,
 from liftcore.cli.reply import progress_bars, reply
 
 if TYPE_CHECKING:
-    from liftcore.settings import LiftSettings
+    from liftcore.values.settings import LiftSettings
 
 
 def add_arguments(parser: Parser) -> None:
@@ -44,7 +44,7 @@ def _photos(options: argparse.Namespace, settings: LiftSettings) -> int:
     """Print which photos to encode first."""
     from liftcore.io.cameras import read_cameras
     from liftcore.io.splats import read_splats
-    from liftcore.planning.photos import plan_photos
+    from liftcore.lifting.planning.photos import plan_photos
 
     splats = read_splats(options.splats, settings.kernel, colour=False)
     with progress_bars() as progress:

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from liftcore.query.render import ViewMask
     from liftcore.query.scene import QueryScene
     from liftcore.query.terms import Example, Query
-    from liftcore.query.text import TextEncoder
     from liftcore.scene.cameras import Camera
+    from liftcore.text import TextEncoder
 
 
 OUTPUTS = ("object", "coloured", "scores", "mask", "attention", "overlay")  # options that name a file to write

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from liftcore.errors import InvalidInput
-from liftcore.progress import Progress
+from liftcore.runtime.progress import Progress
 
 SHOWN_ITEMS = 6  # of a list, for people
 SHOWN_FOLDERS = 8

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
     from liftcore.query.scene import QueryScene
     from liftcore.query.segment import Segmentation
-    from liftcore.query.text import TextEncoder
     from liftcore.scene.cameras import Camera
+    from liftcore.text import TextEncoder
 
 OUTPUTS = ("labels", "picture", "coloured", "splat_labels", "labelled")  # options that name a file to write
 

@@ -37,7 +37,7 @@ def become(program: str, arguments: Sequence[str]) -> NoReturn:
     Raises:
         Unavailable: the service is not installed.
     """
-    from liftcore.page import require_service
+    from liftcore.query.page import require_service
 
     require_service()
     sys.stdout.flush()

@@ -38,7 +38,7 @@ def _seconds(text: str) -> float:
 
 def run(options: argparse.Namespace) -> int:
     """Compare, write the chart, the table and the JSON, and say what to take."""
-    from liftcore.settings import LiftSettings
+    from liftcore.values.settings import LiftSettings
 
     settings = pairs_of(options.set)
     LiftSettings.of(**settings)

@@ -15,7 +15,7 @@ from PIL import Image
 
 from liftcore.errors import InvalidInput, SplatliftError, Unavailable
 from liftcore.query.render import overlay
-from liftcore.query.text import NO_WORDS
+from liftcore.text import NO_WORDS
 
 if TYPE_CHECKING:
     from collections.abc import Callable

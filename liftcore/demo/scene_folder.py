@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from liftcore.errors import InvalidInput
-from liftcore.features.pack import read_features
 from liftcore.io.files import visible_files
 from liftcore.io.kinds import SPLATS_SENT, identify, kind_of
-from liftcore.query.text import BUILT_IN, NO_WORDS, OWN_WORDS
+from liftcore.text import BUILT_IN, NO_WORDS, OWN_WORDS
+from liftcore.values.pack import read_features
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -7,10 +7,11 @@ import torch
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from liftcore.features.views import Regions, ViewFeatures
-from liftcore.raster.base import CompositingParams, Raster
+from liftcore.raster.base import Raster
 from liftcore.scene.cameras import Camera
-from liftcore.solve.geometry import Readout, read_pixels, sample_pixels
+from liftcore.scene.compositing import CompositingParams
+from liftcore.solve.rays import Readout, read_pixels, sample_pixels
+from liftcore.values.views import Regions, ViewFeatures
 
 PIXELS = 1_000  # of a view, whose rendered features are compared with the given ones
 LEAST_PIXELS = 5  # of them, for the mean of a region

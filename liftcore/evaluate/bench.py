@@ -9,21 +9,22 @@ from typing import Any
 
 import torch
 
-from liftcore.device import Device, choose_device
 from liftcore.errors import InvalidInput
 from liftcore.evaluate.hardware import hardware, peak_memory
 from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
-from liftcore.features.views import Regions, ViewFeatures
-from liftcore.one_thread import one_thread
+from liftcore.lifting.warm_up import warm_up_lift
 from liftcore.raster import open_raster
-from liftcore.raster.base import CompositingParams, Raster, ViewRequest, Weighting
+from liftcore.raster.base import Raster, ViewRequest
+from liftcore.runtime.device import Device, choose_device
+from liftcore.runtime.one_thread import one_thread
 from liftcore.scene.cameras import Camera
+from liftcore.scene.compositing import CompositingParams, Weighting
 from liftcore.scene.splats import Splats
-from liftcore.settings import LiftSettings, Preset
 from liftcore.solve.closed_form import solve
 from liftcore.solve.codebook import Codebook, ViewCodebook, as_regions
-from liftcore.solve.weights import RegionWeights, stacked
-from liftcore.warm_up import warm_up_lift
+from liftcore.values.region_weights import RegionWeights, stacked
+from liftcore.values.settings import LiftSettings, Preset
+from liftcore.values.views import Regions, ViewFeatures
 
 PASSES = 3  # over all views, of which the median counts
 PACKS = ("regions.safetensors", "features.safetensors")  # of a scene folder, the first that is there
@@ -150,9 +151,9 @@ def workload(options: Mapping[str, Any]) -> Workload:
 
 
 def _real(folder: Path, channels: int, levels: int, count: int) -> Workload:
-    from liftcore.features.pack import pair, read_features
     from liftcore.io.cameras import read_cameras
     from liftcore.io.splats import read_splats
+    from liftcore.values.pack import pair, read_features
 
     pack = next((folder / name for name in PACKS if (folder / name).is_file()), None)
     if pack is None:

@@ -1,7 +1,7 @@
 """Do splats, cameras, photos and features belong together? What is wrong is told before the work.
 
 Nothing here knows how good a scene is. Each measure has its own control: a render is held against other views' photos
-too, the edges of masks against the same masks mirrored, and features as `liftcore.planning.contradictions` has it.
+too, the edges of masks against the same masks mirrored, and features as `lifting.planning.contradictions` has it.
 
 Photos of another shape than their cameras are told by their headers alone, and compared no further. Where renders are
 not like their photos, the causes that photos can show are tried: photos that are turned or mirrored, photos that are
@@ -21,12 +21,9 @@ import torch
 from PIL import Image
 
 from liftcore.features.encoders.encode import TURNS, read_image, readings_of
-from liftcore.features.lens import photo_as_pinhole_sees
-from liftcore.features.pack import Views, pair
 from liftcore.features.smoothness import smoothness, unlike_maps
-from liftcore.features.views import FeatureGrid, Regions
 from liftcore.io.photos import PhotoHeader, orientation_warnings, read_header
-from liftcore.planning.contradictions import (
+from liftcore.lifting.planning.contradictions import (
     FAR_SCALES,
     LEAST_IN_VIEW,
     LEAST_ROW_SUM,
@@ -36,20 +33,23 @@ from liftcore.planning.contradictions import (
     empty,
     unseen,
 )
-from liftcore.planning.views import visibility
-from liftcore.progress import Progress, silent
+from liftcore.lifting.planning.views import visibility
 from liftcore.query.render import in_photo
 from liftcore.query.splat_colours import seen_colours
-from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.runtime.progress import Progress, silent
 from liftcore.scene.cameras import Camera, Cameras, photo_size
+from liftcore.scene.compositing import CompositingParams
 from liftcore.scene.panorama import with_panoramas
 from liftcore.scene.render_mode import rendering_reason, rendering_warnings
 from liftcore.scene.splats import Splats
 from liftcore.scene.views import cameras_of_views, some_of
-from liftcore.settings import LiftSettings
 from liftcore.solve.diagnostics import is_stretched, shape_warnings
-from liftcore.solve.geometry import LiftViews
+from liftcore.values.lens import photo_as_pinhole_sees
+from liftcore.values.lift_views import LiftViews
+from liftcore.values.pack import Views, pair
+from liftcore.values.settings import LiftSettings
+from liftcore.values.views import FeatureGrid, Regions
 
 VIEWS = 12  # that are looked at, evenly spread
 CONTROLS = 3  # other photos that a render is held against

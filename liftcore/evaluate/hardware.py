@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from liftcore.device import processor
+from liftcore.runtime.device import processor
 
 
 def hardware() -> dict[str, Any]:

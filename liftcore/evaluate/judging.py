@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from liftcore.errors import InvalidInput, InvalidQuery
 from liftcore.evaluate.labels import LabelledObject, LabelledScene
 from liftcore.evaluate.protocols import SEGMENTERS, EvaluationProtocol, Prediction
-from liftcore.progress import Progress, silent
 from liftcore.query.scene import QueryScene
-from liftcore.query.text import RememberingEncoder, TextEncoder
+from liftcore.runtime.progress import Progress, silent
 from liftcore.scene.cameras import photo_size
+from liftcore.text import RememberingEncoder, TextEncoder
 
 
 @dataclass(frozen=True)

@@ -28,10 +28,10 @@ from liftcore.query.render import view_mask
 from liftcore.query.scene import QueryScene
 from liftcore.query.scores import DEFAULT_NEGATIVES, relevancy
 from liftcore.query.terms import Query
-from liftcore.query.text import TextEncoder
 from liftcore.query.threshold import find_threshold
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Camera
+from liftcore.text import TextEncoder
 
 MEAN_FILTER = 30  # pixels
 CUT = 0.4  # of the map stretched to -1..1

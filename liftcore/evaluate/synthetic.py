@@ -3,9 +3,9 @@
 import numpy as np
 import torch
 
-from liftcore.features.views import Regions
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
+from liftcore.values.views import Regions
 
 _HALF = 3.0  # scene units from the middle of the room to its walls
 _BALLS = 12

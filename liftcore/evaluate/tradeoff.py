@@ -22,32 +22,32 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from liftcore.device import choose_device
 from liftcore.errors import InvalidInput, InvalidSettings, SplatliftError, Unavailable
 from liftcore.evaluate.accuracy import centred_cosines, cosine_figures, rendered_scores, shared_pixels
+from liftcore.evaluate.class_masks import read_masks
 from liftcore.evaluate.hardware import hardware, peak_memory
 from liftcore.evaluate.ranking import accuracy_of, choose
-from liftcore.features.pack import Views, pair, read_features
-from liftcore.features.views import cells_under
 from liftcore.io.cameras import read_cameras
-from liftcore.io.class_masks import read_masks
-from liftcore.io.scene_files import open_files
-from liftcore.lifting import lift
-from liftcore.planning.views import spread
-from liftcore.progress import Progress
+from liftcore.lifting.files import open_files
+from liftcore.lifting.pipeline import lift
+from liftcore.lifting.planning.views import spread
+from liftcore.lifting.warm_up import warm_up_lift
 from liftcore.query.ask import ask
 from liftcore.query.objects import objects
 from liftcore.query.render import in_photo, view_mask
+from liftcore.query.result import LiftResult
 from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Query
-from liftcore.query.text.table import TableEncoder
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.result import LiftResult
+from liftcore.runtime.device import choose_device
+from liftcore.runtime.progress import Progress
 from liftcore.scene.cameras import Cameras
 from liftcore.scene.splats import Splats
 from liftcore.scene.views import cameras_of_views
-from liftcore.settings import LiftSettings
-from liftcore.warm_up import warm_up_lift
+from liftcore.text.table import TableEncoder
+from liftcore.values.pack import Views, pair, read_features
+from liftcore.values.settings import LiftSettings
+from liftcore.values.views import cells_under
 
 HOLD_OUT = 8  # every n-th view is held out of the lifts
 LEAST_HELD_OUT = 6  # where there are three times as many: five that agree may do so by chance (1 of 32)

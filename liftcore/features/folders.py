@@ -14,10 +14,10 @@ from typing import Literal, TypeVar
 import numpy as np
 
 from liftcore.errors import InvalidFeatures
-from liftcore.features.views import NO_LABEL, FeatureGrid, Regions, ViewFeatures
 from liftcore.io.files import visible_files
 from liftcore.io.npy import ARRAYS, TENSORS, open_npy, read_floats, without_unit_axes
 from liftcore.scene.views import composed, without_image_suffix
+from liftcore.values.views import NO_LABEL, FeatureGrid, Regions, ViewFeatures
 
 PICKLED = (".pt", ".pth", ".pkl")
 # What feature-3dgs writes after the name of an image, and the layout that it speaks of.

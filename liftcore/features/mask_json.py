@@ -29,8 +29,8 @@ from liftcore.features.mask_files import (
     read_mask,
     read_mask_json,
 )
-from liftcore.query.text.table import plain
 from liftcore.scene.views import composed, without_image_suffix
+from liftcore.text.table import plain
 
 PHRASE_KEYS = (
     *("phrase", "prompt", "text", "label", "class_name", "category_name", "text_input", "noun_phrase"),

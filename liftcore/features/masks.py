@@ -22,10 +22,16 @@ import numpy as np
 
 from liftcore.errors import InvalidFeatures
 from liftcore.features.folders import ViewFolder, files_below, files_by_view, mask_ids, npy_files
-from liftcore.features.mask_files import StoredMasks, label_png, mask_records, read_mask, read_mask_json
+from liftcore.features.mask_files import (
+    StoredMasks,
+    label_png,
+    mask_records,
+    read_mask,
+    read_mask_json,
+)
 from liftcore.features.mask_json import stated_size
-from liftcore.features.views import NO_LABEL, Regions
 from liftcore.io.npy import NUMBERS, open_array, read_floats, without_unit_axes
+from liftcore.values.views import NO_LABEL, Regions
 
 VECTORS = ".npy"
 ARRAY, RUNS, PICTURE = "_masks.npy", ".json", ".png"

@@ -40,11 +40,11 @@ from liftcore.features.mask_json import (
     views_of_images,
 )
 from liftcore.features.masks import layered
-from liftcore.features.views import NO_LABEL, Regions
 from liftcore.io.files import visible_files
 from liftcore.io.npy import ARRAYS, NUMBERS, open_array, without_unit_axes
-from liftcore.query.text.table import TableEncoder, plain
 from liftcore.scene.views import composed, without_image_suffix
+from liftcore.text.table import TableEncoder, plain
+from liftcore.values.views import NO_LABEL, Regions
 
 MOST_PHRASES = 4_096
 LEGEND = "legend"  # the text of a label picture that names its values

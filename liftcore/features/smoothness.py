@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from liftcore.features.views import FeatureGrid, ViewFeatures
+from liftcore.values.views import FeatureGrid, ViewFeatures
 
 LEAST_SMOOTHNESS = 0.1  # of neighbouring cells' agreement over that of any two, as a share of what is left to one
 READINGS = {"[F, h, w]": (1, 2, 0), "[w, h, F]": (1, 0, 2)}  # of the same bytes, and how their axes become h, w, F

@@ -27,14 +27,14 @@ from liftcore.query.presence import (
 from liftcore.query.scene import QueryScene, as_numpy
 from liftcore.query.scores import LEAST_LIKENESS, LOWEST_COSINE, combine, cosines, cosines_about
 from liftcore.query.terms import Query, Vector
-from liftcore.query.text import TextEncoder, encoder_of_space, open_encoder
 from liftcore.query.threshold import find_threshold
+from liftcore.text import TextEncoder, encoder_of_space, open_encoder
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from liftcore.result import LiftResult
     from liftcore.scene.splats import Splats
+    from liftcore.values.lift import Lift
 
 _QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 
@@ -156,7 +156,7 @@ def encoder_for(scene: QueryScene, encoder: TextEncoder | str | Path | None) -> 
 
 
 def query_vectors(
-    result: LiftResult,
+    result: Lift,
     positives: Any,
     negatives: Any = (),
     *,

@@ -13,7 +13,7 @@ from liftcore.errors import InvalidQuery, NotFound
 from liftcore.query.regions import codebook_row, regions_of
 from liftcore.query.scene import QueryScene, as_numpy
 from liftcore.query.terms import OneSplat, Pixel, Query, Region, Vector
-from liftcore.query.text import TextEncoder
+from liftcore.text import TextEncoder
 
 MINIMUM_ROW_SUM = 0.5  # below it a ray mostly misses the scene: no histogram, no mask and no example takes it
 

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from liftcore import __version__
 from liftcore.errors import InvalidLift
 from liftcore.query.objects import LEAST_EVIDENCE, trimmed_box
 from liftcore.query.scene import QueryScene, as_numpy
+from liftcore.runtime.version import __version__
 from liftcore.scene.touching import touching
 
 if TYPE_CHECKING:

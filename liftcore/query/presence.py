@@ -34,9 +34,9 @@ import numpy as np
 from liftcore.errors import InvalidQuery, InvalidTable, Unavailable
 from liftcore.query.scene import QueryScene, as_numpy
 from liftcore.query.scores import cosines
-from liftcore.query.text import LVIS_TABLE, RememberingEncoder, TextEncoder
-from liftcore.query.text.table import TableEncoder
 from liftcore.query.threshold import LEAST_SHARE
+from liftcore.text import LVIS_TABLE, RememberingEncoder, TextEncoder
+from liftcore.text.table import TableEncoder
 
 LEAST_WORDS = 200  # of a table, to be references
 EVERY = 4  # of the shipped words, that another encoder is asked for: 301 take it seconds

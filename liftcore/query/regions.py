@@ -13,7 +13,7 @@ from liftcore.query.scene import QueryScene, as_numpy
 from liftcore.query.terms import Region
 
 if TYPE_CHECKING:
-    from liftcore.features.views import Regions
+    from liftcore.values.views import Regions
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ def regions_of(scene: QueryScene, view: str, argument: str) -> Regions:
     Raises:
         NotFound: the packs lack the view. InvalidQuery: it is a grid. InvalidLift: a pack moved or changed.
     """
-    from liftcore.features.pack import pair
-    from liftcore.features.views import Regions
     from liftcore.scene.views import cameras_of_views
+    from liftcore.values.pack import pair
+    from liftcore.values.views import Regions
 
     packs = scene.packs
     name = cameras_of_views([view], packs.views).get(view)

@@ -17,8 +17,8 @@ from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.objects import Objects, objects
 from liftcore.query.scene import QueryScene
 from liftcore.query.splat_colours import seen_colours
-from liftcore.raster.base import CompositingParams
 from liftcore.scene.cameras import Camera, drawn_by
+from liftcore.scene.compositing import CompositingParams
 from liftcore.scene.distortion import photo_places
 
 LEAST_SHARE = 0.5  # of a ray's weight, that what was found must have in a mask

@@ -10,20 +10,21 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from liftcore.errors import InvalidLift, InvalidQuery, InvalidSplats
-from liftcore.io.lift_file import read_lift
 from liftcore.io.splats import splat_count
 from liftcore.query.scores import mean_direction, norms_of
-from liftcore.query.text.table import TableEncoder, own_words
 from liftcore.scene.kernel import Kernel
+from liftcore.text.table import TableEncoder, own_words
+from liftcore.values.lift_file import read_lift
 
 if TYPE_CHECKING:  # these load torch or pydantic, which scores do without
     from torch import Tensor
 
-    from liftcore.features.pack import Views
-    from liftcore.raster.base import CompositingParams, Raster
-    from liftcore.result import InputFile, LiftMetadata, LiftResult
+    from liftcore.raster.base import Raster
     from liftcore.scene.cameras import Camera, Cameras
+    from liftcore.scene.compositing import CompositingParams
     from liftcore.scene.splats import Splats
+    from liftcore.values.lift import InputFile, Lift, LiftMetadata
+    from liftcore.values.pack import Views
 
 MOST_PIXELS = 1 << 26  # of a picture: 67 million take a minute of one core and 2 GB
 
@@ -47,13 +48,13 @@ class QueryScene:
     cluster_features: np.ndarray | None  # [K, F] like features
     confidence: np.ndarray | None  # [P] f32 in 0..1; None where the lift was not reweighted
     object: np.ndarray | None  # [P] i32, -1 = of no object; None: objects were not looked for
-    object_views: np.ndarray | None  # [N, V] i32, of `LiftResult`
+    object_views: np.ndarray | None  # [N, V] i32, of `Lift`
     _told: str  # the metadata of a lift file, as JSON
     _moved: dict[str, Path | None]  # files that lie elsewhere now, by their roles
 
     def __init__(
         self,
-        result: LiftResult,
+        result: Lift,
         splats: Splats | None = None,
         cameras: Cameras | None = None,
         packs: Views | None = None,
@@ -98,7 +99,7 @@ class QueryScene:
         Raises:
             InvalidLift: the metadata are none of a lift.
         """
-        from liftcore.io.lift_file import parse_metadata
+        from liftcore.values.lift_file import parse_metadata
 
         metadata = parse_metadata(self._told, self.path)
         files = {
@@ -118,11 +119,11 @@ class QueryScene:
         return own_words(self.metadata.words, self._embeddings)
 
     @cached_property
-    def lift(self) -> LiftResult:
+    def lift(self) -> Lift:
         """The lift as torch has it, over the same memory."""
-        from liftcore.io.lift_file import load_lift
+        from liftcore.values.lift_file import open_lift
 
-        return load_lift(self.path)
+        return open_lift(self.path)
 
     @property
     def channels(self) -> int:
@@ -254,7 +255,7 @@ class QueryScene:
         Raises:
             InvalidLift: a pack moved, or is another than the one that was lifted.
         """
-        from liftcore.features.pack import read_features
+        from liftcore.values.pack import read_features
 
         return read_features(*(self._unchanged("features", file) for file in self.metadata.features))
 
@@ -314,8 +315,8 @@ class QueryScene:
         if not remembered.path:
             raise InvalidLift(str(self.path), expected=f"a lift that knows its {role}", got="one of values in memory",
                               hint=f"give the {role} to QueryScene, too")  # fmt: skip
-        from liftcore.io.lift_file import found_input
         from liftcore.io.transforms import FRAME_FILE
+        from liftcore.values.lift_file import found_input
 
         path, moved = Path(remembered.path), getattr(self, "_moved", {}).get(role) is not None
         found = found_input(role, remembered, self.metadata, None if moved else self.path)

@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from liftcore.errors import InvalidQuery
-from liftcore.jit import vectorised
+from liftcore.runtime.jit import vectorised
 
 DEFAULT_NEGATIVES = ("object", "things", "stuff", "texture")  # LangSplat's canonical phrases
 LOWEST_COSINE = -1.0  # what a splat without a feature scores

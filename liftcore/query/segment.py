@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liftcore.errors import InvalidQuery
-from liftcore.progress import Progress, silent
 from liftcore.query.colours import cluster_colours
 from liftcore.query.directions import MINIMUM_ROW_SUM, directions
 from liftcore.query.objects import trimmed_box
@@ -28,11 +27,12 @@ from liftcore.query.scene import QueryScene, as_numpy
 from liftcore.query.scores import cosines, norms_of
 from liftcore.query.terms import Example, Query
 from liftcore.query.threshold import find_threshold
+from liftcore.runtime.progress import Progress, silent
 
 if TYPE_CHECKING:
     from liftcore.query.ask import Point
-    from liftcore.query.text import TextEncoder
     from liftcore.scene.cameras import Camera
+    from liftcore.text import TextEncoder
 
 NO_WORD = -1
 LEAST_OWN = 0.25  # of a word's answer, by evidence, that no other word is nearer to

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from liftcore.errors import InvalidSettings, InvalidSplats
 
 if TYPE_CHECKING:
-    from liftcore.device import Device
     from liftcore.raster.base import Raster
+    from liftcore.runtime.device import Device
     from liftcore.scene.splats import Splats
 
 

@@ -1,75 +1,24 @@
-"""What a raster backend offers: the uses of A, view by view; the values that it takes, and the field's constants.
-
-Nothing here loads torch: settings share these values with processes that never compute.
-"""
+"""What a raster backend offers: the uses of A, view by view, and the values that it takes and gives."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from enum import StrEnum
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from liftcore.errors import InvalidInput, InvalidSettings
-from liftcore.scene.kernel import Kernel
+from liftcore.errors import InvalidInput
+from liftcore.scene.compositing import check_antialiased
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable
 
     from torch import Tensor
 
-    from liftcore.features.views import ViewFeatures
     from liftcore.scene.cameras import Camera
+    from liftcore.scene.compositing import CompositingParams, Weighting
+    from liftcore.scene.kernel import Kernel
     from liftcore.scene.splats import Splats
-    from liftcore.solve.weights import RegionWeights
-
-# The constants of the field, named once. They move results at the 1e-3 level: state them with every number.
-LOW_PASS = 0.3  # px^2, added to both axes of every projected covariance (3DGS; gsplat's eps2d)
-NEAR_PLANE = 0.01  # scene units; a splat whose centre is nearer to the camera plane is not drawn
-ALPHA_FLOOR = 1.0 / 255.0  # a smaller alpha counts as none (3DGS and 2DGS; DBS has compact support instead)
-FIELD_MARGIN = 0.3  # the projection's Jacobian is clamped this share of tan(half field) outside the image
-MAX_LOG_SCALE = 60.0  # log scales are clamped to +-this, so that squares stay finite in float64
-TILE = 16  # px, side of a tile
-LARGEST_EXPONENT = 120.0  # a falloff below 2^-120 counts as none: float32 holds no smaller alphas
-EDGE_ON = 1e-6  # sine of a disc's plane with the ray of its centre; up to this only the low-pass counts (2DGS)
-MOST_OF_A_RAY = 64  # the largest k of top-k
-
-
-@dataclass(frozen=True)
-class CompositingParams:
-    """How splats are composited along a ray, front to back.
-
-    ``antialiased``: alpha at a splat's centre is ``sigmoid(scale theta) sqrt(det(cov) / det(cov + low-pass))``: the
-    low-pass makes a small splat larger on the screen, and the compensation takes as much of its opacity. The scale
-    acts on the logit first, the alpha floor on both together. Scenes trained so (gsplat's ``antialiased``,
-    Mip-Splatting) are to be composited so.
-    """
-
-    opacity_logit_scale: float = 1.0  # lambda: alpha~ = sigmoid(lambda theta)
-    alpha_cap: float = 0.99  # the largest alpha of a splat on a ray
-    transmittance_stop: float = 1e-4  # exclusive: the splat that would bring T to it or below adds nothing
-    antialiased: bool = False  # the mip filter's opacity compensation, 3DGS only
-    stride: int = 1  # region weights look at every n-th pixel in x and in y; renders at all of them
-    offset: tuple[int, int] = (0, 0)  # the first such pixel (x, y), each below the stride
-
-
-class Selection(StrEnum):
-    """Which of a ray's weights count."""
-
-    ALL = "all"
-    TOP_K = "top-k"  # the k largest of the ray, equal ones near to far (argmax lifting: k = 1; Dr. Splat)
-    FRONT_MASS = "front-mass"  # those in front of which less than a share of the light was taken (VALA's gate)
-    CENTRE = "centre"  # one ray a splat: that of the pixel which holds its projected centre (Occam's LGS)
-
-
-@dataclass(frozen=True)
-class Weighting:
-    """What counts as the weight of a splat on a ray: some of ``w = alpha T``, to a power."""
-
-    power: int = 1  # 0, 1 or 2 of what was selected; 0: each kept weight counts one
-    selection: Selection = Selection.ALL
-    count: int = 1  # k of top-k, at most MOST_OF_A_RAY
-    mass: float = 0.75  # of front-mass: a weight counts while 1 - T before it is below this
-    floor: float = 0.0  # a smaller weight counts none, in every selection
+    from liftcore.values.region_weights import RegionWeights
+    from liftcore.values.views import ViewFeatures
 
 
 @dataclass(frozen=True)
@@ -166,37 +115,6 @@ def check_params(kernel: Kernel, camera: Camera, params: CompositingParams) -> N
         raise InvalidInput("offset", expected=expected, got=str(params.offset))
 
 
-def check_antialiased(kernel: Kernel, antialiased: bool) -> None:
-    """Refuse the mip filter's compensation where it has no meaning.
-
-    Raises:
-        InvalidSettings: the splats are no 3D Gaussians.
-    """
-    if antialiased and kernel is not Kernel.GAUSSIAN_3D:
-        raise InvalidSettings(
-            "antialiased",
-            expected="false for splats that are no 3D Gaussians",
-            got=f"true with kernel {kernel}",
-            hint="the opacity compensation of the mip filter is defined for 3DGS alone",
-        )
-
-
-def check_weighting(weighting: Weighting) -> None:
-    """Refuse what is out of its range.
-
-    Raises:
-        InvalidInput: the power, the count, the mass or the floor.
-    """
-    if weighting.power not in (0, 1, 2):
-        raise InvalidInput("power", expected="0, 1 or 2", got=str(weighting.power))
-    if weighting.selection is Selection.TOP_K and not 1 <= weighting.count <= MOST_OF_A_RAY:
-        raise InvalidInput("count", expected=f"1 to {MOST_OF_A_RAY} weights of a ray", got=str(weighting.count))
-    if weighting.selection is Selection.FRONT_MASS and not 0 < weighting.mass <= 1:
-        raise InvalidInput("mass", expected="above 0 and at most 1", got=str(weighting.mass))
-    if not weighting.floor >= 0:
-        raise InvalidInput("floor", expected="0 or more", got=str(weighting.floor))
-
-
 def check_rows(values: Tensor, splats: int) -> None:
     """Refuse values that are not [P, C] (InvalidInput)."""
     if values.ndim != 2 or values.shape[0] != splats:
@@ -215,11 +133,6 @@ def check_labels(labels: Tensor, splats: int) -> None:
     if labels.ndim != 1 or labels.shape[0] != splats or int(labels.min()) < -1:
         got = f"{list(labels.shape)}, the smallest {int(labels.min())}"
         raise InvalidInput("labels", expected=f"a label of -1 or more for each of {splats} splats", got=got)
-
-
-def every_pixel(params: CompositingParams) -> CompositingParams:
-    """The same without a stride: images are whole."""
-    return replace(params, stride=1, offset=(0, 0))
 
 
 def strided_places(params: CompositingParams, pixels: Tensor) -> Tensor | None:

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from liftcore.features.views import Regions, ViewFeatures
-from liftcore.raster.base import (
+from liftcore.raster.base import RayRows, ViewRequest, ViewWeights
+from liftcore.scene.compositing import (
     ALPHA_FLOOR,
     EDGE_ON,
     FIELD_MARGIN,
@@ -23,16 +23,14 @@ from liftcore.raster.base import (
     MAX_LOG_SCALE,
     NEAR_PLANE,
     CompositingParams,
-    RayRows,
     Selection,
-    ViewRequest,
-    ViewWeights,
     Weighting,
     check_antialiased,
 )
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.quaternions import rotation_matrices
-from liftcore.solve.weights import RegionWeights, one_view
+from liftcore.values.region_weights import RegionWeights, one_view
+from liftcore.values.views import Regions, ViewFeatures
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from liftcore.errors import InvalidCameras, NotFound
-from liftcore.nearest import nearest
+from liftcore.runtime.nearest import nearest
 from liftcore.scene.distortion import MAX_SIDE, Distortion, Lens, Rectangle, shared_lens
 from liftcore.scene.panorama import TURNS, Face
 from liftcore.scene.views import cameras_of_views, composed, without_image_suffix

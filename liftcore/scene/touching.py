@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from liftcore.raster.base import MAX_LOG_SCALE
+from liftcore.scene.compositing import MAX_LOG_SCALE
 from liftcore.scene.quaternions import rotation_matrices
 
 if TYPE_CHECKING:

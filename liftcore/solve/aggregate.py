@@ -35,21 +35,21 @@ import torch
 from scipy.sparse import csr_matrix
 from torch import Tensor
 
-from liftcore.features.levels import at_levels
-from liftcore.features.views import Regions, ViewFeatures, cells_under
-from liftcore.jit import kernel
-from liftcore.one_thread import one_thread
-from liftcore.progress import Progress
 from liftcore.raster.base import Raster
+from liftcore.runtime.jit import kernel
+from liftcore.runtime.one_thread import one_thread
+from liftcore.runtime.progress import Progress
 from liftcore.scene.splats import Splats
-from liftcore.settings import LiftSettings
 from liftcore.solve.clusters import BLOCK, NO_CLUSTER, RESOLUTION, Clustering, cluster_splats, parted
 from liftcore.solve.codebook import TABLE_BYTES
 from liftcore.solve.directions import RegionDirections
-from liftcore.solve.geometry import LiftViews
 from liftcore.solve.objects import RegionObjects
 from liftcore.solve.sums import PieceSums, added, piece_sums
-from liftcore.solve.weights import RegionWeights, run_each
+from liftcore.values.levels import at_levels
+from liftcore.values.lift_views import LiftViews
+from liftcore.values.region_weights import RegionWeights, run_each
+from liftcore.values.settings import LiftSettings
+from liftcore.values.views import Regions, ViewFeatures, cells_under
 
 MASKS_MADE = {"filter": "none: masks made the clusters"}
 LEAST_LIGHT = 0.5  # of a ray, that splats must take for it to show a cluster: as for masks of answers

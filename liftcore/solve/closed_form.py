@@ -18,12 +18,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from liftcore.device import CPU, Device, give_back_memory, out_of_memory
-from liftcore.one_thread import one_thread
-from liftcore.progress import Progress, silent
+from liftcore.runtime.device import CPU, Device, give_back_memory, out_of_memory
+from liftcore.runtime.memory import zeros
+from liftcore.runtime.one_thread import one_thread
+from liftcore.runtime.progress import Progress, silent
 from liftcore.solve.codebook import Codebook
-from liftcore.solve.memory import zeros
-from liftcore.solve.weights import BLOCK_ENTRIES, BLOCK_ROWS, RegionWeights, from_zero, row_blocks, run_each
+from liftcore.values.region_weights import BLOCK_ENTRIES, BLOCK_ROWS, RegionWeights, from_zero, row_blocks, run_each
 
 LONG = 256  # terms of a sum that float32 adds up one by one
 DEVICE_ROWS, DEVICE_ENTRIES = 1 << 16, 1 << 24  # of a block on a device; halved where its memory runs out

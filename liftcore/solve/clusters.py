@@ -17,7 +17,7 @@ from torch import Tensor
 
 from liftcore.scene.splats import Splats
 from liftcore.scene.touching import touching
-from liftcore.settings import LiftSettings
+from liftcore.values.settings import LiftSettings
 
 NO_CLUSTER = -1
 BLOCK = 8_192  # rows widened to float32 at once; fixed, so that products have one shape on any machine

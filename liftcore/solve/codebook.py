@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from liftcore.features.levels import label_tuples
-from liftcore.features.views import NO_LABEL, Regions, ViewFeatures
-from liftcore.solve.weights import RegionWeights
+from liftcore.values.levels import label_tuples
+from liftcore.values.region_weights import RegionWeights
+from liftcore.values.views import NO_LABEL, Regions, ViewFeatures
 
 ROWS = 1 << 10  # of a codebook that are widened at a time
 FLOAT16_MAX = 65_504.0

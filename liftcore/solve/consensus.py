@@ -44,11 +44,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from liftcore.jit import kernel
-from liftcore.one_thread import one_thread
+from liftcore.runtime.jit import kernel
+from liftcore.runtime.one_thread import one_thread
 from liftcore.solve.closed_form import morton_codes
 from liftcore.solve.membership import Memberships, RegionGroups, memberships
-from liftcore.solve.weights import RegionWeights, run_each
+from liftcore.values.region_weights import RegionWeights, run_each
 
 OBSERVES = 0.3  # of a region, that a level of a view must see to say anything of it
 PRIOR = 2.0  # views' worth of the scene's mean: one view alone may be the one that is wrong

@@ -25,15 +25,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from liftcore.features.pack import Views
-from liftcore.jit import vectorised
-from liftcore.one_thread import one_thread
-from liftcore.raster.base import LOW_PASS, MAX_LOG_SCALE
+from liftcore.runtime.jit import vectorised
+from liftcore.runtime.one_thread import one_thread
 from liftcore.scene.cameras import Camera, photo_size
+from liftcore.scene.compositing import LOW_PASS, MAX_LOG_SCALE
 from liftcore.scene.splats import Splats
-from liftcore.settings import LiftSettings
 from liftcore.solve.codebook import row_lengths
-from liftcore.solve.geometry import SampledRays
+from liftcore.solve.rays import SampledRays
+from liftcore.values.pack import Views
+from liftcore.values.settings import LiftSettings
 
 _CHUNK_VALUES = 1 << 21  # float32 values gathered at a time: 8 MB, as larger ones are fresh pages every time
 _READS_A_RAY = 8  # levels or taps of a ray; few scenes have more

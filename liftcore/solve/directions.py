@@ -19,10 +19,10 @@ import torch
 from torch import Tensor
 
 from liftcore.io.safetensors_file import map_tensors, write_tensors
-from liftcore.jit import kernel
+from liftcore.runtime.jit import kernel
 from liftcore.solve.codebook import LEAST_CHANNELS, TABLE_BYTES, Codebook
 from liftcore.solve.sums import PieceSums, added, piece_sums
-from liftcore.solve.weights import RegionWeights
+from liftcore.values.region_weights import RegionWeights
 
 CPU = torch.device("cpu")
 ROWS = 1 << 14  # of a table in float64 at a time

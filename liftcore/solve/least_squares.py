@@ -38,16 +38,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from liftcore.features.views import NO_LABEL, Regions, ViewFeatures
-from liftcore.jit import kernel
-from liftcore.one_thread import one_thread
-from liftcore.progress import Progress, silent
-from liftcore.raster.base import CompositingParams, Raster, Weighting
+from liftcore.raster.base import Raster
+from liftcore.runtime.jit import kernel
+from liftcore.runtime.one_thread import one_thread
+from liftcore.runtime.progress import Progress, silent
 from liftcore.scene.cameras import Camera
-from liftcore.settings import LiftSettings
+from liftcore.scene.compositing import CompositingParams, Weighting
 from liftcore.solve.codebook import row_lengths
 from liftcore.solve.diagnostics import ViewMeasures, measure_samples, quantiles
-from liftcore.solve.geometry import Readout, SampledRays, read_pixels
+from liftcore.solve.rays import Readout, SampledRays, read_pixels
+from liftcore.values.settings import LiftSettings
+from liftcore.values.views import NO_LABEL, Regions, ViewFeatures
 
 BLOCK = 32  # channels solved at a time: what a raster does in one pass, and memory for a few [P, 32] f32
 ROWS = 1 << 14  # rows widened at a time

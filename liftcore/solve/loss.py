@@ -18,15 +18,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from liftcore.device import CPU
-from liftcore.jit import kernel, vectorised
-from liftcore.one_thread import one_thread
-from liftcore.progress import Progress, silent
+from liftcore.runtime.device import CPU
+from liftcore.runtime.jit import kernel, vectorised
+from liftcore.runtime.memory import zeros
+from liftcore.runtime.one_thread import one_thread
+from liftcore.runtime.progress import Progress, silent
 from liftcore.solve.closed_form import morton_codes
 from liftcore.solve.codebook import Codebook
-from liftcore.solve.memory import zeros
 from liftcore.solve.sums import PieceSums, added, piece_sums
-from liftcore.solve.weights import BLOCK_ENTRIES, BLOCK_ROWS, MEMORY_LIMIT, RegionWeights, row_blocks, run_each
+from liftcore.values.region_weights import (
+    BLOCK_ENTRIES,
+    BLOCK_ROWS,
+    MEMORY_LIMIT,
+    RegionWeights,
+    row_blocks,
+    run_each,
+)
 
 STEPS = 3  # of reweighting, which hardly move features further
 MOST_SCALE = 126  # the power of two

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from liftcore.jit import kernel
-from liftcore.solve.weights import RegionWeights, run_each
+from liftcore.runtime.jit import kernel
+from liftcore.values.region_weights import RegionWeights, run_each
 
 BELONGS = 0.7  # of a splat's weight in a level of a view: less, and the splat lies on the border of two regions
 FAINT = 0.05  # of rays; a level that weighs less at a splat hardly sees it

@@ -32,11 +32,11 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 
-from liftcore.jit import kernel
+from liftcore.runtime.jit import kernel
 from liftcore.solve.consensus import SplatTuples
 from liftcore.solve.membership import Memberships, RegionGroups, memberships
 from liftcore.solve.sums import PieceSums, added, in_order, piece_sums, pieces
-from liftcore.solve.weights import RegionWeights, row_blocks, run_each
+from liftcore.values.region_weights import RegionWeights, row_blocks, run_each
 
 NO_OBJECT = -1
 OBSERVES = 0.3  # of a region, that a level must see to say anything of it, as for mask consensus

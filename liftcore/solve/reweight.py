@@ -51,15 +51,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from liftcore.jit import kernel, vectorised
-from liftcore.one_thread import one_thread
-from liftcore.progress import Progress, silent
+from liftcore.runtime.jit import kernel, vectorised
+from liftcore.runtime.memory import zeros
+from liftcore.runtime.one_thread import one_thread
+from liftcore.runtime.progress import Progress, silent
 from liftcore.solve.closed_form import morton_codes
 from liftcore.solve.codebook import Codebook
 from liftcore.solve.directions import RegionDirections
-from liftcore.solve.memory import zeros
 from liftcore.solve.sums import PieceSums, piece_sums
-from liftcore.solve.weights import MEMORY_LIMIT, RegionWeights, row_blocks, run_each
+from liftcore.values.region_weights import MEMORY_LIMIT, RegionWeights, row_blocks, run_each
 
 BLOCK_ROWS, BLOCK_ENTRIES = 1 << 11, 1 << 15  # a splat has a sum for each view of it
 LONG = 256  # terms of a sum that float32 adds up one by one

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from liftcore.jit import kernel
+from liftcore.runtime.jit import kernel
 
 
 @dataclass(frozen=True)

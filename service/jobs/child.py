@@ -43,7 +43,7 @@ class Reporter:
         self._turn = threading.Lock()  # one message at a time
 
     def __call__(self, stage: str, done: int, total: int, unit: str) -> None:
-        """Say how far the work is (`liftcore.progress.Progress`)."""
+        """Say how far the work is (`liftcore.runtime.progress.Progress`)."""
         now = time.monotonic()
         if stage == self._stage and done < total and now - self._last < SECONDS_BETWEEN_WORDS:
             return

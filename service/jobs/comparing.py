@@ -7,14 +7,14 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from liftcore.device import Device, choose_device
 from liftcore.evaluate.tradeoff import Scene, candidates_of, compare
 from liftcore.evaluate.tradeoff_report import page_of, save
 from liftcore.io.json_file import finite
-from liftcore.progress import Progress, one_step
+from liftcore.lifting.warm_up import warm_up_lift
+from liftcore.runtime.device import Device, choose_device
+from liftcore.runtime.progress import Progress, one_step
 from liftcore.scene.splats import Kernel
-from liftcore.settings import LiftSettings
-from liftcore.warm_up import warm_up_lift
+from liftcore.values.settings import LiftSettings
 
 SHOWN_DIGITS = 12  # of the splats' digest, by which the chart names the scene
 

@@ -62,7 +62,7 @@ def ask(name: str) -> Mapping[str, Any] | None:
 
 def look(name: str) -> dict[str, object]:
     """Whether ``auto``, ``cpu`` or ``cuda`` can be had here."""
-    from liftcore.device import choose_device  # loads torch
+    from liftcore.runtime.device import choose_device  # loads torch
 
     try:
         choose_device(name)

@@ -7,12 +7,12 @@ from typing import Any
 
 from liftcore.errors import InvalidFeatures, InvalidSettings, InvalidSplats
 from liftcore.io.splats import require_kernel
-from liftcore.query.text.table import nearest_words, plain
-from liftcore.raster.base import check_antialiased
+from liftcore.scene.compositing import check_antialiased
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.panorama import with_panoramas
 from liftcore.scene.views import cameras_of_views, require_pairs, some_of
-from liftcore.settings import LiftSettings
+from liftcore.text.table import nearest_words, plain
+from liftcore.values.settings import LiftSettings
 from service.errors import InvalidRequest
 from service.models import JobKind
 from service.store.assets import AssetRecord, kernel_of

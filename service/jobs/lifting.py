@@ -8,17 +8,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from liftcore.engine import engine_named
-from liftcore.engine.lift import needs_all
 from liftcore.io.json_file import finite
-from liftcore.io.lift_file import save_lift, sha256_of
-from liftcore.io.scene_files import lift_files
-from liftcore.lifting import log_warnings
-from liftcore.planning.plan import Plan
-from liftcore.progress import one_step
-from liftcore.result import InputFile, LiftMetadata
-from liftcore.settings import LiftSettings
-from liftcore.solve.checkpoint import Checkpoint
+from liftcore.lifting.checkpoint import Checkpoint
+from liftcore.lifting.engines import engine_named
+from liftcore.lifting.engines.lift import needs_all
+from liftcore.lifting.files import lift_files
+from liftcore.lifting.pipeline import log_warnings
+from liftcore.lifting.planning.plan import Plan
+from liftcore.runtime.progress import one_step
+from liftcore.values.lift import InputFile, LiftMetadata
+from liftcore.values.lift_file import save_lift, sha256_of
+from liftcore.values.settings import LiftSettings
 from service.child import renamed
 from service.jobs.child import Reporter
 

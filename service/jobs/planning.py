@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from liftcore.errors import SplatliftError
-from liftcore.io.scene_files import open_files
-from liftcore.lifting import plan
-from liftcore.settings import LiftSettings
+from liftcore.lifting.files import open_files
+from liftcore.lifting.pipeline import plan
+from liftcore.values.settings import LiftSettings
 from service.child import fault_of
 from service.jobs.lifting import plan_document
 

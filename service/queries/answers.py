@@ -36,10 +36,10 @@ from liftcore.query.scene import QueryScene
 from liftcore.query.scores import warm_up as warm_up_scores
 from liftcore.query.segment import Segmentation, best_words, map_png, picture_png, segment, word_map, words_of
 from liftcore.query.terms import Example, Query, Region, Vector, parse_example
-from liftcore.query.text import OWN_WORDS, RememberingEncoder, TextEncoder, open_encoder
 from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Kernel
+from liftcore.text import OWN_WORDS, RememberingEncoder, TextEncoder, open_encoder
 from service.child import fault_of, own_stdout
 from service.encoders import encoder_version
 from service.errors import NoSpace

@@ -12,7 +12,7 @@ from fastapi import APIRouter, Header, Query, Response
 from fastapi.responses import JSONResponse
 
 from liftcore.errors import InvalidSettings
-from liftcore.settings import LiftSettings
+from liftcore.values.settings import LiftSettings
 from service import limits, models
 from service.child import error_of
 from service.content import Cursor, Limit, listed

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 
 from liftcore.errors import InvalidFeatures, InvalidInput, InvalidLift, InvalidSplats, SplatliftError
-from liftcore.features.pack import read_features
-from liftcore.io.class_masks import describe_masks
-from liftcore.io.inspect import describe_camera_file, describe_packs, describe_splat_file, describe_table
+from liftcore.evaluate.class_masks import describe_masks
+from liftcore.evaluate.inspect import describe_camera_file, describe_packs, describe_splat_file, describe_table
 from liftcore.io.json_file import finite
 from liftcore.io.kinds import EXPORT_PLY, SUFFIX, SplatFormat, identify, wrong_kind
-from liftcore.io.lift_file import has_poses, parse_metadata, read_lift
 from liftcore.io.splats import format_of
-from liftcore.query.text.table import TableEncoder
+from liftcore.text.table import TableEncoder
+from liftcore.values.lift_file import has_poses, parse_metadata, read_lift
+from liftcore.values.pack import read_features
 from service import limits
 from service.child import fault_of
 from service.models import AssetKind, UploadKind

@@ -18,13 +18,13 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from liftcore.device import choose_device
 from liftcore.errors import Unavailable
-from liftcore.io.scene_files import open_files
-from liftcore.lifting import plan as plan_of
-from liftcore.progress import Progress
+from liftcore.lifting.files import open_files
+from liftcore.lifting.pipeline import plan as plan_of
 from liftcore.query.scene import QueryScene
-from liftcore.settings import LiftSettings
+from liftcore.runtime.device import choose_device
+from liftcore.runtime.progress import Progress
+from liftcore.values.settings import LiftSettings
 from service.child import fault_of
 from service.jobs import child, comparing, device
 from service.jobs import supervisor as pace
@@ -385,8 +385,8 @@ def test_warnings_of_the_machine_reach_the_client_without_its_paths(
     files = [tmp_path / name for name in ("splats.ply", "cameras.json", "features.safetensors")]
     for file, content in zip(files, (scene.splats, scene.cameras, scene.features), strict=True):
         file.write_bytes(content)
-    monkeypatch.setattr("liftcore.planning.plan.MEMORY_LIMIT", 0)
-    monkeypatch.setattr("liftcore.planning.plan.lack_of_disk", lambda size: "0.0 GiB of disk")
+    monkeypatch.setattr("liftcore.lifting.planning.plan.MEMORY_LIMIT", 0)
+    monkeypatch.setattr("liftcore.lifting.planning.plan.lack_of_disk", lambda size: "0.0 GiB of disk")
     settings = LiftSettings.of(device="cpu")
     plan = plan_of(*open_files(files[0], files[1], files[2:], settings), settings)
     assert tempfile.gettempdir() in plan.warnings[0]

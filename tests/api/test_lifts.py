@@ -17,10 +17,10 @@ from PIL import Image
 from safetensors import safe_open
 from safetensors.numpy import load, save
 
-from liftcore.io.scene_files import lift_files
 from liftcore.io.splat import ROW
+from liftcore.lifting.files import lift_files
 from liftcore.query.scene import QueryScene
-from liftcore.settings import LiftSettings
+from liftcore.values.settings import LiftSettings
 from service.photos import PhotoIndexes
 from service.store.__main__ import main
 from service.store.database import DATABASE

@@ -14,7 +14,7 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
 from liftcore.errors import SplatliftError
-from liftcore.settings import LiftSettings
+from liftcore.values.settings import LiftSettings
 from service import problems
 from service.child import error_of, fault_of
 from service.models import COMPARED

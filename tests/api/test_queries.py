@@ -16,9 +16,9 @@ from PIL import Image
 from plyfile import PlyData
 from starlette.requests import ClientDisconnect
 
-from liftcore.features.pack import write_pack
-from liftcore.features.views import Regions
-from liftcore.query.text.table import TableEncoder
+from liftcore.text.table import TableEncoder
+from liftcore.values.pack import write_pack
+from liftcore.values.views import Regions
 from service.content import BINARY, BLOCK_BYTES, Draft
 from service.errors import NoSpace
 from service.models import AssetKind

@@ -22,9 +22,9 @@ import numpy as np
 import pytest
 from safetensors.numpy import save
 
-from liftcore.io.lift_file import save_lift
-from liftcore.io.scene_files import lift_files
-from liftcore.settings import LiftSettings
+from liftcore.lifting.files import lift_files
+from liftcore.values.lift_file import save_lift
+from liftcore.values.settings import LiftSettings
 from service.__main__ import main, parse
 from service.encoders import encoder_label, encoder_spec
 from service.errors import InvalidRequest

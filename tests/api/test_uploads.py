@@ -16,8 +16,8 @@ from fastapi.testclient import TestClient
 from hypothesis import given
 from hypothesis import strategies as st
 
+from liftcore.evaluate.inspect import inspect_file
 from liftcore.io import safetensors_file
-from liftcore.io.inspect import inspect_file
 from service.scopes import parse_scopes
 from service.store.files import DataDirectory
 from service.store.keys import Quota

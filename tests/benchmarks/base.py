@@ -15,7 +15,7 @@ from torch import Tensor
 
 import liftcore as lc
 from liftcore.evaluate.hardware import hardware, machine_line
-from liftcore.features.views import ViewFeatures
+from liftcore.values.views import ViewFeatures
 
 PACKS = ("features", "features_hard", "features_clean", "grids")  # of tabletop
 PRESETS = ("row-sum", "tikhonov")

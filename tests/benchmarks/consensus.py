@@ -25,9 +25,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 import liftcore as lc
-from liftcore.features.views import ViewFeatures
-from liftcore.query.text import open_encoder
 from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.text import open_encoder
+from liftcore.values.views import ViewFeatures
 from tests.benchmarks.base import command_line, read_pack, tell
 from tests.benchmarks.tabletop import Truth, counted, tabletop
 from tests.still_life.masks import Mistakes, mistaken_regions, observe, true_labels

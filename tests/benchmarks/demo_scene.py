@@ -21,8 +21,8 @@ import zstandard
 from safetensors.numpy import load_file, save
 
 import liftcore as lc
-from liftcore.features.pack import write_pack
-from liftcore.query.text import BUILT_IN, LVIS_TABLE, open_encoder
+from liftcore.text import BUILT_IN, LVIS_TABLE, open_encoder
+from liftcore.values.pack import write_pack
 
 SHIPPED = Path(lc.__file__).parent / "demo" / "tabletop"
 EVERY = 3  # of the views with features

@@ -30,9 +30,9 @@ import numpy as np
 import torch
 
 import liftcore as lc
-from liftcore.engine.blocks import WEIGHED
-from liftcore.features.views import ViewFeatures
 from liftcore.io.shards import ROWS
+from liftcore.lifting.engines.blocks import WEIGHED
+from liftcore.values.views import ViewFeatures
 from tests.benchmarks.base import read_pack, read_scene
 
 GIB = 1 << 30

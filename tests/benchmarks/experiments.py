@@ -21,14 +21,14 @@ from torch import Tensor
 from torch.nn.functional import cosine_similarity, normalize
 
 import liftcore as lc
-from liftcore.features.views import NO_LABEL, ViewFeatures
 from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.threshold import find_threshold
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.splats import Kernel
-from liftcore.settings import TIKHONOV_GAIN
-from liftcore.solve.geometry import sample_pixels
 from liftcore.solve.least_squares import AllRays, Channels, solve_block
+from liftcore.solve.rays import sample_pixels
+from liftcore.values.settings import TIKHONOV_GAIN
+from liftcore.values.views import NO_LABEL, ViewFeatures
 from tests.benchmarks.base import PRESETS, command_line, mask_iou, read_pack, read_scene, tell
 from tests.benchmarks.tabletop import Truth, tabletop
 

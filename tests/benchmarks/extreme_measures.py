@@ -16,18 +16,18 @@ import torch
 from numpy.typing import ArrayLike
 
 import liftcore as lc
-from liftcore.features.pack import read_features, write_pack
-from liftcore.features.views import ViewFeatures
+from liftcore.evaluate.inspect import describe_cameras, describe_packs, describe_splats
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.inspect import describe_cameras, describe_packs, describe_splats
 from liftcore.io.ply import write_splats
-from liftcore.io.scene_files import lift_files
+from liftcore.lifting.files import lift_files
 from liftcore.query.threshold import METHODS
-from liftcore.raster.base import NEAR_PLANE, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import DenseView, dense_view, projected_gaussian, reading_matrix
+from liftcore.scene.compositing import NEAR_PLANE, Weighting
 from liftcore.scene.splats import Kernel
 from liftcore.solve.diagnostics import FAINT, order_warnings
+from liftcore.values.pack import read_features, write_pack
+from liftcore.values.views import ViewFeatures
 from tests.scenes import IDENTITY, camera_at_origin, splats_at
 
 KERNELS = (Kernel.GAUSSIAN_3D, Kernel.GAUSSIAN_2D, Kernel.BETA)

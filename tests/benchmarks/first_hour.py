@@ -26,7 +26,7 @@ import torch
 import liftcore as lc
 from liftcore.evaluate.check import check_scene
 from liftcore.features.encoders.encode import find_images
-from liftcore.features.pack import Views, as_views
+from liftcore.values.pack import Views, as_views
 from tests.benchmarks.base import command_line, read_scene
 from tests.still_life.files import write_still_life
 from tests.still_life.scene import still_life

@@ -25,11 +25,11 @@ from torch import Tensor
 from torch.nn.functional import cosine_similarity
 
 import liftcore as lc
-from liftcore.device import CPU, Device, choose_device
 from liftcore.evaluate.bench import run_bench
 from liftcore.evaluate.hardware import hardware, machine_line
-from liftcore.io.lift_file import TENSORS, save_lift
-from liftcore.io.scene_files import lift_files
+from liftcore.lifting.files import lift_files
+from liftcore.runtime.device import CPU, Device, choose_device
+from liftcore.values.lift_file import TENSORS, save_lift
 from tests.benchmarks.base import read_pack, scene_files, table_of
 from tests.benchmarks.peers import Answer, Work, answer_of, at_pixels, dense_target, ours, room, side_by_side
 from tests.benchmarks.scenes import Room, write_bench_room

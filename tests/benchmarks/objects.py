@@ -26,8 +26,8 @@ import numpy as np
 from liftcore.query.ask import Answer, ask
 from liftcore.query.objects import objects
 from liftcore.query.scene import QueryScene
-from liftcore.query.text import open_encoder
 from liftcore.solve.clusters import cluster_splats
+from liftcore.text import open_encoder
 from tests.benchmarks.base import PACKS, PRESETS, box_iou, command_line, read_pack, tell
 from tests.benchmarks.tabletop import Truth, tabletop
 

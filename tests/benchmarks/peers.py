@@ -29,17 +29,17 @@ from torch import Tensor
 from torch.nn.functional import cosine_similarity, embedding, embedding_bag, pad, threshold
 
 import liftcore as lc
-from liftcore.device import CPU, Device
 from liftcore.evaluate.bench import weigh_regions
 from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
-from liftcore.features.views import cells_under
-from liftcore.one_thread import one_thread
 from liftcore.raster import open_raster
-from liftcore.raster.base import ALPHA_FLOOR, TILE, Weighting
 from liftcore.raster.cpu.composite import Frame
 from liftcore.raster.cpu.project import CUTOFF, KY, MX, MY, OPACITY, ROOT_X, SLOPE
 from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.runtime.device import CPU, Device
+from liftcore.runtime.one_thread import one_thread
+from liftcore.scene.compositing import ALPHA_FLOOR, TILE, Weighting
 from liftcore.solve.closed_form import solve
+from liftcore.values.views import cells_under
 from tests.benchmarks.base import command_line, tell
 from tests.benchmarks.scenes import Room
 

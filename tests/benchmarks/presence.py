@@ -19,8 +19,8 @@ import numpy as np
 from liftcore.query.presence import References, judge, references_of
 from liftcore.query.scene import QueryScene
 from liftcore.query.scores import cosines
-from liftcore.query.text import open_encoder
-from liftcore.query.text.table import TableEncoder
+from liftcore.text import open_encoder
+from liftcore.text.table import TableEncoder
 from tests.benchmarks.base import PACKS, command_line, read_pack, tell
 from tests.benchmarks.consensus import still_life_scene
 from tests.benchmarks.tabletop import tabletop

@@ -42,13 +42,13 @@ from torch.nn import functional
 
 import liftcore as lc
 from liftcore.features.encoders.encode import find_images
-from liftcore.features.pack import read_features
 from liftcore.query.ask import ask
 from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.render import overlay, view_mask
 from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Pixel, Query
-from liftcore.query.text.table import TableEncoder
+from liftcore.text.table import TableEncoder
+from liftcore.values.pack import read_features
 from tests.benchmarks.base import box_iou, command_line, scene_files, tell
 
 Box = tuple[int, int, int, int]

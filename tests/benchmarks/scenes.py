@@ -18,11 +18,11 @@ import torch
 
 import liftcore as lc
 from liftcore.evaluate.synthetic import PART_LEVELS, room_cameras, room_parts, room_regions, room_splats
-from liftcore.features.pack import as_views, write_pack
-from liftcore.features.views import NO_LABEL, ViewFeatures
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
 from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.values.pack import as_views, write_pack
+from liftcore.values.views import NO_LABEL, ViewFeatures
 
 NOISE = 0.45
 WRONG, MIXED = 0.1, 0.3  # shares of a view's regions

@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 
 import liftcore as lc
-from liftcore.features.pack import write_pack
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
 from liftcore.raster.cpu.warm_up import warm_up
+from liftcore.values.pack import write_pack
 from service.models import AssetKind
 from service.store.assets import CheckedUpload
 from service.store.owners import SERVICE

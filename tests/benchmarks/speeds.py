@@ -11,8 +11,8 @@ from pathlib import Path
 
 import liftcore as lc
 from liftcore.evaluate.accuracy import cosine_figures
-from liftcore.io.scene_files import lift_files
-from liftcore.settings import Speed
+from liftcore.lifting.files import lift_files
+from liftcore.values.settings import Speed
 from tests.benchmarks.base import command_line, scene_files, tell
 
 

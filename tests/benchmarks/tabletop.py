@@ -20,10 +20,10 @@ from torch import Tensor
 
 import liftcore as lc
 from liftcore.evaluate.accuracy import class_ious
-from liftcore.features.views import NO_LABEL, ViewFeatures
 from liftcore.query.scene import QueryScene
 from liftcore.raster.base import Raster
 from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.values.views import NO_LABEL, ViewFeatures
 from tests.benchmarks.base import command_line, read_pack, read_scene, tell
 
 EVIDENCE_OVER = 0.5  # of the splats that count

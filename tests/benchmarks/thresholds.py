@@ -29,8 +29,8 @@ from liftcore.query.objects import objects
 from liftcore.query.render import view_mask
 from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Query
-from liftcore.query.text import TextEncoder, open_encoder
 from liftcore.query.threshold import METHODS, find_threshold
+from liftcore.text import TextEncoder, open_encoder
 from tests.benchmarks.base import PACKS, command_line, mask_iou, read_pack, tell
 from tests.benchmarks.consensus import still_life_scene
 from tests.benchmarks.tabletop import Truth, tabletop

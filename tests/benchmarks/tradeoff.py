@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import liftcore as lc
-from liftcore.device import CPU
 from liftcore.evaluate.accuracy import centred_cosines
 from liftcore.evaluate.ranking import accuracy_of, choose
 from liftcore.evaluate.tradeoff import candidates_of, hold_out
-from liftcore.features.views import ViewFeatures
-from liftcore.warm_up import warm_up_lift
+from liftcore.lifting.warm_up import warm_up_lift
+from liftcore.runtime.device import CPU
+from liftcore.values.views import ViewFeatures
 from tests.benchmarks.base import command_line, read_pack, tell
 from tests.benchmarks.consensus import still_life_scene
 from tests.benchmarks.tabletop import Truth, tabletop

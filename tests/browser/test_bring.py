@@ -12,8 +12,8 @@ import httpx
 import pytest
 from PIL import Image
 
-from liftcore.io.scene_files import lift_files
-from liftcore.settings import LiftSettings
+from liftcore.lifting.files import lift_files
+from liftcore.values.settings import LiftSettings
 from tests.api.tiny_scene import cameras_document, colmap_zip, make_scene
 from tests.still_life.files import write_still_life
 from tests.still_life.scene import still_life

@@ -23,9 +23,9 @@ import pytest
 import torch
 
 import liftcore as lc
-from liftcore.features.pack import write_pack
 from liftcore.io.ply import write_splats
 from liftcore.io.transforms import transforms_of
+from liftcore.values.pack import write_pack
 from service import errand
 from service.jobs import process as processes
 from service.jobs.child import Reporter

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import torch
 
-from liftcore import lifting
-from liftcore.features.pack import read_features, write_pack
-from liftcore.features.views import FeatureGrid
-from liftcore.io.scene_files import lift_files
-from liftcore.planning.plan import ENTRY_BYTES
-from liftcore.settings import LiftSettings
+from liftcore.lifting import pipeline
+from liftcore.lifting.files import lift_files
+from liftcore.lifting.planning.plan import ENTRY_BYTES
 from liftcore.solve import reweight
+from liftcore.values.pack import read_features, write_pack
+from liftcore.values.settings import LiftSettings
+from liftcore.values.views import FeatureGrid
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -70,7 +70,7 @@ def test_fine_maps_are_planned_with_their_many_weights(shared_data, fine_maps, r
 
 
 def test_plan_has_room_for_what_reweighting_holds(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    held, made = [], (reweight.zeros, lifting.mask_consensus)
+    held, made = [], (reweight.zeros, pipeline.mask_consensus)
 
     def array(*arguments: Any, **own: Any) -> torch.Tensor:
         held.append(made[0](*arguments, **own))
@@ -84,7 +84,7 @@ def test_plan_has_room_for_what_reweighting_holds(shared_data: Path, monkeypatch
         return found
 
     monkeypatch.setattr(reweight, "zeros", array)
-    monkeypatch.setattr(lifting, "mask_consensus", consensus)
+    monkeypatch.setattr(pipeline, "mask_consensus", consensus)
     scene, own = shared_data / "tabletop", {"view_stride": 6, "preset": "default"}
     planned = certified(scene, scene / "features_hard.safetensors", own)["plan"]["memory"]["reweighting"]
     assert sum(part.nbytes for part in held) < planned

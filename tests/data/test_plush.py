@@ -12,15 +12,15 @@ from safetensors.numpy import load_file, save_file
 
 from liftcore.evaluate.check import check_scene
 from liftcore.features.encoders.encode import find_images
-from liftcore.features.pack import read_features
-from liftcore.features.views import FeatureGrid
 from liftcore.io.cameras import read_cameras
-from liftcore.io.scene_files import lift_files
 from liftcore.io.splats import read_splats
-from liftcore.raster.base import CompositingParams
+from liftcore.lifting.files import lift_files
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Cameras
-from liftcore.settings import LiftSettings
+from liftcore.scene.compositing import CompositingParams
+from liftcore.values.pack import read_features
+from liftcore.values.settings import LiftSettings
+from liftcore.values.views import FeatureGrid
 
 if TYPE_CHECKING:
     from pathlib import Path

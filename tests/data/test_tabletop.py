@@ -10,13 +10,13 @@ import pytest
 from PIL import Image
 
 import liftcore as lc
-from liftcore.features.pack import read_features, write_pack
 from liftcore.features.prompts import prompt_views
 from liftcore.query.ask import ask
 from liftcore.query.render import view_mask
 from liftcore.query.segment import segment
 from liftcore.query.terms import OneSplat, Query
-from liftcore.query.text.table import TableEncoder
+from liftcore.text.table import TableEncoder
+from liftcore.values.pack import read_features, write_pack
 from tests.benchmarks.base import read_pack
 from tests.benchmarks.consensus import ranked
 from tests.benchmarks.objects import measure_lift

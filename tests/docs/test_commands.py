@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from liftcore.cli import COMMANDS, build_parser
-from liftcore.settings import LiftSettings, Preset
+from liftcore.values.settings import LiftSettings, Preset
 from service.__main__ import options
 from service.settings import ServiceSettings
 

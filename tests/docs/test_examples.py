@@ -29,12 +29,12 @@ from liftcore.cli import main
 from liftcore.demo.scene_folder import find_scene
 from liftcore.features.encoders import Pixels
 from liftcore.features.encoders.crops import CropEncoder
-from liftcore.features.pack import read_features, write_pack
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
 from liftcore.io.splats import read_splats
-from liftcore.query.text.table import TableEncoder
+from liftcore.text.table import TableEncoder
+from liftcore.values.pack import read_features, write_pack
 from service import models
 from service.routes import assets, jobs, operations, queries, results, scene, words
 from service.scopes import OPEN

@@ -24,11 +24,11 @@ from triton._C import libtriton
 from triton.backends.compiler import BaseBackend, GPUTarget
 from triton.compiler import ASTSource, make_backend
 
-from liftcore.device import Device
-from liftcore.raster.base import CompositingParams, Selection, Weighting
 from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.raster.gpu import launching, raster, render, tiles, weights
 from liftcore.raster.gpu.tiles import _cut as cut
+from liftcore.runtime.device import Device
+from liftcore.scene.compositing import CompositingParams, Selection, Weighting
 from liftcore.scene.splats import Kernel
 from tests.scenes import random_camera, random_grid, random_regions, random_splats
 

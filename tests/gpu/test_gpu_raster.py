@@ -12,11 +12,11 @@ import pytest
 import torch
 
 from liftcore.errors import Unavailable
-from liftcore.raster.base import CompositingParams, Selection, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.gpu.tiles import Frame
+from liftcore.scene.compositing import CompositingParams, Selection, Weighting
 from liftcore.scene.splats import Kernel
-from liftcore.solve.weights import RegionWeights
+from liftcore.values.region_weights import RegionWeights
 from tests.backends import gpu_raster, needs_triton
 from tests.scenes import random_camera, random_grid, random_regions, random_splats
 
@@ -163,6 +163,7 @@ def test_without_a_card_or_the_interpreter_the_backend_says_so():
 
 
 def test_nothing_else_loads_triton():
-    code = "import sys, liftcore.lifting, liftcore.raster.cpu.raster, liftcore.cli; print('triton' in sys.modules)"
+    modules = "liftcore.lifting.pipeline, liftcore.raster.cpu.raster, liftcore.cli"
+    code = f"import sys, {modules}; print('triton' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True)
     assert done.stdout.strip() == "False"

@@ -10,8 +10,8 @@ import torch
 
 import liftcore as lc
 from liftcore.evaluate.tradeoff import RunSpec, Scene, measured
-from liftcore.settings import Preset
-from liftcore.solve import weights
+from liftcore.values import region_weights as weights
+from liftcore.values.settings import Preset
 from tests import paper_card
 from tests.api.tiny_scene import WORDS, make_scene
 from tests.backends import needs_triton

@@ -8,8 +8,6 @@ from itertools import product
 import numpy as np
 import pytest
 
-from liftcore.jit import kernel
-from liftcore.raster.base import ALPHA_FLOOR
 from liftcore.raster.cpu.simd import (
     LANES,
     STARTS,
@@ -20,6 +18,8 @@ from liftcore.raster.cpu.simd import (
     keep_lanes,
     new_state,
 )
+from liftcore.runtime.jit import kernel
+from liftcore.scene.compositing import ALPHA_FLOOR
 
 CAP, STOP = 0.99, 1e-4
 WEIGHTS = STARTS  # room that blending does not write to

@@ -15,14 +15,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from liftcore.errors import InvalidCameras, InvalidFeatures, InvalidInput, InvalidSplats
-from liftcore.features.pack import read_features, write_pack
-from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
 from liftcore.io.cameras import read_cameras
 from liftcore.io.npy import open_npy
 from liftcore.io.ply import usual_layout
 from liftcore.io.splats import read_splats
 from liftcore.scene.cameras import Cameras
 from liftcore.scene.splats import Kernel
+from liftcore.values.pack import read_features, write_pack
+from liftcore.values.views import FeatureGrid, Regions, ViewFeatures
 
 LINES = [
     "ply",

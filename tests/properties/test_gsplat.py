@@ -11,10 +11,10 @@ import torch
 from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
 from gsplat.cuda._torch_impl_2dgs import _fully_fused_projection_2dgs
 
-from liftcore.raster.base import ALPHA_FLOOR, LOW_PASS, NEAR_PLANE, CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import disc_exponents, projected_gaussian
 from liftcore.scene.cameras import Camera
+from liftcore.scene.compositing import ALPHA_FLOOR, LOW_PASS, NEAR_PLANE, CompositingParams
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
 from tests.scenes import random_camera, random_splats

@@ -11,12 +11,13 @@ import torch
 from hypothesis import strategies as st
 
 from liftcore.errors import InvalidInput, InvalidSettings
-from liftcore.features.views import Regions, ViewFeatures
-from liftcore.raster.base import CompositingParams, RayRows, Selection, ViewRequest, Weighting
+from liftcore.raster.base import RayRows, ViewRequest
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import ReferenceRaster, counted_weights, dense_view, reading_matrix, strided_rays
+from liftcore.scene.compositing import CompositingParams, Selection, Weighting
 from liftcore.scene.splats import Kernel, Splats
-from liftcore.solve.weights import RegionWeights
+from liftcore.values.region_weights import RegionWeights
+from liftcore.values.views import Regions, ViewFeatures
 from tests.backends import Backend, every_backend
 from tests.scenes import random_camera, random_grid, random_regions, random_splats, scenes
 

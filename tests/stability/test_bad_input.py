@@ -15,10 +15,10 @@ import torch
 from safetensors.torch import save_file
 
 from liftcore import cli
-from liftcore.features.pack import write_pack
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
 from liftcore.scene.cameras import Camera, Cameras
+from liftcore.values.pack import write_pack
 from tests.scenes import random_grid, random_regions, random_splats
 
 if TYPE_CHECKING:

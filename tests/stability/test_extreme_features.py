@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.features.views import FeatureGrid, Regions
+from liftcore.values.views import FeatureGrid, Regions
 from tests.benchmarks.extreme_measures import cloud, run
 from tests.benchmarks.extremes import checkerboard
 

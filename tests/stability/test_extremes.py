@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.features.views import Regions
-from liftcore.raster.base import ALPHA_FLOOR, CompositingParams, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import alphas, projected_gaussian
 from liftcore.scene.cameras import Camera
+from liftcore.scene.compositing import ALPHA_FLOOR, CompositingParams, Weighting
 from liftcore.scene.splats import Kernel, Splats
+from liftcore.values.views import Regions
 from tests.benchmarks.extreme_measures import WEIGHTS, compare, traced, weights_of
 from tests.scenes import ROW, camera_at_origin, splats_at
 

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from liftcore.features.views import NO_LABEL, Regions
-from liftcore.raster.base import CompositingParams
+from liftcore.scene.compositing import CompositingParams
+from liftcore.values.views import NO_LABEL, Regions
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from numpy.random import Generator
 
-    from liftcore.query.text import TextEncoder
     from liftcore.raster.base import Raster
+    from liftcore.text import TextEncoder
     from tests.still_life.scene import StillLife
 
 LEAST_ROW_SUM = 0.5  # a ray below it has no true label

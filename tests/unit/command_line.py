@@ -11,12 +11,12 @@ import numpy as np
 import torch
 
 from liftcore import cli
-from liftcore.features.pack import write_pack
-from liftcore.features.views import Regions
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
+from liftcore.values.pack import write_pack
+from liftcore.values.views import Regions
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -18,12 +18,12 @@ from liftcore import cli
 from liftcore.cli import reply
 from liftcore.cli.lift import pairs_of
 from liftcore.errors import InvalidFeatures, InvalidSettings, SplatliftError
-from liftcore.features.pack import write_pack
-from liftcore.features.views import FeatureGrid
-from liftcore.io.lift_file import load_lift
-from liftcore.io.scene_files import lift_files
+from liftcore.lifting.files import lift_files
+from liftcore.query.result import load_lift
 from liftcore.query.threshold import METHODS
-from liftcore.settings import LiftSettings, Preset
+from liftcore.values.pack import write_pack
+from liftcore.values.settings import LiftSettings, Preset
+from liftcore.values.views import FeatureGrid
 
 from .command_line import assert_one_line, lift_arguments, programs_become, run, write_toy_scene
 
@@ -188,7 +188,7 @@ def test_our_own_fault_exits_1_with_one_line(
     def broken(path: Path) -> dict[str, Any]:
         raise RuntimeError("two\nlines")
 
-    monkeypatch.setattr("liftcore.io.inspect.inspect_file", broken)
+    monkeypatch.setattr("liftcore.evaluate.inspect.inspect_file", broken)
     status, out, err = run(capsys, "inspect", scene, "--json")
     assert (status, out) == (1, "")
     assert_one_line(err)
@@ -244,7 +244,7 @@ def test_progress_is_drawn_only_on_a_terminal(
 def little_memory(monkeypatch: pytest.MonkeyPatch) -> str:
     """What a machine has to say whose memory is short."""
     told = "the rest of the lift may take 9.0 GiB and 1.0 GiB are free"
-    monkeypatch.setattr("liftcore.planning.plan.check_memory", lambda parts, free: [told])
+    monkeypatch.setattr("liftcore.lifting.planning.plan.check_memory", lambda parts, free: [told])
     return told
 
 

@@ -11,8 +11,8 @@ import pytest
 import torch
 from PIL import ExifTags, Image, ImageOps
 
-from liftcore.features.pack import read_features
-from liftcore.features.views import FeatureGrid
+from liftcore.values.pack import read_features
+from liftcore.values.views import FeatureGrid
 from tests.api.tiny_scene import make_scene
 
 from .command_line import assert_one_line, run
@@ -31,7 +31,7 @@ def photos(tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from liftcore.query.text.open_clip import create_model
+    from liftcore.text.open_clip import create_model
 
     torch.manual_seed(5)
     path = tmp_path_factory.mktemp("weights") / "clip.pt"

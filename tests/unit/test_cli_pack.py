@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image
 
-from liftcore.features.pack import read_features
-from liftcore.features.views import Regions
+from liftcore.values.pack import read_features
+from liftcore.values.views import Regions
 
 from .command_line import assert_one_line, run
 

@@ -14,10 +14,11 @@ from safetensors.numpy import save_file
 
 from liftcore import cli
 from liftcore.errors import InvalidInput
-from liftcore.io.lift_file import load_lift, save_lift
 from liftcore.io.splats import read_splats
+from liftcore.query.result import load_lift
 from liftcore.query.scene import QueryScene
-from liftcore.query.text import BUILT_IN, open_encoder
+from liftcore.text import BUILT_IN, open_encoder
+from liftcore.values.lift_file import save_lift
 
 from .command_line import assert_one_line, lift_arguments, run, write_toy_scene
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from liftcore.device import CPU, Device, choose_device, driver_version, processor, within_memory
 from liftcore.errors import InvalidSettings, Unavailable
-from liftcore.io.scene_files import lift_files
-from liftcore.planning.plan import check_card
-from liftcore.settings import LiftSettings
+from liftcore.lifting.files import lift_files
+from liftcore.lifting.planning.plan import check_card
+from liftcore.runtime.device import CPU, Device, choose_device, driver_version, processor, within_memory
+from liftcore.values.settings import LiftSettings
 from service.jobs import device as device_process
 from tests.scenes import write_scene
 

@@ -14,15 +14,15 @@ from PIL import Image
 from liftcore.errors import InvalidCameras, InvalidQuery
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.lift_file import save_lift
-from liftcore.io.scene_files import lift_files
+from liftcore.lifting.files import lift_files
 from liftcore.query.ask import ask
 from liftcore.query.render import render_png, view_mask
+from liftcore.query.result import LiftResult
 from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Pixel, Query, Region
-from liftcore.result import LiftResult
 from liftcore.scene.cameras import Camera
-from liftcore.settings import LiftSettings
+from liftcore.values.lift_file import save_lift
+from liftcore.values.settings import LiftSettings
 from tests.distorted_scene import (
     BARREL,
     HEIGHT,

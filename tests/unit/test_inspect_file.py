@@ -14,15 +14,16 @@ import torch
 from safetensors.torch import save_file
 
 from liftcore.errors import InvalidInput, SplatliftError
-from liftcore.features.pack import write_pack
-from liftcore.features.views import FeatureGrid, Regions
-from liftcore.io.class_masks import read_masks
+from liftcore.evaluate.class_masks import read_masks
+from liftcore.evaluate.inspect import inspect_file
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.inspect import inspect_file
-from liftcore.io.lift_file import load_lift, save_lift
 from liftcore.io.ply import write_splats
+from liftcore.query.result import load_lift
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
+from liftcore.values.lift_file import save_lift
+from liftcore.values.pack import write_pack
+from liftcore.values.views import FeatureGrid, Regions
 from tests.labelled_scene import WORDS, write_lift
 
 SPLATS = Path(__file__).parents[1] / "data" / "splats"

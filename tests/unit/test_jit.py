@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 import liftcore
-from liftcore.jit import SHARED_SOURCES
+from liftcore.runtime.jit import SHARED_SOURCES
 
 COMPILING = {"kernel", "inlined", "vectorised", "without_zero_checks", "compiled"}  # decorators
 ROOT = Path(liftcore.__file__).parent
-WITH_KERNELS = [path for path in sorted(ROOT.rglob("*.py")) if "from liftcore.jit import" in path.read_text()]
+WITH_KERNELS = [path for path in sorted(ROOT.rglob("*.py")) if "from liftcore.runtime.jit import" in path.read_text()]
 
 
 def compiled_names(path: Path) -> set[str]:

@@ -7,10 +7,11 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from liftcore.io.scene_files import lift_files
-from liftcore.one_thread import one_thread
-from liftcore.settings import LiftSettings
-from liftcore.solve import closed_form, geometry, reweight
+from liftcore.lifting import geometry
+from liftcore.lifting.files import lift_files
+from liftcore.runtime.one_thread import one_thread
+from liftcore.solve import closed_form, reweight
+from liftcore.values.settings import LiftSettings
 from tests.scenes import write_scene
 
 

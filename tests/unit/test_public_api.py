@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import liftcore as lc
-from liftcore.io.scene_files import lift_files
+from liftcore.lifting.files import lift_files
 from tests.scenes import observed, write_scene
 
 PUBLIC = """
@@ -164,7 +164,7 @@ def test_every_stage_is_told_in_order_and_the_plan_after_the_first_views(tmp_pat
 
 def test_what_a_machine_lacks_goes_to_whoever_listens_else_to_the_log(tmp_path, monkeypatch, caplog):
     little_memory = "the rest of the lift may take 9.0 GiB and 1.0 GiB are free"
-    monkeypatch.setattr("liftcore.planning.plan.check_memory", lambda parts, free: [little_memory])
+    monkeypatch.setattr("liftcore.lifting.planning.plan.check_memory", lambda parts, free: [little_memory])
     splats, cameras, pack = write_scene(tmp_path, 3)
     heard = []
 

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 import torch
 
-from liftcore.raster.base import CompositingParams, ViewRequest, Weighting
+from liftcore.raster.base import ViewRequest
 from liftcore.raster.cpu.raster import side_by_side, views_at_a_time
+from liftcore.scene.compositing import CompositingParams, Weighting
 from tests.scenes import random_camera, random_regions
 
 if TYPE_CHECKING:

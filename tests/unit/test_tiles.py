@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.raster.base import CompositingParams, Selection, Weighting
 from liftcore.raster.cpu import tiles
 from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.scene.compositing import CompositingParams, Selection, Weighting
 from liftcore.scene.splats import Kernel
 from tests.scenes import random_camera, random_grid, random_regions, random_splats
 

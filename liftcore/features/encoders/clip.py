@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from liftcore.errors import InvalidInput
 from liftcore.features.encoders import Pixels
-from liftcore.query.text.open_clip import OpenedModel, create_model, library, open_model
+from liftcore.text.open_clip import OpenedModel, create_model, library, open_model
 
 RESNET_PATCH = 32  # pixels, the stride of a ResNet's last feature map
 

@@ -23,10 +23,10 @@ from liftcore.features.encoders import Pixels
 from liftcore.features.encoders.clip import space_of, training_pixels
 from liftcore.features.encoders.encode import prepare, read_image
 from liftcore.features.masks import labels_alone
-from liftcore.features.views import check_finite
 from liftcore.io.photos import Reading
-from liftcore.progress import Progress, silent
-from liftcore.query.text.open_clip import OpenedModel, open_model
+from liftcore.runtime.progress import Progress, silent
+from liftcore.text.open_clip import OpenedModel, open_model
+from liftcore.values.views import check_finite
 
 SPEC = "open_clip:MODEL/TAG or open_clip:MODEL@FILE"
 BATCH = 32  # crops that are encoded together

@@ -17,11 +17,11 @@ from torch import Tensor
 from liftcore.errors import InvalidInput
 from liftcore.features.encoders import ImageEncoder, Pixels
 from liftcore.features.folders import files_below, grids_of
-from liftcore.features.pack import write_pack
-from liftcore.features.views import check_finite
 from liftcore.io.photos import ORIENTATION, UPRIGHT, PhotoHeader, Reading, header_of
-from liftcore.progress import Progress, silent
+from liftcore.runtime.progress import Progress, silent
 from liftcore.scene.views import IMAGE_SUFFIXES, without_image_suffix
+from liftcore.values.pack import write_pack
+from liftcore.values.views import check_finite
 
 LARGEST_F16 = 65_504.0
 MAX_CELLS = 65_536  # of a grid: attention over more patches takes more memory than a photo is worth

@@ -12,10 +12,10 @@ from torch import Tensor, nn
 
 from liftcore.errors import InvalidInput, Unavailable
 from liftcore.features.encoders import Pixels
-from liftcore.nearest import nearest
-from liftcore.query.text.open_clip import WEIGHT_SUFFIXES
-from liftcore.query.text.torchvision_ops import import_torchvision
-from liftcore.query.text.weights import fetched
+from liftcore.runtime.nearest import nearest
+from liftcore.text.open_clip import WEIGHT_SUFFIXES
+from liftcore.text.torchvision_ops import import_torchvision
+from liftcore.text.weights import fetched
 
 # What checkpoints hold beside the backbone: classifiers, and what only the training needed.
 _LEFT_OVER = ("mask_token",)

@@ -16,8 +16,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numba.extending import overload
 
-from liftcore.jit import inlined, kernel
-from liftcore.raster.base import ALPHA_FLOOR, TILE, Selection, Weighting, check_weighting
 from liftcore.raster.cpu.project import (
     BETA,
     CENTRE_X,
@@ -78,6 +76,8 @@ from liftcore.raster.cpu.simd import (
     where_reached,
     without_lowest,
 )
+from liftcore.runtime.jit import inlined, kernel
+from liftcore.scene.compositing import ALPHA_FLOOR, TILE, Selection, Weighting, check_weighting
 from liftcore.scene.kernel import Kernel
 
 if TYPE_CHECKING:

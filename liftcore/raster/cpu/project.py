@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from liftcore.jit import inlined, kernel, without_zero_checks
-from liftcore.raster.base import (
+from liftcore.runtime.jit import inlined, kernel, without_zero_checks
+from liftcore.scene.compositing import (
     ALPHA_FLOOR,
     EDGE_ON,
     FIELD_MARGIN,

@@ -18,20 +18,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from liftcore.device import give_back_memory
 from liftcore.raster.base import (
-    TILE,
-    CompositingParams,
     Raster,
     RayRows,
     ViewRequest,
     ViewWeights,
-    Weighting,
     check_image,
     check_labels,
     check_params,
     check_rows,
-    every_pixel,
     strided_places,
 )
 from liftcore.raster.cpu.composite import (
@@ -48,17 +43,19 @@ from liftcore.raster.cpu.composite import (
 from liftcore.raster.cpu.project import COLUMNS, Targets, activated, project, view_of, with_opacities
 from liftcore.raster.cpu.tiles import Bands, depth_order
 from liftcore.raster.cpu.weights import entries_of, merged, reading_of, weigh_tiles
-from liftcore.solve.weights import RegionWeights, one_view
+from liftcore.runtime.device import give_back_memory
+from liftcore.scene.compositing import TILE, CompositingParams, Weighting, every_pixel
+from liftcore.values.region_weights import RegionWeights, one_view
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Sequence
 
     from torch import Tensor
 
-    from liftcore.features.views import ViewFeatures
     from liftcore.raster.cpu.project import Scene, View
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
+    from liftcore.values.views import ViewFeatures
 
 SPLAT_SHARES = 8  # shares of the projection and the binning
 TILE_SHARES = 48  # shares of the compositing; more of them even out crowded tiles

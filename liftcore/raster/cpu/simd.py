@@ -20,7 +20,7 @@ from numba.core import cgutils
 from numba.core.datamodel import models
 from numba.extending import intrinsic, register_model
 
-from liftcore.raster.base import LARGEST_EXPONENT, TILE
+from liftcore.scene.compositing import LARGEST_EXPONENT, TILE
 
 if TYPE_CHECKING:
     from collections.abc import Callable

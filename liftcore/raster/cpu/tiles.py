@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from liftcore.jit import inlined, kernel
-from liftcore.raster.base import TILE
 from liftcore.raster.cpu.composite import circle_of
 from liftcore.raster.cpu.project import CUTOFF, EXTENT_X, EXTENT_Y, KY, LEAN, MX, MY, ROOT_X, SLOPE
 from liftcore.raster.cpu.simd import fetch_row
+from liftcore.runtime.jit import inlined, kernel
+from liftcore.scene.compositing import TILE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

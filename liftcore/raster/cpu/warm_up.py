@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from liftcore.device import CPU, Device
-from liftcore.features.views import FeatureGrid, Regions
 from liftcore.raster import open_raster
-from liftcore.raster.base import CompositingParams, Weighting
+from liftcore.runtime.device import CPU, Device
 from liftcore.scene.cameras import Camera
+from liftcore.scene.compositing import CompositingParams, Weighting
 from liftcore.scene.kernel import Kernel, scale_count
 from liftcore.scene.splats import Splats
+from liftcore.values.views import FeatureGrid, Regions
 
 PLAIN, ALL = CompositingParams(), Weighting()
 

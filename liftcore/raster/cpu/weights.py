@@ -25,9 +25,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from liftcore.features.views import Regions, ViewFeatures, cells_under
-from liftcore.jit import inlined, kernel
-from liftcore.raster.base import TILE, CompositingParams
 from liftcore.raster.cpu.composite import (
     CENTRAL,
     CHECK_EVERY,
@@ -66,7 +63,10 @@ from liftcore.raster.cpu.simd import (
     times,
     without_lowest,
 )
-from liftcore.solve.weights import RegionWeights
+from liftcore.runtime.jit import inlined, kernel
+from liftcore.scene.compositing import TILE, CompositingParams
+from liftcore.values.region_weights import RegionWeights
+from liftcore.values.views import Regions, ViewFeatures, cells_under
 
 Run = Callable[[Callable, list], list]
 

@@ -16,10 +16,10 @@ float64 units.
 
 import triton.language as tl
 
-from liftcore.raster.base import ALPHA_FLOOR, LARGEST_EXPONENT, TILE
 from liftcore.raster.cpu.composite import CENTRAL, FRONT, LARGEST
 from liftcore.raster.gpu import project as scene
 from liftcore.raster.gpu.launching import jit, lang
+from liftcore.scene.compositing import ALPHA_FLOOR, LARGEST_EXPONENT, TILE
 from liftcore.scene.splats import Kernel
 
 GAUSSIANS, BETAS, DISCS = 0, 1, 2

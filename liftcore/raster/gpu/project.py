@@ -11,8 +11,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from liftcore.raster.base import EDGE_ON, NEAR_PLANE
 from liftcore.raster.cpu.project import HALF_LOG2_E, HORIZON, MARGIN, RELATIVE, Scene, View, low_pass_curvature
+from liftcore.scene.compositing import EDGE_ON, NEAR_PLANE
 from liftcore.scene.splats import Kernel
 
 # What the walk reads of a splat. PLACES [n, PLACE] f64 holds what is taken at a row's first pixel, where large

@@ -16,20 +16,15 @@ from typing import Concatenate, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
-from liftcore.device import indexed, out_of_memory
 from liftcore.errors import Unavailable
-from liftcore.features.views import ViewFeatures
 from liftcore.raster.base import (
-    CompositingParams,
     RayRows,
     ViewRequest,
     ViewWeights,
-    Weighting,
     check_image,
     check_labels,
     check_params,
     check_rows,
-    every_pixel,
     strided_places,
 )
 from liftcore.raster.cpu.composite import choice_of
@@ -40,9 +35,12 @@ from liftcore.raster.gpu.project import DeviceScene, scene_on, with_opacity
 from liftcore.raster.gpu.render import ray_rows
 from liftcore.raster.gpu.tiles import BLOCK, Frame
 from liftcore.raster.gpu.weights import DeviceReading
+from liftcore.runtime.device import indexed, out_of_memory
 from liftcore.scene.cameras import Camera
+from liftcore.scene.compositing import CompositingParams, Weighting, every_pixel
 from liftcore.scene.splats import Splats
-from liftcore.solve.weights import RegionWeights
+from liftcore.values.region_weights import RegionWeights
+from liftcore.values.views import ViewFeatures
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")

@@ -9,10 +9,11 @@ import torch
 import triton.language as tl
 from torch import Tensor
 
-from liftcore.raster.base import TILE, RayRows
+from liftcore.raster.base import RayRows
 from liftcore.raster.gpu.composite import CHUNK, PART, PARTS, blend_chunk, fill_alphas, start_rays, weights_of
 from liftcore.raster.gpu.launching import WARPS, jit, lang, launch
 from liftcore.raster.gpu.tiles import Frame, Lists
+from liftcore.scene.compositing import TILE
 
 WIDEST = 64  # channels a walk
 NARROWEST = 16  # columns of a matrix product

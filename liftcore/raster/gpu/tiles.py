@@ -11,11 +11,11 @@ import torch
 import triton.language as tl
 from torch import Tensor
 
-from liftcore.raster.base import TILE, CompositingParams
 from liftcore.raster.cpu.project import View
 from liftcore.raster.gpu.composite import FLOORS, KINDS, PART, PARTS
 from liftcore.raster.gpu.launching import jit, lang, launch
 from liftcore.raster.gpu.project import DeviceScene, Outlines, ProjectedSplats, project
+from liftcore.scene.compositing import TILE, CompositingParams
 from liftcore.scene.splats import Kernel
 
 SPANS = 256  # a program

@@ -17,8 +17,6 @@ import torch
 import triton.language as tl
 from torch import Tensor
 
-from liftcore.features.views import ViewFeatures
-from liftcore.raster.base import TILE, CompositingParams
 from liftcore.raster.cpu.composite import FRONT, LARGEST, Choice
 from liftcore.raster.cpu.weights import Reading, reading_of
 from liftcore.raster.gpu.composite import (
@@ -36,7 +34,9 @@ from liftcore.raster.gpu.composite import (
 from liftcore.raster.gpu.launching import WARPS, jit, lang, launch
 from liftcore.raster.gpu.tiles import Frame, Lists, expanded
 from liftcore.scene.cameras import Camera
-from liftcore.solve.weights import RegionWeights, one_view
+from liftcore.scene.compositing import TILE, CompositingParams
+from liftcore.values.region_weights import RegionWeights, one_view
+from liftcore.values.views import ViewFeatures
 
 PIXELS = TILE * TILE
 NONE = -1

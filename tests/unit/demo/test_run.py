@@ -10,8 +10,8 @@ from PIL import Image
 from liftcore.cli import demo
 from liftcore.demo.scene_folder import SHIPPED
 from liftcore.errors import Unavailable
-from liftcore.io.lift_file import load_lift
-from liftcore.query.text import LVIS_TABLE
+from liftcore.query.result import load_lift
+from liftcore.text import LVIS_TABLE
 
 pytestmark = pytest.mark.slow
 

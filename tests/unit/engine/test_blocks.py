@@ -11,12 +11,12 @@ import pytest
 import torch
 
 import liftcore as lc
-from liftcore.engine import blocks
-from liftcore.engine.base import LocalEngine
-from liftcore.engine.lift import lift_in_blocks
-from liftcore.features.pack import write_pack
-from liftcore.io.lift_file import ALL
-from liftcore.settings import LiftSettings
+from liftcore.lifting.engines import blocks
+from liftcore.lifting.engines.base import LocalEngine
+from liftcore.lifting.engines.lift import lift_in_blocks
+from liftcore.values.lift_file import ALL
+from liftcore.values.pack import write_pack
+from liftcore.values.settings import LiftSettings
 from tests.scenes import look_at, random_splats
 
 ROWS = 1 << 15  # of a shard, whose rows fill pages with two bytes a channel

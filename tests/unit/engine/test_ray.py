@@ -19,11 +19,11 @@ from typing import Any
 import pytest
 
 import liftcore as lc
-from liftcore.engine import engine_named
-from liftcore.engine.base import LocalEngine
-from liftcore.engine.ray import RayEngine, check_reach
-from liftcore.features.pack import write_pack
-from liftcore.settings import LiftSettings
+from liftcore.lifting.engines import engine_named
+from liftcore.lifting.engines.base import LocalEngine
+from liftcore.lifting.engines.ray import RayEngine, check_reach
+from liftcore.values.pack import write_pack
+from liftcore.values.settings import LiftSettings
 
 from .test_blocks import assert_same, in_blocks, scene
 

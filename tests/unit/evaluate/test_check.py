@@ -13,19 +13,19 @@ from safetensors.torch import load_file, save_file
 
 from liftcore import cli
 from liftcore.evaluate.check import check_scene
-from liftcore.features.pack import as_views, read_features, write_pack
-from liftcore.features.views import FeatureGrid, Regions
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
-from liftcore.planning import contradictions
-from liftcore.planning.contradictions import ViewAgreement
+from liftcore.lifting.planning import contradictions
+from liftcore.lifting.planning.contradictions import ViewAgreement
 from liftcore.query.splat_colours import seen_colours
-from liftcore.query.text.table import TableEncoder
-from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Cameras
-from liftcore.settings import LiftSettings
-from liftcore.solve.geometry import LiftViews
+from liftcore.scene.compositing import CompositingParams
+from liftcore.text.table import TableEncoder
+from liftcore.values.lift_views import LiftViews
+from liftcore.values.pack import as_views, read_features, write_pack
+from liftcore.values.settings import LiftSettings
+from liftcore.values.views import FeatureGrid, Regions
 from tests.still_life.masks import Mistakes, observe
 from tests.still_life.scene import StillLife, still_life
 
@@ -175,8 +175,9 @@ def test_cameras_of_another_scale_are_told_by_features_alone() -> None:
 def test_a_principal_point_that_is_off_is_no_scale() -> None:
     scene = still_life(seed=7, views=12, density=0.1)
     words = TableEncoder("words", [*scene.things, *scene.parts], np.eye(len(scene.things) + len(scene.parts)))
-    masks = as_views(observe(scene, CpuRaster(scene.splats), words, Mistakes(), 7))
-    scrambled = {name: Regions(masks[name].labels, masks[name].codebook.roll(k, 0)) for k, name in enumerate(masks)}
+    observed = observe(scene, CpuRaster(scene.splats), words, Mistakes(), 7)
+    masks = as_views(observed)
+    scrambled = {name: Regions(own.labels, own.codebook.roll(k, 0)) for k, (name, own) in enumerate(observed.items())}
     off = [camera.replace(cx=camera.cx + 0.15 * camera.width) for camera in scene.cameras.values()]
     for cameras, features in ((Cameras(off), masks), (scene.cameras, as_views(scrambled))):
         for text in check_scene(scene.splats, cameras, features=features).wrong:

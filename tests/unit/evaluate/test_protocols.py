@@ -27,9 +27,9 @@ from liftcore.query.ask import ask
 from liftcore.query.render import view_mask
 from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Query
-from liftcore.query.text import open_encoder
 from liftcore.query.threshold import find_threshold
 from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.text import open_encoder
 from tests.labelled_scene import HEIGHT, WIDTH, isat, rectangle, write_lift
 
 P1, P2, P3, _ = EvaluationProtocol

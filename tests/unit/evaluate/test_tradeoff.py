@@ -23,11 +23,11 @@ from liftcore.evaluate.accuracy import centred_cosines, class_ious, cosine_figur
 from liftcore.evaluate.ranking import accuracy_of, choose
 from liftcore.evaluate.tradeoff import RunSpec, Scene, candidates_of, measured
 from liftcore.evaluate.tradeoff_report import table_of
-from liftcore.features.views import FeatureGrid
-from liftcore.progress import silent
-from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import dense_view, reading_matrix
+from liftcore.runtime.progress import silent
+from liftcore.scene.compositing import CompositingParams
+from liftcore.values.views import FeatureGrid
 from tests.scenes import centred, observed, random_camera, random_splats, write_scene
 
 pytestmark = pytest.mark.slow

@@ -28,11 +28,11 @@ from liftcore.features.encoders.encode import (
     read_image,
 )
 from liftcore.features.encoders.timm_backbone import TimmEncoder, cell_shift
-from liftcore.features.pack import read_features
-from liftcore.features.views import FeatureGrid
 from liftcore.io.photos import Reading, read_header
-from liftcore.query.text import weights
-from liftcore.query.text.open_clip import OpenedModel, library
+from liftcore.text import weights
+from liftcore.text.open_clip import OpenedModel, library
+from liftcore.values.pack import read_features
+from liftcore.values.views import FeatureGrid
 
 pytestmark = pytest.mark.slow
 

@@ -14,9 +14,9 @@ from safetensors.numpy import save_file
 
 from liftcore.errors import InvalidFeatures
 from liftcore.features.folders import Layout, array_views, files_below, langsplat_views
-from liftcore.features.pack import read_features, write_pack
-from liftcore.features.views import FeatureGrid, Regions
 from liftcore.io.npy import open_npy
+from liftcore.values.pack import read_features, write_pack
+from liftcore.values.views import FeatureGrid, Regions
 from service.photos import describe_photos
 
 if TYPE_CHECKING:

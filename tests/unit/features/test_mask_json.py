@@ -13,7 +13,7 @@ from liftcore.errors import InvalidFeatures
 from liftcore.features.mask_files import fill_polygons, mask_of_runs, read_polygons, read_runs
 from liftcore.features.masks import mask_views
 from liftcore.features.prompts import Prompts, prompt_views
-from liftcore.features.views import NO_LABEL, Regions
+from liftcore.values.views import NO_LABEL, Regions
 from tests.run_lengths import sam_records
 
 if TYPE_CHECKING:

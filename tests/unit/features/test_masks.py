@@ -16,8 +16,8 @@ from PIL import Image
 from liftcore.errors import InvalidFeatures
 from liftcore.features.mask_files import mask_of_runs, read_runs
 from liftcore.features.masks import MAX_LEVELS, layered, mask_views
-from liftcore.features.pack import read_features, write_pack
-from liftcore.features.views import Regions
+from liftcore.values.pack import read_features, write_pack
+from liftcore.values.views import Regions
 from tests.run_lengths import compressed, lengths_of, sam_records
 
 LABELS = np.array([[-1, 0, 0, 2], [1, 1, -1, 2], [1, 1, -1, -1]])

@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from liftcore.errors import InvalidFeatures
-from liftcore.features import levels
-from liftcore.features.lens import as_pinhole_sees
-from liftcore.features.levels import at_levels, composite
-from liftcore.features.pack import pair, read_features, write_pack
-from liftcore.features.views import NO_LABEL, FeatureGrid, Regions
 from liftcore.scene.cameras import Camera, Cameras, behind_lens
 from liftcore.scene.distortion import Brown, Distortion, Fisheye
+from liftcore.values import levels
+from liftcore.values.lens import as_pinhole_sees
+from liftcore.values.levels import at_levels, composite
+from liftcore.values.pack import pair, read_features, write_pack
+from liftcore.values.views import NO_LABEL, FeatureGrid, Regions
 from tests.scenes import random_grid, random_regions
 
 

@@ -14,11 +14,11 @@ import torch
 from safetensors.torch import load_file, save, save_file
 
 from liftcore.errors import InvalidFeatures, Unavailable
-from liftcore.features.pack import Views, as_views, pair, read_features, write_pack
-from liftcore.features.views import FeatureGrid, Regions, ViewFeatures
 from liftcore.io.cameras import read_cameras
 from liftcore.io.safetensors_file import write_tensors
 from liftcore.scene.cameras import Camera, Cameras
+from liftcore.values.pack import Views, as_views, pair, read_features, write_pack
+from liftcore.values.views import FeatureGrid, Regions, ViewFeatures
 
 MAP = np.arange(24, dtype=np.float32).reshape(3, 2, 4)  # [F, h, w]
 ANY_REGIONS: Any = Regions  # by what types do not allow

@@ -13,9 +13,9 @@ from PIL.PngImagePlugin import PngInfo
 
 import liftcore as lc
 from liftcore.errors import InvalidFeatures, InvalidQuery
-from liftcore.features.pack import read_features, write_pack
 from liftcore.features.prompts import prompt_views
-from liftcore.features.views import Regions
+from liftcore.values.pack import read_features, write_pack
+from liftcore.values.views import Regions
 from tests.api.tiny_scene import labels, make_scene
 from tests.run_lengths import sam_records
 from tests.unit.command_line import assert_one_line, run

@@ -11,11 +11,11 @@ import torch
 
 import liftcore as lc
 from liftcore import cli
-from liftcore.planning.photos import SEEN
-from liftcore.planning.views import WELL_COVERED
-from liftcore.raster.base import CompositingParams
+from liftcore.lifting.planning.photos import SEEN
+from liftcore.lifting.planning.views import WELL_COVERED
 from liftcore.raster.reference import dense_view
 from liftcore.scene.cameras import Cameras
+from liftcore.scene.compositing import CompositingParams
 from tests.scenes import random_camera, random_splats, write_scene
 
 

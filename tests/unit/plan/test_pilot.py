@@ -9,17 +9,17 @@ import pytest
 import torch
 
 from liftcore.evaluate.accuracy import cosine_figures
-from liftcore.features.pack import write_pack
-from liftcore.features.views import Regions
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
-from liftcore.io.scene_files import lift_files, open_files
-from liftcore.planning.plan import FEW_VIEWS
-from liftcore.planning.views import PILOT_VIEWS, Pilot, fly_pilot, visibility
+from liftcore.lifting.files import lift_files, open_files
+from liftcore.lifting.planning.plan import FEW_VIEWS
+from liftcore.lifting.planning.views import PILOT_VIEWS, Pilot, fly_pilot, visibility
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Cameras
-from liftcore.settings import LiftSettings
-from liftcore.solve.geometry import LiftViews
+from liftcore.values.lift_views import LiftViews
+from liftcore.values.pack import write_pack
+from liftcore.values.settings import LiftSettings
+from liftcore.values.views import Regions
 from tests.benchmarks.scenes import Room, write_room
 from tests.scenes import centred, random_splats
 from tests.unit.plan.test_views import ring

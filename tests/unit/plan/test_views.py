@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.io.scene_files import lift_files
-from liftcore.planning.views import (
+from liftcore.lifting.files import lift_files
+from liftcore.lifting.planning.views import (
     SIDES,
     WELL_COVERED,
     Visibility,
@@ -17,10 +17,10 @@ from liftcore.planning.views import (
     views_to_show,
     visibility,
 )
-from liftcore.raster.base import CompositingParams, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.scene.compositing import CompositingParams, Weighting
 from liftcore.scene.splats import Kernel
-from liftcore.settings import LiftSettings
+from liftcore.values.settings import LiftSettings
 from tests.scenes import look_at, random_camera, random_regions, random_splats, write_scene
 
 

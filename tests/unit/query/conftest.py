@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from liftcore.io.lift_file import save_lift
-from liftcore.io.scene_files import lift_files
+from liftcore.lifting.files import lift_files
 from liftcore.query.scene import QueryScene
-from liftcore.settings import LiftSettings
+from liftcore.values.lift_file import save_lift
+from liftcore.values.settings import LiftSettings
 from tests.api.tiny_scene import make_scene
 
 

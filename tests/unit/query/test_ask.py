@@ -15,13 +15,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from liftcore.errors import InvalidLift, InvalidQuery, NotFound, SplatliftError
-from liftcore.io.lift_file import load_lift, save_lift
 from liftcore.query.ask import answers, ask, question, top
 from liftcore.query.directions import directions
+from liftcore.query.result import LiftResult, load_lift
 from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Example, OneSplat, Pixel, Query, Region, Vector, parse_example, read_vector
 from liftcore.query.threshold import find_threshold
-from liftcore.result import LiftResult
+from liftcore.values.lift_file import save_lift
 from tests.api.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH
 
 COUNT = 3 * SPLATS_A_CLUSTER
@@ -124,7 +124,7 @@ def test_what_cannot_be_asked_is_refused(scene: QueryScene) -> None:
     ):
         with pytest.raises(InvalidQuery, match=message):
             refused()
-    sure = replace(scene.lift, confidence=torch.ones(len(scene.features)))
+    sure = LiftResult.of(replace(scene.lift, confidence=torch.ones(len(scene.features))))
     told, plain = (sure.query(np.eye(CHANNELS)[0], weigh=weigh) for weigh in ("confidence", "evidence"))
     assert torch.equal(told.splats, plain.splats) and told.threshold == plain.threshold
 
@@ -132,21 +132,21 @@ def test_what_cannot_be_asked_is_refused(scene: QueryScene) -> None:
 def test_vectors_are_asked_as_their_words_are(scene: QueryScene) -> None:
     words = ask(scene, Query(("x",), ("y",)), Axes())
     for positive in (torch.eye(CHANNELS)[0], 7 * np.eye(CHANNELS)[:1]):
-        found = scene.lift.query(positive, torch.eye(CHANNELS)[1], splats=scene.splats)
+        found = LiftResult.of(scene.lift).query(positive, torch.eye(CHANNELS)[1], splats=scene.splats)
         assert found.scores.numpy().tolist() == words.scores.tolist() and found.threshold == words.threshold
         assert np.array_equal(found.splats.numpy(), words.selected) and found.clear
         assert found.objects is not None and len(found.objects.found) == 1
-    alike = replace(scene.lift, features=torch.ones(COUNT, CHANNELS))
+    alike = LiftResult.of(replace(scene.lift, features=torch.ones(COUNT, CHANNELS)))
     alone = alike.query(torch.eye(CHANNELS)[0])
     assert not alone.clear and alone.objects is None
     for wrong in (torch.ones(5), torch.zeros(CHANNELS), torch.empty(0, CHANNELS)):
         with pytest.raises(InvalidQuery):
-            scene.lift.query(wrong)
+            LiftResult.of(scene.lift).query(wrong)
 
 
 def test_scene_made_of_values_needs_no_files(scene: QueryScene) -> None:
     nowhere = scene.metadata.splats.model_copy(update={"path": ""})
-    lift: LiftResult = replace(scene.lift, metadata=scene.metadata.model_copy(update={"splats": nowhere}))
+    lift = replace(scene.lift, metadata=scene.metadata.model_copy(update={"splats": nowhere}))
     bare = QueryScene(lift, scene.splats, scene.cameras, scene.packs)
     query = Query((Pixel("middle", 6, HEIGHT // 2), Region("left", 0, 1)))
     assert np.array_equal(ask(bare, query).selected, ask(scene, query).selected)
@@ -158,7 +158,7 @@ def test_words_of_a_table_are_asked_without_torch(tiny_lift: Path) -> None:
     code = (
         "import sys; from pathlib import Path; from liftcore.query.ask import ask, top; "
         "from liftcore.query.scene import QueryScene; from liftcore.query.terms import OneSplat, Query; "
-        "import liftcore.query.text.table; "
+        "import liftcore.text.table; "
         "scene = QueryScene.open(Path(sys.argv[1])); answer = ask(scene, Query((OneSplat(0),))); "
         "assert top(answer, scene, 3).best and 'torch' not in sys.modules"
     )

@@ -13,9 +13,10 @@ import pytest
 
 from liftcore.cli import main
 from liftcore.errors import InvalidLift, InvalidQuery
-from liftcore.io.lift_file import load_lift, save_lift
 from liftcore.query.catalogue import NOT_LOOKED_FOR, catalogue, table_csv
+from liftcore.query.result import load_lift
 from liftcore.query.scene import QueryScene
+from liftcore.values.lift_file import save_lift
 from tests.api.tiny_scene import CHANNELS, SPLATS_A_CLUSTER, VIEWS, WORDS, text_table
 
 EYE = np.eye(3, CHANNELS, dtype=np.float32)

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from liftcore.errors import InvalidLift
-from liftcore.io.scene_files import lift_files
 from liftcore.io.splats import read_splats
+from liftcore.lifting.files import lift_files
 from liftcore.query.ask import Answer, ask
 from liftcore.query.colours import NOT_SEEN_COLOUR, colour_map
 from liftcore.query.export import coloured_ply, object_splats
 from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Query, Region
 from liftcore.scene.harmonics import SH_C0
-from liftcore.settings import LiftSettings
+from liftcore.values.settings import LiftSettings
 from tests.api.tiny_scene import SPLATS_A_CLUSTER, ply, splat_rows
 
 

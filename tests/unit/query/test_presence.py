@@ -15,11 +15,12 @@ from liftcore.query.export import object_splats
 from liftcore.query.objects import objects
 from liftcore.query.presence import References, references_of
 from liftcore.query.render import view_mask
+from liftcore.query.result import LiftResult
 from liftcore.query.scene import QueryScene
 from liftcore.query.segment import segment
 from liftcore.query.terms import OneSplat, Query
-from liftcore.query.text import LVIS_TABLE, RememberingEncoder
-from liftcore.query.text.table import TableEncoder
+from liftcore.text import LVIS_TABLE, RememberingEncoder
+from liftcore.text.table import TableEncoder
 from tests.api.tiny_scene import SPLATS_A_CLUSTER
 
 COUNT = 3 * SPLATS_A_CLUSTER
@@ -150,23 +151,24 @@ def test_without_references_presence_is_not_known(clip: QueryScene, table: Table
 
 def test_vectors_of_words_are_present_or_absent_too(clip: QueryScene, table: TableEncoder) -> None:
     cat, sofa = table.encode(["cat", "sofa"])
-    assert clip.lift.query(cat).present and clip.lift.query(sofa).present is False
-    assert not clip.lift.query(sofa, splats=clip.splats).splats.any()
-    assert clip.lift.query(sofa, absent="keep").splats.any()
+    assert LiftResult.of(clip.lift).query(cat).present and LiftResult.of(clip.lift).query(sofa).present is False
+    assert not LiftResult.of(clip.lift).query(sofa, splats=clip.splats).splats.any()
+    assert LiftResult.of(clip.lift).query(sofa, absent="keep").splats.any()
     turn = np.linalg.qr(np.random.default_rng(3).normal(size=(512, 512)))[0].astype(np.float32)
-    turned = replace(clip.lift, features=clip.lift.features @ torch.from_numpy(turn))
+    turned = LiftResult.of(replace(clip.lift, features=clip.lift.features @ torch.from_numpy(turn)))
     assert turned.query(sofa @ turn).present is None
     told = turned.query(sofa @ turn, references=table.embeddings @ turn)
     assert told.present is False and told.presence is not None and told.presence < 0.5
     for wrong in (table.embeddings[:9], table.embeddings[:, :9], np.zeros((300, 512))):
         with pytest.raises(InvalidQuery, match="references"):
-            clip.lift.query(sofa, references=wrong)
+            LiftResult.of(clip.lift).query(sofa, references=wrong)
 
 
 def test_texts_are_asked_as_their_vectors_are(
     clip: QueryScene, table: TableEncoder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    lift, cat = clip.lift, clip.lift.query(table.encode(["cat"]), table.encode(["pizza"]))
+    lift = LiftResult.of(clip.lift)
+    cat = lift.query(table.encode(["cat"]), table.encode(["pizza"]))
     opened: list[str] = []
 
     def encoder_of_space(space: str, hint: str, *, stand_in: bool) -> TableEncoder:

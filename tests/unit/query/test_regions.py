@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from liftcore.errors import InvalidQuery, NotFound
-from liftcore.features.pack import as_views
-from liftcore.features.views import FeatureGrid, Regions
 from liftcore.query.regions import region_mask, regions_at
 from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Region
+from liftcore.values.pack import as_views
+from liftcore.values.views import FeatureGrid, Regions
 from tests.api.tiny_scene import CHANNELS, HEIGHT, WIDTH, codebook
 
 

@@ -31,9 +31,9 @@ from liftcore.query.render import (
 from liftcore.query.scene import QueryScene
 from liftcore.query.splat_colours import principal_colours, seen_colours
 from liftcore.query.terms import Query, Region
-from liftcore.raster.base import CompositingParams
 from liftcore.raster.reference import ReferenceRaster
 from liftcore.scene.cameras import Camera, Cameras, behind_lens, drawn_by
+from liftcore.scene.compositing import CompositingParams
 from liftcore.scene.distortion import Brown, Distortion, Fisheye, photo_places
 from liftcore.scene.harmonics import SH_C0
 from liftcore.scene.splats import Kernel, Splats

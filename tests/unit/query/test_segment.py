@@ -19,6 +19,7 @@ from liftcore.io.inria import write_inria_cameras
 from liftcore.io.splats import read_splats
 from liftcore.query.colours import NO_CLUSTER_COLOUR
 from liftcore.query.render import render
+from liftcore.query.result import LiftResult
 from liftcore.query.scene import QueryScene
 from liftcore.query.segment import best_words, map_png, named_ply, picture_png, segment, word_map
 from liftcore.query.splat_colours import seen_colours
@@ -93,7 +94,7 @@ def test_words_without_directions_of_their_own_are_refused(clear: QueryScene, wo
 
 
 def test_a_lift_in_memory_is_segmented_by_one_call(clear: QueryScene) -> None:
-    found = clear.lift.segment(["apple", "book", "lamp"], torch.eye(CHANNELS)[:3], clear.splats)
+    found = LiftResult.of(clear.lift).segment(["apple", "book", "lamp"], torch.eye(CHANNELS)[:3], clear.splats)
     assert np.array_equal(found.labels, CLUSTER)
 
 
@@ -102,15 +103,15 @@ def test_words_need_no_vectors_where_there_is_an_encoder(clear: QueryScene, tmp_
     words, table = ["apple", "book", "lamp"], tmp_path / "table.safetensors"
     table.write_bytes(text_table())
     for encoder in (f"table:{table}", lc.open_encoder(f"table:{table}")):
-        found = clear.lift.segment(words, splats=clear.splats, encoder=encoder)
+        found = LiftResult.of(clear.lift).segment(words, splats=clear.splats, encoder=encoder)
         assert np.array_equal(found.labels, CLUSTER)
     with pytest.raises(InvalidQuery, match="give encoder="):
-        clear.lift.segment(words, splats=clear.splats)
+        LiftResult.of(clear.lift).segment(words, splats=clear.splats)
     with pytest.raises(InvalidQuery, match="give encoder="):
-        clear.lift.objects(clear.splats, words)
+        LiftResult.of(clear.lift).objects(clear.splats, words)
     for nothing in ([], ["no such word"]):
         with pytest.raises(InvalidQuery):
-            clear.lift.segment(nothing, splats=clear.splats, encoder=f"table:{table}")
+            LiftResult.of(clear.lift).segment(nothing, splats=clear.splats, encoder=f"table:{table}")
 
 
 def test_pictures_show_the_words_of_the_pixels(clear: QueryScene) -> None:

@@ -12,8 +12,8 @@ import torch
 from safetensors.torch import save_file
 
 from liftcore.errors import InvalidQuery, Unavailable
-from liftcore.query.text import RememberingEncoder, open_encoder, without_templates
-from liftcore.query.text.open_clip import OpenClipEncoder, tokenizer_of
+from liftcore.text import RememberingEncoder, open_encoder, without_templates
+from liftcore.text.open_clip import OpenClipEncoder, tokenizer_of
 
 pytestmark = pytest.mark.slow
 

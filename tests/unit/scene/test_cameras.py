@@ -16,15 +16,15 @@ import pytest
 from camera_files import CAMERAS, IMAGES, assert_same, binary_files, text_files, with_json, write_files
 
 from liftcore.errors import InvalidCameras
+from liftcore.evaluate.inspect import describe_camera_file, inspect_file
 from liftcore.io import cameras, json_file
 from liftcore.io.cameras import MODEL_FOLDERS, other_models, read_cameras
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.inspect import describe_camera_file, inspect_file
-from liftcore.io.lift_file import camera_input, has_poses, poses_of
-from liftcore.result import LiftMetadata
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.distortion import Brown, Fisheye, Lens
-from liftcore.settings import LiftSettings
+from liftcore.values.lift import LiftMetadata
+from liftcore.values.lift_file import camera_input, has_poses, poses_of
+from liftcore.values.settings import LiftSettings
 
 ONE = IMAGES[:1]
 OPENCV = Brown(k1=0.01, k2=-0.02, p1=0.001, p2=0.002)

@@ -13,13 +13,13 @@ import pytest
 
 from liftcore.cli import main
 from liftcore.errors import InvalidCameras, InvalidInput, InvalidSplats
+from liftcore.evaluate.inspect import inspect_file
 from liftcore.io.cameras import read_cameras
 from liftcore.io.files import MAX_DIRECTORY_BYTES, open_zip
-from liftcore.io.inspect import inspect_file
 from liftcore.io.kinds import SplatFormat, identify, kind_of, wrong_kind
-from liftcore.io.lift_file import input_file
 from liftcore.io.ply import write_splats
 from liftcore.io.splats import read_splats, splat_files
+from liftcore.values.lift_file import input_file
 from tests.scenes import random_splats
 
 SOG = Path(__file__).parents[2] / "data" / "splats" / "degree3.sog"

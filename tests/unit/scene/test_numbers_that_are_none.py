@@ -14,13 +14,13 @@ import pytest
 import torch
 
 import liftcore as lc
-from liftcore.io.inspect import inspect_file
+from liftcore.evaluate.inspect import inspect_file
 from liftcore.io.ply import write_splats
 from liftcore.io.splats import read_places, read_splats, some_rows
-from liftcore.planning.photos import plan_photos
+from liftcore.lifting.planning.photos import plan_photos
 from liftcore.query.splat_colours import seen_colours
-from liftcore.raster.base import CompositingParams
 from liftcore.raster.reference import dense_view
+from liftcore.scene.compositing import CompositingParams
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
 from tests.scenes import look_at, observed, random_camera, random_splats

@@ -14,10 +14,7 @@ from PIL import Image
 import liftcore as lc
 from liftcore.errors import InvalidCameras, NotFound
 from liftcore.evaluate.check import check_scene
-from liftcore.features.lens import as_pinhole_sees
-from liftcore.features.pack import as_views, pair
 from liftcore.io.cameras import read_cameras
-from liftcore.io.lift_file import poses_of
 from liftcore.query.regions import region_mask, regions_at
 from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Region
@@ -26,6 +23,9 @@ from liftcore.scene.panorama import with_panoramas
 from liftcore.scene.quaternions import rotation_matrices
 from liftcore.scene.splats import Splats
 from liftcore.solve.diagnostics import shape_warnings
+from liftcore.values.lens import as_pinhole_sees
+from liftcore.values.lift_file import poses_of
+from liftcore.values.pack import as_views, pair
 
 WIDTH, HEIGHT = 128, 64
 QUATERNION = (0.6, -0.2, 0.5, 0.1)

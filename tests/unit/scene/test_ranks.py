@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from liftcore.errors import InvalidSplats
-from liftcore.io.inspect import inspect_file
-from liftcore.io.lift_file import input_file
+from liftcore.evaluate.inspect import inspect_file
 from liftcore.io.splats import read_places, read_splats
 from liftcore.query.scene import QueryScene
 from liftcore.scene.splats import Splats
+from liftcore.values.lift_file import input_file
 from tests.scenes import random_splats, write_scene
 from tests.unit.command_line import run
 

@@ -14,11 +14,11 @@ import torch
 
 import liftcore as lc
 from liftcore.cli import main
-from liftcore.features.pack import write_pack
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.ply import write_splats
 from liftcore.io.remote import local_path
 from liftcore.io.shards import INDEX
+from liftcore.values.pack import write_pack
 from tests.scenes import centred, observed, random_camera, random_splats
 
 FILES = ("splats.ply", "cameras.json", "features.safetensors")
@@ -126,7 +126,7 @@ def test_commands_take_inputs_and_write_lifts_elsewhere(elsewhere: str, capsys: 
 def test_storage_that_does_not_open_is_told_before_the_lift(
     elsewhere: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("liftcore.io.scene_files.lift_files", None)  # the work, which would be our fault
+    monkeypatch.setattr("liftcore.lifting.files.lift_files", None)  # the work, which would be our fault
     status = main(
         ["lift", *(f"{elsewhere}/{name}" for name in FILES), "-o", "nothing-like-it://bucket/x.safetensors"]
     )

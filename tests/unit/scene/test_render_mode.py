@@ -15,15 +15,15 @@ import torch
 
 import liftcore as lc
 from liftcore.errors import InvalidSettings, InvalidSplats
-from liftcore.io.inspect import inspect_file
+from liftcore.evaluate.inspect import inspect_file
 from liftcore.io.ply import write_splats
-from liftcore.io.scene_files import lift_files
 from liftcore.io.splats import read_splats, some_rows, with_columns
+from liftcore.lifting.files import lift_files
 from liftcore.query.render import _as_trained as params_of_renders
 from liftcore.query.scene import QueryScene
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
-from liftcore.settings import LiftSettings
+from liftcore.values.settings import LiftSettings
 from tests.scenes import observed, random_camera, random_splats, write_scene
 from tests.unit.command_line import run
 

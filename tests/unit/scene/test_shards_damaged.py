@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from liftcore.errors import InvalidLift
-from liftcore.io.lift_file import read_lift
 from liftcore.io.shards import INDEX, features_file, write_shards
+from liftcore.values.lift_file import read_lift
 
 
 def write(folder: Path) -> Path:

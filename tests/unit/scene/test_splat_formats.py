@@ -21,7 +21,6 @@ import zstandard
 
 from liftcore.errors import InvalidSplats
 from liftcore.io.kinds import SplatFormat, kind_of
-from liftcore.io.lift_file import input_file
 from liftcore.io.ply import write_splats
 from liftcore.io.quantised import LEAST_ALPHA
 from liftcore.io.splats import (
@@ -37,6 +36,7 @@ from liftcore.query.splat_colours import _sh_basis
 from liftcore.scene.harmonics import band_rotation, band_values, constant_terms
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
+from liftcore.values.lift_file import input_file
 from tests.scenes import random_splats
 
 FILES = Path(__file__).parents[2] / "data" / "splats"

@@ -18,14 +18,14 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from liftcore.errors import InvalidCameras, Unavailable
+from liftcore.evaluate.inspect import inspect_file
 from liftcore.io import cameras
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.inspect import inspect_file
-from liftcore.io.lift_file import camera_input
 from liftcore.io.transforms import FRAME_FILE, transforms_of
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.distortion import Brown, Fisheye, Lens
+from liftcore.values.lift_file import camera_input
 
 
 def test_transforms_and_colmap_mean_the_same(tmp_path: Path) -> None:

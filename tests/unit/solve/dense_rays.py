@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from liftcore.features.views import ViewFeatures
-from liftcore.raster.base import CompositingParams
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import reading_matrix
 from liftcore.scene.cameras import Camera
+from liftcore.scene.compositing import CompositingParams
 from liftcore.solve.least_squares import AllRays
+from liftcore.values.views import ViewFeatures
 from tests.scenes import random_camera, random_grid, random_regions, random_splats
 
 

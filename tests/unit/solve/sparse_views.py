@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from liftcore.solve.codebook import Codebook, ViewCodebook
-from liftcore.solve.weights import RegionWeights, one_view
+from liftcore.values.region_weights import RegionWeights, one_view
 
 
 def of_dense(view: np.ndarray) -> RegionWeights:

@@ -11,26 +11,27 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from liftcore.errors import InvalidLift
-from liftcore.features.pack import read_features, write_pack
-from liftcore.features.views import FeatureGrid, Regions
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.lift_file import CLUSTER_TENSORS, load_lift, save_lift
 from liftcore.io.ply import write_splats
-from liftcore.io.scene_files import lift_files
 from liftcore.io.splats import read_splats
-from liftcore.lifting import LEAST_KEPT
-from liftcore.progress import silent
+from liftcore.lifting.files import lift_files
+from liftcore.lifting.pipeline import LEAST_KEPT
+from liftcore.query.result import load_lift
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import ReferenceRaster, dense_view
+from liftcore.runtime.progress import silent
 from liftcore.scene.cameras import Cameras
-from liftcore.settings import LiftSettings
 from liftcore.solve.aggregate import (
     evidence_means,
     filter_regions,
 )
 from liftcore.solve.clusters import Clustering
-from liftcore.solve.geometry import LiftViews
+from liftcore.values.lift_file import CLUSTER_TENSORS, save_lift
+from liftcore.values.lift_views import LiftViews
+from liftcore.values.pack import read_features, write_pack
+from liftcore.values.settings import LiftSettings
+from liftcore.values.views import FeatureGrid, Regions
 from tests.scenes import centred, random_camera, random_grid, random_regions, random_splats
 
 pytestmark = pytest.mark.slow
@@ -150,7 +151,7 @@ def weights_of(splats, cameras, maps, settings) -> np.ndarray:
 
 @pytest.mark.parametrize("least", [LEAST_KEPT, 0.0])
 def test_what_takes_no_cluster_is_solved_again_as_if_the_other_regions_had_never_been(tmp_path, monkeypatch, least):
-    monkeypatch.setattr("liftcore.lifting.LEAST_KEPT", least)
+    monkeypatch.setattr("liftcore.lifting.pipeline.LEAST_KEPT", least)
     (splats, cameras, features), _ = write_scene(tmp_path, "regions")
     # A tenth of the first view is a region that no cluster confirms.
     packs = read_features(features)

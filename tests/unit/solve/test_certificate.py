@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from liftcore.io.cameras import read_cameras
-from liftcore.io.scene_files import lift_files
-from liftcore.raster.base import CompositingParams
+from liftcore.lifting.files import lift_files
 from liftcore.raster.reference import dense_view, reading_matrix
-from liftcore.settings import LiftSettings
+from liftcore.scene.compositing import CompositingParams
+from liftcore.values.settings import LiftSettings
 from tests.scenes import observed, random_splats, write_scene
 
 pytestmark = pytest.mark.slow

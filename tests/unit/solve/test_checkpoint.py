@@ -11,18 +11,19 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.device import CPU, Device
-from liftcore.features.pack import write_pack
-from liftcore.features.views import NO_LABEL, FeatureGrid, Regions
 from liftcore.io.cameras import read_cameras
-from liftcore.io.lift_file import TENSORS
-from liftcore.io.scene_files import lift_files
-from liftcore.raster.base import CompositingParams, ViewRequest, Weighting
+from liftcore.lifting.checkpoint import Checkpoint, question
+from liftcore.lifting.files import lift_files
+from liftcore.query.result import LiftResult
+from liftcore.raster.base import ViewRequest
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.result import LiftResult
+from liftcore.runtime.device import CPU, Device
 from liftcore.scene.cameras import Camera
-from liftcore.settings import LiftSettings
-from liftcore.solve.checkpoint import Checkpoint, question
+from liftcore.scene.compositing import CompositingParams, Weighting
+from liftcore.values.lift_file import TENSORS
+from liftcore.values.pack import write_pack
+from liftcore.values.settings import LiftSettings
+from liftcore.values.views import NO_LABEL, FeatureGrid, Regions
 from tests.scenes import observed, write_scene
 
 pytestmark = pytest.mark.slow
@@ -44,8 +45,10 @@ def walks(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         return walk(self, camera, *rest, **named)
 
     monkeypatch.setattr(CpuRaster, "region_weights", counted)
-    monkeypatch.setattr("liftcore.lifting.contradictions", lambda *_: [])  # which may look at some views, coarsely
-    monkeypatch.setattr("liftcore.lifting.choose_device", lambda _: CPU)  # on machines with a card too
+    monkeypatch.setattr(
+        "liftcore.lifting.pipeline.contradictions", lambda *_: []
+    )  # which may look at some views, coarsely
+    monkeypatch.setattr("liftcore.lifting.pipeline.choose_device", lambda _: CPU)  # on machines with a card too
     return walked
 
 

@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from liftcore.device import CPU, Device
+from liftcore.runtime.device import CPU, Device
 from liftcore.solve import closed_form
 from liftcore.solve.closed_form import Solution, solve
-from liftcore.solve.weights import RegionWeights, stacked
+from liftcore.values.region_weights import RegionWeights, stacked
 from tests.unit.solve.sparse_views import codebook_of, defined, of_dense, random_view
 
 HERE = torch.device("cuda:0" if torch.cuda.is_available() else "cpu")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.settings import LiftSettings
 from liftcore.solve.clusters import NO_CLUSTER, Clustering, cluster_splats, draw, parted, principal_axes
+from liftcore.values.settings import LiftSettings
 from tests.scenes import random_splats
 
 SETTINGS = LiftSettings.of(aggregation=True, aggregation_cluster_size=20, aggregation_neighbours=5)

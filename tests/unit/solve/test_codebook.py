@@ -8,12 +8,12 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from liftcore.features.views import NO_LABEL, FeatureGrid, Regions
-from liftcore.raster.base import CompositingParams, Weighting
 from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.scene.compositing import CompositingParams, Weighting
 from liftcore.solve.closed_form import Solution, solve
 from liftcore.solve.codebook import Codebook, ViewCodebook, as_regions
-from liftcore.solve.weights import RegionWeights, stacked
+from liftcore.values.region_weights import RegionWeights, stacked
+from liftcore.values.views import NO_LABEL, FeatureGrid, Regions
 from tests.scenes import random_camera, random_splats
 
 SIZE = 48

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.features.levels import region_levels
-from liftcore.features.views import Regions
 from liftcore.solve import consensus
 from liftcore.solve.consensus import OBSERVES, PRIOR, mask_consensus
 from liftcore.solve.membership import BELONGS, FAINT
 from liftcore.solve.reweight import SHARPNESS, Agreement, agreement_factors
-from liftcore.solve.weights import RegionWeights, stacked
+from liftcore.values.levels import region_levels
+from liftcore.values.region_weights import RegionWeights, stacked
+from liftcore.values.views import Regions
 from tests.unit.solve.sparse_views import codebook_of, dense, of_dense
 
 SPLATS = 60

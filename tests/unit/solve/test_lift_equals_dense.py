@@ -12,23 +12,23 @@ import pytest
 import torch
 
 from liftcore.errors import InvalidFeatures, InvalidSettings, InvalidSplats
-from liftcore.features.pack import read_features, write_pack
-from liftcore.features.views import Regions
 from liftcore.io.cameras import read_cameras
-from liftcore.io.lift_file import CLUSTER_TENSORS, TENSORS, load_lift, save_lift
 from liftcore.io.ply import write_splats
-from liftcore.io.scene_files import lift_files
 from liftcore.io.splats import read_splats
+from liftcore.lifting.files import lift_files
+from liftcore.lifting.geometry import strided
 from liftcore.query.directions import directions
+from liftcore.query.result import LiftResult, load_lift
 from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Query, Region
-from liftcore.raster.base import CompositingParams, Selection, Weighting
 from liftcore.raster.reference import counted_weights, dense_view, reading_matrix, strided_rays
-from liftcore.result import LiftResult
 from liftcore.scene.cameras import Cameras
+from liftcore.scene.compositing import CompositingParams, Selection, Weighting
 from liftcore.scene.splats import Kernel, Splats
-from liftcore.settings import LiftSettings
-from liftcore.solve.geometry import strided
+from liftcore.values.lift_file import CLUSTER_TENSORS, TENSORS, save_lift
+from liftcore.values.pack import read_features, write_pack
+from liftcore.values.settings import LiftSettings
+from liftcore.values.views import Regions
 from tests.scenes import observed, random_camera, write_scene
 from tests.unit.features.test_observations import dense_sums
 
@@ -155,8 +155,8 @@ def test_the_number_of_threads_changes_no_bit_of_a_lift(tmp_path, settings):
 def test_weights_in_files_give_the_same_lift_as_weights_in_memory(tmp_path, monkeypatch):
     paths = write_scene(tmp_path, 8)
     memory = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of())
-    monkeypatch.setattr("liftcore.solve.geometry.MEMORY_LIMIT", 0)
-    monkeypatch.setattr("liftcore.solve.weights.MEMORY_LIMIT", 0)
+    monkeypatch.setattr("liftcore.lifting.geometry.MEMORY_LIMIT", 0)
+    monkeypatch.setattr("liftcore.values.region_weights.MEMORY_LIMIT", 0)
     files = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of())
     assert torch.equal(memory.features, files.features)
 

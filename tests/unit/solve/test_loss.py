@@ -11,7 +11,7 @@ import liftcore as lc
 from liftcore.io.cameras import read_cameras
 from liftcore.io.splats import read_splats
 from liftcore.solve.loss import STEPS, huber_factors
-from liftcore.solve.weights import stacked
+from liftcore.values.region_weights import stacked
 from tests.scenes import observed, write_scene
 from tests.unit.solve.sparse_views import codebook_of, dense, random_view
 

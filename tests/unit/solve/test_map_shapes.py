@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.features.pack import pair, read_features, write_pack
-from liftcore.features.views import FeatureGrid, ViewFeatures
+from liftcore.evaluate.inspect import inspect_file
 from liftcore.io.cameras import read_cameras
-from liftcore.io.inspect import inspect_file
-from liftcore.io.scene_files import lift_files, open_files
-from liftcore.lifting import plan
+from liftcore.lifting.files import lift_files, open_files
+from liftcore.lifting.pipeline import plan
 from liftcore.scene.cameras import Camera
-from liftcore.settings import LiftSettings
 from liftcore.solve.diagnostics import shape_warnings
+from liftcore.values.pack import pair, read_features, write_pack
+from liftcore.values.settings import LiftSettings
+from liftcore.values.views import FeatureGrid, ViewFeatures
 from tests.benchmarks.base import cameras_of
 from tests.scenes import write_scene
 

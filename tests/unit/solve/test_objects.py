@@ -7,7 +7,7 @@ import pytest
 
 from liftcore.solve import objects
 from liftcore.solve.objects import CONTAINS, LEAST_VIEWS, OBSERVES, TOGETHER, region_objects
-from liftcore.solve.weights import RegionWeights, stacked
+from liftcore.values.region_weights import RegionWeights, stacked
 from tests.unit.solve.sparse_views import dense, of_dense
 from tests.unit.solve.test_consensus import SPLATS, belonging, of_things, random_scene
 

@@ -8,12 +8,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from liftcore.io.scene_files import lift_files
-from liftcore.progress import silent
-from liftcore.settings import LiftSettings
+from liftcore.lifting.files import lift_files
+from liftcore.runtime.progress import silent
 from liftcore.solve.diagnostics import ViewMeasures, measure_rows, quantiles
-from liftcore.solve.geometry import SampledRays, read_pixels, sample_pixels
 from liftcore.solve.least_squares import reference, row_betas
+from liftcore.solve.rays import SampledRays, read_pixels, sample_pixels
+from liftcore.values.settings import LiftSettings
 from tests.scenes import write_scene
 from tests.unit.solve.dense_rays import SmallScene
 

@@ -10,13 +10,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from liftcore.io.scene_files import lift_files
-from liftcore.settings import LiftSettings
+from liftcore.lifting.files import lift_files
 from liftcore.solve.aggregate import explained_by
 from liftcore.solve.closed_form import LONG
 from liftcore.solve.directions import RegionDirections
 from liftcore.solve.reweight import NO_CONSENSUS, agreement_factors, reweighted
-from liftcore.solve.weights import RegionWeights, stacked
+from liftcore.values.region_weights import RegionWeights, stacked
+from liftcore.values.settings import LiftSettings
 from tests.scenes import write_scene
 from tests.unit.solve.sparse_views import codebook_of, dense, of_dense
 
@@ -127,7 +127,7 @@ def test_neither_threads_nor_files_nor_order_change_a_bit_and_the_first_weights_
     assert_same(threads=5)
     assert_same(threads=2, means=means)
     monkeypatch.setattr("liftcore.solve.reweight.MEMORY_LIMIT", 0)
-    monkeypatch.setattr("liftcore.solve.weights.MEMORY_LIMIT", 0)
+    monkeypatch.setattr("liftcore.values.region_weights.MEMORY_LIMIT", 0)
     assert_same(threads=2)
     W = scene.stacked()
     before = W.weight.clone()

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from liftcore.errors import InvalidSettings
-from liftcore.settings import LiftSettings, Preset
+from liftcore.values.settings import LiftSettings, Preset
 
 LEVELS = "'rows' or 'composite' or a valid integer"
 

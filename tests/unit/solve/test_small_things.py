@@ -13,8 +13,8 @@ from liftcore.query.ask import ask
 from liftcore.query.render import view_mask
 from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Query
-from liftcore.query.text.table import TableEncoder
 from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.text.table import TableEncoder
 from tests.benchmarks.base import mask_iou
 from tests.still_life.masks import Mistakes, observe, true_labels
 from tests.still_life.objects import small_things

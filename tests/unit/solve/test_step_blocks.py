@@ -27,7 +27,7 @@ from liftcore.solve.membership import RegionGroups, memberships
 from liftcore.solve.reweight import SceneAgreement, ViewConsistency, agreement_factors
 from liftcore.solve.rows import SomeRows, gather_rows, take_rows
 from liftcore.solve.sums import PIECE, PieceSums, added, packed, unpacked
-from liftcore.solve.weights import RegionWeights, one_view, stacked
+from liftcore.values.region_weights import RegionWeights, one_view, stacked
 from tests.unit.solve.sparse_views import codebook_of
 
 SPLATS = 3 * PIECE - 700

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from liftcore.errors import InvalidInput, Unavailable
-from liftcore.solve import weights
-from liftcore.solve.weights import RegionWeights, stacked
+from liftcore.values import region_weights as weights
+from liftcore.values.region_weights import RegionWeights, stacked
 from tests.unit.solve.sparse_views import dense, of_dense, random_view
 
 SPLATS = 300
@@ -74,6 +74,6 @@ def test_more_regions_than_four_bytes_number_are_refused():
 
 
 def test_a_full_disk_is_told_in_words(monkeypatch):
-    monkeypatch.setattr("liftcore.solve.memory.lack_of_disk", lambda size: "0.0 GiB of disk")
+    monkeypatch.setattr("liftcore.runtime.memory.lack_of_disk", lambda size: "0.0 GiB of disk")
     with pytest.raises(Unavailable, match="GiB of memory for them, or of disk"):
         views()[0].in_files()

@@ -1,0 +1,393 @@
+"""What is in any file of ours, and what looks wrong with it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from liftcore.errors import InvalidInput, InvalidTable
+from liftcore.evaluate.class_masks import describe_masks
+from liftcore.features.smoothness import some_grids, unlike_maps
+from liftcore.io.cameras import TRANSFORMS, camera_source, has_nerfstudio_beside, other_models, read_cameras
+from liftcore.io.kinds import SplatFormat, identify
+from liftcore.io.ply import nearest_dialect
+from liftcore.io.splats import format_of, read_splats, splat_files
+from liftcore.io.transforms import FRAME_FILE
+from liftcore.scene.cameras import Cameras, distortion_warning, photo_size
+from liftcore.scene.compositing import ALPHA_FLOOR
+from liftcore.scene.splats import Kernel, Splats
+from liftcore.solve.diagnostics import UNSEEN
+from liftcore.text.table import plain
+from liftcore.values.pack import read_features
+from liftcore.values.views import NO_LABEL, Regions
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from liftcore.values.lift import Lift, LiftMetadata
+    from liftcore.values.pack import Views
+    from liftcore.values.views import ViewFeatures
+
+ANY_KIND = "splats, cameras, features, masks, a text table or a lift"
+QUANTILES = {"min": 0.0, "q01": 0.01, "median": 0.5, "q99": 0.99, "max": 1.0}
+FAR = 1e5  # scene units; float32 resolves only a hundredth there
+TINY = 1e-7  # scene units
+LARGEST = 1e300  # shown in place of what overflows, which JSON cannot hold
+OFF_CENTRE = 0.1  # of the image's side
+OTHER_FRAME = (
+    f"the COLMAP model was read, and beside it lies nerfstudio's {TRANSFORMS}, which is in another frame: if "
+    f"nerfstudio trained the splats, put its run's {FRAME_FILE} beside them"
+)
+SHOWN = 3  # names in a warning
+MANY = 100  # splats: what all of so many have in common is no accident
+FLAT = 100  # times thinner than wide: what converters make of discs
+NARROW = 4  # times longer than wide, or wider: photos are not
+UNIT_TOLERANCE = 0.01  # a float16 unit vector of 512 channels is within it
+
+
+def inspect_file(path: Path) -> dict[str, Any]:
+    """Describe a file of splats, cameras, features, masks, a lift or a table of text embeddings.
+
+    Returns:
+        ``kind``, ``bytes``, counts and ranges of the kind, and ``warnings``: what looks wrong.
+
+    Raises:
+        InvalidInput: the file is missing, malformed or none of these.
+    """
+    if not path.exists():
+        raise InvalidInput(str(path), expected="a file or a folder", got="nothing of that name")
+    found = identify(path)
+    describe, files_of = DESCRIPTIONS.get(found.kind or "", (None, None))
+    if describe is None or files_of is None:
+        if not found.recognised and (path.is_dir() or path.suffix.lower() == ".json"):
+            describe_camera_file(path)  # raises with what cameras lack
+        raise InvalidInput(str(path), expected=ANY_KIND, got=found.name, hint=found.hint)
+    description = describe(path)  # first: a reader says better which of its files is not there
+    size = sum(file.stat().st_size for file in files_of(path))
+    return {"kind": found.kind, "bytes": size, **description}
+
+
+def describe_lift_file(path: Path) -> dict[str, Any]:
+    """`describe_lift` of a file or a folder of shards.
+
+    Raises:
+        InvalidLift: it is malformed.
+    """
+    from liftcore.values.lift_file import open_lift
+
+    return describe_lift(open_lift(path))
+
+
+def _files_of_lift(path: Path) -> list[Path]:
+    return sorted(path.iterdir()) if path.is_dir() else [path]
+
+
+def _refuse_photos(path: Path) -> dict[str, Any]:
+    hint = "'splatlift encode' and 'splatlift pack masks' make features of photos"
+    raise InvalidInput(str(path), expected=ANY_KIND, got="photos", hint=hint)
+
+
+def describe_splat_file(path: Path) -> dict[str, Any]:
+    """`describe_splats` of a file; the dialect of what is no PLY is its format.
+
+    Raises:
+        InvalidSplats: the file is malformed.
+    """
+    found, splats = format_of(path), read_splats(path)
+    return describe_splats(splats) | ({} if found is SplatFormat.PLY else {"dialect": found.value})
+
+
+def describe_splats(splats: Splats) -> dict[str, Any]:
+    """Counts, ranges (after activation) and warnings of splats."""
+    low, high = splats.means.amin(dim=0), splats.means.amax(dim=0)
+    opacities = torch.sigmoid(splats.opacity_logits)
+    scales = torch.exp(splats.log_scales.double()).clamp(max=LARGEST)
+    return {
+        "splats": splats.count,
+        "kernel": splats.kernel.value,
+        "dialect": nearest_dialect(splats.layout),
+        "render_mode": None if splats.render_mode is None else splats.render_mode.model.value,
+        "render_mode_source": None if splats.render_mode is None else splats.render_mode.source,
+        "sh_degree": splats.sh_degree,
+        "extras": sorted(splats.extras),
+        "box": [low.tolist(), high.tolist()],
+        "scales": _quantiles(scales),
+        "opacities": _quantiles(opacities),
+        "warnings": _splat_warnings(splats, scales, opacities),
+    }
+
+
+def describe_camera_file(path: Path) -> dict[str, Any]:
+    """The same of a camera file or folder, with a warning of what in it was not read.
+
+    Raises:
+        InvalidCameras: the file is malformed.
+    """
+    found, others = describe_cameras(read_cameras(path)), other_models(path)
+    if others:
+        found["warnings"].append(f"{len(others)} more COLMAP models were not read: {', '.join(others[:SHOWN])}")
+    if found["frame"] is None:
+        found["warnings"] += [OTHER_FRAME] if has_nerfstudio_beside(path) else []
+    return found
+
+
+def describe_cameras(cameras: Cameras) -> dict[str, Any]:
+    """Counts, ranges and warnings of cameras."""
+    centres = np.stack([camera.centre for camera in cameras.values()])
+    sizes = sorted({"{}x{}".format(*photo_size(camera)) for camera in cameras.values()})
+    focals = [focal for camera in cameras.values() for focal in (camera.fx, camera.fy)]
+    return {
+        "views": len(cameras),
+        "names": list(cameras),
+        "sizes": sizes,
+        "distorted": len(cameras.distorted),
+        "frame": cameras.frame,
+        "focal_lengths": {"min": min(focals), "max": max(focals)},
+        "box": [centres.min(axis=0).tolist(), centres.max(axis=0).tolist()],
+        "warnings": _camera_warnings(cameras, centres),
+    }
+
+
+def _quantiles(values: Tensor) -> dict[str, float]:
+    # torch.quantile refuses large inputs; numpy's partition does not.
+    flat = values.double().flatten().cpu().numpy()
+    found = np.quantile(flat, list(QUANTILES.values()), method="nearest")
+    return dict(zip(QUANTILES, found.tolist(), strict=True))
+
+
+def _splat_warnings(splats: Splats, scales: Tensor, opacities: Tensor) -> list[str]:
+    zero_quats = int((splats.quats == 0).all(dim=1).sum())
+    extent = float((splats.means.amax(dim=0).double() - splats.means.amin(dim=0)).max())
+    large = int((scales.amax(dim=1) > extent).sum()) if splats.count > 1 and extent > 0 else 0
+    tiny = int((scales.amax(dim=1) < TINY).sum())
+    far = int((splats.means.abs().amax(dim=1) > FAR).sum())
+    faint = int((opacities < ALPHA_FLOOR).sum()) if splats.kernel is not Kernel.BETA else 0
+    counted = {
+        "have a zero quaternion, which counts as no rotation": zero_quats,
+        "are larger than the scene": large,
+        f"are smaller than {TINY:g} scene units on every axis": tiny,
+        f"lie further than {FAR:g} scene units from the origin, where float32 is coarse": far,
+        "have an opacity below 1/255 and are never seen": faint,
+    }
+    warnings = [*splats.warnings]
+    warnings += [f"{count} of {splats.count} splats {what}" for what, count in counted.items() if count]
+    warnings += _reading_warnings(splats)
+    if splats.sh is None:
+        warnings.append("no colour: renders in RGB are not possible")
+    if splats.kernel is Kernel.GAUSSIAN_3D and bool((scales[:, 2] * FLAT < scales[:, :2].amin(dim=1)).all()):
+        warnings.append("every splat is flat along its third axis: if they are discs of 2DGS, lift with kernel=2dgs")
+    return warnings
+
+
+def _reading_warnings(splats: Splats) -> list[str]:
+    """Files that may mean something else than they say."""
+    warnings, many = [], splats.count >= MANY
+    logits = splats.opacity_logits
+    if many and bool(((logits >= 0) & (logits <= 1)).all()):
+        warnings.append(
+            "all opacities lie between 0 and 1, as if they were no logits: sigmoid makes them 0.5 to 0.73"
+        )
+    if many and bool((splats.log_scales > 0).all()):
+        warnings.append("all scales are above 0, as if they were no logarithms: exp makes them larger than 1")
+    return warnings
+
+
+def _camera_warnings(cameras: Cameras, centres: np.ndarray) -> list[str]:
+    photos = {camera.name: camera.lens or camera for camera in cameras.values()}
+    off = [
+        name
+        for name, photo in photos.items()
+        if abs(photo.cx / photo.width - 0.5) > OFF_CENTRE or abs(photo.cy / photo.height - 0.5) > OFF_CENTRE
+    ]
+    warnings = distortion_warning(list(cameras.values())) + list(cameras.warnings)
+    if off:
+        warnings.append(f"{len(off)} views have their principal point far off the centre, such as {off[0]!r}")
+    places = len(np.unique(centres, axis=0))
+    if places < len(cameras):
+        warnings.append(f"{len(cameras)} views share {places} places")
+    return warnings
+
+
+@dataclass(frozen=True)
+class _ViewFacts:
+    """What is counted of a view."""
+
+    is_regions: bool
+    size: str
+    sides: tuple[int, int]  # width and height of the map
+    rows: int  # of the codebook, or cells
+    zero: int  # rows without a length
+    unused: int  # rows that no label reads
+    unlabelled: float  # share of the labels
+    norms: tuple[float, float] | None  # the least and largest of rows with a length
+    alone: bool = False  # whether all labels are of one region
+
+
+def describe_packs(packs: Views) -> dict[str, Any]:
+    """Read every view: counts, ranges and warnings of feature packs."""
+    found = [_view_facts(view) for view in packs.values()]
+    regions = [view for view in found if view.is_regions]
+    norms = [view.norms for view in found if view.norms is not None] or [(0.0, 0.0)]
+    low, high = min(least for least, _ in norms), max(largest for _, largest in norms)
+    return {
+        "views": len(packs),
+        "names": list(packs),
+        "region_maps": len(regions),
+        "grids": len(found) - len(regions),
+        "channels": packs.channels,
+        "encoder": packs.encoder,
+        "text_space": packs.text_space,
+        "normalised": packs.normalised,
+        "sizes": sorted({view.size for view in found}),
+        "codebook_rows": sum(view.rows for view in found),
+        "norms": {"min": low, "max": high},
+        "unlabelled": sum(view.unlabelled for view in regions) / len(regions) if regions else 0.0,
+        "warnings": [*_pack_warnings(packs, found, low, high), *unlike_maps(some_grids(packs, packs.views))],
+    }
+
+
+def _view_facts(view: ViewFeatures) -> _ViewFacts:
+    norms = torch.linalg.vector_norm(view.codebook, dim=1, dtype=torch.float64)
+    long = norms[norms > 0]
+    ends = (float(long.min()), float(long.max())) if len(long) else None
+    rows, zero = len(norms), len(norms) - len(long)
+    if not isinstance(view, Regions):
+        height, width, _ = view.grid.shape
+        return _ViewFacts(False, f"{width}x{height} cells", (width, height), rows, zero, 0, 0.0, ends)
+    levels, height, width = view.labels.shape
+    unused = int((torch.bincount(view.labels.flatten() - NO_LABEL, minlength=rows + 1)[1:] == 0).sum())
+    unlabelled = float((view.labels == NO_LABEL).float().mean())
+    size = f"{levels} levels of {width}x{height}"
+    alone = bool((view.labels == view.labels[0, 0, 0]).all()) and unlabelled == 0.0
+    return _ViewFacts(True, size, (width, height), rows, zero, unused, unlabelled, ends, alone)
+
+
+def _pack_warnings(packs: Views, found: list[_ViewFacts], low: float, high: float) -> list[str]:
+    rows = sum(view.rows for view in found)
+    zero = sum(view.zero for view in found)
+    unused = sum(view.unused for view in found)
+    empty = sum(view.unlabelled == 1.0 for view in found)
+    unit = abs(low - 1) < UNIT_TOLERANCE and abs(high - 1) < UNIT_TOLERANCE
+    warnings = []
+    if packs.normalised and not unit:
+        warnings.append(f"the pack says normalised, but its vectors have norms from {low:.4g} to {high:.4g}")
+    if packs.normalised is None and not unit:
+        warnings.append(f"unnormalised vectors: their norms, from {low:.4g} to {high:.4g}, weigh in a lift")
+    if zero:
+        warnings.append(f"{zero} of {rows} codebook rows are zero")
+    if unused:
+        warnings.append(f"{unused} of {rows} codebook rows are read by no label")
+    if empty:
+        warnings.append(f"{empty} views have no label at all")
+    if len(alone := [view for view in found if view.alone]) > len(found) / 2:
+        warnings.append(
+            f"{len(alone)} views have one region alone, over all of their pixels: masks tell nothing apart"
+        )
+    if not packs.encoder:
+        warnings.append("the pack does not name its encoder")
+    narrow = next((view for view in found if max(view.sides) > NARROW * min(view.sides)), None)
+    if narrow is not None:
+        shape = f"maps of {narrow.size}, which few images are like"
+        warnings.append(f"{shape}: where channels come first, pack them with --layout chw")
+    return warnings
+
+
+def describe_lift(lift: Lift) -> dict[str, Any]:
+    """Counts, ranges, how it was made, and warnings of a lift."""
+    metadata = lift.metadata
+    count, channels = lift.features.shape
+    return {
+        "splats": count,
+        "channels": channels,
+        "dtype": str(lift.features.dtype).removeprefix("torch."),
+        "seen_share": float(lift.seen.float().mean()),
+        "evidence": _ends(lift.evidence),
+        "agreement": _ends(lift.agreement[lift.seen]),
+        "encoder": metadata.encoder,
+        "text_space": metadata.text_space,
+        "views": len(metadata.views),
+        "settings": metadata.settings.model_dump(mode="json"),
+        "certificate": metadata.certificate,
+        "timings": metadata.timings,
+        "version": metadata.version,
+        "inputs": [file.path for file in (metadata.splats, metadata.cameras, *metadata.features)],
+        "warnings": _lift_warnings(lift, metadata),
+    }
+
+
+def _ends(values: torch.Tensor) -> dict[str, float]:
+    if not len(values):
+        return {}
+    low, high = torch.aminmax(values)
+    return {"min": float(low), "mean": float(values.mean()), "max": float(high)}
+
+
+def _lift_warnings(lift: Lift, metadata: LiftMetadata) -> list[str]:
+    count = len(lift.features)
+    unseen = int((~lift.seen).sum())
+    bad = int((~torch.isfinite(lift.features)).any(dim=1).sum())
+    warnings = list(metadata.certificate.get("warnings", ()))
+    if unseen:
+        warnings.append(f"{unseen} of {count} {UNSEEN}")
+    if bad:
+        warnings.append(f"{bad} of {count} splats have features that are not finite")
+    for name, file in (("splats", metadata.splats), ("cameras", metadata.cameras)):
+        if not Path(file.path).exists():
+            warnings.append(f"the {name} are no longer at {file.path}")
+    return list(dict.fromkeys(warnings))
+
+
+def describe_table(path: Path) -> dict[str, Any]:
+    """Counts, ranges and warnings of a table of text embeddings that opens, be it fit for use or not.
+
+    Raises:
+        InvalidTable: there is more in the file, so that it may be of another kind too.
+    """
+    from safetensors import safe_open
+
+    with safe_open(str(path), framework="pt") as handle:
+        more = sorted({*handle.keys()} - {"embeddings"})
+        if more:
+            raise InvalidTable(str(path), expected="embeddings alone", got=f"{more[0][:80]!r} beside them")
+        embeddings, metadata = handle.get_tensor("embeddings"), handle.metadata() or {}
+    norms = torch.linalg.vector_norm(embeddings.float().reshape(len(embeddings), -1), dim=1)
+    words = _words(metadata)
+    warnings = [] if len(words) == len(embeddings) else [f"{len(words)} words for {len(embeddings)} rows"]
+    if int((norms == 0).sum()):
+        warnings.append(f"{int((norms == 0).sum())} rows are zero")
+    if twice := len(words) - len(set(map(plain, words))):
+        warnings.append(f"{twice} of {len(words)} words come again, and only their first row is read")
+    return {
+        "rows": len(embeddings),
+        "channels": embeddings.shape[-1],
+        "encoder": metadata.get("encoder", metadata.get("model", "")),
+        "words": words,
+        "norms": _ends(norms),
+        "warnings": warnings,
+    }
+
+
+def _words(metadata: dict[str, str]) -> list[str]:
+    try:
+        words = json.loads(metadata.get("words", "[]"))
+    except ValueError:
+        return []
+    return [str(word) for word in words] if isinstance(words, list) else []
+
+
+# By kind: how a file is described, and the files whose bytes count.
+DESCRIPTIONS: dict[str, tuple[Callable[[Path], dict[str, Any]], Callable[[Path], list[Path]]]] = {
+    "splats": (describe_splat_file, splat_files),
+    "cameras": (describe_camera_file, lambda path: camera_source(path).files),
+    "features": (lambda path: describe_packs(read_features(path)), lambda path: [path]),
+    "masks": (describe_masks, lambda path: [path]),
+    "table": (describe_table, lambda path: [path]),
+    "lift": (describe_lift_file, _files_of_lift),
+    "photos": (_refuse_photos, lambda path: [path]),
+}

@@ -1,0 +1,31 @@
+"""Where a lift's blocks of views and of splats are worked on: in this process, or by the workers of a Ray cluster."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from liftcore.errors import InvalidSettings
+
+if TYPE_CHECKING:
+    from liftcore.lifting.engines.base import Engine
+
+ENGINES = ("local", "ray")
+
+
+def engine_named(name: str | None, address: str | None = None, threads: int | None = None) -> Engine | None:
+    """The engine of that name; None for none.
+
+    Raises:
+        InvalidSettings: there is none, or an address without Ray. Unavailable: as `RayEngine` has it.
+    """
+    if name is not None and name not in ENGINES:
+        raise InvalidSettings("engine", expected=" or ".join(ENGINES), got=repr(name)[:80])
+    if address is not None and name != "ray":
+        raise InvalidSettings("address", expected="an address beside the engine ray alone", got=f"engine {name}")
+    if name == "ray":
+        from liftcore.lifting.engines.ray import RayEngine
+
+        return RayEngine(address)
+    from liftcore.lifting.engines.base import LocalEngine
+
+    return LocalEngine(threads) if name == "local" else None

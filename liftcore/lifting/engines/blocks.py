@@ -1,0 +1,235 @@
+"""A lift in blocks: the job that all workers know, and its first step, W of a few views. Files in, files out.
+
+**Weighing** (`weigh`) reads WEIGHED views and writes a file each: its ``W = A'^T S`` (`RegionWeights`), the codebook
+E of its regions, and its sampled rays. It holds the splats that its views can see, and no others.
+
+What follows on the views' files are the steps of `lifting.engines.steps`, whose pieces are views or blocks of splats.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from liftcore.io.safetensors_file import map_tensors, write_tensors
+from liftcore.io.shards import ROWS, features_file
+from liftcore.lifting.geometry import Question, question_of
+from liftcore.lifting.warm_up import warm_up_lift
+from liftcore.raster import open_raster
+from liftcore.raster.base import RayRows, ViewWeights
+from liftcore.raster.cpu.project import COLUMNS, Targets, activated, project, view_of
+from liftcore.runtime.device import choose_device
+from liftcore.runtime.one_thread import one_thread
+from liftcore.scene.cameras import Camera, Cameras
+from liftcore.scene.kernel import Kernel
+from liftcore.scene.splats import Splats
+from liftcore.solve.codebook import ViewCodebook
+from liftcore.solve.rays import Readout, SampledRays
+from liftcore.values.lift_views import LiftViews
+from liftcore.values.pack import pair, read_features
+from liftcore.values.region_weights import RegionWeights, run_each
+from liftcore.values.settings import LiftSettings
+
+WEIGHED = 8  # views of a piece: some seconds of work, which is what a worker that dies loses
+SELECTED = 1 << 22  # splats beyond which a worker holds only those that its views see: 1 GB as the raster has them
+STEP = 1 << 18  # splats that are looked at together for it
+SCENE = "scene.safetensors"
+
+
+@dataclass(frozen=True)
+class Job:
+    """A lift in blocks, as every worker knows it. Paths lead to the same files for all of them."""
+
+    folder: Path  # where pieces are written
+    packs: tuple[Path, ...]  # of the features
+    cameras: Cameras
+    names: tuple[str, ...]  # of the views, in the order of the sums
+    settings: LiftSettings
+    kernel: Kernel
+    splats: int  # P
+    channels: int  # F
+    dtype: torch.dtype = torch.float16  # of X
+    selected: int = SELECTED
+    rows: int = ROWS  # of a block of splats: pieces of sums, and whole pages of X
+    step: int = 0  # of those that are taken several times
+    related: bool = False  # whether tuples of masks are needed
+    usual_share: float | None = None  # the mean share of mask consensus; None where there is none
+    by_region: bool = False  # whether regions are weighted as a whole
+    delta: float | None = None  # of Huber's loss
+    clusters: int = 0  # whose features splats may take
+    guarded: bool = False  # whether they do where it explains them
+
+    @property
+    def weighings(self) -> int:
+        """Pieces of views."""
+        return -(-len(self.names) // WEIGHED)
+
+    @property
+    def solutions(self) -> int:
+        """Pieces of splats."""
+        return -(-self.splats // self.rows)
+
+    def view_file(self, number: int) -> Path:
+        """What was found of the view of that number."""
+        return self.folder / f"view-{number:05}.safetensors"
+
+    def views_of(self, piece: int) -> range:
+        """The numbers of the views of a piece."""
+        return range(WEIGHED * piece, min(WEIGHED * (piece + 1), len(self.names)))
+
+    def piece_file(self, step: str, number: int) -> Path:
+        """What a step wrote of a piece."""
+        return self.folder / f"{step}-{number:05}.safetensors"
+
+    def solved_file(self, number: int) -> Path:
+        """X of a range of splats as it is solved; splats may take other features then."""
+        return self.piece_file("solved", number) if self.clusters else self.features_file(number)
+
+    def features_file(self, number: int) -> Path:
+        """X of a range of splats."""
+        return self.folder / "lift" / features_file(number)
+
+    def columns_file(self, number: int) -> Path:
+        """What else is known of these splats."""
+        return self.folder / f"columns-{number:05}.safetensors"
+
+
+class FoundView(NamedTuple):
+    """What a weighing wrote of a view."""
+
+    weights: RegionWeights
+    codebook: ViewCodebook
+    sample: SampledRays
+    levels: np.ndarray  # [M] i8, as `Geometry` has them
+
+
+# ---- weighing
+
+
+@one_thread()
+def weigh(job: Job, piece: int, threads: int | None) -> None:
+    """Write W, E and sampled rays of a few views; those that lie there already are left as they are.
+
+    Raises:
+        InvalidFeatures: a view is malformed.
+    """
+    numbers = [number for number in job.views_of(piece) if not job.view_file(number).exists()]
+    if not numbers:
+        return
+    device = choose_device(job.settings.device)
+    views = LiftViews(job.cameras, pair(_packs(*job.packs), job.cameras)[0], list(job.names), [])
+    cameras = [views.camera(number) for number in numbers]
+    splats, ids = seen_splats(job, cameras, threads)
+    warm_up_lift(job.kernel, device, job.settings)
+    raster = open_raster(splats, device, threads)
+    waiting = deque[Question]()
+
+    def requests():
+        for number in numbers:
+            waiting.append(question_of(views, number, job.settings, by_rows=job.settings.weighs_rows))
+            yield waiting[-1].request
+
+    with closing(raster.iterate_views(requests())) as found:
+        for number, view in zip(numbers, found, strict=True):
+            asked = waiting.popleft()
+            weights = asked.weights(_renumbered(view, ids)).cpu()
+            _write_view(
+                job.view_file(number), weights, asked, replace(view.rows, splats=ids[view.rows.splats.long()])
+            )
+
+
+def seen_splats(job: Job, cameras: list[Camera], threads: int | None) -> tuple[Splats, Tensor]:
+    """The splats that any of the cameras may show, as the raster's own projection decides, and their numbers [n] i32.
+
+    All of them where they are few, and the first alone where none is in sight. Their order stays, so rays meet the
+    same splats one after the other as in the whole scene.
+    """
+    scene = scene_of(job)
+    if job.splats <= job.selected:
+        return scene, torch.arange(job.splats, dtype=torch.int32)
+    params, seen = job.settings.lift_params, np.zeros(job.splats, bool)
+    views = [view_of(camera, params) for camera in cameras]
+
+    def look(first: int, last: int) -> None:
+        some = activated(_rows(scene, slice(first, last)), params.opacity_logit_scale)
+        count = last - first
+        room = np.empty((count, COLUMNS[job.kernel])), np.empty(count, np.float32), np.empty(count, np.int32)
+        targets = Targets(*room)
+        for view in views:
+            found = project((0, count), some, view, job.kernel, params.antialiased, targets)
+            seen[first + targets.ids[:found]] = True
+
+    run_each(look, [(first, min(first + STEP, job.splats)) for first in range(0, job.splats, STEP)], threads)
+    ids = np.flatnonzero(seen).astype(np.int32)
+    ids = ids if ids.size else np.zeros(1, np.int32)
+    return _rows(scene, torch.from_numpy(ids).long()), torch.from_numpy(ids)
+
+
+def write_scene(splats: Splats, path: Path) -> None:
+    """Write the geometry of splats for workers to map."""
+    tensors = {name: getattr(splats, name) for name in ("means", "quats", "log_scales", "opacity_logits", "beta")}
+    write_tensors(path, {name: tensor.cpu() for name, tensor in tensors.items() if tensor is not None}, {})
+
+
+def scene_of(job: Job) -> Splats:
+    """The geometry of all splats, mapped."""
+    path = job.folder / SCENE
+    return _scene(path, file_version(path), job.kernel)
+
+
+def file_version(path: Path) -> tuple[int, int]:
+    """What tells a file from one that was in its place before."""
+    found = path.stat()
+    return found.st_mtime_ns, found.st_ino
+
+
+@lru_cache(maxsize=1)
+def _scene(path: Path, _version: tuple[int, int], kernel: Kernel) -> Splats:
+    found = {name: torch.from_numpy(array) for name, array in map_tensors(path)[0].items()}
+    means, quats, log_scales, logits = (found[name] for name in ("means", "quats", "log_scales", "opacity_logits"))
+    return Splats(means, quats, log_scales, logits, kernel, beta=found.get("beta"))
+
+
+def _rows(splats: Splats, rows: slice | Tensor) -> Splats:
+    beta = None if splats.beta is None else splats.beta[rows]
+    parts = splats.means[rows], splats.quats[rows], splats.log_scales[rows], splats.opacity_logits[rows]
+    return Splats(*parts, splats.kernel, beta=beta)
+
+
+_packs = lru_cache(maxsize=1)(read_features)  # whose headers are read once a worker
+
+
+def _renumbered(view: ViewWeights, ids: Tensor) -> ViewWeights:
+    """The same with the scene's numbers of its splats."""
+    weights = view.weights
+    numbers = ids.to(weights.device)
+    own = {name: numbers[getattr(weights, name).long()] for name in ("splats", "evidence_splats")}
+    return replace(view, weights=replace(weights, **own))
+
+
+# A view's file: W by the names of its own, and beside it the codebook and the sampled rays.
+
+
+def _write_view(path: Path, weights: RegionWeights, asked: Question, rows: RayRows) -> None:
+    readout, tuples = asked.readout, asked.codebook.tuples
+    others = {f"rays/{name}": getattr(rows, name) for name in ("indptr", "splats", "weights")}
+    others |= {f"read/{name}": torch.from_numpy(getattr(readout, name)) for name in ("rays", "columns", "shares")}
+    others |= {"codebook": asked.codebook.rows, "levels": torch.from_numpy(asked.levels)}
+    weights.save(path, others | ({} if tuples is None else {"tuples": tuples}))
+
+
+def read_view(path: Path) -> FoundView:
+    """What a weighing wrote, mapped."""
+    weights, others = RegionWeights.load_with_others(path)
+    rows = RayRows(**{name: others[f"rays/{name}"] for name in ("indptr", "splats", "weights")})
+    readout = Readout(**{name: others[f"read/{name}"].numpy() for name in ("rays", "columns", "shares")})
+    codebook, sample = ViewCodebook(others["codebook"], others.get("tuples")), SampledRays(rows, readout)
+    return FoundView(weights, codebook, sample, others["levels"].numpy())

@@ -1,0 +1,468 @@
+"""The steps of a lift in blocks after its views are weighed, of pieces of views or of blocks of splats.
+
+A step is a function ``(job, piece, threads)`` that reads what earlier ones wrote, and writes one file, whole or not
+at all. What is summed over the scene is written by pieces of splats (`liftcore.solve.sums`) and added up by the
+driver (`lifting.engines.lift`), which shares what it finds as files too. So the bits are those of a lift in memory.
+
+    step      piece of   writes
+    relate    views      which regions their splats belong to, as tuples (`liftcore.solve.consensus`)
+    gather    splats     W of all views, a row a splat, its sums and evidence; the tuples of all views
+    contain   views      which regions contain theirs (`liftcore.solve.objects`)
+    label     splats     the object of each splat, and what it weighs in other regions and in views
+    share     views      what other views say of the entries of theirs (`liftcore.solve.consensus`)
+    compare   splats     cosines of regions with the other views (`liftcore.solve.reweight`)
+    measure   splats     distances of regions from features (`liftcore.solve.loss`)
+    solve     splats     X, and what supports it
+    spread    splats     X with the features of clusters (`liftcore.solve.aggregate`)
+
+A worker holds one piece: W of some views or of a block, in mapped files where it is large, and tables of the size of
+M, of which those of codebooks and directions are at most TABLE_BYTES.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from liftcore.io.safetensors_file import map_tensors, write_tensors
+from liftcore.io.shards import shard_at, write_rows
+from liftcore.lifting.engines.blocks import Job, file_version, read_view, scene_of
+from liftcore.runtime.device import choose_device
+from liftcore.runtime.memory import zeros
+from liftcore.runtime.one_thread import one_thread
+from liftcore.solve.aggregate import cluster_sums, guard, with_feature
+from liftcore.solve.aggregate import spread as give_features
+from liftcore.solve.closed_form import solve_rows
+from liftcore.solve.codebook import Codebook, ViewCodebook
+from liftcore.solve.consensus import SplatTuples, along_curve, region_shares, splat_tuples, with_mean
+from liftcore.solve.directions import StoredDirections, region_totals
+from liftcore.solve.loss import RegionDistances, huber_factors
+from liftcore.solve.membership import RegionGroups, memberships
+from liftcore.solve.objects import (
+    node_views,
+    object_labels,
+    object_shares,
+    sampled_nodes,
+    sampled_splats,
+    view_shares,
+)
+from liftcore.solve.reweight import SceneAgreement, ViewConsistency, reweighted
+from liftcore.solve.rows import SomeRows, fill_rows, row_starts, take_rows
+from liftcore.solve.sums import PieceSums, packed
+from liftcore.values.region_weights import MEMORY_LIMIT, RegionWeights
+
+# What the driver shares, of the size of M.
+REGIONS = "regions.safetensors"  # offsets [V + 1] i64, levels [M] i8
+CODEBOOK = "codebook.safetensors"  # rows/v [M_v, F] and, where regions are tuples of rows, tuples/v [T_v, L] i32
+TUPLES = "tuples.safetensors"  # bases [pieces] i64, parents and members [T] i32
+CURVE = "curve.safetensors"  # bounds [2, 3] f64 of the splats with weight
+NODES = "nodes.safetensors"  # nodes and others, i64
+CLUSTERS = "clusters.safetensors"  # clusters [M] i32; merged [K, F] of the aggregation
+AGREEMENT = "agreement-{}.safetensors"  # regions [M] f32, numbers [3] f64
+
+
+def mapped(path: Path) -> dict[str, Any]:
+    """The arrays of a file, by name; mapped anew where another has taken its place."""
+    return _mapped(path, file_version(path))
+
+
+@lru_cache(maxsize=4)
+def _mapped(path: Path, _version: tuple[int, int]) -> dict[str, np.ndarray]:
+    return map_tensors(path)[0]
+
+
+def codebook_of(job: Job) -> Codebook:
+    """E of all views, mapped."""
+    path = job.folder / CODEBOOK
+    return _codebook(path, file_version(path), len(job.names))
+
+
+@lru_cache(maxsize=1)
+def _codebook(path: Path, _version: tuple[int, int], views: int) -> Codebook:
+    tensors = {name: torch.from_numpy(array) for name, array in map_tensors(path)[0].items()}
+    return Codebook([ViewCodebook(tensors[f"rows/{v}"], tensors.get(f"tuples/{v}")) for v in range(views)])
+
+
+def offsets_of(job: Job) -> np.ndarray:
+    """[V + 1] i64, the first region of each view."""
+    return mapped(job.folder / REGIONS)["offsets"]
+
+
+def groups_of(job: Job) -> RegionGroups:
+    """The view and the level of each region."""
+    return RegionGroups.of(offsets_of(job), mapped(job.folder / REGIONS)["levels"])
+
+
+def write_piece(path: Path, arrays: dict[str, Any], sums: Sequence[PieceSums] | None = None) -> None:
+    """Write the arrays or tensors of a piece, and sums of its pieces of splats."""
+    tensors = {name: part if isinstance(part, Tensor) else torch.from_numpy(part) for name, part in arrays.items()}
+    write_tensors(path, tensors | (packed(sums) if sums else {}), {})
+
+
+# ---- blocks of views
+
+
+class ViewBlock(NamedTuple):
+    """The splats of a piece of views, and W of these views."""
+
+    base: int  # the first of their regions
+    splats: np.ndarray  # [n] i32 ascending
+    W: RegionWeights  # a row for each, regions with the numbers that they have in all views
+
+
+def _view_block(job: Job, piece: int) -> ViewBlock:
+    numbers, offsets = job.views_of(piece), offsets_of(job)
+    parts = [read_view(job.view_file(number)).weights for number in numbers]
+    splats = np.unique(np.concatenate([part.splats.numpy() for part in parts]))
+    rows = [
+        SomeRows(
+            np.searchsorted(splats, part.splats.numpy()),
+            part.indptr.numpy(),
+            [part.region.numpy() + np.int32(offsets[number]), part.weight.numpy()],
+        )
+        for number, part in zip(numbers, parts, strict=True)
+    ]
+    own = offsets[numbers.start : numbers.stop + 1] - offsets[numbers.start]
+    return ViewBlock(int(offsets[numbers.start]), splats, _weights(lambda: rows, splats.size, own))
+
+
+def _weights(parts: Callable[[], Iterable[SomeRows]], count: int, offsets: np.ndarray) -> RegionWeights:
+    """W of so many splats from rows of regions and weights."""
+    starts = row_starts(parts(), count)
+    region, weight = _values(int(starts[-1]), torch.int32), _values(int(starts[-1]), torch.float32)
+    fill_rows(parts(), starts, [region.numpy(), weight.numpy()])
+    every, none = torch.arange(count, dtype=torch.int32), torch.zeros(0, dtype=torch.int32)
+    return RegionWeights(
+        every, torch.from_numpy(starts), region, weight, none, torch.zeros(0), torch.from_numpy(offsets)
+    )
+
+
+def _values(count: int, dtype: torch.dtype) -> Tensor:
+    """Zeros [n], in a mapped file where they are many."""
+    return zeros((count,), dtype, name="weights", in_file=count * dtype.itemsize > MEMORY_LIMIT >> 1)
+
+
+@one_thread()
+def relate(job: Job, piece: int, threads: int | None) -> None:
+    """Write the tuples of the splats of some views, and how many splats belong to each of their regions."""
+    path = job.piece_file("relate", piece)
+    if path.exists():
+        return
+    block, groups = _view_block(job, piece), groups_of(job)
+    own = memberships(block.W, groups, threads).own
+    tuples = splat_tuples(block.W, own, groups, np.arange(block.splats.size), threads)
+    sizes = np.bincount(block.W.region.numpy()[own] - block.base, minlength=int(block.W.offsets[-1]))
+    arrays = {"splats": block.splats, "sizes": sizes}
+    arrays |= {name: getattr(tuples, name) for name in ("starts", "tuples", "parents", "members")}
+    write_piece(path, arrays)
+
+
+def _tuples_of(job: Job, splats: np.ndarray) -> tuple[SplatTuples, np.ndarray]:
+    """The tuples of some splats [n] ascending, in all views, and their t_j [n] f64."""
+    ends = np.searchsorted(splats, np.arange(job.solutions + 1) * job.rows)
+    starts, totals = np.zeros(splats.size + 1, np.int64), np.zeros(splats.size)
+    for target in (None, "filled"):
+        tuples = _values(int(starts[-1]) if target else 0, torch.int32).numpy()
+        for block, (first, last) in enumerate(pairwise(ends.tolist())):
+            if first == last:
+                continue
+            arrays, rows = map_tensors(job.piece_file("tuples", block))[0], splats[first:last] - block * job.rows
+            if target is None:
+                starts[first + 1 : last + 1] = np.diff(arrays["starts"])[rows]
+                totals[first:last] = arrays["totals"][rows]
+            else:
+                tuples[starts[first] : starts[last]] = take_rows(arrays["starts"], rows, arrays["tuples"])[1]
+        if target is None:
+            np.cumsum(starts, out=starts)
+    named = mapped(job.folder / TUPLES)
+    return SplatTuples(starts, tuples, named["parents"], named["members"]), totals
+
+
+def _taken(tuples: SplatTuples, rows: np.ndarray) -> SplatTuples:
+    return SplatTuples(*take_rows(tuples.starts, rows, tuples.tuples), tuples.parents, tuples.members)
+
+
+@one_thread()
+def contain(job: Job, piece: int, threads: int | None) -> None:
+    """Write what the levels and views of all nodes say of those of some views."""
+    path = job.piece_file("contain", piece)
+    if path.exists():
+        return
+    block, groups, nodes = _view_block(job, piece), groups_of(job), mapped(job.folder / NODES)["nodes"]
+    own = memberships(block.W, groups, threads).own
+    begins, rows = sampled_splats(block.W, own, nodes, block.base)
+    local, numbers = np.unique(rows, return_inverse=True)
+    tuples, totals = _tuples_of(job, block.splats[local])
+    found = node_views(
+        sampled_nodes(begins, numbers, tuples, totals, nodes, groups.view.size), nodes, groups, threads
+    )
+    write_piece(path, {"container": found.container, "sees": found.sees})
+
+
+@one_thread()
+def share(job: Job, piece: int, threads: int | None) -> None:
+    """Write what other views say of the entries of some views."""
+    path = job.piece_file("share", piece)
+    if path.exists():
+        return
+    block, groups = _view_block(job, piece), groups_of(job)
+    own, splats = memberships(block.W, groups, threads).own, torch.from_numpy(block.splats).long()
+    bounds = torch.from_numpy(mapped(job.folder / CURVE)["bounds"])
+    rows = along_curve(scene_of(job).means[splats], bounds)
+    tuples, totals = _tuples_of(job, block.splats)
+    tuples = _taken(tuples, rows)
+    found = region_shares(block.W, own, groups, rows, totals[rows], tuples, base=block.base, threads=threads)
+    arrays = {"splats": block.splats, "starts": block.W.indptr, "sums": found.sums, "views": found.views}
+    write_piece(path, arrays | {"told": np.array([found.told, found.asked])})
+
+
+# ---- blocks of splats
+
+
+def _bounds(job: Job, piece: int) -> tuple[int, int]:
+    return piece * job.rows, min((piece + 1) * job.rows, job.splats)
+
+
+def _part(splats: np.ndarray, starts: np.ndarray, values: Iterable[np.ndarray], ends: tuple[int, int]) -> SomeRows:
+    """The rows of a part that are in a block, without the others' values."""
+    first, last = np.searchsorted(splats, ends)
+    own = slice(int(starts[first]), int(starts[last]))
+    return SomeRows(
+        splats[first:last] - ends[0], starts[first : last + 1] - own.start, [part[own] for part in values]
+    )
+
+
+def _view_rows(job: Job, ends: tuple[int, int]) -> Iterator[SomeRows]:
+    """The rows of W of a block in each view, of which one view's file is open at a time."""
+    for number, base in enumerate(offsets_of(job)[:-1]):
+        own = read_view(job.view_file(number)).weights
+        values = own.region.numpy(), own.weight.numpy()
+        part = _part(own.splats.numpy(), own.indptr.numpy(), values, ends)
+        yield SomeRows(part.rows, part.starts, [part.values[0] + np.int32(base), part.values[1]])
+
+
+@one_thread()
+def gather(job: Job, piece: int, threads: int | None) -> None:
+    """Write W of a range of splats in all views, what supports them, and their tuples."""
+    path = job.piece_file("rows", piece)
+    if path.exists():
+        return
+    ends = first, last = _bounds(job, piece)
+    W = _weights(lambda: _view_rows(job, ends), last - first, offsets_of(job))
+    evidence, sums = torch.zeros(last - first, dtype=torch.float64), W.row_sums()
+    if job.related:
+        _gather_tuples(job, piece, ends, sums)
+    for number in range(len(job.names)):
+        view = read_view(job.view_file(number)).weights
+        begin, end = torch.searchsorted(view.evidence_splats, torch.tensor(ends, dtype=torch.int32)).tolist()
+        evidence[view.evidence_splats[begin:end].long() - first] += view.evidence[begin:end].double()
+    means = scene_of(job).means[first:last][W.indptr.diff() > 0].double()
+    none = torch.zeros(0, 3, dtype=torch.float64)
+    bounds = torch.stack([means.amin(dim=0), means.amax(dim=0)]) if means.numel() else none
+    arrays = {"indptr": W.indptr, "region": W.region, "weight": W.weight, "sums": sums}
+    totals = list(region_totals(W, threads)) if job.settings.robust_steps else None
+    write_piece(path, arrays | {"evidence": evidence.float(), "bounds": bounds}, totals)
+
+
+def _gather_tuples(job: Job, piece: int, ends: tuple[int, int], totals: Tensor) -> None:
+    bases = mapped(job.folder / TUPLES)["bases"]
+
+    def parts() -> Iterator[SomeRows]:
+        for number, base in enumerate(bases):
+            own = map_tensors(job.piece_file("relate", number))[0]
+            part = _part(own["splats"], own["starts"], [own["tuples"]], ends)
+            yield SomeRows(part.rows, part.starts, [part.values[0] + np.int32(base)])
+
+    starts = row_starts(parts(), ends[1] - ends[0])
+    tuples = _values(int(starts[-1]), torch.int32)
+    fill_rows(parts(), starts, [tuples.numpy()])
+    write_piece(job.piece_file("tuples", piece), {"starts": starts, "tuples": tuples, "totals": totals})
+
+
+@dataclass(frozen=True)
+class SplatBlock:
+    """A range of splats, and W of these in all views."""
+
+    first: int
+    last: int
+    W: RegionWeights
+    means: Tensor  # [n, 3]
+    arrays: dict[str, np.ndarray]  # what else `gather` wrote
+
+
+def _splat_block(job: Job, piece: int) -> SplatBlock:
+    first, last = _bounds(job, piece)
+    arrays = map_tensors(job.piece_file("rows", piece))[0]
+    indptr, region, weight = (torch.from_numpy(arrays[name]) for name in ("indptr", "region", "weight"))
+    every, none = torch.arange(last - first, dtype=torch.int32), torch.zeros(0, dtype=torch.int32)
+    offsets = torch.from_numpy(offsets_of(job))
+    W = RegionWeights(every, indptr, region, weight, none, torch.zeros(0), offsets)
+    return SplatBlock(first, last, W, scene_of(job).means[first:last], arrays)
+
+
+@one_thread()
+def label(job: Job, piece: int, threads: int | None) -> None:
+    """Write the object of each splat, and what objects weigh: in step 0 in other regions, then in views."""
+    path = job.piece_file(f"labels-{job.step}", piece)
+    if path.exists():
+        return
+    block, clusters = _splat_block(job, piece), mapped(job.folder / CLUSTERS)["clusters"]
+    number = int(clusters.max(initial=-1)) + 1
+    labels = object_labels(block.W, clusters, number, threads)
+    if job.step == 0:
+        others = mapped(job.folder / NODES)["others"]
+        sums = object_shares(block.W, labels, number, others, threads)
+    else:
+        sums = view_shares(block.W, groups_of(job), labels, number, threads)
+    write_piece(path, {"labels": labels}, list(sums))
+
+
+def labels_of(job: Job, piece: int) -> np.ndarray:
+    """[n] i32: the object of each splat of a block, as the driver numbers them; -1 for none."""
+    labels = map_tensors(job.piece_file("labels-1", piece))[0]["labels"]
+    return mapped(job.folder / CLUSTERS)["place"][labels]
+
+
+def _consensus(job: Job, block: SplatBlock, threads: int | None) -> Tensor | None:
+    """c_jm of the entries of a block [nnz] f32, where views have masks."""
+    if job.usual_share is None:
+        return None
+    sums, views = _values(block.W.region.shape[0], torch.float32), _values(block.W.region.shape[0], torch.uint8)
+    ends = block.first, block.last
+
+    def parts() -> Iterator[SomeRows]:
+        for number in range(job.weighings):
+            own = map_tensors(job.piece_file("share", number))[0]
+            yield _part(own["splats"], own["starts"], (own["sums"], own["views"]), ends)
+
+    fill_rows(parts(), block.W.indptr.numpy(), [sums.numpy(), views.numpy()])
+    with_mean(sums.numpy(), views.numpy(), job.usual_share, threads)
+    return sums
+
+
+def scene_agreement(job: Job, step: int) -> SceneAgreement:
+    """What the driver found in a step."""
+    arrays = map_tensors(job.folder / AGREEMENT.format(step))[0]
+    usual, power, reliability = arrays["numbers"].tolist()
+    return SceneAgreement(
+        usual, torch.from_numpy(arrays["regions"]), power, None if np.isnan(reliability) else reliability
+    )
+
+
+def write_agreement(job: Job, step: int, scene: SceneAgreement) -> None:
+    """Share what the driver found in a step."""
+    reliability = np.nan if scene.reliability is None else scene.reliability
+    numbers = torch.tensor([scene.usual, scene.power, reliability], dtype=torch.float64)
+    write_tensors(job.folder / AGREEMENT.format(step), {"regions": scene.regions, "numbers": numbers}, {})
+
+
+def _weighed(
+    job: Job, piece: int, block: SplatBlock, judge: ViewConsistency, step: int, threads: int | None
+) -> tuple[Tensor, Tensor]:
+    """The factors after so many steps, at least one, and the scores of splats."""
+    cosines = torch.from_numpy(map_tensors(job.piece_file(f"cosines-{step - 1}", piece))[0]["cosines"])
+    before = _before(job, piece, step - 1)
+    factors = _values(cosines.shape[0], torch.float32).copy_(cosines)
+    scores = judge.weigh(factors, before, scene_agreement(job, step - 1), _consensus(job, block, threads))
+    return factors, scores
+
+
+def _before(job: Job, piece: int, step: int) -> Tensor | None:
+    """The factors that a step begins with, as the step before left them; None for the first one."""
+    if step == 0:
+        return None
+    return torch.from_numpy(map_tensors(job.piece_file(f"factors-{step}", piece))[0]["factors"])
+
+
+@one_thread()
+def compare(job: Job, piece: int, threads: int | None) -> None:
+    """Write the cosines of a step, and what the scene is to learn of them; and the factors of the step before."""
+    path = job.piece_file(f"cosines-{job.step}", piece)
+    if path.exists():
+        return
+    block = _splat_block(job, piece)
+    judge, sums, before = ViewConsistency(block.W, block.means, threads), list[PieceSums](), None
+    if job.step:
+        before, _ = _weighed(job, piece, block, judge, job.step, threads)
+        write_piece(job.piece_file(f"factors-{job.step}", piece), {"factors": before})
+    directions = StoredDirections(job.folder)
+    write_piece(path, {"cosines": judge.cosines(directions, before, job.by_region, sums.append)}, sums)
+
+
+def _reweighted(job: Job, piece: int, block: SplatBlock, threads: int | None) -> tuple[RegionWeights, Tensor | None]:
+    """W of a block after all robust steps, and the scores of splats [2, n]; None without a step."""
+    if not job.settings.robust_steps:
+        return block.W, None
+    judge = ViewConsistency(block.W, block.means, threads)
+    factors, scores = _weighed(job, piece, block, judge, job.settings.robust_steps, threads)
+    return reweighted(block.W, factors), scores
+
+
+@one_thread()
+def measure(job: Job, piece: int, threads: int | None) -> None:
+    """Write what the distances of regions from the first closed form add up to."""
+    path = job.piece_file("measure", piece)
+    if path.exists():
+        return
+    block = _splat_block(job, piece)
+    W, _ = _reweighted(job, piece, block, threads)
+    distances = RegionDistances(W, codebook_of(job), block.means, threads)
+    write_piece(path, {}, list(distances.sums(distances.after(torch.ones_like(W.weight)))))
+
+
+@one_thread()
+def solve(job: Job, piece: int, threads: int | None) -> None:
+    """Write X of a range of splats, and what supports it: evidence, agreement, confidence, and the sums of W."""
+    columns_file, features_file = job.columns_file(piece), job.solved_file(piece)
+    if columns_file.exists() and features_file.exists():
+        return
+    block, codebook, settings = _splat_block(job, piece), codebook_of(job), job.settings
+    W, scores = _reweighted(job, piece, block, threads)
+    if settings.loss == "huber":
+        W = reweighted(W, huber_factors(W, codebook, means=block.means, threads=threads, delta=job.delta))
+    X = torch.zeros(block.last - block.first, job.channels, dtype=job.dtype)
+    rows, device = torch.nonzero(W.indptr.diff())[:, 0], choose_device(settings.device)
+    squares = solve_rows(X, rows, W, codebook, means=block.means, threads=threads, device=device)
+    write_rows(features_file, X)
+    sums, evidence = torch.from_numpy(block.arrays["sums"]), torch.from_numpy(block.arrays["evidence"])
+    agreement = squares.sqrt().clamp(0.0, 1.0).float()
+    columns = {"evidence": evidence, "agreement": agreement, "seen": sums > 0, "sums": sums}
+    if scores is not None:
+        columns["confidence"] = scores[0]
+    parts = None
+    if job.clusters:
+        labels = labels_of(job, piece)
+        parts = list(cluster_sums(X, block.arrays["evidence"], labels, job.clusters, threads))
+        if settings.aggregation_guard and scores is not None:
+            write_piece(job.piece_file("guard", piece), {"weight": W.weight, "explained": scores[1]})
+    write_piece(columns_file, columns, parts)
+
+
+@one_thread()
+def spread(job: Job, piece: int, threads: int | None) -> None:
+    """Write X with the features of clusters where splats take them, and which do."""
+    path = job.piece_file("taken", piece)
+    if path.exists() and job.features_file(piece).exists():
+        return
+    block, labels = _splat_block(job, piece), torch.from_numpy(labels_of(job, piece))
+    merged = torch.from_numpy(map_tensors(job.folder / CLUSTERS)[0]["merged"])
+    shard = shard_at(job.solved_file(piece))
+    X = torch.from_numpy(np.fromfile(shard.path, shard.dtype, offset=shard.begin).reshape(shard.shape))
+    taken = with_feature(labels, merged)
+    columns = {"taken": taken}
+    if job.guarded:
+        own = map_tensors(job.piece_file("guard", piece))[0]
+        weight, explained = torch.from_numpy(own["weight"]), torch.from_numpy(own["explained"])
+        W = replace(block.W, weight=weight)
+        columns["guarded"] = guard(taken, labels, merged, W, StoredDirections(job.folder), explained, threads)
+    give_features(X, labels, merged, taken)
+    write_rows(job.features_file(piece), X)
+    write_piece(path, columns)

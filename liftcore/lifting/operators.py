@@ -1,0 +1,109 @@
+"""A alone, for whoever needs more than a lift: region weights ``A^T S`` and renders ``A X``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from liftcore.errors import InvalidCameras, InvalidSettings
+from liftcore.lifting.geometry import weigh_views
+from liftcore.raster import check_given, open_raster
+from liftcore.runtime.device import choose_device
+from liftcore.runtime.progress import Progress, silent
+from liftcore.runtime.torch_modes import usual_modes
+from liftcore.scene.cameras import Camera, Cameras
+from liftcore.scene.compositing import CompositingParams, check_antialiased
+from liftcore.scene.splats import Splats, shared_tensor
+from liftcore.values.lift_views import Given, LiftViews
+from liftcore.values.region_weights import RegionWeights
+from liftcore.values.settings import LiftSettings, Preset
+
+
+@usual_modes()
+def render(
+    splats: Splats,
+    camera: Camera,
+    values: Tensor | np.ndarray,
+    params: CompositingParams | None = None,
+    *,
+    normalise: bool = False,
+    device: str = "auto",
+    threads: int | None = None,
+) -> Tensor:
+    """Composite values on splats front to back, as a rasterizer does colours: ``A X``.
+
+    Args:
+        values: [P] or [P, F] of any numbers or booleans, a row a splat, in the splats' order.
+        params: how rays meet splats; None: as they were trained (`Splats.antialiased`), with the field's other
+            constants. The scale of the opacity logits is 1; the background is zero.
+        normalise: whether pixels are divided by the sum of their weights, where that is not zero.
+        device: ``auto``, ``cpu`` or ``cuda``. threads: of the CPU; the number changes no bit.
+
+    Returns:
+        [H, W] or [H, W, F] f32, on the CPU.
+
+    Raises:
+        InvalidSplats, InvalidCameras: splats or camera are something else, such as a path or a name.
+        InvalidSettings: values have another number of rows than there are splats, or threads are no number.
+        Unavailable: there is no such device.
+    """
+    splats = check_given(splats, threads)
+    params = CompositingParams(antialiased=splats.antialiased) if params is None else params
+    if not isinstance(params, CompositingParams):
+        raise InvalidSettings("params", expected="CompositingParams, or None", got=repr(params)[:80])
+    check_antialiased(splats.kernel, params.antialiased)
+    if not isinstance(camera, Camera):
+        got, hint = repr(camera)[:80], "cameras[name] is the camera of a view"
+        raise InvalidCameras("camera", expected="a Camera", got=got, hint=hint)
+    try:
+        given = shared_tensor(values).cpu()
+    except (TypeError, ValueError) as error:
+        got = f"{type(values).__name__} ({error})"[:120]
+        raise InvalidSettings("values", expected="numbers or booleans of splats", got=got) from None
+    if given.ndim not in (1, 2) or given.shape[0] != splats.count:
+        expected = f"[{splats.count}] or [{splats.count}, F], a row a splat"
+        raise InvalidSettings("values", expected=expected, got=str(list(given.shape)))
+    raster = open_raster(splats, choose_device(device), threads)
+    rows = given.float()[:, None] if given.ndim == 1 else given.float()
+    image = raster.render(camera, rows, params)
+    if normalise:
+        sums = raster.row_sums(camera, params)[:, :, None]
+        image = torch.where(sums > 0, image / sums.clamp_min(torch.finfo(torch.float32).tiny), 0.0)
+    return (image[:, :, 0] if given.ndim == 1 else image).cpu()
+
+
+@usual_modes()
+def region_weights(
+    splats: Splats,
+    cameras: Cameras | Mapping[str, Camera],
+    views: Given,
+    preset: Preset | str | LiftSettings = Preset.DEFAULT,
+    *,
+    progress: Progress = silent,
+    threads: int | None = None,
+    **settings: Any,
+) -> RegionWeights:
+    """What each region, or cell of a grid, of each view weighs at each splat: ``W = A^T S``, without any feature.
+
+    Args:
+        splats, cameras, views, preset, threads, settings: as `lift` has them. All views are weighed, whatever the
+            settings' coverage. A label on several levels is a region each time.
+
+    Returns:
+        W on the CPU, a row a splat: in memory, or in mapped files where it is large. Rows of ``W E`` over the sums of
+        rows of W are the features that `lift` finds.
+
+    Raises:
+        InvalidFeatures, InvalidSettings, Unavailable: as `lift` has it.
+    """
+    chosen = LiftSettings.chosen(preset, settings)
+    splats = check_given(splats, threads)
+    chosen = chosen.for_splats(splats)
+    found = LiftViews.of(views, cameras, chosen)
+    own = chosen.model_copy(update={"certificate_rays": 0})
+    raster = open_raster(splats, choose_device(chosen.device), threads)
+    return weigh_views(raster, splats.count, found, own, progress, by_rows=True, threads=threads).weights.cpu()

@@ -1,0 +1,435 @@
+"""The plan of a lift: what is visible, which views it takes, and a bound of its memory, before the first view."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from liftcore.errors import Unavailable
+from liftcore.lifting.geometry import weigh_views
+from liftcore.lifting.planning.contradictions import contradictions
+from liftcore.lifting.planning.views import (
+    PILOT_VIEWS,
+    WELL_COVERED,
+    Visibility,
+    fly_pilot,
+    spare_views,
+    view_order,
+    views_to_show,
+    visibility,
+)
+from liftcore.raster import open_raster
+from liftcore.raster.base import Raster
+from liftcore.runtime.device import CPU, Device
+from liftcore.runtime.memory import check_disk, lack_of_disk
+from liftcore.runtime.one_thread import one_thread
+from liftcore.runtime.progress import silent
+from liftcore.scene.cameras import Camera, distortion_warning
+from liftcore.scene.compositing import TILE
+from liftcore.scene.render_mode import rendering_reason, rendering_warnings
+from liftcore.scene.splats import Splats
+from liftcore.solve.codebook import TABLE_BYTES
+from liftcore.solve.consensus import BLOCK_ENTRIES
+from liftcore.solve.diagnostics import shape_warnings
+from liftcore.values.lift_views import LiftViews
+from liftcore.values.pack import Views
+from liftcore.values.region_weights import MEMORY_LIMIT
+from liftcore.values.settings import LiftSettings
+
+FEW_VIEWS = 32  # and below, view_cosine takes all: a pilot would cost what it saves
+TIMED_VIEWS = 32  # and more have one of them timed: it costs a part of what it tells
+SHOWN_VIEWS = 6  # names in a line for people
+MIB, GIB = 2**20, 2**30
+LIBRARIES = 450_000_000  # of torch, numba, numpy and the compiled kernels, before anything is read
+SCENE_BYTES = 230  # of a splat: as the raster has it, its order and counts in a view, sums of the solution
+RECORD_BYTES = 240  # of a splat that a view shows: projected, with its row of W
+TILE_BYTES = 100  # of a splat in a tile: its place in the tile's list, and what the tile found of it
+ENTRY_BYTES, ROW_BYTES = 8, 20  # of W: region and weight; a splat's number, row start and evidence
+JUDGED_BYTES = 12  # of an entry: factors, and the products and squares that they are made of
+CONSENSUS_BYTES = 10  # of an entry: what it gets, of how many views, whether it belongs; the tuple of its view
+BLOCK_BYTES = 9  # of an entry that lies by region
+CG_VECTORS, CG_CHANNELS = 14, 32  # [P, 32] f32 of conjugate gradients, with the images of a view
+CLUSTERING = 80_000_000  # of hdbscan and what it stands on
+TOUCHING_BYTES = 1_000  # of a splat, where those that touch are told
+SPARE = 0.9  # of the free memory: 10 % are left to other processes
+CARD_SPARE = 0.8  # of a card's free memory: what is freed does not lie in one piece
+CARD_SPLAT_BYTES = 400  # of a splat on a card, walked in the smallest pieces
+CONTROL_GROUPS = (  # folder, and the files of limit, use and statistics: versions 2 and 1
+    ("/sys/fs/cgroup", ("memory.max", "memory.current", "memory.stat")),
+    ("/sys/fs/cgroup/memory", ("memory.limit_in_bytes", "memory.usage_in_bytes", "memory.stat")),
+)
+FILE_PAGES = ("inactive_file", "active_file")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a lift is about to do. Plain values: the same inputs and settings give the same plan."""
+
+    kernel: str
+    antialiased: bool  # opacities are compensated for the low-pass
+    rendering: str  # why: what says so, or who
+    splats: int  # P
+    views: tuple[str, ...]  # that will be lifted, in the order of the sums
+    left_out: tuple[str, ...]  # that the settings' coverage or view_cosine leaves out
+    there: int  # views with features and a camera, whatever the settings take of them
+    view_cosine: float | None  # expected of the views' features against those of all, where a pilot chose them
+    spare: tuple[str, ...]  # of those lifted: what they show, WELL_COVERED of the others show too
+    seen_share: float  # of the splats, that some view can see, before occlusion
+    splats_a_view: float  # that a view can see, before occlusion
+    channels: int  # F
+    dtype: str  # that X is stored as, when it can hold the codebooks
+    memory: Mapping[str, int]  # bytes a part at the peak, about
+    weight_bytes: int  # of W of all views, about
+    device: Device  # that will walk and solve
+    kept_on_card: int  # bytes of W that may stay on a card between the phases
+    features_room: int | None  # bytes of this machine's memory that X may take today; None for no limit
+    seconds: float | None  # that looking through the views takes on this machine today, about; None for few views
+    warnings: tuple[str, ...]  # of this machine, today
+    told: tuple[str, ...]  # warnings of what is lifted, which the certificate of the lift has too
+
+    @property
+    def memory_bytes(self) -> int:
+        """The estimated peak."""
+        return sum(self.memory.values())
+
+    @property
+    def in_files(self) -> int:
+        """Bytes of W beyond those that stay in memory, about."""
+        return max(0, self.weight_bytes - MEMORY_LIMIT - self.kept_on_card)
+
+    def facts(self) -> dict[str, Any]:
+        """Plain numbers for the certificate, without what only this machine has to do with."""
+        return {
+            "kernel": self.kernel,
+            "antialiased": self.antialiased,
+            "rendering": self.rendering,
+            "splats": self.splats,
+            "seen_share": self.seen_share,
+            "splats_a_view": self.splats_a_view,
+            "views": len(self.views),
+            "views_left_out": len(self.left_out),
+            "view_cosine": self.view_cosine,
+            "spare_views": list(self.spare),
+            "channels": self.channels,
+            "dtype": self.dtype,
+            "memory_bytes": self.memory_bytes,
+            "memory": dict(self.memory),
+            "weights_in_files_bytes": max(0, self.weight_bytes - MEMORY_LIMIT),
+            "device": self.device.kind,
+        }
+
+    def summary(self) -> Iterator[str]:
+        """The plan in short, for people: what is lifted, what it is made of, and what that takes."""
+        seen = f"{self.seen_share:.1%} in some view's field"
+        spare = f", {len(self.spare)} of them see nothing that {WELL_COVERED} others do not" if self.spare else ""
+        how = f"{self.kernel}, antialiased: {self.rendering}" if self.antialiased else self.kernel
+        yield f"{self.splats} splats ({how}), {seen}; {len(self.views)} of {self.there} views{spare}"
+        yield f"{self.channels} channels, stored as {self.dtype}"
+        files = f", {self.in_files / MIB:.0f} MiB of region weights in files" if self.in_files else ""
+        yield f"about {self.memory_bytes / MIB:.0f} MiB at the peak{files}, on {self.device.name}"
+
+    def lines(self) -> Iterator[str]:
+        """The whole plan for people."""
+        head, channels, memory = self.summary()
+        yield f"plan: {head}"
+        yield f"  a view shows {self.splats_a_view:.0f} of them, before occlusion"
+        left = f"{len(self.left_out)} views left out" if self.left_out else "no view left out"
+        if self.view_cosine is not None:
+            left += f" (a pilot expects features with a cosine of {self.view_cosine:.3f} to those of all)"
+        yield f"  {left}{self._spare_line()}"
+        yield f"  {channels}"
+        parts = ", ".join(f"{name} {size / MIB:.0f}" for name, size in self.memory.items())
+        yield f"  {memory} ({parts})"
+        yield from (f"warning: {warning}" for warning in (*self.warnings, *self.told))
+
+    def _spare_line(self) -> str:
+        if not self.spare:
+            return ""
+        some = ", ".join(self.spare[:SHOWN_VIEWS]) + (", ..." if len(self.spare) > SHOWN_VIEWS else "")
+        return f"; {len(self.spare)} add nothing that {WELL_COVERED} others do not show: {some}"
+
+
+@one_thread()
+def plan_lift(
+    splats: Splats,
+    views: LiftViews,
+    settings: LiftSettings,
+    device: Device,
+    threads: int | None = None,
+    *,
+    apart: bool = False,
+    look: bool = False,
+) -> Plan:
+    """Plan the lift of the views; the settings' coverage and view_cosine may choose among them.
+
+    Args:
+        device: where it should run. A card with too little room leaves an ``auto`` lift to the processor.
+        threads: that walk on the processor; None takes the cores that this process may use.
+        apart: whether others hold W and X, so that this machine needs no room for them.
+        look: whether a few views are weighed, to tell inputs that contradict each other and how long the views take.
+            A lift in one place tells both by the views that it begins with.
+
+    Raises:
+        Unavailable: this machine has no room for the codebooks, or for the features in no place; or the card that
+            the lift was sent to has none.
+    """
+    features = views.features
+    names = views.names
+    cameras = [views.cameras[name] for name in names]
+    seen = visibility(splats, cameras, settings.lift_params)
+    short = [] if apart else check_card(device, splats.count, settings.device)
+    device = CPU if short else device
+    raster, seconds, wrong = None, None, list[str]()
+    if look or _has_pilot(settings, len(names)):
+        raster = open_raster(splats, device, threads)
+    if look and raster is not None:
+        wrong = contradictions(raster, views, settings, seen.seen_share)
+    chosen, expected = _choose_views(raster, views, settings, seen)
+    names, seen, cameras = [names[k] for k in chosen], seen.of(chosen), [cameras[k] for k in chosen]
+    if look and raster is not None and device.kind == "cpu":
+        seconds = _seconds(raster, views, names, settings)
+    weights = weight_bytes(seen, features, names, settings)
+    parts = memory_parts(splats, seen, cameras, features, names, settings)
+    free, on_card = (None, None) if apart else (free_memory(), None if short else device.free_bytes())
+    kept = 0 if on_card is None else min(weights, int(CARD_SPARE * on_card) // 4)
+    in_files = 0 if apart else max(0, weights - MEMORY_LIMIT - kept)
+    lifted = set(names)
+    return Plan(
+        kernel=str(splats.kernel),
+        antialiased=settings.lift_params.antialiased,
+        rendering=rendering_reason(splats.render_mode, settings.lift_params.antialiased),
+        splats=splats.count,
+        views=tuple(names),
+        left_out=tuple(name for name in views.names if name not in lifted),
+        there=len(features),
+        view_cosine=expected,
+        spare=tuple(names[k] for k in spare_views(seen)),
+        seen_share=seen.seen_share,
+        splats_a_view=seen.splats_a_view,
+        channels=features.channels,
+        dtype=settings.dtype,
+        memory=parts,
+        weight_bytes=weights,
+        device=device,
+        kept_on_card=kept,
+        features_room=features_room(parts, free),
+        seconds=seconds,
+        warnings=(*short, *check_memory(parts, free), *check_weights(in_files)),
+        told=(
+            *splats.warnings,
+            *rendering_warnings(splats.render_mode, settings.lift_params.antialiased, splats.kernel),
+            *views.cameras.warnings,
+            *distortion_warning(cameras),
+            *shape_warnings(features, cameras),
+            *wrong,
+        ),
+    )
+
+
+def _has_pilot(settings: LiftSettings, views: int) -> bool:
+    """Whether the settings choose among so many views by what a pilot tells of them."""
+    return bool(settings.view_cosine) and views > FEW_VIEWS
+
+
+def _choose_views(
+    raster: Raster | None, views: LiftViews, settings: LiftSettings, seen: Visibility
+) -> tuple[list[int], float | None]:
+    """The views to lift, ascending, and the cosine that a pilot expects of them, where one was flown.
+
+    They show each splat ``coverage`` times and come to ``view_cosine``, whatever takes more of the same order. Where
+    a pilot could spare no more views than it looks at, none is flown and all are taken.
+    """
+    every = list(range(seen.areas.shape[0]))
+    if not settings.coverage and not _has_pilot(settings, len(every)):
+        return every, None
+    order = list(view_order(seen))
+    least = views_to_show(seen, order, settings.coverage)
+    if not settings.view_cosine:
+        return sorted(order[:least]), None
+    if raster is None or len(every) <= max(FEW_VIEWS, least + PILOT_VIEWS):
+        return every, None
+    pilot = fly_pilot(raster, views, settings, seen)
+    count, expected = pilot.views_for(settings.view_cosine, order, least)
+    return sorted(order[:count]), expected
+
+
+def _seconds(raster: Raster, views: LiftViews, names: Sequence[str], settings: LiftSettings) -> float | None:
+    """About how long the views take, by the one in the middle."""
+    if len(names) < TIMED_VIEWS:
+        return None
+    begin = time.perf_counter()
+    one = replace(views, names=[names[len(names) // 2]])
+    own = settings.model_copy(update={"certificate_rays": 0})
+    weigh_views(raster, raster.splats.count, one, own, silent, by_rows=False)
+    return len(names) * (time.perf_counter() - begin)
+
+
+def weight_bytes(seen: Visibility, features: Views, names: Sequence[str], settings: LiftSettings) -> int:
+    """Bytes of W of all views, about."""
+    judged = 4 if settings.robust_steps or settings.loss == "huber" else 0
+    return int(ROW_BYTES * _shown(seen) + (ENTRY_BYTES + judged) * _entries(seen, features, names, settings))
+
+
+def _shown(seen: Visibility) -> float:
+    """Splats that the views show, each as often as views show it."""
+    return int(seen.in_view.sum()) / seen.areas.shape[1] * seen.splats
+
+
+def _entries(seen: Visibility, features: Views, names: Sequence[str], settings: LiftSettings) -> float:
+    """Of W of all views, about: a splat meets a region or four cells in each tile and level that it touches."""
+    parts = max(_parts_a_tile(features, name, settings) for name in names)
+    return _shown(seen) * parts * _tiles(seen)
+
+
+def memory_parts(
+    splats: Splats,
+    seen: Visibility,
+    cameras: Sequence[Camera],
+    features: Views,
+    names: Sequence[str],
+    settings: LiftSettings,
+) -> dict[str, int]:
+    """Bytes of each part of a lift at its peak, about."""
+    inputs = sum(t.nbytes for t in (splats.means, splats.quats, splats.log_scales, splats.opacity_logits))
+    largest, channels = max(camera.width * camera.height for camera in cameras), features.channels
+    weights = weight_bytes(seen, features, names, settings)
+    shown = seen.in_view.sum(axis=1).max(initial=0) / seen.areas.shape[1] * splats.count
+    view = int(shown * (RECORD_BYTES + TILE_BYTES * _tiles(seen))) + 16 * largest
+    books = [math.prod(_codebook(features, name)) for name in names]
+    size = 2 if settings.dtype == "float16" else 4
+    parts = {
+        "libraries": LIBRARIES,
+        "splats": inputs,
+        "scene": splats.count * SCENE_BYTES,
+        "view": 2 * view,  # two are in work, or one and what is made of it
+        "weights": min(weights, MEMORY_LIMIT),  # a view at a time
+        "gathered": min(weights, MEMORY_LIMIT),  # of all views, a row a splat
+        "codebooks": size * sum(books) + min(8 * sum(books), 2 * TABLE_BYTES),
+        "features": splats.count * channels * size,
+    }
+    if settings.robust_steps or settings.loss == "huber":
+        entries = _entries(seen, features, names, settings)
+        parts["reweighting"] = int(JUDGED_BYTES * min(entries, MEMORY_LIMIT / ENTRY_BYTES))  # more lies in files
+        if settings.consensus:
+            parts["reweighting"] += int(CONSENSUS_BYTES * entries + BLOCK_BYTES * min(entries, BLOCK_ENTRIES))
+    if settings.cg_steps or settings.reference_channels:
+        parts["refinement"] = 4 * (splats.count * (CG_VECTORS * CG_CHANNELS) + 3 * largest * CG_CHANNELS)
+    if settings.aggregation:
+        parts["aggregation"] = CLUSTERING + 24 * channels * min(splats.count, settings.aggregation_sample)
+        if settings.aggregation_clusters in ("auto", "touching"):  # afterwards, and of one cluster at a time
+            parts["aggregation"] = max(parts["aggregation"], TOUCHING_BYTES * splats.count)
+    return parts
+
+
+def _tiles(seen: Visibility) -> float:
+    """Tiles that a shown splat touches, in the mean."""
+    sides = np.sqrt(seen.areas[seen.in_view], dtype=np.float64)
+    return float(np.mean((sides / TILE + 1.0) ** 2)) if sides.size else 1.0
+
+
+def _parts_a_tile(features: Views, view: str, settings: LiftSettings) -> int:
+    if not features.is_regions(view):
+        return 4  # nearest reads fewer, but fine cells are smaller than a tile
+    shape = features.specs(view)["labels"].shape
+    return shape[0] if len(shape) == 3 and not isinstance(settings.levels, int) else 1
+
+
+def _codebook(features: Views, view: str) -> tuple[int, ...]:
+    """The shape of the view's codebook, or of its grid."""
+    return next(spec.shape for part, spec in features.specs(view).items() if part != "labels")
+
+
+def check_card(device: Device, splats: int, asked: str) -> list[str]:
+    """What to say when the card has no room for the scene and ``auto`` may take the processor.
+
+    Raises:
+        Unavailable: the same, and ``cuda`` was asked for.
+    """
+    free = device.free_bytes()
+    least = splats * CARD_SPLAT_BYTES
+    if free is None or least <= free:
+        return []
+    need, there = f"{least / GIB:.1f} GiB", f"{free / GIB:.1f} GiB"
+    if asked == "cuda":
+        raise Unavailable(
+            "device", expected=f"{need} of free memory on {device.name}", got=there,
+            hint="end what else runs there, take fewer splats, smaller images or fewer channels, or take device=cpu",
+        )  # fmt: skip
+    return [f"{device.name} has {there} free and the lift needs {need}: the processor lifts"]
+
+
+def features_room(parts: Mapping[str, int], free: int | None) -> int | None:
+    """Bytes that X may take beside the rest; None for no limit. Beyond them it is kept in a mapped file."""
+    if free is None:
+        return None
+    return max(0, int(SPARE * free) - sum(parts.values()) + parts["features"])
+
+
+def check_memory(parts: Mapping[str, int], free: int | None) -> list[str]:
+    """What to say about the room that there is: nothing, or warnings.
+
+    Raises:
+        Unavailable: not even the codebooks fit, or there is no disk for features that do not.
+    """
+    if free is None:
+        return []
+    room = features_room(parts, free)
+    there, rest = f"{free / GIB:.1f} GiB", sum(parts.values()) - parts["features"]
+    hint = "try fewer views (coverage) or fewer channels"
+    if parts["codebooks"] > free:
+        got = f"{parts['codebooks'] / GIB:.1f} GiB for codebooks"
+        raise Unavailable("memory", expected=f"at most the {there} that are free", got=got, hint=hint)
+    told = []
+    if room is not None and parts["features"] > room:
+        check_disk(parts["features"], "features")
+        size = f"{parts['features'] / GIB:.1f} GiB"
+        told.append(f"the features, {size}, do not fit into the {there} that are free: they go through a mapped file")
+    if rest > SPARE * free:
+        told.append(f"the rest of the lift may take {rest / GIB:.1f} GiB and {there} are free: {hint}")
+    return told
+
+
+def check_weights(size: int) -> list[str]:
+    """What to say of so many bytes of region weights in the temporary folder: nothing, or a warning."""
+    got = lack_of_disk(size) if size else ""
+    if not got:
+        return []
+    told = f"region weights of about {size / GIB:.1f} GiB go to files in {tempfile.gettempdir()}, and there is {got}"
+    return [f"{told}: set TMPDIR to a folder with more room on a disk, or try fewer views (coverage)"]
+
+
+def free_memory() -> int | None:
+    """Bytes that this process may still take: of the machine, or of its control group; None where neither says."""
+    found = []
+    with suppress(OSError, ValueError):  # not Linux
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        found += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
+    for folder, names in CONTROL_GROUPS:
+        with suppress(OSError, ValueError):  # a machine has one of the two, or none
+            limit, used, stat = (Path(folder, name).read_text(encoding="ascii") for name in names)
+            found += [group_memory(limit, used, stat)]
+    return min((room for room in found if room is not None), default=None)
+
+
+def group_memory(limit: str, used: str, stat: str) -> int | None:
+    """Bytes that a control group has left, from the texts of its files; None where it has no limit.
+
+    What is used counts the files that were read, which make room when memory is asked for: they are free.
+
+    Raises:
+        ValueError: the texts are not those of a control group.
+    """
+    if limit.strip() == "max":
+        return None
+    counts = dict(line.split() for line in stat.splitlines())
+    names = [f"total_{name}" if f"total_{name}" in counts else name for name in FILE_PAGES]  # version 1: all below it
+    cached = sum(int(counts.get(name, 0)) for name in names)
+    return max(0, int(limit) - max(0, int(used) - cached))

@@ -1,0 +1,41 @@
+"""Everything that a lift compiles, before its time is taken."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from liftcore.raster.cpu.warm_up import warm_up
+from liftcore.solve.aggregate import explained_by
+from liftcore.solve.codebook import Codebook, ViewCodebook
+from liftcore.solve.consensus import mask_consensus
+from liftcore.solve.directions import RegionDirections
+from liftcore.solve.loss import huber_factors
+from liftcore.solve.objects import region_objects
+from liftcore.solve.reweight import agreement_factors
+from liftcore.values.region_weights import one_view
+
+if TYPE_CHECKING:
+    from liftcore.runtime.device import Device
+    from liftcore.scene.splats import Kernel
+    from liftcore.values.settings import LiftSettings
+
+
+def warm_up_lift(kernel: Kernel, device: Device, settings: LiftSettings) -> None:
+    """Compile what a lift with these settings runs, or load it from the disk cache; its diagnostics excepted."""
+    warm_up(kernel, device, settings.lift_params, settings.weighting)
+    one = torch.zeros(1, dtype=torch.int32)
+    W = one_view(one, torch.tensor([0, 1]), one, torch.ones(1), one, torch.ones(1), regions=1)
+    book = Codebook((ViewCodebook(torch.ones(1, 1)),))
+    if settings.objects or settings.aggregation:
+        region_objects(W, np.zeros(1, np.int8), np.ones(1), 1)
+    if settings.consensus:
+        mask_consensus(W, np.zeros(1, np.int8), 1)
+    if settings.reliability:
+        agreement_factors(W, book, 1, threads=1, reliability=torch.ones(1, dtype=torch.bool))
+    if settings.loss == "huber":
+        huber_factors(W, book, threads=1)
+    if settings.aggregation:
+        explained_by(W, RegionDirections.of_weights(W, book), one, torch.ones(1, 1), 1)

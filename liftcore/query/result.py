@@ -1,0 +1,172 @@
+"""The result of a lift, which answers questions, is written to a file, and is shown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+from liftcore.values.lift import Lift
+from liftcore.values.lift_file import open_lift, save_lift
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from liftcore.query.ask import VectorAnswer
+    from liftcore.query.catalogue import Catalogue
+    from liftcore.query.segment import Segmentation
+    from liftcore.scene.cameras import Camera
+    from liftcore.scene.splats import Splats
+    from liftcore.text import TextEncoder
+
+
+@dataclass(frozen=True, repr=False)
+class LiftResult(Lift):
+    """X and what supports it, one row a splat, in the splats' order."""
+
+    @classmethod
+    def of(cls, lift: Lift) -> Self:
+        """The same values, which answer questions too."""
+        return cls(**vars(lift))
+
+    def query(
+        self,
+        positives: Any,
+        negatives: Any = (),
+        *,
+        splats: Splats | None = None,
+        threshold: str | float = "auto",
+        instances: int | None = None,
+        keep: str = "all",
+        absent: str = "drop",
+        weigh: str = "evidence",
+        references: Any = None,
+        encoder: TextEncoder | str | Path | None = None,
+    ) -> VectorAnswer:
+        """Which splats answer words, or vectors of the lift's text space.
+
+        Args:
+            positives: a text or several, or [n, F] or [F], torch or numpy: what is looked for; rows of any length
+                above zero.
+            negatives: the same, what takes away from the scores.
+            splats: that were lifted; with them the answer has objects with boxes.
+            threshold: auto, valley, paper, otsu, stability or a number on the scores.
+            instances: how many things there are, where the caller knows. keep: of the objects, all or the largest.
+            absent: drop what is not there, so that nothing is selected, or keep what is most like it.
+            weigh: what splats count by in the threshold's histogram and in objects: evidence, or that times
+                `confidence`.
+            references: [n, F], the vectors of 200 words or more, by which presence is known; None = those of the
+                lift's text space, where it has some.
+            encoder: of texts and of reference words, or the specification of one (`liftcore.open_encoder`). None: the
+                lift's own words (`table`), else the encoder of its text space, opened for this question (give one for
+                many), or the table of it that ships, where its weights cannot be had.
+
+        Raises:
+            InvalidQuery: a vector of another length, of zeros or not finite; a text that the encoder cannot read, or
+                no encoder of the lift's text space; or an unknown threshold.
+            Unavailable: the encoder's weights are not on this machine.
+        """
+        from liftcore.query.ask import query_vectors
+
+        return query_vectors(
+            self, positives, negatives, splats=splats, threshold=threshold, instances=instances, keep=keep,
+            absent=absent, weigh=weigh, references=references, encoder=encoder,
+        )  # fmt: skip
+
+    def segment(
+        self,
+        words: Sequence[str],
+        vectors: Any = None,
+        splats: Splats | None = None,
+        *,
+        encoder: TextEncoder | str | Path | None = None,
+    ) -> Segmentation:
+        """Name every splat by the word that it is most like, or by none (`liftcore.query.segment`).
+
+        Args:
+            words: n different ones. vectors: [n, F], torch or numpy, their text vectors, of any length above zero.
+                None: the encoder makes them.
+            splats: that were lifted; may be left out where the lift was made of files that are where they were.
+            encoder: as in `query`.
+
+        Raises:
+            InvalidQuery: no words, one word twice, vectors that are no directions of the lift's space, a word that
+                the encoder cannot read, or no encoder of the space.
+            Unavailable: the encoder's weights are not on this machine.
+        """
+        from liftcore.query.ask import encoder_for
+        from liftcore.query.presence import references_of
+        from liftcore.query.scene import QueryScene
+        from liftcore.query.segment import segment
+
+        scene, references = QueryScene(self.cpu(), splats), None
+        if vectors is None:
+            encoder = encoder_for(scene, encoder)
+            vectors, references = encoder.encode(words), references_of(encoder, scene.metadata.text_space)
+        return segment(scene, words, vectors, references=references)
+
+    def objects(
+        self,
+        splats: Splats | None = None,
+        words: Sequence[str] = (),
+        vectors: Any = None,
+        *,
+        encoder: TextEncoder | str | Path | None = None,
+    ) -> Catalogue:
+        """The objects that masks of many views agree on, found at lift time without a word; the largest first.
+
+        Args:
+            splats: that were lifted; may be left out where the lift was made of files that are where they were.
+            words: n, that objects are named by. vectors: [n, F], torch or numpy, their text vectors, of any length
+                above zero. None: the encoder makes them.
+            encoder: as in `query`.
+
+        Raises:
+            InvalidQuery: vectors that are no directions of the lift's space, a word that the encoder cannot read, or
+                no encoder of the space.
+            Unavailable: the encoder's weights are not on this machine.
+        """
+        from liftcore.query.ask import encoder_for
+        from liftcore.query.catalogue import catalogue
+        from liftcore.query.scene import QueryScene
+
+        scene = QueryScene(self.cpu(), splats)
+        if words and vectors is None:
+            vectors = encoder_for(scene, encoder).encode(words)
+        return catalogue(scene, words, vectors)
+
+    def save(self, path: Path | str) -> None:
+        """Write a lift file (`liftcore.values.lift_file`), whole or not at all."""
+        save_lift(self, path)
+
+    def show(
+        self,
+        splats: Splats | None = None,
+        cameras: Mapping[str, Camera] | None = None,
+        *,
+        port: int = 0,
+        browser: bool = True,
+    ) -> None:
+        """Show it on the service's page at a port of this machine, until Ctrl-C or a notebook's interrupt.
+
+        Args:
+            splats: that were lifted. cameras: of its views. Both may be left out where the lift was made of files
+                that are where they were.
+            port: 0 picks a free one. browser: whether to open one; the address is printed.
+
+        Raises:
+            InvalidInput: splats or cameras that it needs are not given, or not those of the lift.
+            Unavailable: the package ``service`` is not installed.
+        """
+        from liftcore.query.page import show
+
+        show(self, splats, cameras, port=port, browser=browser)
+
+
+def load_lift(path: Path | str) -> LiftResult:
+    """Open a lift file; the tensors are mapped, not read.
+
+    Raises:
+        InvalidLift: the file is missing, is not a safetensors file, or is not a lift with a row a splat.
+    """
+    return LiftResult.of(open_lift(path))

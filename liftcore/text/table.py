@@ -1,0 +1,130 @@
+"""A table of precomputed text embeddings: queries without weights, for the words that it holds."""
+
+import json
+import re
+import unicodedata
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from liftcore.errors import InvalidQuery, InvalidTable
+from liftcore.io.safetensors_file import check_header, map_tensors
+from liftcore.runtime import nearest
+from liftcore.text import check_texts
+
+_HALF = re.compile("[\ud800-\udfff]")  # half a surrogate pair, which UTF-8 cannot carry
+_ARTICLES = frozenset({"a", "an", "the"})
+_NEAREST = 5  # words named when one is unknown
+
+
+def plain(text: str) -> str:
+    """The text as tables compare it, in Unicode's composed form.
+
+    Cases, ``_`` for a space and a leading article make no difference.
+    """
+    parts = unicodedata.normalize("NFC", text.casefold()).replace("_", " ").split()
+    return " ".join(parts[1:] if len(parts) > 1 and parts[0] in _ARTICLES else parts)
+
+
+def nearest_words(text: str, words: Iterable[str]) -> str:
+    """A hint that names the words most like the text, of the first thousands; the words are `plain`."""
+    return nearest.nearest(plain(text), words, _NEAREST)
+
+
+class TableEncoder:
+    """Looks words up; cases, ``_`` for a space and a leading article make no difference.
+
+    Args:
+        name: what to call the table in messages.
+        words: n words, one a row.
+        embeddings: [n, F] f16 or f32, finite rows of any length above zero.
+
+    Raises:
+        InvalidTable: shapes that do not fit, rows that are zero or not finite, no words.
+    """
+
+    def __init__(self, name: str, words: Sequence[str], embeddings: np.ndarray) -> None:
+        if embeddings.ndim != 2 or not words or len(embeddings) != len(words) or embeddings.shape[1] == 0:
+            got = f"shape {str(list(embeddings.shape))[:80]} with {len(words)} words"
+            raise InvalidTable(name, expected="embeddings [n, F] with n words", got=got)
+        wide = np.asarray(embeddings, np.float64)
+        lengths = np.linalg.norm(wide, axis=1, keepdims=True)
+        bad = np.flatnonzero(~np.isfinite(lengths) | (lengths == 0))
+        if len(bad):
+            got = f"row {bad[0]} ({words[bad[0]][:80]!r}) has none"
+            raise InvalidTable(name, expected="finite rows with a direction", got=got)
+        self.name = name
+        self.words = tuple(words)
+        self.channels = int(embeddings.shape[1])
+        self._unit = (wide / lengths).astype(np.float32)
+        # The first of two equal words wins: reversed, so that it is written last.
+        self._rows = {plain(word): row for row, word in reversed(list(enumerate(words)))}
+
+    @classmethod
+    def open(cls, path: Path) -> Self:
+        """Open ``embeddings`` [n, F] f16 or f32 with metadata ``words`` (a JSON list of n strings).
+
+        Raises:
+            InvalidTable: no such file, or not a table.
+        """
+        from safetensors import SafetensorError
+
+        name = f"text table {path.name}"
+        if not path.is_file():
+            raise InvalidTable(name, expected="a file", got=f"nothing at {path}")
+        expected = "a safetensors file with embeddings and words"
+        check_header(path, name, InvalidTable, expected=expected)
+        try:
+            tensors, metadata = map_tensors(path)
+        except (SafetensorError, OSError, ValueError) as error:
+            raise InvalidTable(name, expected=expected, got=str(error)[:120]) from None
+        if "embeddings" not in tensors:
+            raise InvalidTable(name, expected=expected, got="no embeddings")
+        return cls.of(name, metadata.get("words", "null"), tensors["embeddings"])
+
+    @classmethod
+    def of(cls, name: str, words: str, embeddings: np.ndarray) -> Self:
+        """A table as files hold it: ``words`` is a JSON list of n strings, ``embeddings`` [n, F] f16 or f32.
+
+        Raises:
+            InvalidTable: the words are no such list, or the embeddings do not fit them.
+        """
+        try:
+            listed = json.loads(words)
+        except (ValueError, RecursionError) as error:
+            raise InvalidTable(name, expected="metadata words, a JSON list", got=str(error)[:120]) from None
+        if not isinstance(listed, list) or not all(
+            isinstance(word, str) and not _HALF.search(word) for word in listed
+        ):
+            raise InvalidTable(name, expected="metadata words, a JSON list of strings", got="none")
+        if embeddings.dtype not in (np.float16, np.float32):
+            raise InvalidTable(name, expected="float16 or float32", got=str(embeddings.dtype))
+        return cls(name, listed, embeddings)
+
+    @property
+    def embeddings(self) -> np.ndarray:
+        """[n, F] f32, the unit rows of the words."""
+        return self._unit
+
+    def encode(self, texts: Sequence[str]) -> np.ndarray:
+        """n words -> [n, F] f32 unit rows.
+
+        Raises:
+            InvalidQuery: a word that the table lacks; the error names the nearest ones.
+        """
+        check_texts(texts)
+        return self._unit[[self._row(text) for text in texts]]
+
+    def _row(self, text: str) -> int:
+        row = self._rows.get(plain(text))
+        if row is None:
+            expected = f"one of the {len(self.words)} words of {self.name}"
+            raise InvalidQuery("text", expected=expected, got=repr(text), hint=nearest_words(text, self._rows))
+        return row
+
+
+def own_words(words: Sequence[str], embeddings: np.ndarray | None) -> TableEncoder | None:
+    """The table that a lift brings; None where it has none."""
+    return None if embeddings is None or not words else TableEncoder("the lift's own words", words, embeddings)

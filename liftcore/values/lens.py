@@ -1,0 +1,121 @@
+"""What a camera's pinhole observes of a distorted photo or a panorama: maps, carried from the photo's pixels."""
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from liftcore.scene.cameras import Camera
+from liftcore.scene.distortion import Lens
+from liftcore.scene.panorama import Face
+from liftcore.values.views import FeatureGrid, Regions, ViewFeatures
+
+BAND_VALUES = 1 << 22  # of a grid, carried at a time in float32
+BAND_PIXELS = 1 << 15  # whose rays are bent at a time: what that takes stays in the cache
+KEPT_PINHOLES = 6  # whose labels' places are kept: mostly one lens took all photos, or all are panoramas
+
+
+def as_pinhole_sees(observation: ViewFeatures, camera: Camera) -> ViewFeatures:
+    """The observation of a camera's photo as one of its pinhole; itself where that is the photo's own.
+
+    A pixel of the pinhole reads the label of the pixel of the photo that shows the same ray, so labels get the
+    pinhole's size. A grid keeps the size of its cells, and each is read bilinearly where the ray of its centre
+    meets the photo: smoother than the given one by less than a cell.
+    """
+    if camera.lens is None and camera.face is None:
+        return observation
+    if isinstance(observation, Regions):
+        return Regions.unchecked(_labels(observation.labels, camera), observation.codebook)
+    return FeatureGrid.unchecked(_grid(observation.grid, camera))
+
+
+def grid_sides(height: int, width: int, camera: Camera) -> tuple[int, int]:
+    """Rows and columns of a grid [height, width] of the camera's photo, as its pinhole sees it."""
+    photo = camera.lens or camera.face
+    if photo is None:
+        return height, width
+    rows, columns = height * camera.height / photo.height, width * camera.width / photo.width
+    return max(1, round(rows)), max(1, round(columns))
+
+
+def photo_as_pinhole_sees(photo: np.ndarray, camera: Camera) -> np.ndarray:
+    """[height, width, C], the nearest pixels of a photo [h, w, C]; itself where the camera's picture is the photo."""
+    if camera.lens is None and camera.face is None:
+        return photo
+    places = _label_places(_pinhole(camera), *photo.shape[:2]).numpy()
+    return photo.reshape(-1, photo.shape[2])[places].reshape(camera.height, camera.width, -1)
+
+
+def _labels(labels: Tensor, camera: Camera) -> Tensor:
+    """[L, H, W] i32 of labels [L, h, w] of the photo."""
+    places = _label_places(_pinhole(camera), labels.shape[1], labels.shape[2])
+    return labels.flatten(1).index_select(1, places).reshape(labels.shape[0], camera.height, camera.width)
+
+
+@lru_cache(maxsize=KEPT_PINHOLES)
+def _label_places(pinhole: "_Pinhole", height: int, width: int) -> Tensor:
+    """[H * W] i32, of a huge map i64: the place among the photo's labels [height, width] that each pixel reads."""
+    places = np.empty((pinhole.height, pinhole.width), np.int32 if height * width < 1 << 31 else np.int64)
+    band = max(1, BAND_PIXELS // pinhole.width)
+    columns = np.arange(pinhole.width) + 0.5
+    for first in range(0, pinhole.height, band):
+        here = slice(first, first + band)
+        u, v = np.meshgrid(columns, np.arange(pinhole.height)[here] + 0.5)
+        x, y = _shares(u, v, pinhole)
+        rows, own = (y * height).astype(np.int64), (x * width).astype(np.int64)
+        places[here] = rows.clip(0, height - 1) * width + own.clip(0, width - 1)
+    return torch.from_numpy(places.ravel())
+
+
+def _grid(grid: Tensor, camera: Camera) -> Tensor:
+    """[rows, columns, F] of a grid [h, w, F] of the photo, of its dtype."""
+    height, width, channels = grid.shape
+    rows, columns = grid_sides(height, width, camera)
+    centres = np.meshgrid(
+        (np.arange(columns) + 0.5) * camera.width / columns, (np.arange(rows) + 0.5) * camera.height / rows
+    )
+    x, y = _shares(*centres, _pinhole(camera))
+    u, v = x * width - 0.5, (y * height - 0.5).clip(0, height - 1)
+    if camera.face is None:  # a panorama's last column meets its first
+        u = u.clip(0, width - 1)
+    left, top = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
+    cells = grid.reshape(-1, channels)
+    carried = torch.empty((*x.shape, channels), dtype=grid.dtype)
+    band = max(1, BAND_VALUES // (x.shape[1] * channels))
+    for first in range(0, x.shape[0], band):
+        here = slice(first, first + band)
+        total = torch.zeros((*x[here].shape, channels))
+        for row in (0, 1):
+            for column in (0, 1):
+                share = (1 - np.abs(u - left - column)) * (1 - np.abs(v - top - row))
+                place = (top + row).clip(max=height - 1) * width + (left + column) % width
+                taken = cells[torch.from_numpy(place[here])].to(torch.float32)
+                total += taken * torch.from_numpy(share[here].astype(np.float32))[..., None]
+        carried[here] = total.to(grid.dtype)
+    return carried
+
+
+class _Pinhole(NamedTuple):
+    """A camera of a photo that is not its own picture, by what its maps depend on."""
+
+    photo: Lens | Face
+    width: int
+    height: int
+    cx: float
+    cy: float
+
+
+def _pinhole(camera: Camera) -> _Pinhole:
+    photo = camera.lens or camera.face
+    if photo is None:
+        raise ValueError("the camera has no lens, and is no face of a panorama")
+    return _Pinhole(photo, camera.width, camera.height, camera.cx, camera.cy)
+
+
+def _shares(u: np.ndarray, v: np.ndarray, pinhole: _Pinhole) -> tuple[np.ndarray, np.ndarray]:
+    """Where on the photo the rays of places (u, v) of a pinhole lie, as shares of its sides."""
+    photo = pinhole.photo
+    x, y = photo.on_photo((u - pinhole.cx) / photo.fx, (v - pinhole.cy) / photo.fy)
+    return x / photo.width, y / photo.height

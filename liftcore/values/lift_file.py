@@ -1,0 +1,271 @@
+"""The lift file: features on splats, with all that is needed to trust and to use them.
+
+A ``.safetensors`` file holds ``features`` [P, F], ``evidence`` [P], ``agreement`` [P] and ``seen`` [P]. After
+reweighting it has ``confidence`` [P] f32, which tells right splats from wrong ones, as agreement does not; after
+Post-Lifting Aggregation ``cluster`` [P] i32, -1 for splats in none, and ``cluster_features`` [K, F]; where objects
+were looked for ``object`` [P] i32, -1 for none, and ``object_views`` [N, 5] i32 (`Lift`); of packs with words
+their vectors, ``embeddings`` [n, F] f32. Its metadata hold settings, inputs with digests, the encoder, words, the
+certificate, timings and the version, as JSON. A lift too large for one file is a folder of shards with the same
+tensors (`liftcore.io.shards`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import unicodedata
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from liftcore.errors import InvalidInput, InvalidLift
+from liftcore.io.files import open_regular, visible_files
+from liftcore.io.remote import landing, local_path
+from liftcore.io.safetensors_file import map_tensors
+from liftcore.io.shards import INDEX, SUFFIX, map_shards, write_shards
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator, Sequence
+
+    from liftcore.scene.cameras import Camera
+    from liftcore.values.lift import InputFile, Lift, LiftMetadata
+
+TENSORS = ("features", "evidence", "agreement", "seen")
+CONFIDENCE = "confidence"  # in lifts that were reweighted
+NEAR = 3  # folders of an input's path, and above a lift, among which it is looked for
+MOST_BESIDE = 16  # files of one kind beside a lift, that are read to know one of them
+CLUSTER_TENSORS = ("cluster", "cluster_features")  # in lifts with aggregation only
+OBJECT_TENSORS = ("object", "object_views")  # in lifts that looked for objects
+EMBEDDINGS = "embeddings"  # in lifts of packs with words
+ALL = (*TENSORS, CONFIDENCE, *CLUSTER_TENSORS, *OBJECT_TENSORS, EMBEDDINGS)
+
+
+def save_lift(lift: Lift, path: Path | str) -> None:
+    """Write the lift whole or not at all (temporary file, fsync, rename), with no copy of X in memory.
+
+    Args:
+        path: a file; with ``.shards`` at its end, a folder of shards. Either may lie elsewhere (`io.remote`).
+
+    Raises:
+        InvalidInput: it lies elsewhere and cannot be sent there.
+    """
+    from liftcore.io.safetensors_file import write_tensors
+
+    metadata = lift.metadata.model_dump_json()
+    tensors = {name: getattr(lift, name) for name in ALL if getattr(lift, name) is not None}
+    with landing(path) as place:
+        if place.suffix == SUFFIX:
+            write_shards(place, tensors, metadata)
+        else:
+            write_tensors(place, tensors, {"splatlift": metadata})
+
+
+def open_lift(path: Path | str) -> Lift:
+    """Open a lift file; the tensors are mapped, not read.
+
+    Raises:
+        InvalidLift: the file is missing, is not a safetensors file, or is not a lift with a row a splat.
+    """
+    import torch
+
+    from liftcore.values.lift import Lift
+
+    arrays, told = read_lift(path)
+    metadata = parse_metadata(told, path)
+    return Lift(**{name: torch.from_numpy(array) for name, array in arrays.items()}, metadata=metadata)
+
+
+def read_lift(path: Path | str) -> tuple[dict[str, np.ndarray], str]:
+    """The same as mapped arrays by their names, and its metadata as JSON: without torch and pydantic.
+
+    Raises:
+        InvalidLift: as `open_lift` has it.
+    """
+    from safetensors import SafetensorError
+
+    source = local_path(path)
+    try:
+        tensors, told = map_shards(source) if (source / INDEX).is_file() else map_tensors(source)
+        if "splatlift" not in told:
+            raise InvalidLift(str(path), expected="a lift file", got="safetensors without lift metadata")
+        missing = [name for name in TENSORS if name not in tensors]
+        if missing:
+            raise ValueError(f"no {missing[0]} in it")
+        arrays = {name: tensors[name] for name in ALL if name in tensors}
+    except FileNotFoundError as error:
+        lacking = Path(str(error.filename or ""))
+        got = f"no {lacking.name} in it" if lacking.parent == source else "no such file"
+        raise InvalidLift(str(path), expected="a lift file", got=got) from None
+    except (SafetensorError, OSError, ValueError) as error:
+        raise _no_lift(path, error) from None
+    _check_shapes(arrays, path)
+    return arrays, told["splatlift"]
+
+
+def parse_metadata(told: str, path: Path | str) -> LiftMetadata:
+    """The metadata of a lift file from its JSON.
+
+    Raises:
+        InvalidLift: they are none.
+    """
+    from liftcore.values.lift import LiftMetadata
+
+    try:
+        return LiftMetadata.model_validate_json(told)
+    except ValueError as error:  # pydantic's
+        raise _no_lift(path, error) from None
+
+
+def _no_lift(path: Path | str, error: Exception) -> InvalidLift:
+    got = f"a file that does not open as one: {error}"
+    return InvalidLift(str(path), expected="a lift file (.safetensors)", got=got)
+
+
+def _check_shapes(arrays: dict[str, np.ndarray], path: Path | str) -> None:
+    features = arrays["features"]
+    rows = features.shape[:1]
+    fits = features.ndim == 2 and features.dtype in (np.float16, np.float32) and features.size
+    columns = (("evidence", np.float32), ("agreement", np.float32), ("seen", np.bool_))
+    columns += ((CONFIDENCE, np.float32),) if CONFIDENCE in arrays else ()
+    if not fits or any(arrays[name].shape != rows or arrays[name].dtype != dtype for name, dtype in columns):
+        shapes = {name: list(arrays[name].shape) for name in TENSORS}
+        raise InvalidLift(str(path), expected="one row a splat in every tensor of a lift", got=str(shapes))
+    words = arrays.get(EMBEDDINGS)
+    if words is not None and (words.shape[1:] != features.shape[1:] or words.dtype != np.float32):
+        expected, got = "a vector of the features' channels for each word", f"{list(words.shape)} {words.dtype}"
+        raise InvalidLift(str(path), expected=expected, got=got)
+    for pair, channels, dtype in (
+        (CLUSTER_TENSORS, features.shape[1], features.dtype),
+        (OBJECT_TENSORS, None, np.dtype(np.int32)),
+    ):
+        one, table = (arrays.get(name) for name in pair)
+        if one is None and table is None:
+            continue
+        if one is None or table is None:
+            raise InvalidLift(str(path), expected=f"{pair[0]} and {pair[1]}, or neither", got="one of them")
+        fits = one.shape == rows and one.dtype == np.int32 and table.ndim == 2 and table.dtype == dtype
+        fits &= channels is None or table.shape[1] == channels
+        if not fits or int(one.min()) < -1 or int(one.max()) >= len(table):
+            got = f"{list(one.shape)} {one.dtype} and {list(table.shape)} {table.dtype}"
+            raise InvalidLift(str(path), expected=f"a {pair[0]} of -1 or a row of {pair[1]} for each splat", got=got)
+
+
+def input_files(
+    splats: Path, cameras: Path, features: Sequence[Path], views: Collection[str] = ()
+) -> list[InputFile]:
+    """The inputs of a lift with their digests: splats, cameras (as `camera_input` has them) and feature packs."""
+    return [input_file(splats), camera_input(cameras, views), *(input_file(pack) for pack in features)]
+
+
+def input_file(path: Path) -> InputFile:
+    """Where a file, or a SOG that is not bundled, is, and its digest.
+
+    Raises:
+        OSError: it does not open, or is no regular file.
+    """
+    from liftcore.io.ranks import rank_files
+    from liftcore.io.sog import META, sog_files
+    from liftcore.values.lift import InputFile
+
+    resolved = path.resolve()
+    folder = resolved if resolved.is_dir() else resolved.parent
+    if resolved == folder and (ranks := rank_files(folder)):
+        return InputFile(path=str(resolved), sha256=_digest_of_several(ranks, folder))
+    if resolved in (folder, folder / META):
+        return InputFile(path=str(resolved), sha256=_digest_of_several(sog_files(resolved), folder))
+    return InputFile(path=str(resolved), sha256=sha256_of(resolved))
+
+
+def camera_input(path: Path, views: Collection[str] = ()) -> InputFile:
+    """Where cameras are, and the digest of their file or, of several, of the names and digests of all that are read.
+
+    Photos, features and lifts that lie in the same folder do not count: they may come and go.
+
+    Args:
+        path: of the cameras. views: of the features, as `read_cameras` has them.
+    """
+    from liftcore.io.cameras import camera_source
+    from liftcore.values.lift import InputFile
+
+    given = Path(os.path.abspath(path))  # links stay: other files count beside them than where they lead
+    files = camera_source(given, views).files
+    if files == [given]:
+        return InputFile(path=str(given), sha256=sha256_of(given))
+    return InputFile(path=str(given), sha256=_digest_of_several(files, given if given.is_dir() else given.parent))
+
+
+def _digest_of_several(files: Sequence[Path], folder: Path) -> str:
+    total = hashlib.sha256()
+    for part in files:
+        total.update(f"{os.path.relpath(part, folder)} {sha256_of(part)}\n".encode())
+    return total.hexdigest()
+
+
+def found_input(role: str, remembered: InputFile, metadata: LiftMetadata, lift: Path | None) -> Path | None:
+    """Where an input of a lift is: where it was, or beside the lift under its name or another; None if nowhere.
+
+    Cameras will do if those of the lifted views are what they were, whatever others there are.
+
+    Args:
+        role: splats, cameras or features. lift: the lift's file; None looks at the remembered path alone.
+    """
+    path = Path(remembered.path)
+    places = [path] if lift is None else [path, *_beside(lift, path)]
+    for place in places:
+        if place.exists():
+            with suppress(InvalidInput, OSError):
+                found = camera_input(place, metadata.views) if role == "cameras" else input_file(place)
+                if found.sha256 == remembered.sha256 or (role == "cameras" and has_poses(place, metadata)):
+                    return place
+    return None
+
+
+def _beside(lift: Path, path: Path) -> Iterator[Path]:
+    """Where an input may have moved to: under its name, with some of its folders; else any of its kind."""
+    folder, parts = Path(os.path.abspath(lift)).parent, path.parts[1:]
+    for above in (folder, *folder.parents[:NEAR]):
+        yield from (above.joinpath(*parts[-count:]) for count in range(1, min(len(parts), NEAR) + 1))
+    if path.suffix:
+        yield from [other for other in visible_files(folder, f"*{path.suffix}") if other != lift][:MOST_BESIDE]
+
+
+def has_poses(place: Path, metadata: LiftMetadata) -> bool:
+    """Whether a file or folder has the cameras of the lifted views as they were, whatever others it has.
+
+    Lifts from before poses were kept have none to compare: then it has not.
+
+    Raises:
+        InvalidCameras: it does not read.
+    """
+    from liftcore.io.cameras import read_cameras
+
+    if not metadata.poses:
+        return False
+    cameras = read_cameras(place, choosing=False, views=metadata.views)
+    known = [cameras[view] for view in metadata.views if view in cameras]
+    if len(known) != len(metadata.views):
+        return False
+    # Lifts from before names were composed have the digest of those that a Mac gave.
+    return metadata.poses in (poses_of(known), poses_of(known, "NFD"))
+
+
+def poses_of(cameras: Sequence[Camera], form: Literal["NFC", "NFD"] = "NFC") -> str:
+    """A digest of what cameras see, in their order, with their names in a form of Unicode."""
+    total = hashlib.sha256()
+    for camera in cameras:
+        total.update(camera.viewmat.tobytes() + camera.K.tobytes())
+        seen = (unicodedata.normalize(form, camera.name), camera.width, camera.height, camera.lens)
+        total.update(repr(seen if camera.face is None else (*seen, camera.face)).encode())
+    return total.hexdigest()
+
+
+def sha256_of(path: Path) -> str:
+    """The digest of a file, in hexadecimal digits.
+
+    Raises:
+        OSError: it does not open, or is no regular file.
+    """
+    with open_regular(path) as handle:
+        return hashlib.file_digest(handle, "sha256").hexdigest()

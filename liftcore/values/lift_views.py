@@ -1,0 +1,48 @@
+"""The views of a lift: features and cameras, paired by name."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+from liftcore.scene.cameras import Camera, Cameras
+from liftcore.values.pack import Views, as_views, pair
+from liftcore.values.settings import LiftSettings
+from liftcore.values.views import ViewFeatures
+
+Given = Mapping[str, ViewFeatures] | Iterable[tuple[str, ViewFeatures]]
+
+
+@dataclass
+class LiftViews:
+    """The views of a lift, features and cameras paired by name; each view is read when it is asked for."""
+
+    cameras: Cameras
+    features: Views  # paired with the cameras
+    names: list[str]  # that are lifted, in the order of the sums
+    unpaired: list[str]  # views with features and no camera, which are skipped
+
+    @classmethod
+    def of(cls, views: Given, cameras: Cameras | Mapping[str, Camera], settings: LiftSettings) -> "LiftViews":
+        """Views paired with cameras by name, every ``view_stride``-th of them.
+
+        Raises:
+            InvalidFeatures: no view has a camera, or views are malformed.
+            InvalidCameras: there is no camera.
+        """
+        known = cameras if isinstance(cameras, Cameras) else Cameras(cameras)
+        features, unpaired = pair(as_views(views), known)
+        return cls(known, features, list(features.views[:: settings.view_stride]), unpaired)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, number: int) -> tuple[Camera, ViewFeatures]:
+        """The camera of the view of that number, and what it observes."""
+        return self.cameras[self.names[number]], self.features[self.names[number]]
+
+    def __iter__(self) -> Iterator[tuple[Camera, ViewFeatures]]:
+        """The views, one in memory at a time."""
+        return (self[number] for number in range(len(self)))
+
+    def camera(self, number: int) -> Camera:
+        """Of the view of that number."""
+        return self.cameras[self.names[number]]

@@ -1,0 +1,499 @@
+"""Views of features by name: from feature packs, from values in memory or from an iterator, read alike.
+
+A feature pack is a ``.safetensors`` file of what 2D encoders saw: it can be mapped and holds no code. A view ``V``
+is either regions, ``V/labels`` [L, h, w] (u8 with 255 for none, i16 or i32 with -1) with ``V/codebook`` [M, F], or a
+grid, ``V/grid`` [h, w, F]. A pack may bring its words: ``embeddings`` [n, F] and the metadata ``words``, as a table
+of text embeddings has them; a lift of it is asked in these without an encoder.
+"""
+
+import errno
+import json
+import math
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import IO, Any, Protocol, cast
+
+import torch
+from torch import Tensor
+
+from liftcore.errors import InvalidFeatures, InvalidTable, Unavailable
+from liftcore.io.files import whole_file
+from liftcore.io.remote import local_path
+from liftcore.io.safetensors_file import MAX_HEADER_BYTES, TYPES, check_header, safetensors_header, tensor_bytes
+from liftcore.runtime.progress import Progress, silent
+from liftcore.runtime.torch_modes import callers_modes
+from liftcore.scene.cameras import Camera
+from liftcore.scene.views import composed, require_pairs
+from liftcore.text.table import TableEncoder
+from liftcore.values.lens import as_pinhole_sees, grid_sides
+from liftcore.values.views import MAX_CHANNELS, NO_LABEL, FeatureGrid, Regions, ViewFeatures
+
+U8_NO_LABEL = 255
+LARGEST_I16 = 32_767
+LABEL_TYPES = ("U8", "I16", "I32")
+FEATURE_TYPES = ("F16", "F32", "BF16")
+PARTS = ("labels", "codebook", "grid")
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+TABLE = "embeddings"
+
+
+@dataclass(frozen=True)
+class TensorSpec:
+    """What is known of a tensor before it is read."""
+
+    dtype: str  # safetensors' name: "F16"
+    shape: tuple[int, ...]
+
+
+class _Source(Protocol):
+    """Where one view is."""
+
+    @property
+    def specs(self) -> Mapping[str, TensorSpec]: ...  # by part: labels and codebook, or grid
+    def read(self) -> ViewFeatures: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Views(Mapping[str, ViewFeatures]):
+    """View name -> `Regions` or `FeatureGrid`, names sorted; each view is read and checked when it is asked for.
+
+    Of packs, headers are checked at once. Reading a view raises InvalidFeatures where there is none of that name, a
+    label is out of the codebook, or a feature is not finite. Paired with cameras (`pair`), a view is what the
+    camera's pinhole sees.
+    """
+
+    channels: int  # F
+    encoder: str  # the 2D encoder as the packs tell it, "" when they do not
+    text_space: str  # the text encoder that shares the space; "" unknown, "none" when there is none
+    normalised: bool | None  # whether codebook rows and grid cells are unit vectors; None when not told
+    _sources: Mapping[str, _Source] = field(repr=False)
+    table: TableEncoder | None = None  # the packs' own words
+    paths: tuple[Path, ...] = ()  # of the packs that it reads; () where views come from elsewhere
+    _cameras: Mapping[str, Camera] = field(default_factory=dict, repr=False)
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """The names, sorted."""
+        return tuple(sorted(self._sources))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.views)
+
+    def __len__(self) -> int:
+        return len(self._sources)
+
+    def __contains__(self, view: object) -> bool:
+        return view in self._sources
+
+    def __getitem__(self, view: str) -> ViewFeatures:
+        found = self._find(view).read()
+        if found.codebook.shape[1] != self.channels:
+            got = f"{found.codebook.shape[1]} in {view!r}"
+            raise InvalidFeatures("features", expected=f"{self.channels} channels in every view", got=got)
+        camera = self.seeing(view)
+        return found if camera is None else as_pinhole_sees(found, camera)
+
+    def is_regions(self, view: str) -> bool:
+        """Whether the view is a region map; else it is a grid."""
+        return "labels" in self._find(view).specs
+
+    def specs(self, view: str) -> dict[str, TensorSpec]:
+        """The tensors of a view by part (labels and codebook, or grid), from the header alone."""
+        specs = dict(self._find(view).specs)
+        camera = self.seeing(view)
+        if camera is None or (camera.lens is None and camera.face is None):
+            return specs
+        if "grid" in specs:
+            height, width, channels = specs["grid"].shape
+            return {"grid": replace(specs["grid"], shape=(*grid_sides(height, width, camera), channels))}
+        levels = math.prod(specs["labels"].shape[:-2])
+        return specs | {"labels": replace(specs["labels"], shape=(levels, camera.height, camera.width))}
+
+    def map_size(self, view: str) -> tuple[int, int]:
+        """Width and height of a view's labels or grid as they are stored, from the header alone."""
+        specs = self._find(view).specs
+        height, width = specs["labels"].shape[-2:] if "labels" in specs else specs["grid"].shape[:2]
+        return width, height
+
+    def seen_by(self, views: Mapping[str, str], cameras: Mapping[str, Camera]) -> "Views":
+        """The views that ``views`` names for cameras, and no others, each as its camera sees it, under its name."""
+        sources = {name: self._find(view) for name, view in views.items()}
+        seeing = {name: self._cameras.get(view, cameras[name]) for name, view in views.items()}
+        return replace(self, _sources=sources, _cameras=seeing)
+
+    def seeing(self, view: str) -> Camera | None:
+        """The camera whose pinhole sees the view; None of views that are not paired."""
+        return self._cameras.get(composed(view))
+
+    def _find(self, view: str) -> _Source:
+        found = self._sources.get(composed(view))
+        if found is None:
+            raise InvalidFeatures("view", expected="a view of the features", got=repr(view))
+        return found
+
+
+def as_views(
+    views: Mapping[str, ViewFeatures] | Iterable[tuple[str, ViewFeatures]], scratch: Path | None = None
+) -> Views:
+    """What `lift` reads of any views: as they are, a mapping's when they are asked for, an iterator's from the disk.
+
+    An iterator is consumed once, a view at a time: each is written to a file that has no name any more once this
+    returns, so a lift that reads views again never holds all of them.
+
+    Args:
+        views: `Views`, a mapping of names, which may read its values lazily, or pairs of a name and a value.
+        scratch: the folder for an iterator's views; None: the system's for temporary files.
+
+    Raises:
+        InvalidFeatures: there are none, one is neither regions nor a grid, a name comes twice, channels differ, or it
+            is something else, such as a path.
+        Unavailable: the disk has no room for an iterator's views.
+    """
+    if isinstance(views, Views):
+        return views
+    if isinstance(views, str | Path) or not isinstance(views, Iterable):
+        got, hint = f"{type(views).__name__} {views!r}"[:80], "read_features(path) opens a feature pack"
+        raise InvalidFeatures("features", expected="views by name, or pairs of a name and a view", got=got, hint=hint)
+    if not isinstance(views, Mapping):
+        return _spooled(views, scratch)
+    given = cast("Mapping[str, ViewFeatures]", views)
+    sources = {name: _Given(given, key) for name, key in _composed_names(given).items()}
+    if not sources:
+        raise InvalidFeatures("features", expected="at least one view", got="none")
+    if isinstance(views, dict):  # other mappings may read files: theirs are checked one by one
+        _check_channels((name, source.read()) for name, source in sources.items())
+    channels = next(iter(sources.values())).read().codebook.shape[1]
+    return Views(channels, "", "", None, sources)
+
+
+def read_features(*paths: str | Path) -> Views:
+    """Open feature packs as one set of views; only headers are read.
+
+    Raises:
+        InvalidInput: one lies elsewhere (`io.remote`), and does not come.
+        InvalidFeatures: a file is no feature pack, a view is malformed or in two packs, or the packs do not
+            share their channels and their encoder.
+    """
+    packs = [_open(local_path(path)) for path in paths]
+    sources: dict[str, _Stored] = {}
+    channels: dict[int, str] = {}
+    for pack in packs:
+        for view, stored in _composed_names(_views(pack)).items():
+            if view in sources:
+                got = f"{view!r} in {sources[view].pack.path} and {pack.path}"
+                raise InvalidFeatures("features", expected="each view in one pack", got=got)
+            sources[view] = _Stored(pack, stored)
+            channels.setdefault(_check_specs(sources[view]), sources[view].where)
+    if not sources:
+        raise InvalidFeatures("features", expected="at least one view", got=f"{len(packs)} packs without any")
+    if len(channels) > 1:
+        (one, here), (other, there) = list(channels.items())[:2]
+        got = f"{one} in {here} and {other} in {there}"
+        raise InvalidFeatures("features", expected="the same channels in every view", got=got)
+    normalised = {"true": True, "false": False}.get(_agreed(packs, "normalised").lower())
+    encoder, text_space = _agreed(packs, "encoder"), _agreed(packs, "text_space")
+    table = _table(packs, next(iter(channels)))
+    told = (encoder, text_space, normalised, sources, table, tuple(pack.path for pack in packs))
+    return Views(next(iter(channels)), *told)
+
+
+def pair(views: Views, cameras: Mapping[str, Camera]) -> tuple[Views, list[str]]:
+    """The views that have a camera, named like it, and the names of those that have none, to be skipped and told.
+
+    A panorama's view is one of each of its faces; a view that is named like a face is a map of the face itself.
+
+    Raises:
+        InvalidFeatures: no view has a camera.
+    """
+    faces: dict[str, list[str]] = {}
+    for name, camera in cameras.items():
+        if camera.face is not None:
+            faces.setdefault(camera.face.photo, []).append(name)
+    names = require_pairs(views.views, {*cameras, *faces})
+    seen = {face: view for view, name in names.items() for face in faces.get(name, [])}
+    own = {name: view for view, name in names.items() if name not in faces}
+    seeing = {**cameras, **{name: cameras[name].replace(face=None) for name in own}}
+    return views.seen_by(seen | own, seeing), [view for view in views if view not in names]
+
+
+def write_pack(
+    path: Path,
+    views: Mapping[str, ViewFeatures],
+    metadata: Mapping[str, str],
+    progress: Progress = silent,
+    table: TableEncoder | None = None,
+) -> None:
+    """Write views as a feature pack, whole or not at all.
+
+    ``views`` may read its views when they are asked for: each is asked for twice, once for its shape and once for
+    its bytes, and forgotten in between. Labels are stored as int16 where the codebook allows.
+
+    Args:
+        path: the file to write.
+        views: view name -> what it observes.
+        metadata: ``encoder``, ``text_space``, ``normalised`` ("true" or "false") and what else to keep.
+        progress: told about the stages "check" and "pack", in views.
+        table: words of the pack's own, of as many channels.
+
+    Raises:
+        InvalidFeatures: there are no views, or their channels differ.
+    """
+    if not views:
+        raise InvalidFeatures(str(path), expected="at least one view", got="none")
+    with whole_file(path) as handle:
+        if table is None:
+            return _write(handle, views, metadata, progress)
+        own = {TABLE: torch.from_numpy(table.embeddings).half()}
+        _write(handle, views, {**metadata, "words": json.dumps(table.words)}, progress, own)
+
+
+def _write(
+    handle: IO[bytes],
+    views: Mapping[str, ViewFeatures],
+    metadata: Mapping[str, str],
+    progress: Progress,
+    others: Mapping[str, Tensor] = MappingProxyType({}),
+) -> None:
+    specs = [(name, one.dtype, tuple(one.shape)) for name, one in others.items()]
+
+    def checked() -> Iterator[tuple[str, ViewFeatures]]:
+        for done, (view, features) in enumerate(views.items(), start=1):
+            yield view, features
+            specs.extend((f"{view}/{part}", one.dtype, tuple(one.shape)) for part, one in _parts(features))
+            progress("check", done, len(views), "views")
+
+    _check_channels(checked())
+    header, offsets = safetensors_header(specs, metadata)
+    if len(header) > MAX_HEADER_BYTES:
+        raise InvalidFeatures("views", expected="fewer views in a pack", got=str(len(views)))
+    handle.write(header)
+    for name, tensor in others.items():
+        handle.seek(len(header) + offsets[name])
+        handle.write(tensor_bytes(tensor))
+    for done, (view, features) in enumerate(views.items(), start=1):
+        for part, tensor in _parts(features):
+            handle.seek(len(header) + offsets[f"{view}/{part}"])
+            handle.write(tensor_bytes(tensor))
+        progress("pack", done, len(views), "views")
+
+
+def _parts(features: ViewFeatures) -> Iterator[tuple[str, Tensor]]:
+    """The tensors of a view as they are stored."""
+    if isinstance(features, Regions):
+        narrow = len(features.codebook) <= LARGEST_I16
+        yield "labels", features.labels.to(torch.int16 if narrow else torch.int32)
+        yield "codebook", features.codebook
+    else:
+        yield "grid", features.grid
+
+
+def _check_channels(views: Iterable[tuple[str, ViewFeatures]]) -> None:
+    channels: dict[int, str] = {}
+    for view, features in views:
+        channels.setdefault(features.codebook.shape[1], view)
+    if len(channels) > 1:
+        got = ", ".join(f"{count} in {view!r}" for count, view in list(channels.items())[:3])
+        raise InvalidFeatures("features", expected="the same channels in every view", got=got)
+
+
+def _spooled(pairs: Iterable[tuple[str, ViewFeatures]], scratch: Path | None) -> Views:
+    with tempfile.TemporaryDirectory(dir=scratch, prefix="splatlift-views-") as folder:
+        files: dict[str, Path] = {}
+        for pair in _in_callers_modes(pairs):
+            if not (isinstance(pair, tuple | list) and len(pair) == 2):
+                got = type(pair).__name__
+                raise InvalidFeatures("features", expected="pairs of a name and a view", got=got)
+            name, features = pair
+            (name,) = _composed_names([name])
+            if name in files:
+                raise InvalidFeatures("features", expected="each view once", got=f"{name!r} twice")
+            files[name] = Path(folder, f"{len(files)}.safetensors")
+            view = _Given({name: features}, name).read()
+            try:
+                with files[name].open("wb") as handle:
+                    _write(handle, {name: view}, {}, silent)
+            except OSError as error:
+                if error.errno not in NO_ROOM:
+                    raise
+                hint = "set TMPDIR to a folder with more room, or give a mapping of views, which is read as it is"
+                expected, got = f"room for an iterator's views in {folder}", error.strerror or str(error)
+                raise Unavailable("features", expected=expected, got=got, hint=hint) from error
+        if not files:
+            raise InvalidFeatures("features", expected="at least one view", got="none")
+        return replace(read_features(*files.values()), paths=())  # mapped: the files may lose their names
+
+
+def _composed_names(names: Iterable[Any]) -> dict[str, str]:
+    """Composed name (NFC) -> the name as it came."""
+    found: dict[str, str] = {}
+    for name in names:
+        if not isinstance(name, str):
+            expected, got = "names that are texts, as of cameras", f"{type(name).__name__} {name!r}"[:80]
+            raise InvalidFeatures("features", expected=expected, got=got)
+        if found.setdefault(composed(name), name) != name:
+            got = f"{name!a} and {found[composed(name)]!a}, which are one name in other forms of Unicode"
+            raise InvalidFeatures("features", expected="each view once", got=got[:200])
+    return found
+
+
+def _in_callers_modes(values: Iterable[Any]) -> Iterator[Any]:
+    """The values, each made as if there were no library around the iterator."""
+    with callers_modes():
+        rest = iter(values)
+    end = object()
+    while True:
+        with callers_modes():
+            value = next(rest, end)
+        if value is end:
+            return
+        yield value
+
+
+@dataclass(frozen=True)
+class _Given:
+    """A view of a mapping of values."""
+
+    views: Mapping[str, ViewFeatures]
+    name: str
+
+    @property
+    def specs(self) -> Mapping[str, TensorSpec]:
+        return {part: TensorSpec(TYPES[str(one.dtype)], tuple(one.shape)) for part, one in _parts(self.read())}
+
+    def read(self) -> ViewFeatures:
+        with callers_modes():
+            found = self.views[self.name]
+        if isinstance(found, Regions | FeatureGrid):
+            return found.cpu()
+        hint = "make FeatureGrid(map [h, w, F]) or Regions(labels [L, h, w], codebook [M, F]) of arrays"
+        raise InvalidFeatures(
+            f"view {self.name!r}", expected="Regions or FeatureGrid", got=type(found).__name__, hint=hint
+        )
+
+
+@dataclass(frozen=True)
+class _PackFile:
+    path: Path
+    handle: Any  # an open safetensors mapping
+    specs: dict[str, TensorSpec]
+    metadata: dict[str, str]
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """A view of a pack."""
+
+    pack: _PackFile
+    name: str
+
+    @property
+    def where(self) -> str:
+        return f"{self.pack.path} view {self.name!r}"
+
+    @property
+    def specs(self) -> dict[str, TensorSpec]:
+        keys = {part: f"{self.name}/{part}" for part in PARTS}
+        return {part: self.pack.specs[key] for part, key in keys.items() if key in self.pack.specs}
+
+    def read(self) -> ViewFeatures:
+        tensor = self.pack.handle.get_tensor
+        if "grid" in self.specs:
+            return FeatureGrid(tensor(f"{self.name}/grid"), where=self.where)
+        stored = tensor(f"{self.name}/labels")
+        labels = stored.to(torch.int32)
+        if stored.dtype == torch.uint8:
+            labels[stored == U8_NO_LABEL] = NO_LABEL
+        return Regions(labels, tensor(f"{self.name}/codebook"), where=self.where)
+
+
+def _open(path: Path) -> _PackFile:
+    from safetensors import SafetensorError, safe_open
+
+    expected, hint = "a feature pack (.safetensors)", "make packs with 'splatlift pack'"
+    check_header(path, str(path), InvalidFeatures, expected=expected, hint=hint)
+    try:
+        handle: Any = safe_open(str(path), framework="pt")
+        slices = {name: handle.get_slice(name) for name in tuple(handle.keys())}
+        specs = {name: TensorSpec(part.get_dtype(), _axes(name, part.get_shape())) for name, part in slices.items()}
+        return _PackFile(path, handle, specs, handle.metadata() or {})
+    except (SafetensorError, OSError) as error:
+        got = f"a file that does not open as one ({str(error)[:120]})"
+        raise InvalidFeatures(str(path), expected=expected, got=got) from None
+
+
+def _axes(name: str, shape: Sequence[int]) -> tuple[int, ...]:
+    """The shape of a tensor of a pack without axes of length 1 before its own, which values do without too."""
+    most = {"labels": 3, "grid": 3, "codebook": 2}.get(name.rpartition("/")[2], len(shape))
+    extra = max(len(shape) - most, 0)
+    return tuple(shape[extra:]) if all(side == 1 for side in shape[:extra]) else tuple(shape)
+
+
+def _views(pack: _PackFile) -> list[str]:
+    views: dict[str, None] = {}
+    for key in pack.specs:
+        view, _, part = key.rpartition("/")
+        if key == TABLE and len(pack.specs) > 1:
+            continue
+        if not view or part not in PARTS:
+            hint = "a table of text embeddings belongs to a query" if key == TABLE else ""
+            expected = "tensors 'VIEW/labels' with 'VIEW/codebook', or 'VIEW/grid'"
+            raise InvalidFeatures(str(pack.path), expected=expected, got=repr(key)[:120], hint=hint)
+        views[view] = None
+    return list(views)
+
+
+def _check_specs(stored: _Stored) -> int:
+    """Check the header of one view; its channels."""
+    specs = stored.specs
+    if set(specs) not in ({"grid"}, {"labels", "codebook"}):
+        raise InvalidFeatures(stored.where, expected="labels with a codebook, or a grid", got=" with ".join(specs))
+    axes = {"grid": "h w F", "codebook": "M F", "labels": "L h w"}
+    for part, spec in specs.items():
+        wanted = "h w" if part == "labels" and len(spec.shape) == 2 else axes[part]
+        types = LABEL_TYPES if part == "labels" else FEATURE_TYPES
+        fits = len(spec.shape) == len(wanted.split()) and all(spec.shape) and spec.dtype in types
+        if not fits or (part != "labels" and spec.shape[-1] > MAX_CHANNELS):
+            expected = f"{' or '.join(types)} [{wanted.replace(' ', ', ')}], no side empty"
+            got = f"{spec.dtype} {list(spec.shape)}"
+            raise InvalidFeatures(f"{stored.where} {part}", expected=expected, got=got)
+    return specs["grid" if "grid" in specs else "codebook"].shape[-1]
+
+
+def _table(packs: Sequence[_PackFile], channels: int) -> TableEncoder | None:
+    """The words that the packs bring, the same in all that bring some."""
+    found: dict[Path, TableEncoder] = {}
+    for pack in packs:
+        if TABLE not in pack.specs:
+            continue
+        if pack.specs[TABLE].dtype not in ("F16", "F32"):
+            raise InvalidFeatures(f"{pack.path} {TABLE}", expected="F16 or F32", got=pack.specs[TABLE].dtype)
+        try:
+            rows = pack.handle.get_tensor(TABLE).numpy()
+            found[pack.path] = TableEncoder.of(f"words of {pack.path.name}", pack.metadata.get("words", "null"), rows)
+        except InvalidTable as error:
+            argument = f"{pack.path} {TABLE}"
+            raise InvalidFeatures(argument, expected=error.expected, got=error.got, hint=error.hint) from None
+        if found[pack.path].channels != channels:
+            expected, got = f"{channels} channels, as its views have", str(found[pack.path].channels)
+            raise InvalidFeatures(f"{pack.path} {TABLE}", expected=expected, got=got)
+    first = next(iter(found), None)
+    for path, table in found.items():
+        if first and not (table.words == found[first].words and (table.embeddings == found[first].embeddings).all()):
+            hint = "write the masks of all views into one pack"
+            raise InvalidFeatures(
+                "features", expected="one table in all packs", got=f"two in {first} and {path}", hint=hint
+            )
+    return found[first] if first else None
+
+
+def _agreed(packs: Sequence[_PackFile], key: str) -> str:
+    values = {pack.metadata.get(key, ""): pack.path for pack in packs}
+    told = {value: path for value, path in values.items() if value}
+    if len(told) > 1:
+        got = " and ".join(f"{value[:80]!r} in {path}" for value, path in told.items())
+        hint = "features of different spaces cannot make one lift"
+        raise InvalidFeatures("features", expected=f"one {key} in all packs", got=got, hint=hint)
+    return next(iter(told), "")

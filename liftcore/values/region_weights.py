@@ -1,0 +1,308 @@
+"""Region weights ``W = A^T S``: what each region of each view weighs at each splat, before any feature."""
+
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields, replace
+from itertools import pairwise
+from math import ceil
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from scipy.sparse import csr_array
+from torch import Tensor
+
+from liftcore.errors import InvalidInput, Unavailable
+from liftcore.io.safetensors_file import map_tensors, write_tensors
+from liftcore.runtime.device import out_of_memory
+from liftcore.runtime.memory import zeros
+from liftcore.runtime.one_thread import one_thread
+
+FORMAT = "splatlift-weights/1"
+MEMORY_LIMIT = 1 << 28  # bytes of W that stay in memory; what is beyond lies in mapped files
+MOST_REGIONS = 2**31 - 1  # of all views: an entry names its region in four bytes
+BLOCK_ENTRIES = 1 << 17  # that a thread works on at a time, unless a splat alone has more
+BLOCK_ROWS = 1 << 11
+
+
+@dataclass(frozen=True)
+class RegionWeights:
+    """``W = A'^T S`` of one view or of many, CSR by splat, and the evidence ``A^T 1``.
+
+    ``A'`` holds the weights that the settings select, to their power; for all of them at power 1 it is A. Features of
+    any encoder for the same regions are ``D^-1 W E`` with D the sums of rows. W of several views has a row for every
+    splat, so that ``splats`` is 0..P - 1 and ``indptr`` [P + 1]. Tensors lie in memory, on a device, or in a mapped
+    file.
+    """
+
+    splats: Tensor  # [n] i32 ascending, the splats that have a row; it may be empty
+    indptr: Tensor  # [n + 1] i64, where rows begin
+    region: Tensor  # [nnz] i32 ascending in a row: view v's region m, or cell of a grid, is offsets[v] + m
+    weight: Tensor  # [nnz] f32, sums over rays of the selected w^p times the reading S
+    evidence_splats: Tensor  # [m] i32 ascending, the splats that any ray met, labelled or not
+    evidence: Tensor  # [m] f32, sum of plain weights w (opacity_logit_scale 1, power 1), each ray once
+    offsets: Tensor  # [V + 1] i64, on the CPU: the first region of each view, and how many there are in all
+    views: tuple[str, ...] = ()  # their names, in the order of the offsets; () where nobody named them
+
+    def __repr__(self) -> str:
+        sizes = {"splats": self.splats.shape[0], "regions": int(self.offsets[-1]), "entries": self.region.shape[0]}
+        return f"RegionWeights({', '.join(f'{name}={size}' for name, size in sizes.items())}, on {self.device})"
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all tensors."""
+        return sum(tensor.nbytes for tensor in self.tensors().values())
+
+    @property
+    def device(self) -> torch.device:
+        """Where it lies."""
+        return self.region.device
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Its tensors by name."""
+        return {field.name: getattr(self, field.name) for field in fields(self) if field.name != "views"}
+
+    def cpu(self) -> Self:
+        """The same on the CPU: all of it at once into pinned memory, as other copies wait for each part."""
+        if not self.region.is_cuda:
+            return self
+        made = {}
+        for name, part in self.tensors().items():
+            made[name] = torch.empty(part.shape, dtype=part.dtype, pin_memory=True).copy_(part, non_blocking=True)
+        torch.cuda.current_stream(self.device).synchronize()
+        return replace(self, **made)
+
+    def in_files(self) -> Self:
+        """The same in mapped files, of which only the pages at work are in memory.
+
+        Raises:
+            Unavailable: the disk has no room.
+        """
+        return replace(
+            self,
+            **{
+                name: zeros(tuple(part.shape), part.dtype, name="weights", in_file=True).copy_(part)
+                for name, part in self.tensors().items()
+            },
+        )
+
+    def row_sums(self) -> Tensor:
+        """``W 1``: [n] f64."""
+        sums = torch.zeros(self.splats.shape[0], dtype=torch.float64, device=self.device)
+        for first, last in self.blocks(BLOCK_ROWS << 4, BLOCK_ENTRIES << 2):
+            starts = self.indptr[first : last + 1]
+            values = self.weight[int(starts[0]) : int(starts[-1])]
+            sums[first:last] = segment_sums(values, starts - starts[0])
+        return sums
+
+    def blocks(self, rows: int = BLOCK_ROWS, entries: int = BLOCK_ENTRIES) -> list[tuple[int, int]]:
+        """(first, last) of rows that go together, of about so many rows or entries, whichever is less."""
+        return row_blocks(self.indptr.diff().cpu().numpy(), rows, entries)
+
+    def take(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Where some rows [B] i64 begin among their entries [B + 1] i64, and where these lie in W [nnz'] i64."""
+        begins = self.indptr[rows]
+        starts = from_zero(self.indptr[rows + 1] - begins)
+        total = int(starts[-1])
+        entries = torch.repeat_interleave(begins - starts[:-1], starts.diff(), output_size=total)
+        entries += torch.arange(total, device=entries.device)
+        return starts, entries
+
+    def of_splats(self, first: int, last: int) -> Self:
+        """W and evidence of the splats ``first..last`` alone, counted from ``first`` on; a copy."""
+        bounds = torch.tensor([first, last], dtype=torch.int32, device=self.device)
+        begin, end = torch.searchsorted(self.splats, bounds).tolist()
+        met_begin, met_end = torch.searchsorted(self.evidence_splats, bounds).tolist()
+        starts = self.indptr[begin : end + 1]
+        own = slice(int(starts[0]), int(starts[-1]))
+        return replace(
+            self,
+            splats=self.splats[begin:end] - first,
+            indptr=starts - own.start,
+            region=self.region[own].clone(),
+            weight=self.weight[own].clone(),
+            evidence_splats=self.evidence_splats[met_begin:met_end] - first,
+            evidence=self.evidence[met_begin:met_end].clone(),
+        )
+
+    def runs(self, starts: Tensor, region: Tensor) -> tuple[Tensor, Tensor]:
+        """The runs of some rows, a run being the entries of one view in a row.
+
+        Args:
+            starts: [B + 1] i64, where the rows begin. region: [n] i32, of their entries.
+
+        Returns:
+            Where runs begin among the entries [R + 1] i64, and the row of each [R] i64.
+        """
+        view = torch.searchsorted(self.offsets[1:], region, right=True)
+        begun = torch.ones_like(view, dtype=torch.bool)
+        torch.not_equal(view[1:], view[:-1], out=begun[1:])
+        begun[starts[:-1][starts.diff() > 0]] = True
+        firsts = torch.nonzero(begun)[:, 0]
+        return torch.cat([firsts, starts[-1:]]), torch.searchsorted(starts, firsts, right=True) - 1
+
+    def matrix(self, splats: int) -> csr_array:
+        """W [splats, M] for scipy, a row for each of so many splats.
+
+        Raises:
+            InvalidInput: a splat of W is beyond them.
+        """
+        if self.splats.numel() and int(self.splats[-1]) >= splats:
+            raise InvalidInput("splats", expected=f"{int(self.splats[-1]) + 1} or more", got=str(splats))
+        own, lengths = self.cpu(), np.zeros(splats, np.int64)
+        lengths[own.splats.numpy()] = np.diff(own.indptr.numpy())
+        indptr = np.concatenate([[0], np.cumsum(lengths)])
+        return csr_array((own.weight.numpy(), own.region.numpy(), indptr), shape=(splats, int(own.offsets[-1])))
+
+    def save(self, path: Path | str, others: Mapping[str, Tensor] | None = None) -> None:
+        """Write one safetensors file, whole or not at all: its tensors by name, and ``views`` in the metadata.
+
+        Args:
+            others: tensors that lie beside, under names of their own.
+        """
+        metadata = {"format": FORMAT, "views": json.dumps(self.views)}
+        write_tensors(Path(path), self.tensors() | dict(others or {}), metadata)
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """Map a file that `save` wrote.
+
+        Raises:
+            InvalidInput: it is no such file.
+        """
+        return cls.load_with_others(path)[0]
+
+    @classmethod
+    def load_with_others(cls, path: Path | str) -> tuple[Self, dict[str, Tensor]]:
+        """`load`, and the tensors that lie beside."""
+        names, hint = [field.name for field in fields(cls) if field.name != "views"], "save it anew"
+        try:
+            arrays, metadata = map_tensors(Path(path))
+        except (OSError, ValueError, SafetensorError) as error:
+            raise InvalidInput("weights", expected=f"a file of {FORMAT}", got=str(error), hint=hint) from None
+        if metadata.get("format") != FORMAT or not set(names) <= arrays.keys():
+            raise InvalidInput("weights", expected=f"a file of {FORMAT}", got="another safetensors file", hint=hint)
+        tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
+        others = {name: tensor for name, tensor in tensors.items() if name not in names}
+        own = {name: tensors[name] for name in names}
+        return cls(**own, views=tuple(json.loads(metadata["views"]))), others
+
+
+def one_view(
+    splats: Tensor, indptr: Tensor, region: Tensor, weight: Tensor, evidence_splats: Tensor, evidence: Tensor,
+    *, regions: int,
+) -> RegionWeights:  # fmt: skip
+    """W of a view of so many regions, as a raster finds it. See `RegionWeights`."""
+    offsets = torch.tensor([0, regions])
+    return RegionWeights(splats, indptr, region, weight, evidence_splats, evidence, offsets)
+
+
+@one_thread()
+def stacked(parts: Sequence[RegionWeights], splats: int, threads: int | None = None) -> RegionWeights:
+    """W of all views of the parts, in their order, with a row for every splat; evidence is added up.
+
+    The result lies where all parts lie if there is room, else on the CPU: in memory, or in mapped files beyond
+    MEMORY_LIMIT.
+
+    Args:
+        splats: P. threads: None takes the cores that this process may use. The number changes no bit.
+
+    Raises:
+        Unavailable: there are more regions than four bytes can number, or no room for W.
+    """
+    try:
+        return _stacked(parts, splats, threads)
+    except RuntimeError as error:
+        if not out_of_memory(error) or all(not part.region.is_cuda for part in parts):
+            raise
+    return _stacked([part.cpu() for part in parts], splats, threads)  # out here the error holds nothing any more
+
+
+def _stacked(parts: Sequence[RegionWeights], splats: int, threads: int | None) -> RegionWeights:
+    counts = [int(part.offsets[-1]) for part in parts]
+    bases = np.concatenate([[0], np.cumsum(counts)]).tolist()
+    if bases[-1] > MOST_REGIONS:
+        got, hint = f"{bases[-1]} in {len(parts)} views", "lift fewer views, or smaller maps"
+        raise Unavailable("features", expected=f"at most {MOST_REGIONS} regions", got=got, hint=hint)
+    places = {part.device for part in parts}
+    place = places.pop() if len(places) == 1 else torch.device("cpu")
+    lengths = torch.zeros(splats, dtype=torch.int64, device=place)
+    evidence = torch.zeros(splats, dtype=torch.float64, device=place)
+    for part in parts:  # whose splats are different ones, so that no two threads of a device add to one
+        lengths.index_add_(0, part.splats.to(place), part.indptr.diff().to(place))
+        evidence.index_add_(0, part.evidence_splats.to(place), part.evidence.to(place).double())
+    indptr = from_zero(lengths)
+    total = int(indptr[-1])
+    made = []
+    for dtype in (torch.int32, torch.float32):
+        if place.type == "cpu":
+            made.append(zeros((total,), dtype, name="weights", in_file=8 * total > MEMORY_LIMIT))
+        else:
+            made.append(torch.empty(total, dtype=dtype, device=place))
+    region, weight = made
+
+    def fill(first: int, last: int) -> None:
+        cursors = indptr[first:last].clone()
+        for part, base in zip(parts, bases[:-1], strict=True):
+            bounds = torch.tensor([first, last], dtype=torch.int32, device=part.device)
+            begin, end = torch.searchsorted(part.splats, bounds).tolist()
+            if begin == end:
+                continue
+            rows, starts = part.splats[begin:end].to(place) - first, part.indptr[begin : end + 1]
+            own = slice(int(starts[0]), int(starts[-1]))
+            starts = starts.to(place) - own.start
+            at, lengths = cursors.index_select(0, rows), starts.diff()
+            to = torch.repeat_interleave(at - starts[:-1], lengths, output_size=own.stop - own.start)
+            to += torch.arange(to.shape[0], device=place)
+            region.scatter_(0, to, part.region[own].to(place) + base)
+            weight.scatter_(0, to, part.weight[own].to(place))
+            cursors.index_add_(0, rows, lengths)
+
+    ranges = [(0, splats)]  # on a card, which takes longer to be asked for a piece than to move it
+    if place.type == "cpu":
+        ranges = row_blocks(lengths.numpy(), max(splats, 1), max(1 << 20, total >> 5))  # each asks every view
+    run_each(fill, ranges, threads)
+    met = torch.nonzero(evidence)[:, 0]
+    own = [part.offsets[1:] + base for part, base in zip(parts, bases, strict=False)]
+    offsets = torch.cat([torch.zeros(1, dtype=torch.int64), *own])
+    names = tuple(name for part in parts for name in part.views)
+    every = torch.arange(splats, dtype=torch.int32, device=place)
+    return RegionWeights(every, indptr, region, weight, met.int(), evidence[met].float(), offsets, names)
+
+
+def row_blocks(lengths: np.ndarray, rows: int, entries: int) -> list[tuple[int, int]]:
+    """(first, last) of rows that go together: at most about so many rows and entries, at least one row.
+
+    Args:
+        lengths: [n] i64, entries of each row.
+    """
+    before = np.concatenate([[0], np.cumsum(lengths / entries + 1 / rows)])  # of a full block
+    number = max(ceil(before[-1]), 1)
+    ends = np.searchsorted(before, before[-1] * np.arange(1, number) / number)
+    edges = np.unique([0, *ends, lengths.size]).tolist()
+    return list(pairwise(edges))
+
+
+def run_each(work: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], threads: int | None) -> None:
+    """Do the work for each tuple of arguments, by so many threads; None takes the cores that this process may use.
+
+    What several of them write must not overlap. The first error of any is raised.
+    """
+    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
+        list(pool.map(lambda own: work(*own), arguments))
+
+
+def from_zero(lengths: Tensor) -> Tensor:
+    """[n] -> [n + 1], their sums from the left, from nought."""
+    return torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
+
+
+def segment_sums(values: Tensor, starts: Tensor) -> Tensor:
+    """Sums [n] f64 of values between ``starts`` [n + 1] i64, each in its order."""
+    if values.numel() == 0:
+        return torch.zeros(starts.shape[0] - 1, dtype=torch.float64, device=values.device)
+    return torch.segment_reduce(values.double(), "sum", offsets=starts, initial=0)

@@ -1,0 +1,352 @@
+"""The settings of a lift: presets by name, and the knobs that they set.
+
+Importing this module loads neither torch nor numba: the service validates requests with it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from enum import StrEnum
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
+from pydantic_core import PydanticCustomError
+
+from liftcore.errors import InvalidSettings
+from liftcore.runtime.nearest import nearest
+from liftcore.scene.compositing import MOST_OF_A_RAY, CompositingParams, Selection, Weighting, check_antialiased
+
+if TYPE_CHECKING:  # it loads torch
+    from liftcore.scene.splats import Splats
+
+TIKHONOV_GAIN = 1.2  # lambda of the paper's Tikhonov Guidance (App. Tikhonov, lambda sweep)
+LARGEST_ALPHA = 0.9999999  # nearer to one, float32 says one, and the ray has no light left to go on with
+VISIBLE_WEIGHT = 0.05  # a splat that weighs less at its centre is hidden there, or hardly there at all
+NO_MASKS = "grids, or maps without a label"
+_SHOWN = 80  # characters of a wrong value in an error
+NEAREST = 3  # settings that are named where one is unknown
+
+
+class Preset(StrEnum):
+    """Ours, which trusts no single mask, or a published choice of weights on the same ray walk."""
+
+    DEFAULT = "default"  # row-sum, reweighted by mask consensus, by region reliability and by view consistency
+    ROW_SUM = "row-sum"  # x_j = sum w b / sum w, Eq. 6
+    TIKHONOV = "tikhonov"  # x_j = sum w~^2 b / sum w~^2 with alpha~ = sigmoid(1.2 theta)
+    ARGMAX = "argmax"  # the largest w of a ray alone
+    TOP_K = "top-k"  # the 40 largest w of a ray (Dr. Splat's paper)
+    FRONT_MASS = "front-mass"  # the front splats, until three quarters of the light are taken (VALA's gate)
+    CENTRE = "centre"  # one ray a splat and view, through its projected centre (Occam's LGS)
+    MEAN = "mean"  # the same ray, and the plain mean over the views that see the splat (Semantic Gaussians)
+
+
+_REWEIGHTED = {"reliability": "auto", "consensus": "auto", "aggregation_guard": True}  # what asks for a robust step
+_PRESETS: dict[Preset, dict[str, Any]] = {
+    Preset.DEFAULT: {"robust_steps": 1, **_REWEIGHTED, "aggregation_clusters": "auto"},
+    Preset.ROW_SUM: {},
+    Preset.TIKHONOV: {"power": 2, "lift_gain": TIKHONOV_GAIN, "render_gain": TIKHONOV_GAIN},
+    Preset.ARGMAX: {"selection": Selection.TOP_K, "k": 1},
+    Preset.TOP_K: {"selection": Selection.TOP_K, "k": 40},
+    Preset.FRONT_MASS: {"selection": Selection.FRONT_MASS, "mass": 0.75},
+    Preset.CENTRE: {"selection": Selection.CENTRE},
+    Preset.MEAN: {"selection": Selection.CENTRE, "power": 0, "weight_floor": VISIBLE_WEIGHT},
+}
+
+
+class Speed(StrEnum):
+    """Where the dial between speed and accuracy stands."""
+
+    EXACT = "exact"  # every pixel of every view
+    BALANCED = "balanced"
+    FAST = "fast"
+    DRAFT = "draft"
+
+
+_SPEEDS: dict[Speed, dict[str, Any]] = {
+    Speed.EXACT: {},
+    Speed.BALANCED: {"stride": 2, "certificate_rays": 2_000},
+    Speed.FAST: {
+        "stride": 3,
+        "view_cosine": 0.992,
+        "coverage": 40,
+        "transmittance_stop": 0.003,
+        "certificate_rays": 500,
+    },
+    Speed.DRAFT: {
+        "stride": 4,
+        "view_cosine": 0.98,
+        "coverage": 20,
+        "transmittance_stop": 0.01,
+        "certificate_rays": 200,
+    },
+}
+
+
+MOST_CERTIFICATE_RAYS = 1_000_000  # of a new lift: ten millions of one view took 8 GB
+
+
+class LiftSettings(BaseModel):
+    """All that decides the result of a lift, and where it runs. Knobs left out take the preset's values."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    preset: Preset = Preset.DEFAULT
+    speed: Speed = Field(Speed.EXACT, description="the dial: sets stride, cut-off, views and certificate rays")
+    selection: Selection = Field(Selection.ALL, description="which of a ray's weights count")
+    k: int = Field(40, ge=1, le=MOST_OF_A_RAY, description="how many weights of a ray top-k keeps")
+    mass: float = Field(0.75, gt=0, le=1, description="the share of the light within which front-mass keeps weights")
+    weight_floor: float = Field(0.0, ge=0, lt=1, description="smaller weights count none, in every selection")
+    power: int = Field(1, ge=0, le=2, description="a kept weight's exponent: 1, w or w^2")
+    lift_gain: float = Field(1.0, gt=0, le=16, description="lambda on the opacity logits, lifting")
+    render_gain: float = Field(1.0, gt=0, le=16, description="lambda on the opacity logits, rendering")
+    alpha_cap: float = Field(0.99, gt=0, le=LARGEST_ALPHA, description="the largest alpha of a splat on a ray")
+    transmittance_stop: float = Field(1e-4, ge=0, lt=1, description="a ray ends before T falls to this")
+    antialiased: bool | Literal["auto"] = Field(
+        "auto",
+        description="opacities compensated for the low-pass (mip filter), 3DGS only; auto: where the file of the "
+        "splats says that they were trained so",
+    )
+    stride: int = Field(1, ge=1, le=64, description="lift from every n-th pixel in x and in y")
+    view_stride: int = Field(1, ge=1, description="lift from every n-th view, from the first on")
+    coverage: int = Field(
+        0, ge=0, description="views are chosen until they show a splat so often; with view_cosine, so often at least"
+    )
+    view_cosine: float = Field(
+        0.0, ge=0, lt=1, description="the fewest views whose features should come this near to those of all, 0 = all"
+    )
+    levels: Literal["rows", "composite"] | Annotated[int, Field(strict=True, ge=0)] = Field(
+        "rows", description="levels as rows of their own, summed in composite regions, or one level by its number"
+    )
+    grid_reading: Literal["bilinear", "nearest"] = Field(
+        "bilinear", description="what a pixel reads of a feature grid: four cells by distance, or the nearest alone"
+    )
+    robust_steps: int = Field(0, ge=0, le=100, description="times that regions are reweighted by their agreement")
+    reliability: bool | Literal["auto"] = Field(
+        False,
+        description="regions are weighted as a whole too, by what other views say of all their splats; auto: those "
+        "of masks, and grids stay as they are",
+    )
+    consensus: bool | Literal["auto"] = Field(
+        False,
+        description="regions are weighted by whether masks of other views keep their splats together; auto: where "
+        "there are masks, and grids stay as they are",
+    )
+    objects: bool | Literal["auto"] = Field(
+        "auto",
+        description="find objects without words, by what masks of many views keep together; auto: where the lift "
+        "has a region for each mask",
+    )
+    loss: Literal["l2", "huber"] = Field(
+        "l2", description="what features are nearest by: squares, or Huber's loss, by a few reweighted closed forms"
+    )
+    dtype: Literal["float16", "float32"] = Field(
+        "float16", description="how features are stored, if it can hold them"
+    )
+    aggregation: bool = Field(False, description="Post-Lifting Aggregation: one feature a cluster of splats")
+    aggregation_clusters: Literal["hdbscan", "touching", "graph", "auto"] = Field(
+        "hdbscan",
+        description="what makes clusters: HDBSCAN on features; touching, its clusters parted in space; the graph of "
+        "regions, which other views keep together; auto: the graph where there are masks, else touching",
+    )
+    aggregation_guard: bool = Field(
+        False,
+        description="splats take their cluster's feature only where it explains what views say of them as well as "
+        "their own",
+    )
+    aggregation_iou: float = Field(0.75, gt=0, le=1, description="from which IoU with its cluster a region is kept")
+    aggregation_cluster_size: int = Field(500, ge=2, le=10_000_000, description="splats at least in a cluster")
+    aggregation_neighbours: int = Field(10, ge=1, le=1_000, description="neighbours that a splat's density reaches")
+    aggregation_sample: int = Field(10_000, ge=2, le=50_000, description="splats that HDBSCAN sees")
+    aggregation_resolve: bool = Field(
+        False,
+        description="splats without a cluster's feature are solved for again from the kept regions alone, if these "
+        "have most of their weight",
+    )
+    aggregation_channels: int = Field(50, ge=1, le=1_024, description="principal components that it sees")
+    certificate_rays: int = Field(
+        10_000,
+        ge=0,
+        le=10_000_000,
+        description="rays sampled for the certificate",
+        json_schema_extra={"maximum": MOST_CERTIFICATE_RAYS},  # of a new lift
+    )
+    seed: int = Field(0, ge=0, lt=2**31, description="of samples, random projections and strides")
+    cg_steps: int = Field(0, ge=0, le=10_000, description="least-squares steps from the closed form on, 0 = none")
+    damping: float = Field(1.0, ge=0, le=1e6, description="mu, pulls least squares towards the closed form")
+    cg_basis: int = Field(0, ge=0, le=65_536, description="principal feature directions refined, 0 = all channels")
+    reference_channels: int = Field(
+        0, ge=0, le=1_024, description="random projections in which the certificate finds L(x^), 0 = off"
+    )
+    kernel: Literal["auto", "3dgs", "2dgs", "dbs"] = Field(
+        "auto",
+        description="what the splats are; auto: by their properties, else by what the file says of its training",
+    )
+    device: Literal["auto", "cpu", "cuda"] = Field(
+        "auto", description="what walks and solves: auto takes a card where torch and Triton can use one"
+    )
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _fill_from_preset_and_speed(cls, values: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        if not isinstance(values, dict):
+            return handler(values)
+        preset, speed = values.get("preset", Preset.DEFAULT), values.get("speed", Speed.EXACT)
+        weights = _PRESETS[Preset(preset)] if isinstance(preset, str) and preset in set(Preset) else {}
+        effort = _SPEEDS[Speed(speed)] if isinstance(speed, str) and speed in set(Speed) else {}
+        if values.get("robust_steps") in (0, "0"):  # what comes in with a step goes with it, unless it is asked for
+            weights = {name: value for name, value in weights.items() if name not in _REWEIGHTED}
+        settings = handler({**weights, **effort, **values})
+        settings.model_fields_set.intersection_update(values)  # what a caller set, which stays when a preset changes
+        return settings
+
+    @model_validator(mode="after")
+    def _resolves_whole_regions(self) -> Self:
+        if self.aggregation_resolve and self.levels == "composite":
+            told = "other levels than composite, which cut to pieces the regions that aggregation_resolve drops"
+            raise PydanticCustomError("whole_regions", "{expected}", {"expected": told})
+        if self.aggregation_resolve and self.aggregation_clusters == "graph":
+            told = "aggregation_clusters=hdbscan beside aggregation_resolve: masks that make clusters are all kept"
+            raise PydanticCustomError("whole_regions", "{expected}", {"expected": told})
+        if self.loss == "huber" and self.cg_steps:
+            told = "cg_steps=0 beside loss=huber: such steps go towards the least squares"
+            raise PydanticCustomError("one_loss", "{expected}", {"expected": told})
+        if (self.reliability or self.consensus or self.aggregation_guard) and not self.robust_steps:
+            told = "robust_steps of 1 or more beside reliability, consensus and aggregation_guard, which need a step"
+            raise PydanticCustomError("whole_regions", "{expected}", {"expected": told})
+        return self
+
+    @property
+    def lift_params(self) -> CompositingParams:
+        """How rays meet splats while lifting, at every pixel."""
+        return self._compositing(self.lift_gain)
+
+    @property
+    def render_params(self) -> CompositingParams:
+        """How rays meet splats when attention maps and masks are rendered."""
+        return self._compositing(self.render_gain)
+
+    def for_splats(self, splats: Splats) -> Self:
+        """The same with ``antialiased`` as true or false: what auto means for these splats.
+
+        Raises:
+            InvalidSettings: it is true, and the splats are no 3D Gaussians.
+        """
+        antialiased = splats.antialiased if self.antialiased == "auto" else self.antialiased
+        check_antialiased(splats.kernel, antialiased)
+        return self if antialiased == self.antialiased else self.model_copy(update={"antialiased": antialiased})
+
+    @property
+    def weighting(self) -> Weighting:
+        """What counts as a weight while lifting."""
+        return Weighting(self.power, self.selection, self.k, self.mass, self.weight_floor)
+
+    @property
+    def clusters_by_masks(self) -> bool:
+        """Whether masks, where there are any, make the clusters of the aggregation; then no region is dropped."""
+        chosen = self.aggregation_clusters == "auto" and not self.aggregation_resolve
+        return self.aggregation and (chosen or self.aggregation_clusters == "graph")
+
+    @property
+    def weighs_rows(self) -> bool:
+        """Whether each row of a codebook needs weights of its own: what reads them counts no tuples of rows."""
+        named = self.robust_steps or self.loss == "huber" or self.aggregation_resolve or self.objects is True
+        return bool(named or self.clusters_by_masks)
+
+    def finds_objects(self, masks: bool) -> bool:
+        """Whether objects are looked for, where views have masks or not.
+
+        Raises:
+            InvalidSettings: objects, or clusters that masks make, are asked for, and no view has masks.
+        """
+        graph = self.aggregation and self.aggregation_clusters == "graph"
+        for name, asked in (("objects", self.objects is True), ("aggregation_clusters", graph)):
+            if asked and not masks:
+                expected = "views with masks: objects are what masks of several views keep together"
+                raise InvalidSettings(name, expected=expected, got=NO_MASKS, hint="take auto")
+        return masks and bool(self.objects or self.clusters_by_masks)
+
+    def asks_consensus(self, masks: bool) -> bool:
+        """Whether masks are compared with one another, where views have masks or not.
+
+        Raises:
+            InvalidSettings: consensus is asked for, and no view has masks.
+        """
+        if self.consensus is True and not masks:
+            expected = "views with masks: cells of a grid say nothing of what they show"
+            raise InvalidSettings("consensus", expected=expected, got=NO_MASKS, hint="leave it at auto")
+        return masks and bool(self.consensus)
+
+    def _compositing(self, opacity_logit_scale: float) -> CompositingParams:
+        antialiased = self.antialiased is True  # auto stands for splats that say nothing, before `for_splats`
+        return CompositingParams(opacity_logit_scale, self.alpha_cap, self.transmittance_stop, antialiased)
+
+    @classmethod
+    def of(cls, /, **values: Any) -> Self:
+        """Settings from keyword arguments, of which texts may stand for numbers, as on a command line.
+
+        Raises:
+            InvalidSettings: an unknown name or a value out of range.
+        """
+        return cls._checked(lambda: cls(**values))
+
+    @classmethod
+    def chosen(cls, preset: Preset | str | Self, others: Mapping[str, Any]) -> Self:
+        """A preset by its name, or settings as they are, with others in place of some.
+
+        Raises:
+            InvalidSettings: an unknown name or a value out of range.
+        """
+        if not isinstance(preset, cls):
+            return cls.of(preset=preset, **others)
+        if not others:
+            return preset
+        chosen = {"preset": preset.preset, "speed": preset.speed}
+        values, filled = preset.model_dump(), cls.of(**chosen).model_dump()
+        given = preset.model_fields_set
+        given = given if len(given) < len(values) else set()  # all of them: settings of a file
+        own = {name: value for name, value in values.items() if name in given or value != filled[name]}
+        return cls.of(**chosen | own | dict(others))
+
+    @classmethod
+    def of_json(cls, values: Mapping[str, Any]) -> Self:
+        """Settings from JSON, where a number is a number and a boolean no number.
+
+        Raises:
+            InvalidSettings: an unknown name, or a value of another type or out of range.
+        """
+        whole = {name: int(value) if _is_whole(value) else value for name, value in values.items()}
+        text = json.dumps(whole, ensure_ascii=False).encode("utf-8", "replace")  # half a surrogate pair is no setting
+        return cls._checked(lambda: cls.model_validate_json(text, strict=True))
+
+    @classmethod
+    def _checked(cls, made: Callable[[], Self]) -> Self:
+        """The settings that are made, or what is wrong with them in the project's own words."""
+        try:
+            settings = made()
+        except ValidationError as error:
+            raise _told(error, cls.model_fields) from None
+        if settings.certificate_rays > MOST_CERTIFICATE_RAYS:  # here, not in the field: older lifts have more
+            expected, got = f"at most {MOST_CERTIFICATE_RAYS} rays", str(settings.certificate_rays)
+            raise InvalidSettings("certificate_rays", expected=expected, got=got)
+        return settings
+
+
+def _told(error: ValidationError, known: Iterable[str]) -> InvalidSettings:
+    """The first thing that is wrong, with all that its setting may be."""
+    first, *others = error.errors()
+    name, branches = "settings", [first]
+    if first["loc"]:
+        name = str(first["loc"][0])[:_SHOWN]
+        branches += [other for other in others if other["loc"][:1] == first["loc"][:1]]
+    if first["type"] == "extra_forbidden":
+        names = list(known)
+        expected, hint = f"one of {', '.join(names)}", nearest(name, names, NEAREST)
+        return InvalidSettings(name, expected=expected, got="an unknown setting", hint=hint)
+    expected = " or ".join(branch["msg"].removeprefix("Input should be ") for branch in branches)
+    return InvalidSettings(name, expected=expected, got=repr(first["input"])[:_SHOWN])
+
+
+def _is_whole(value: Any) -> bool:
+    """Whether JSON means a whole number, which some write as 2.0."""
+    return isinstance(value, float) and value.is_integer()
