@@ -296,15 +296,17 @@ def object_shares(
     W: RegionWeights, labels: np.ndarray, number: int, others: np.ndarray, threads: int | None = None
 ) -> Iterator[PieceSums]:
     """The weight of some regions [n] i64 in each object at every piece of a block: [1, (number + 1) n], -1 first."""
-    place = node_numbers(others, int(W.offsets[-1]))
+    place, shape = node_numbers(others, int(W.offsets[-1])), (number + 1, others.size)
 
     def summed(first: int, last: int) -> PieceSums:
-        own = slice(int(W.indptr[first]), int(W.indptr[last]))
-        rows = np.repeat(labels[first:last] + 1, W.indptr[first : last + 1].diff().numpy())
-        columns = place[W.region[own].numpy()]
-        kept = columns >= 0
-        parts = W.weight[own].double().numpy()[kept], (rows[kept], columns[kept])
-        table = csr_array(parts, shape=(number + 1, others.size)).tocoo()
+        lengths, whole = W.indptr[first : last + 1].diff().numpy(), csr_array(shape, dtype=np.float64)
+        for a, b in row_blocks(lengths, last - first, BLOCK_ENTRIES):
+            own = slice(int(W.indptr[first + a]), int(W.indptr[first + b]))
+            columns = place[W.region[own].numpy()]
+            kept = columns >= 0
+            rows = np.repeat(labels[first + a : first + b] + 1, lengths[a:b])[kept]
+            whole = whole + csr_array((W.weight[own].numpy()[kept].astype(np.float64), (rows, columns[kept])), shape)
+        table = whole.tocoo()
         places = table.row.astype(np.int64) * others.size + table.col
         order = np.argsort(places)
         return PieceSums(places[order], table.data[None, order])
