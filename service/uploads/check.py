@@ -104,6 +104,8 @@ def check_lift(path: Path, cameras: Path | None = None) -> dict[str, Any]:
         for first in range(0, len(values), BLOCK_ROWS):
             if not np.isfinite(values[first : first + BLOCK_ROWS]).all():
                 raise InvalidLift("lift", expected="finite numbers", got=f"others in {name!r} from row {first} on")
+    if "object" in arrays and (missing := set(range(len(arrays["object_views"]))) - set(np.unique(arrays["object"]))):
+        raise InvalidLift("lift", expected="splats of each object", got=f"none of object {min(missing)}")
     require_texts("view name", metadata["views"], limits.VIEW_CHARACTERS, InvalidLift)
     require_texts("word", metadata["words"], limits.WORD_CHARACTERS, InvalidLift)
     if None in metadata["timings"].values():  # as JSON has what is not finite

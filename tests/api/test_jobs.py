@@ -10,11 +10,13 @@ import sys
 import tempfile
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
@@ -31,17 +33,18 @@ from service.jobs import supervisor as pace
 from service.jobs.child import Reporter
 from service.jobs.device import Devices
 from service.jobs.lifting import plan_document
+from service.models import AssetKind
 from service.store.jobs import LINE_CHARACTERS, LOG_LINES, EventKind, log_line, note
 from service.store.owners import SERVICE
 from service.store.store import Store
 from tests.crash.conftest import order, until
 from tests.crash.server import standing_in
 
-from .conftest import LIFT_REQUEST, Uploaded, parts_of
+from .conftest import LIFT_REQUEST, Uploaded, parts_of, put
 from .following import ended
 from .guarded import finish
 from .test_problems import assert_problem
-from .tiny_scene import CHANNELS, SPLATS_A_CLUSTER, VIEWS, TinyScene
+from .tiny_scene import CHANNELS, SPLATS_A_CLUSTER, VIEWS, TinyScene, cameras_document
 
 Quick = Callable[..., AbstractContextManager[tuple[TestClient, dict[str, Any]]]]
 
@@ -177,6 +180,19 @@ def test_no_work_is_taken_below_the_disk_floor_and_the_service_lives(
         assert client.get("/jobs").json()["jobs"] == [] and len(client.get("/assets").json()["assets"]) == 3
         monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=1000))
         assert ended(client, client.post("/lift", json=body).headers["location"])["state"] == "succeeded"
+
+
+def test_job_and_lift_keep_what_the_plan_warned_of(client: TestClient, uploaded: Uploaded) -> None:
+    away = cameras_document()
+    for frame in away["frames"]:  # they look the other way
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([-1.0, 1, -1, 1])).tolist()
+    cameras = put(client, AssetKind.CAMERAS, json.dumps(away).encode())
+    order = replace(uploaded, cameras=cameras).order(preset="row-sum")
+    job = ended(client, client.post("/lift", json=order).headers["location"])
+    assert job["state"] == "succeeded", job
+    told = [line for line in job["plan"]["warnings"] if "no camera can see" in line]
+    assert told and set(told) <= set(client.get(job["links"]["lift"]).json()["certificate"]["warnings"])
+    assert client.delete(f"{job['links']['self']}?with_lift=true").status_code == 204
 
 
 def test_job_tells_of_every_stage_and_its_plan_comes_before_the_walk(
