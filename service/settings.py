@@ -97,8 +97,7 @@ class ServiceSettings(BaseSettings):
     )
     engine: Literal["local", "ray"] | None = Field(
         None,
-        description="who lifts in blocks, of bounded memory: local or ray (a cluster); not set = in memory, as are "
-        "jobs that need all regions at once",
+        description="who lifts all jobs in blocks, of bounded memory: local or ray (a cluster); not set = in memory",
     )
     ray_address: str = Field("auto", description="of that cluster, host:port; auto takes RAY_ADDRESS")
     parallel_lifts: int = Field(1, ge=1, le=64, description="jobs that run at the same time")

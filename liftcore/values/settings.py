@@ -277,6 +277,31 @@ class LiftSettings(BaseModel):
             raise InvalidSettings("consensus", expected=expected, got=NO_MASKS, hint="leave it at auto")
         return masks and bool(self.consensus)
 
+    def check_blocks(self, masks: bool = True) -> None:
+        """Refuse what no engine can work on in blocks of views and splats.
+
+        Args:
+            masks: whether any view has masks, which make clusters in blocks.
+
+        Raises:
+            InvalidSettings: least squares, or an aggregation by HDBSCAN.
+        """
+        asked = [name for name in ("cg_steps", "reference_channels") if getattr(self, name)]
+        if self.aggregation and not self.clusters_by_masks:
+            asked += [name for name in ("aggregation_clusters", "aggregation_resolve") if getattr(self, name)]
+        whole = [f"{name}={getattr(self, name)}" for name in asked]
+        if self.aggregation and self.clusters_by_masks and not masks:
+            whole.append(f"aggregation_clusters={self.aggregation_clusters} of grids")
+        if whole:
+            raise InvalidSettings(
+                "engine",
+                expected="settings that work on blocks of splats: least squares need all rays, and clusters by "
+                "HDBSCAN all features in one place",
+                got=", ".join(whole),
+                hint="set cg_steps=0 and reference_channels=0, aggregation_clusters=graph where views have masks, or "
+                "aggregation=false; or lift without an engine",
+            )
+
     def _compositing(self, opacity_logit_scale: float) -> CompositingParams:
         antialiased = self.antialiased is True  # auto stands for splats that say nothing, before `for_splats`
         return CompositingParams(opacity_logit_scale, self.alpha_cap, self.transmittance_stop, antialiased)

@@ -95,12 +95,20 @@ async def submit_tradeoff(deps: Deps, order: models.TradeoffRequest = TRADEOFF_B
 
 
 def _lift(order: models.LiftRequest, deps: AppState, key: str | None) -> Response:
-    settings = LiftSettings.of_json(order.settings).model_dump(mode="json")
+    settings = _checked(order, deps)
     return _take(order, deps, key, sent=order.model_dump(mode="json"), settings=settings)
 
 
+def _checked(order: models.LiftRequest, deps: AppState) -> dict[str, Any]:
+    """The whole settings of an order, which the service's engine, where it has one, can lift by."""
+    settings = LiftSettings.of_json(order.settings)
+    if deps.settings.engine is not None:
+        settings.check_blocks()
+    return settings.model_dump(mode="json")
+
+
 def _planned(order: models.LiftRequest, deps: AppState) -> models.Plan:
-    settings = LiftSettings.of_json(order.settings).model_dump(mode="json")
+    settings = _checked(order, deps)
     wanted = JobOrder(order.splats, order.cameras, tuple(order.features), settings)
     _require_fit(wanted, deps)
     deps.devices.require(wanted.settings.get("device", "auto"))

@@ -80,38 +80,19 @@ PACKED = 64  # views of a pack
 IDENTITY = "lift.json"  # of what the pieces in a folder are
 
 
-def needs_all(settings: LiftSettings) -> list[str]:
-    """The settings that need all rays or all features in one place, as they are set."""
-    asked = [name for name in ("cg_steps", "reference_channels") if getattr(settings, name)]
-    if settings.aggregation and not settings.clusters_by_masks:
-        asked += [name for name in ("aggregation_clusters", "aggregation_resolve") if getattr(settings, name)]
-    return [f"{name}={getattr(settings, name)}" for name in asked]
-
-
 def check_engine(engine: Engine, settings: LiftSettings, masks: bool) -> None:
-    """Refuse, before the work, what needs rays or features in one place.
+    """Refuse, before the work, what is no engine, and what needs rays or features in one place.
 
     Args:
         masks: whether any view has masks, which make clusters in blocks.
 
     Raises:
-        InvalidSettings: it is no engine; least squares, or an aggregation by HDBSCAN.
+        InvalidSettings: it is no engine; or as `LiftSettings.check_blocks` has it.
     """
     if not hasattr(engine, "run"):
         hint = "LocalEngine() or RayEngine(address) makes one"
         raise InvalidSettings("engine", expected="an engine, or None", got=repr(engine)[:80], hint=hint)
-    asked = needs_all(settings)
-    if settings.aggregation and settings.clusters_by_masks and not masks:
-        asked.append(f"aggregation_clusters={settings.aggregation_clusters} of grids")
-    if asked:
-        raise InvalidSettings(
-            "engine",
-            expected="settings that work on blocks of splats: least squares need all rays, and clusters by HDBSCAN "
-            "all features in one place",
-            got=", ".join(asked),
-            hint="set cg_steps=0 and reference_channels=0, aggregation_clusters=graph where views have masks, or "
-            "aggregation=false; or lift without an engine",
-        )
+    settings.check_blocks(masks)
 
 
 def lift_in_blocks(
