@@ -20,14 +20,16 @@ from liftcore.query.presence import (
     Presence,
     References,
     judge,
+    pack_of,
     references_beside,
     references_of,
     together,
 )
 from liftcore.query.scene import QueryScene, as_numpy
 from liftcore.query.scores import LEAST_LIKENESS, LOWEST_COSINE, combine, cosines, cosines_about
+from liftcore.query.selection import LEAST_FIRST, Rivals, contest, nearer_than_rivals, whole_things
 from liftcore.query.terms import Query, Vector
-from liftcore.query.threshold import find_threshold
+from liftcore.query.threshold import Threshold, find_threshold, nothing_alike
 from liftcore.text import TextEncoder, encoder_of_space, open_encoder
 
 if TYPE_CHECKING:
@@ -47,6 +49,7 @@ class Question:
     rows: np.ndarray  # [n, F] f32, the unit direction of each term
     plain: np.ndarray  # [n] bool, the terms that are compared by plain cosines: words
     references: References | str  # of the words' space, or why there are none
+    pack: np.ndarray | None = None  # [n, F] f32, unit, all words of a table that has too few to be references
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,7 @@ class Answer:
     threshold: float  # on the scores
     threshold_method: str  # what was asked for: auto, valley, paper, otsu, stability or fixed
     explanation: str  # one sentence on how the threshold was found
-    selected: np.ndarray  # [P] bool, seen and at or above the threshold
+    selected: np.ndarray  # [P] bool, what answers (`ask`)
     statistics: Mapping[str, float]  # min, max, mean and quantiles q01..q99 of the seen scores
     clear: bool = True  # whether the scores have what the threshold's method looks for
     presence: Presence = NOT_IN_WORDS  # whether it is there at all
@@ -118,7 +121,9 @@ def ask(scene: QueryScene, query: Query | str, encoder: TextEncoder | None = Non
     """Score every splat for a query and choose those that answer it.
 
     A splat counts in the histogram by its evidence: what hardly a ray met scores by the chance of a few pixels. It is
-    still selected by its score. With ``weigh`` its confidence counts too. A word for what is not there
+    still selected by its score. With ``weigh`` its confidence counts too. The threshold `auto` is held to other
+    words, and things of the region graph may be taken whole (`liftcore.query.selection`); any other selects by the
+    score alone. Scores that are all equal or zero select nothing. A word for what is not there
     (`liftcore.query.presence`) is left out of the scores, and where no other positive is left nothing is selected,
     unless the query keeps what is absent. Negatives and examples are not questioned.
 
@@ -203,7 +208,8 @@ def query_vectors(
         others = references_of(encoder, scene.metadata.text_space)
     else:
         others = references_beside(rows, scene.metadata.text_space)
-    answer = answers(scene, [Question(query, rows, np.ones(len(rows), np.bool_), others)])[0]
+    pack = None if encoder is None else pack_of(encoder)
+    answer = answers(scene, [Question(query, rows, np.ones(len(rows), np.bool_), others, pack)])[0]
     scores, selected = map(torch.from_numpy, (answer.scores, answer.selected))
     found = None if splats is None else objects(scene, answer)
     clear = answer.clear and answer.count > 0
@@ -233,7 +239,7 @@ def question(scene: QueryScene, query: Query, encoder: TextEncoder | None) -> Qu
     encoder = encoder or scene.table
     if encoder is None or not words[: len(query.positives)].any():
         return Question(query, rows, words, "")
-    return Question(query, rows, words, references_of(encoder, scene.metadata.text_space))
+    return Question(query, rows, words, references_of(encoder, scene.metadata.text_space), pack_of(encoder))
 
 
 def answers(scene: QueryScene, questions: Sequence[Question]) -> list[Answer]:
@@ -293,13 +299,13 @@ def _answer(scene: QueryScene, asked: Question, similarities: np.ndarray) -> Ans
     if not scene.all_seen:
         scores = np.where(seen, scores, np.float32(LOWEST_COSINE))
     known = scores if scene.all_seen else scores[seen]
-    least = -math.inf if (asked.plain & kept)[: len(query.positives)].any() else LEAST_LIKENESS
-    plain = query.weigh == "evidence"
-    weights = scene.weights if plain else scene.seen_alone(scene.counted(query.weigh))
-    counted = "evidence" if plain else "evidence times confidence"
-    found = find_threshold(known, query.threshold, weights, least, counted)
-    if presence.present is False and query.absent == "drop":
-        found = replace(found, value=math.inf, explanation=presence.why, clear=False)
+    weights = scene.counted(query.weigh)
+    found, selected = _selected(scene, asked, kept, scores, weights)
+    if presence.present is False:
+        found = replace(found, clear=False)
+        if query.absent == "drop":
+            found = replace(found, value=math.inf, explanation=presence.why)
+            selected = np.zeros_like(seen)
     return Answer(
         query=query,
         scores=scores,
@@ -307,11 +313,63 @@ def _answer(scene: QueryScene, asked: Question, similarities: np.ndarray) -> Ans
         threshold=found.value,
         threshold_method=found.method,
         explanation=found.explanation,
-        selected=seen & (scores >= np.float32(found.value)),
+        selected=selected,
         statistics=_statistics(known),
         clear=found.clear,
         presence=presence,
     )
+
+
+def _selected(
+    scene: QueryScene, asked: Question, kept: np.ndarray, scores: np.ndarray, weights: np.ndarray
+) -> tuple[Threshold, np.ndarray]:
+    """The threshold of a question and what it selects, [P] bool.
+
+    Args:
+        kept: [n] bool, the terms that count. scores, weights: [P] f32, how much each splat counts.
+    """
+    query, positives = asked.query, len(asked.query.positives)
+    known = scores if scene.all_seen else scores[scene.seen]
+    nothing = nothing_alike(known)
+    if nothing:
+        found = Threshold(math.inf, query.threshold if isinstance(query.threshold, str) else "fixed", nothing, False)
+        return found, np.zeros_like(scene.seen)
+    in_words = (asked.plain & kept)[:positives]
+    least = -math.inf if in_words.any() else LEAST_LIKENESS
+    counted = "evidence" if query.weigh == "evidence" else "evidence times confidence"
+    alone = scene.seen_alone(weights)
+    found = find_threshold(known, query.threshold, alone, least, counted)
+    selected = scene.seen & (scores >= np.float32(found.value))
+    rivals = _rivals(asked, asked.rows[:positives][in_words])
+    if query.threshold != "auto" or not rivals or in_words.sum() < kept[:positives].sum():
+        return found, selected
+    standing = contest(scene, scores, weights, found.value, rivals[0])
+    if standing.lowest > found.value:
+        again = find_threshold(known, "auto", alone, standing.lowest, counted)
+        value = max(again.value, standing.lowest)
+        told = f"Below {standing.lowest:.4g} other words are nearer. {again.explanation}"
+        found = replace(again, value=value, explanation=told, clear=again.clear and again.value == value)
+        selected = scene.seen & (scores >= np.float32(value))
+    found = replace(found, clear=found.clear and standing.first >= LEAST_FIRST)
+    if rivals[-1].allowed == 0:
+        selected = nearer_than_rivals(scene, selected, rivals[-1])
+    whole = whole_things(scene, selected, weights, rivals[0])
+    if whole:
+        selected = selected | (scene.seen & np.isin(np.asarray(scene.object), whole))
+        things = "a thing" if len(whole) == 1 else f"{len(whole)} things"
+        told = f"{found.explanation.removesuffix('.')}; of {things} mostly above it all is taken."
+        found = replace(found, explanation=told)
+    return found, selected
+
+
+def _rivals(asked: Question, directions: np.ndarray) -> list[Rivals]:
+    """The words that compete with the positives [p, F]: reference words, then the others of a pack."""
+    if not len(directions):
+        return []
+    rivals = [Rivals.among(asked.references, directions)] if isinstance(asked.references, References) else []
+    if asked.pack is not None:
+        rivals.append(Rivals.of_pack(asked.pack, directions))
+    return [some for some in rivals if len(some.vectors)]
 
 
 def _presence(scene: QueryScene, asked: Question, similarities: np.ndarray) -> tuple[Presence, np.ndarray]:
@@ -325,10 +383,10 @@ def _presence(scene: QueryScene, asked: Question, similarities: np.ndarray) -> t
     names = [repr(term) if isinstance(term, str) else str(term) for term in asked.query.positives]
     told = [judge(scene, names[k], asked.rows[k], similarities[:, k], asked.references) for k in words]
     here = together(told)
-    if not here.present and len(words) < positives:  # examples are not questioned
+    if here.present is False and len(words) < positives:  # examples are not questioned
         here = replace(here, present=None)
     if here.present is not False and asked.query.absent == "drop":
-        kept[[k for k, one in zip(words, told, strict=True) if not one.present]] = False
+        kept[[k for k, one in zip(words, told, strict=True) if one.present is False]] = False
     return here, kept
 
 

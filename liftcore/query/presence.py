@@ -6,7 +6,11 @@ of them; for one that is not, the words of what really is there come first, and 
 
     presence = share, by evidence, of the word's best splats at which at most MOST_AHEAD of the references are nearer
 
-and it is present from a half on. A phrase that is none of the references may have twice as many ahead: they are more
+taken twice: with the words as they lie, and about the scene's mean, which takes away what all of a scene's features
+share. (Images lie apart from words, and some words lie nearer to all images than the right ones.) It is present where
+both shares are a half or more. It is absent where the first is less and, about the mean, not even a half has the word
+as the nearest of all. Between these it is **not sure**: there is no saying, and what stands apart is shown. A phrase
+that is none of the references may have twice as many ahead: they are more
 to the point than it is. The best splats are the few with LEAST_SHARE of the scene's evidence: less is no
 thing to a threshold either. A reference that means nearly the same takes nothing away: those related to the word,
 with RELATED of the similarity of the word's nearest reference, are left out (an encoder's words share a cone, so they
@@ -53,7 +57,7 @@ _IN_CONE = 0.5  # cosine to the shipped words' mean direction: they have .75 to 
 class Presence:
     """Whether what was asked for is there."""
 
-    present: bool | None  # None: not known
+    present: bool | None  # None: not known, or not sure
     presence: float | None  # in 0..1, present from 0.5 on; None: not known
     why: str  # one sentence for the user
 
@@ -119,18 +123,47 @@ def judge(
     if not len(best):
         return Presence(False, 0.0, f"{name} is not there: no splat has a feature.")
     others, allowed = references.against(direction)
-    near = cosines(scene.features[best], scene.norms[best], references.vectors[others])
-    ahead = (near >= scores[best, None]).sum(axis=1)
-    count = len(references.words)
-    presence = float(weights[ahead <= allowed].sum() / weights.sum())
+    rows, norms, count = scene.features[best], scene.norms[best], len(references.words)
+    plain, contrast = nearer_counts(rows, norms, scene.rough_mean, direction[None], references.vectors[others])
+    shares = [float(weights[ahead <= allowed].sum() / weights.sum()) for ahead in (plain, contrast)]
+    presence = min(shares)
     if presence >= 0.5:
         told = f"at {presence:.0%} of its best splats at most {allowed} of {count} reference words are nearer"
         return Presence(True, presence, f"{name} is there: {told}.")
-    order = np.argsort(ahead, kind="stable")
-    middle = int(ahead[order[np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2)]])
-    nearest = references.words[others[int((weights @ near).argmax())]].replace("_", " ")
+    order = np.argsort(plain, kind="stable")
+    middle = int(plain[order[np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2)]])
+    near = weights @ cosines(rows, norms, references.vectors[others])
+    nearest = references.words[others[int(near.argmax())]].replace("_", " ")
     told = f"its best splats are nearer to {middle} of {count} reference words, first of all to {nearest!r}"
-    return Presence(False, presence, f"{name} is not there: {told}.")
+    first = float(weights[contrast == 0].sum() / weights.sum())
+    if shares[0] < 0.5 and first < 0.5:
+        return Presence(False, presence, f"{name} is not there: {told}.")
+    if shares[0] < 0.5:
+        yet = "but to what sets them apart from the rest of the scene it is the nearest"
+        return Presence(None, presence, f"Whether {name} is there is not sure: {told}, {yet}.")
+    told = "hardly a reference word is nearer to its best splats, but many are to what sets them apart from the rest"
+    return Presence(None, presence, f"Whether {name} is there is not sure: {told}.")
+
+
+def nearer_counts(
+    features: np.ndarray, norms: np.ndarray, mean: np.ndarray, directions: np.ndarray, others: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """How many other words are as near to splats as the nearest of some words: as they lie, and about a mean.
+
+    Args:
+        features: [n, F] f16 or f32. norms: [n] f32. mean: [F] f32, of unit features.
+        directions: [p, F] f32, unit, the words. others: [m, F] f32, unit.
+
+    Returns:
+        [n] i64 twice.
+    """
+    if not len(others):
+        return np.zeros(len(features), np.int64), np.zeros(len(features), np.int64)
+    own, near = cosines(features, norms, directions), cosines(features, norms, others)
+    plain = (near >= own.max(axis=1, keepdims=True)).sum(axis=1)
+    own -= directions @ mean
+    near -= others @ mean
+    return plain, (near >= own.max(axis=1, keepdims=True)).sum(axis=1)
 
 
 NOT_IN_WORDS = Presence(None, None, "Nothing was asked in words: what an example shows is not questioned.")
@@ -138,7 +171,7 @@ NOT_IN_WORDS = Presence(None, None, "Nothing was asked in words: what an example
 
 def together(words: Sequence[Presence]) -> Presence:
     """Whether any of one or more words is there."""
-    first = max(words, key=lambda one: one.presence or 0.0)
+    first = max(words, key=lambda one: (one.present is not False, one.present is True, one.presence or 0.0))
     return Presence(first.present, first.presence, " ".join(one.why for one in words))
 
 
@@ -206,6 +239,17 @@ def references_beside(vectors: np.ndarray, text_space: str) -> References | str:
     space = f"the text space {text_space!r}" if text_space else "a text space without a name"
     needed = f"a text table of {LEAST_WORDS} words or more, or a text encoder, has some"
     return f"Whether it is there is not known: {space} has no reference words here; {needed}."
+
+
+def pack_of(encoder: TextEncoder) -> np.ndarray | None:
+    """All words of a table that has too few to be references, [n, F] f32, unit; None for any other encoder.
+
+    They are the references of each other: its author distinguishes these words and no others.
+    """
+    source = encoder.source if isinstance(encoder, RememberingEncoder) else encoder
+    if isinstance(source, TableEncoder) and 1 < len(source.words) < LEAST_WORDS:
+        return _unit(np.asarray(source.embeddings, np.float32))
+    return None
 
 
 @cache

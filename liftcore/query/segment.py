@@ -144,7 +144,10 @@ def segment(
         many = len(words) >= LEAST_WORDS
         references = References(words, unit) if many else references_beside(unit, scene.metadata.text_space)
     for row, scores in _scores(scene, rows, np.flatnonzero(shares >= LEAST_OWN).tolist()):
-        if isinstance(references, References) and not judge(scene, words[row], unit[row], scores, references).present:
+        if (
+            isinstance(references, References)
+            and judge(scene, words[row], unit[row], scores, references).present is False
+        ):
             continue
         named.take(row, np.where(scene.seen & (scores >= thresholds[row]), scores, -np.inf))
     labels = np.where(named.score > -np.inf, named.row, NO_WORD).astype(np.int32)

@@ -93,8 +93,8 @@ def find_threshold(
     """A threshold on scores by one of the methods above.
 
     Degenerate maps have a defined answer. No scores at all give infinity: nothing is found. Equal scores give
-    that score: all of them answer alike. Scores without what a method looks for fall back to Otsu's split, and the
-    explanation says so.
+    that score: all of them answer alike, which a question takes for no answer (`nothing_alike`). Scores without what
+    a method looks for fall back to Otsu's split, and the explanation says so.
 
     Args:
         scores: [n] f32, finite.
@@ -127,11 +127,28 @@ def find_threshold(
     return Threshold(value, method, f"{explanation.removesuffix('.')}; {told}.", clear)
 
 
+def all_alike(low: float, high: float) -> str:
+    """Why scores from low to high select nothing, where they differ by no more than their last bits; else ""."""
+    if (high - low) / BINS > 4 * np.spacing(np.float32(max(abs(low), abs(high)))):
+        return ""
+    return f"All scores are {high:.4g}: nothing stands apart, so nothing is selected."
+
+
+def nothing_alike(scores: np.ndarray) -> str:
+    """Why scores [n] f32 of a question select nothing, whatever the threshold, as where all are zero; else ""."""
+    if not scores.size:
+        return "There are no scores: nothing can be found."
+    low, high = float(scores.min()), float(scores.max())
+    if high == 0 and low < 0:
+        return "No score is above zero: nothing is like what was asked for, so nothing is selected."
+    return all_alike(low, high)
+
+
 def _count(scores: np.ndarray, low: float, high: float, weights: ArrayLike | None) -> Histogram | None:
     """The histogram of scores; None where they differ by their last bits, or weigh nothing."""
-    width = (high - low) / BINS
-    if not width > 4 * np.spacing(np.float32(max(abs(low), abs(high)))):
+    if all_alike(low, high):
         return None
+    width = (high - low) / BINS
     places = np.minimum(((scores.astype(np.float64) - low) * (1.0 / width)).astype(np.int32), BINS - 1)
     shares = None if weights is None else np.asarray(weights, np.float32).ravel()
     mass = np.bincount(places, shares, BINS).astype(np.float64)

@@ -1,0 +1,176 @@
+"""What a question selects answers it: other words compete for what lies above the automatic threshold.
+
+A histogram says where scores part, not whether what lies above is what was asked for. So the automatic threshold is
+held to other words. Two kinds of them compete:
+
+- **Reference words** (`liftcore.query.presence`) say of each splat whether the word is among the nearest. Of the
+  splats at or above the threshold, by evidence, the word must be among the nearest for a half at least; else the
+  threshold is sought again from the score on where that holds.
+- **The other words of a pack** or of a short table are all that its author distinguishes: where one of them is
+  nearer, a splat is not selected.
+
+A thing of the region graph (`liftcore.solve.objects`) that is mostly selected may be taken whole: its other splats
+got wrong masks. It may hold two things, though. So the rest of it must be nearer to the part that is selected than to
+any other thing, in features; and where less than `MOST` is selected, no other thing's best word may be nearer to it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from liftcore.query.presence import References, nearer_counts
+from liftcore.query.scores import cosines
+from liftcore.query.threshold import LEAST_SHARE
+
+if TYPE_CHECKING:
+    from liftcore.query.scene import QueryScene
+
+HALF = 0.5  # of the selected evidence, at which the word must be among the nearest; .5 to .9 give the same masks
+SAMPLED = 512  # splats of each octave of the ranking that are looked at: a million splats have eleven octaves
+MOST = 2 / 3  # of a thing: it is mostly selected
+SOME = 1 / 3  # of a thing, below which its mean says nothing of what was asked
+LEAST_FIRST = 0.25  # of the evidence at which the word is the nearest of all, that a clear answer selects
+SAME_WORD = 1 - 1e-4  # cosine from which two words of a table are one
+_AT_ONCE = 1 << 14  # splats that are compared with a pack's words at once
+
+
+@dataclass(frozen=True)
+class Rivals:
+    """Words that compete with those of a query."""
+
+    directions: np.ndarray  # [p, F] f32, unit, of the query's own words
+    vectors: np.ndarray  # [m, F] f32, unit, of words that mean something else
+    allowed: int  # how many of them may be nearer where a word is among the nearest
+
+    @classmethod
+    def among(cls, references: References, directions: np.ndarray) -> Rivals:
+        """Those of the reference words that mean something else than any of the query's words [p, F]."""
+        others, allowed = zip(*map(references.against, directions), strict=True)
+        rows = others[0]
+        for more in others[1:]:
+            rows = np.intersect1d(rows, more)
+        return cls(directions, references.vectors[rows], max(allowed))
+
+    @classmethod
+    def of_pack(cls, vectors: np.ndarray, directions: np.ndarray) -> Rivals:
+        """The words [n, F] of a pack that are none of the query's [p, F], and mean something else than they do."""
+        rivals = cls.among(References(("",) * len(vectors), vectors), directions)
+        same = (rivals.vectors @ directions.T >= SAME_WORD).any(axis=1)
+        return cls(directions, rivals.vectors[~same], 0)
+
+    def ahead(self, scene: QueryScene, rows: np.ndarray) -> np.ndarray:
+        """[n] i64, how many of them are nearer to these splats [n] than the query's words (`nearer_counts`)."""
+        return np.minimum(*nearer_counts(scene.features[rows], scene.norms[rows], scene.rough_mean, *self._pair))
+
+    def ahead_of_means(self, scene: QueryScene, means: np.ndarray) -> np.ndarray:
+        """The same for unit features [n, F]."""
+        ones = np.ones(len(means), np.float32)
+        return np.minimum(*nearer_counts(means, ones, scene.rough_mean, *self._pair))
+
+    @property
+    def _pair(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.directions, self.vectors
+
+
+@dataclass(frozen=True)
+class Contest:
+    """How a ranking of splats stands beside other words."""
+
+    lowest: float  # the least score down to which the word is among the nearest for half of the evidence
+    first: float  # share, of the evidence at which the word is the nearest of all, at or above a threshold
+
+
+def contest(scene: QueryScene, scores: np.ndarray, weights: np.ndarray, threshold: float, rivals: Rivals) -> Contest:
+    """Compare the splats of a ranking with rivals, from the best down.
+
+    A sample is looked at, denser where scores are higher: `SAMPLED` of each octave of the ranking, evenly. Where the
+    word is nowhere among the nearest, as for what is not there, it counts as among them where no more rivals are
+    nearer than at the middle one of its best splats: what is most like it is selected, and no more.
+
+    Args:
+        scene: an opened lift. scores, weights: [P] f32, how much each splat counts. threshold: on the scores.
+    """
+    order = np.flatnonzero(scene.seen)
+    order = order[np.argsort(-scores[order], kind="stable")]
+    rows, widths = _octaves(order)
+    counts = weights[rows] * widths
+    if not counts.any():
+        counts = widths
+    ahead, sums = rivals.ahead(scene, rows), np.cumsum(counts)
+    best = max(1, int(np.searchsorted(sums, LEAST_SHARE * sums[-1])) + 1)
+    ranked = np.argsort(ahead[:best], kind="stable")
+    middle = ahead[ranked[np.searchsorted(np.cumsum(counts[ranked]), counts[:best].sum() / 2)]]
+    near = np.cumsum(np.where(ahead <= max(rivals.allowed, int(middle)), counts, 0.0))
+    held = np.flatnonzero(near >= HALF * sums)
+    above = scores[rows] >= np.float32(threshold)
+    first = np.where(ahead == 0, counts, 0.0)
+    share = float(first[above].sum() / first.sum()) if first.any() else 1.0
+    return Contest(float(scores[rows[held[-1]]]) if held.size else float(scores[rows[0]]), share)
+
+
+def nearer_than_rivals(scene: QueryScene, selected: np.ndarray, rivals: Rivals) -> np.ndarray:
+    """[P] bool: the selected splats [P] bool to which no rival is nearer than the query's words."""
+    kept = np.zeros_like(selected)
+    rows = np.flatnonzero(selected)
+    for first in range(0, len(rows), _AT_ONCE):
+        some = rows[first : first + _AT_ONCE]
+        own = cosines(scene.features[some], scene.norms[some], rivals.directions).max(axis=1)
+        others = cosines(scene.features[some], scene.norms[some], rivals.vectors).max(axis=1)
+        kept[some] = others <= own
+    return kept
+
+
+def whole_things(scene: QueryScene, selected: np.ndarray, weights: np.ndarray, rivals: Rivals) -> list[int]:
+    """The things of the region graph that a selection [P] bool covers mostly and that it may take whole.
+
+    Args:
+        scene: an opened lift. weights: [P] f32, how much each splat counts.
+    """
+    if scene.object is None or scene.object_views is None or len(scene.object) != len(selected):
+        return []
+    number, own = len(scene.object_views), np.where(scene.seen, scene.object, -1)
+    of_thing = own >= 0
+    whole = np.bincount(own[of_thing], weights[of_thing], number)
+    inside = np.bincount(own[of_thing & selected], weights[of_thing & selected], number)
+    shares = inside / np.where(whole > 0, whole, 1.0)
+    open_ones = np.flatnonzero((shares >= SOME) & (inside < whole))
+    if not open_ones.size:
+        return []
+    means = scene.thing_means
+    known = np.linalg.norm(means, axis=1) > 0
+    near = known & (rivals.ahead_of_means(scene, means) <= rivals.allowed)
+    others = means[known & ~near]  # what has no part in the answer
+    words = rivals.vectors[np.unique((others @ rivals.vectors.T).argmax(axis=1))] if len(rivals.vectors) else others
+    taken = []
+    for thing in open_ones[near[open_ones]].tolist():
+        mine = own == thing
+        part, rest = (scene.mean_of(np.flatnonzero(mine & side)) for side in (selected, ~selected))
+        if len(others) and _about(scene, others, rest).max() >= _about(scene, part[None], rest)[0]:
+            continue
+        if shares[thing] < MOST and (words @ rest).max(initial=-1.0) > (rivals.directions @ rest).max():
+            continue
+        taken.append(thing)
+    return taken
+
+
+def _about(scene: QueryScene, means: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """[n] f32, the cosines of unit features [n, F] and [F] about the scene's mean."""
+    offsets, offset = means - scene.rough_mean, mean - scene.rough_mean
+    lengths = np.linalg.norm(offsets, axis=1) * np.linalg.norm(offset)
+    return (offsets @ offset) / np.maximum(lengths, np.float32(1e-12))
+
+
+def _octaves(order: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of a ranking [n], all of the first and ever fewer of the later ones, and how many each stands for."""
+    rows, widths, first, last = [], [], 0, SAMPLED
+    while first < len(order):
+        some = order[first:last]
+        step = -(-len(some) // SAMPLED)
+        chosen = some[step // 2 :: step]
+        rows.append(chosen)
+        widths.append(np.full(len(chosen), len(some) / len(chosen)))
+        first, last = last, 2 * last
+    return np.concatenate(rows), np.concatenate(widths)

@@ -1,0 +1,137 @@
+"""What is selected answers the question: other words compete, zero scores select nothing, things are taken whole."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from liftcore.query.ask import answers, ask, question
+from liftcore.query.scene import QueryScene
+from liftcore.query.terms import Query
+from liftcore.text import LVIS_TABLE
+from liftcore.text.table import TableEncoder
+from liftcore.query.threshold import METHODS, find_threshold
+
+CAT, COW, CURTAIN = 21, 2320, 659  # splats: .7 % of the evidence, 77.3 % and 22 %
+THINGS = np.repeat([0, 1, 2], [CAT, COW, CURTAIN])
+
+
+@pytest.fixture(scope="module")
+def table() -> TableEncoder:
+    return TableEncoder.open(LVIS_TABLE)
+
+
+def lifted(scene: QueryScene, features: np.ndarray, **fields: Any) -> QueryScene:
+    """A lift of other features [P, F], of evidence one."""
+    ones = torch.ones(len(features))
+    given = {"evidence": ones, "agreement": ones, "seen": ones > 0, "object": None, "object_views": None}
+    return QueryScene(replace(scene.lift, features=torch.from_numpy(features.astype(np.float32)), **given | fields))
+
+
+def noisy(vectors: np.ndarray, noise: float, seed: int = 0) -> np.ndarray:
+    """Vectors [n, F] with noise of a length."""
+    more = np.random.default_rng(seed).normal(size=vectors.shape)
+    return vectors + noise * more / np.linalg.norm(more, axis=1, keepdims=True)
+
+
+def pictures(table: TableEncoder, words: Sequence[str], noise: float, hub: float = 0.0) -> np.ndarray:
+    """[n, 512]: vectors as a photo's are, .29 like their word, .22 like others; ``hub`` draws them to some words."""
+    rows, mean = table.encode(words), table.embeddings.mean(axis=0)
+    gap = np.random.default_rng(5).normal(size=512)
+    gap -= mean * (gap @ mean) / np.square(mean).sum()
+    hubs = (table.encode(table.words[::100]) - mean).sum(axis=0)
+    return noisy(0.28 * rows + 0.9 * gap / np.linalg.norm(gap) + hub * hubs / np.linalg.norm(hubs), noise)
+
+
+@pytest.fixture
+def thin(scene: QueryScene, table: TableEncoder) -> QueryScene:
+    """A thin cat before a large cow and a curtain, whose scores part far below the cat."""
+    words = np.array(["cat", "cow", "curtain"])[THINGS].tolist()
+    return lifted(scene, pictures(table, words, 0.2))
+
+
+def test_thin_thing_does_not_take_the_scene(thin: QueryScene, table: TableEncoder) -> None:
+    scores = ask(thin, Query(("cat",), threshold=0.0), table).scores
+    plain = scores >= find_threshold(scores).value
+    assert plain.mean() > 0.5  # which the histogram alone selects
+    answer = ask(thin, "cat", table)
+    assert answer.presence.present is not False
+    assert answer.selected[THINGS == 0].mean() > 0.4
+    assert answer.selected.sum() < 3 * CAT
+    assert "other words are nearer" in answer.explanation
+    for method in ("otsu", 0.0):  # what was asked for by name is done as asked
+        found = ask(thin, Query(("cat",), threshold=method), table)
+        assert np.array_equal(found.selected, found.scores >= np.float32(found.threshold))
+
+
+def test_competition_keeps_what_the_histogram_finds_well(thin: QueryScene, table: TableEncoder) -> None:
+    answer = ask(thin, "curtain", table)
+    assert answer.threshold == find_threshold(answer.scores).value
+    assert np.array_equal(answer.selected, answer.scores >= np.float32(answer.threshold))
+    assert answer.selected[THINGS == 2].mean() > 0.9 and answer.clear
+
+
+def test_selection_has_the_same_bits_together_and_alone(thin: QueryScene, table: TableEncoder) -> None:
+    asked = [question(thin, Query((word,), absent="keep"), table) for word in ("cat", "cow", "sofa")]
+    for together, one in zip(answers(thin, asked), asked, strict=True):
+        (alone,) = answers(thin, [one])
+        assert np.array_equal(together.selected, alone.selected) and together.threshold == alone.threshold
+
+
+@pytest.mark.parametrize("method", [*METHODS, 0.0, -1.0])
+@pytest.mark.parametrize("level", [0.0, 0.25])
+def test_equal_or_zero_scores_select_nothing_and_say_why(
+    scene: QueryScene, method: str | float, level: float
+) -> None:
+    rows = np.zeros((60, 4))
+    rows[:, :2] = level, (1 - level**2) ** 0.5
+    axis = TableEncoder("axis", ("x",), np.eye(4, dtype=np.float32)[:1])
+    answer = ask(lifted(scene, rows), Query(("x",), threshold=method), axis)
+    assert answer.count == 0 and not answer.clear
+    assert answer.threshold == np.inf and "nothing is selected" in answer.explanation
+
+
+def test_words_of_a_pack_compete_with_each_other(scene: QueryScene) -> None:
+    """Four words in a table of their own: where another one is nearer, a splat is not selected."""
+    axes = np.eye(8, dtype=np.float32)
+    rows = np.repeat(axes[:3], 20, axis=0)
+    rows[20:40, 0] = 0.9  # nearer to the second word, and like the first
+    rows = noisy(rows, 0.02)
+    pack = TableEncoder("pack", ("one", "two", "three", "first"), axes[[0, 1, 2, 0]])
+    plain = find_threshold(ask(lifted(scene, rows), Query(("one",), threshold=0.0), pack).scores).value
+    assert (ask(lifted(scene, rows), Query(("one",), threshold=plain), pack).selected).sum() == 40
+    answer = ask(lifted(scene, rows), "one", pack)  # "first" is the same word, and takes nothing
+    assert np.flatnonzero(answer.selected).tolist() == list(range(20))
+    both = ask(lifted(scene, rows), Query(("one", "two")), pack)
+    assert np.flatnonzero(both.selected).tolist() == list(range(40))
+
+
+def test_what_hubs_hide_is_not_sure_and_shown(scene: QueryScene, table: TableEncoder) -> None:
+    """Splats that all lie nearer to some words than to their own, as images may: contrast tells them apart."""
+    words = [word for word in ("cat", "boat", "pizza") for _ in range(200)]
+    drawn = lifted(scene, pictures(table, words, 0.2, hub=0.3))
+    found = ask(drawn, "pizza", table)
+    assert found.presence.present is None and "not sure" in found.presence.why
+    assert found.presence.presence is not None and found.presence.presence < 0.5
+    assert found.selected[400:].mean() > 0.9 and found.count < 300
+    assert ask(drawn, "sofa", table).presence.present is False
+
+
+def test_thing_that_is_mostly_selected_is_taken_whole_unless_it_holds_two(
+    scene: QueryScene, table: TableEncoder
+) -> None:
+    words = ["cat"] * 300 + ["boat"] * 200 + ["pizza"] * 200
+    rows = pictures(table, words, 0.1)
+    rows[200:300] = pictures(table, ["cat"] * 100, 0.1) * 0.6 + 0.4 * pictures(table, ["zebra"] * 100, 0.1)
+    views = torch.zeros((3, 5), dtype=torch.int32)
+    one = torch.from_numpy(np.repeat([0, 1, 2], [300, 200, 200]).astype(np.int32))
+    two = torch.from_numpy(np.repeat([0, 1, 2], [400, 100, 200]).astype(np.int32))  # half of the boat in the cat's
+    cut = ask(lifted(scene, rows), "cat", table)
+    whole = ask(lifted(scene, rows, object=one, object_views=views), "cat", table)
+    assert cut.selected[:200].mean() > 0.9
+    assert np.flatnonzero(whole.selected).tolist() == list(range(300))
+    mixed = ask(lifted(scene, rows, object=two, object_views=views), "cat", table)
+    assert not mixed.selected[300:].any()
