@@ -637,13 +637,13 @@ class QueryAnswer(BaseModel):
     encoder: str | None = Field(description="the text encoder that was asked, without its file; null without a text")
     statistics: dict[str, Any] = Field(description="of the scores over the seen splats")
     threshold: Threshold
-    count: int = Field(description="splats at or above the threshold")
+    count: int = Field(description="splats that were selected")
     clear: bool = Field(description="whether what was found stands apart")
-    present: bool | None = Field(description="whether it is there; null when that is not known")
+    present: bool | None = Field(description="whether it is there; null when not known or not sure")
     presence: float | None = Field(description="how sure that is, in 0..1: there from 0.5 on; null when not known")
     why: str = Field(description="one sentence on how it is known whether it is there, or why it is not")
     top: list[TopSplat]
-    box: Box | None = Field(description="around all splats at or above the threshold, strays too: see objects")
+    box: Box | None = Field(description="around all selected splats, strays too: see objects")
     links: dict[str, str]
 
 
@@ -652,13 +652,13 @@ class ObjectsAnswer(BaseModel):
 
     lift: JobId
     threshold: Threshold
-    count: int = Field(description="splats at or above the threshold")
+    count: int = Field(description="splats that were selected")
     clear: bool = Field(description="whether they stand apart")
-    present: bool | None = Field(description="whether they are what was asked for; null when that is not known")
+    present: bool | None = Field(description="whether they are what was asked for; null when not known or not sure")
     presence: float | None = Field(description="how sure that is, in 0..1: there from 0.5 on; null when not known")
     why: str = Field(description="one sentence on how it is known whether it is there, or why it is not")
     objects: list[FoundObject] = Field(description="those with the most evidence first")
-    strays: int = Field(description="splats at or above the threshold in none of them")
+    strays: int = Field(description="selected splats in none of them")
 
 
 class SceneObject(BaseModel):
