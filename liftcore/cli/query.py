@@ -217,7 +217,8 @@ def _lines(document: dict[str, Any]) -> Iterable[str]:
         found = f"{document['selected']} of {document['splats']} splats at or above {document['threshold']:.4g}"
         yield f"{asked}: {found} ({document['explanation']})"
     else:
-        yield f"{asked}: nothing is selected; --absent keep selects what is most like it"
+        kept = "nothing is selected; --absent keep selects what is most like it"
+        yield f"{asked}: {kept if document['present'] is False else document['explanation']}"
     if "view" in document:
         view = document["view"]
         yield f"  view {view['name']}: {view['mask_share']:.2%} of the image ({view['explanation']})"

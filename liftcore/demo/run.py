@@ -99,7 +99,7 @@ class Finding:
     """What one phrase found."""
 
     phrase: str
-    there: bool | None  # whether the scene has it; None: not known
+    there: bool | None  # whether the scene has it; None: not known, or not sure
     why: str  # how that is known
     object: str | None  # what the masks show most of, where somebody knows
     splats: int  # selected
@@ -241,6 +241,8 @@ def _lines(found: Finding) -> list[str]:
         f"      {found.splats:,} splats, best score {found.score:.2f}, {bar}, "
         f"{found.query_ms:.0f} ms (mask {found.mask_ms:.0f} ms){iou}",
     ]
+    if found.there is None:
+        lines.append(f"      {found.why}")
     for number, thing in enumerate(found.objects, 1):
         place = ", ".join(f"{value:.2f}" for value in thing["centre"])
         lines.append(f"      object {number}: {thing['splats']:,} splats around ({place})")

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from liftcore.query.scene import QueryScene
 
 HALF = 0.5  # of the selected evidence, at which the word must be among the nearest; .5 to .9 give the same masks
-SAMPLED = 512  # splats of each octave of the ranking that are looked at: a million splats have eleven octaves
+SAMPLED = 256  # splats of each octave of the ranking that are looked at: a million splats have twelve octaves
 MOST = 2 / 3  # of a thing: it is mostly selected
 SOME = 1 / 3  # of a thing, below which its mean says nothing of what was asked
 LEAST_FIRST = 0.25  # of the evidence at which the word is the nearest of all, that a clear answer selects
