@@ -1,6 +1,6 @@
 """Masks on the tabletop scene: mean IoU in the views that were not lifted, a phrase at a time.
 
-    python -m tests.benchmarks.thresholds DIR [--lifts NAME ...] [--every N] [--still-life] [--json]
+    python -m tests.benchmarks.thresholds DIR [--lifts NAME ...] [--every N] [--still-life] [--alone] [--json]
 
 Each phrase is asked alone, no other phrase and no truth is known to the threshold. A column a method: masks of the
 objects that it finds; ``worst`` is the phrase that ``auto`` shows least well. ``rendered`` cuts the rendered scores
@@ -8,13 +8,17 @@ of each view by an ``auto`` of its own instead (protocol P3), and ``best`` by th
 mask, which needs the truth. ``absent`` and ``absent rendered`` are the mean shares of the image that masks cover
 where nothing of the phrase is to be seen.
 
+``--alone`` asks with ``absent=keep`` by ``auto`` of the preset `default`: of each lift the mean, the worst phrase,
+what is there and called absent or not sure, and the share of 200 words for what is not there (20 for the still life,
+of which five seeds of mistakes are asked) that select nothing.
+
 The scene is where the constants of ``valley`` were tuned; those of ``auto`` were not tuned. ``--still-life`` judges
 the tests' still life too, with three kinds of mistakes; its words need the extra ``minilm``. Examples in place of
 words: ``tests.benchmarks.examples``.
 """
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -26,13 +30,15 @@ from torch import Tensor
 from liftcore.query.ask import Answer, ask
 from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.objects import objects
-from liftcore.query.render import view_mask
+from liftcore.query.render import LEAST_SHARE, MOST_GROUPED, view_mask
 from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Query
 from liftcore.query.threshold import METHODS, find_threshold
 from liftcore.text import TextEncoder, open_encoder
+from liftcore.text.table import TableEncoder
 from tests.benchmarks.base import PACKS, command_line, mask_iou, read_pack, tell
 from tests.benchmarks.consensus import still_life_scene
+from tests.benchmarks.presence import ABSENT, NOT_THERE
 from tests.benchmarks.tabletop import Truth, tabletop
 
 COLUMNS = (*METHODS, "rendered", "best", "absent", "absent rendered")
@@ -120,6 +126,48 @@ def still_life_rows(lifts: Iterable[str]) -> Iterator[dict[str, Any]]:
             yield {"scene": "still life", "features": kind, "lift": name} | measure_phrases(scene, truth, encoder)
 
 
+def measure_alone(scene: QueryScene, truth: Truth, encoder: TextEncoder, absent: Sequence[str]) -> dict[str, Any]:
+    """What ``auto`` selects of each word, ``absent=keep``, and of words for what is not there."""
+    told = [ask(scene, Query((word,), absent="keep"), encoder) for word in truth.words]
+    found = [objects(scene, one).numbers >= 0 if one.count <= MOST_GROUPED else one.selected for one in told]
+    values = torch.from_numpy(np.stack([*found, np.ones(len(found[0]))], axis=1).astype(np.float32))
+    rows: dict[str, list[float]] = {word: [] for word in truth.words}
+    for view, mask in truth.held_out.items():
+        image = scene.image(view, lambda camera: scene.raster.render(camera, values, scene.compositing))
+        weights, sums = image[..., :-1], image[..., -1:]
+        seen = (sums >= MINIMUM_ROW_SUM) & (weights >= LEAST_SHARE * sums)
+        for number, word in enumerate(truth.words):
+            if bool((mask == number).any()):
+                rows[word].append(mask_iou(seen[..., number], mask == number))
+    means = {word: float(np.mean(values)) for word, values in rows.items() if values}
+    worst = min(means, key=lambda word: means[word])
+    states = {word: one.presence.present for word, one in zip(truth.words, told, strict=True)}
+    nothing = [ask(scene, word, encoder).count == 0 for word in absent]
+    return {
+        "mean": float(np.mean(list(means.values()))),
+        "worst": means[worst],
+        "worst phrase": worst,
+        "called absent": ", ".join(word for word, state in states.items() if state is False) or "-",
+        "not sure": ", ".join(word for word, state in states.items() if state is None) or "-",
+        "absent words select nothing": float(np.mean(nothing)),
+    }
+
+
+def rows_alone(folder: Path, packs: Iterable[str], every: int, still_life: bool) -> Iterator[dict[str, Any]]:
+    """One row a lift by `default`: of tabletop, and of the still life with five seeds of mistakes."""
+    truth, table = tabletop(folder), TableEncoder.open(folder / "text_table.safetensors")
+    others = [word for word in table.words if word not in truth.words]
+    absent = np.random.default_rng(0).choice(others, ABSENT, replace=False).tolist()
+    for pack in packs:
+        scene = truth.opened(truth.lift(read_pack(folder, pack), preset="default", view_stride=every))
+        yield {"scene": f"{pack}, {len(scene.metadata.views)} views"} | measure_alone(scene, truth, table, absent)
+    for kind, seed in product(("usual", "hard"), range(7, 12) if still_life else ()):
+        made, views = still_life_scene(kind, seed)
+        scene = made.opened(made.lift(views, preset="default"))
+        head = {"scene": f"still life, {kind} {seed}"}
+        yield head | measure_alone(scene, made, open_encoder("minilm"), NOT_THERE)
+
+
 def main() -> None:
     """Print the table, or one JSON object."""
     parser = command_line(
@@ -129,9 +177,13 @@ def main() -> None:
         ("--features", {"nargs": "*", "default": PACKS, "choices": PACKS}),
         ("--lifts", {"nargs": "+", "default": tuple(LIFTS), "choices": tuple(LIFTS)}),
         ("--still-life", {"action": "store_true", "help": "the still life too, which nothing was tuned on"}),
+        ("--alone", {"action": "store_true", "help": "each phrase alone by auto, and words for what is not there"}),
         ("--every", {"type": int, "default": 1, "metavar": "N", "help": "tabletop's every N-th view alone"}),
     )
     options = parser.parse_args()
+    if options.alone:
+        tell(rows_alone(options.folder, options.features, options.every, options.still_life), as_json=options.json)
+        return
     rows = list(rows_of(options.folder, options.features, options.lifts, options.every))
     rows += still_life_rows(options.lifts) if options.still_life else []
     tell(rows, as_json=options.json, columns=("scene", "features", "lift", "worst", *COLUMNS))

@@ -11,9 +11,9 @@ import torch
 from liftcore.query.ask import answers, ask, question
 from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Query
+from liftcore.query.threshold import METHODS, find_threshold
 from liftcore.text import LVIS_TABLE
 from liftcore.text.table import TableEncoder
-from liftcore.query.threshold import METHODS, find_threshold
 
 CAT, COW, CURTAIN = 21, 2320, 659  # splats: .7 % of the evidence, 77.3 % and 22 %
 THINGS = np.repeat([0, 1, 2], [CAT, COW, CURTAIN])
