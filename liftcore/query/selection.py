@@ -32,7 +32,7 @@ HALF = 0.5  # of the selected evidence, at which the word must be among the near
 SAMPLED = 256  # splats of each octave of the ranking that are looked at: a million splats have twelve octaves
 MOST = 2 / 3  # of a thing: it is mostly selected
 SOME = 1 / 3  # of a thing, below which its mean says nothing of what was asked
-LEAST_FIRST = 0.25  # of the evidence at which the word is the nearest of all, that a clear answer selects
+LEAST_FIRST = 0.1  # of the evidence at which the word is the nearest of all, that a clear answer selects
 SAME_WORD = 1 - 1e-4  # cosine from which two words of a table are one
 _AT_ONCE = 1 << 14  # splats that are compared with a pack's words at once
 
