@@ -299,13 +299,12 @@ def _answer(scene: QueryScene, asked: Question, similarities: np.ndarray) -> Ans
     if not scene.all_seen:
         scores = np.where(seen, scores, np.float32(LOWEST_COSINE))
     known = scores if scene.all_seen else scores[seen]
-    weights = scene.counted(query.weigh)
-    found, selected = _selected(scene, asked, kept, scores, weights)
-    if presence.present is False:
-        found = replace(found, clear=False)
-        if query.absent == "drop":
-            found = replace(found, value=math.inf, explanation=presence.why)
-            selected = np.zeros_like(seen)
+    if presence.present is False and query.absent == "drop":
+        method = query.threshold if isinstance(query.threshold, str) else "fixed"
+        found, selected = Threshold(math.inf, method, presence.why, clear=False), np.zeros_like(seen)
+    else:
+        found, selected = _selected(scene, asked, kept, scores, scene.counted(query.weigh))
+        found = replace(found, clear=found.clear and presence.present is not False)
     return Answer(
         query=query,
         scores=scores,
