@@ -72,7 +72,8 @@ serve: $(READY)
 	$(BIN)/splatlift serve
 
 # Needs Node.js with npm; what it builds is committed, so that nobody else does.
-web:  ## the page, from service/web/src into service/web/built
+web: $(READY)  ## the page, from service/web/src into service/web/built
+	$(BIN)/python -m liftcore.io.kinds > service/web/src/kinds.json
 	cd service/web && npm ci --silent && node build.mjs
 	cp service/web/node_modules/axe-core/axe.min.js tests/browser/axe.min.js
 

@@ -36,7 +36,9 @@ from liftcore.scene.views import IMAGE_SUFFIXES
 LIFT_KEY = "splatlift"  # of the metadata of a lift
 PARTS = {"labels", "codebook", "grid"}  # of a feature pack's views
 LOD_META = "lod-meta.json"  # of a streamed SOG
-CAMERA_FILES = re.compile(r"(^|/)((cameras|images|frames|rigs)\.(bin|txt)|transforms[^/]*\.json|cameras\.json)$")
+CAMERA_FILES = re.compile(
+    r"(^|/)((cameras|images|frames|rigs)\.(bin|txt)|(dataparser_)?transforms[^/]*\.json|cameras\.json)$"
+)
 MAX_JSON_BYTES = 64 << 20  # that are parsed to tell what a document is
 HEAD_BYTES = 4096  # of what is told by its first bytes
 DEPTH = 5  # folders down
@@ -644,3 +646,6 @@ __all__ = [
     "CONVERT", "EXPORT_PLY", "PICKLED", "SPLATS_SENT", "SUFFIX", "FileKind", "SplatFormat", "identify",
     "keys_of", "kind_of", "page_table", "splat_format", "wrong_kind",
 ]  # fmt: skip
+
+if __name__ == "__main__":  # what `make web` builds the page with
+    print(json.dumps(page_table(), indent=1, sort_keys=True))

@@ -162,7 +162,11 @@ def _invalid(error: SplatliftError, kind: UploadKind, path: Path) -> dict[str, A
 
 def _of_another_kind(kind: UploadKind, path: Path) -> InvalidInput | None:
     """What to say of a file that belongs elsewhere; None where it looks like what it was sent as, or like nothing."""
-    found = identify(path).kind
+    looks = identify(path)
+    found = looks.kind
+    if looks.format is SplatFormat.SOG and not zipfile.is_zipfile(path):
+        got, hint = "the meta.json of a SOG without its pictures", "zip it with them as one .sog file, and send that"
+        return INVALID[kind](kind, expected=f"a file of {kind}", got=got, hint=hint)
     if found is None:
         return wrong_kind(path, kind, INVALID[kind], argument=kind, expected=f"a file of {kind}")
     hint = "POST it to /lifts" if found == LIFT else f"PUT it to /assets/{found}"

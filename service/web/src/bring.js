@@ -51,9 +51,9 @@ export class Bring {
 
   async add(files) {
     for (const file of await gathered(files)) {
-      const { kind, needs } = await kindOf(file);
+      const { kind, needs, why } = await kindOf(file);
       const one = { name: file.name, bytes: file.size, kind, needs, file, sent: 0, asset: null, problem: null };
-      if (!kind) one.problem = { title: "Not sent", detail: /\.bin$/i.test(file.name) ? "drop the folder of the COLMAP model, or a zip of it" : `it is none of ${Object.values(WANTED).join("; ")}; photos; or a lift file` };
+      if (!kind) one.problem = { title: "Not sent", detail: why ?? (/\.bin$/i.test(file.name) ? "drop the folder of the COLMAP model, or a zip of it" : `it is none of ${Object.values(WANTED).join("; ")}; photos; or a lift file`) };
       if (kind && kind !== "features") this.files = this.files.filter(known => known.kind !== kind || !known.asset);
       this.files.push(one);
       if (kind === "lift") this.sendLift(one);

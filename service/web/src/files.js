@@ -1,26 +1,32 @@
 // What a file is, by its name and what is in it: nothing is sent before that is known.
 import { Zip, ZipPassThrough } from "fflate";
+import table from "./kinds.json"; // of liftcore.io.kinds: suffixes that are sent, and what others are
 
 const HEADER = 32 << 20; // bytes of a safetensors header that are read here
 const TAIL = 1 << 20; // of a zip: its list of names lies at its end
 const DEPTH = 5; // folders down
-const CAMERAS = /(^|\/)((cameras|images|frames|rigs)\.(bin|txt)|(dataparser_)?transforms\.json|cameras\.json)$/;
-const SPLATS = /\.(ply|splat|spz|sog)$/i;
+const CAMERAS = new RegExp(table.cameras);
 const PACK = /\.safetensors$/i;
 const PHOTO = /\.(jpe?g|png)$/i;
+const suffix = name => /\.[^.]*$/.exec(name.toLowerCase())?.[0] ?? "";
+const isSplats = name => table.kinds[suffix(name)] === "splats";
 
-// {kind} of a file, null for what is not known; a lift file brings what it `needs`: [{kind, id, name}].
+// {kind} of a file, null for what is not sent, with a word on `why` where there is one; a lift file brings what it `needs`:
+// [{kind, id, name}]. The server looks at the content, and its answer names a file that is something else.
 export async function kindOf(file) {
-  if (/\.(ply|splat|spz|sog)$/i.test(file.name)) return { kind: "splats" };
-  if (/\.json$/i.test(file.name)) return { kind: "cameras" };
-  if (/\.zip$/i.test(file.name)) return { kind: await zipKind(file) };
-  if (/\.safetensors$/i.test(file.name)) return safetensors(file);
-  return { kind: null };
+  const kind = table.kinds[suffix(file.name)] ?? null;
+  const other = kind ? null : table.others[suffix(file.name)];
+  if (other) return { kind: null, why: other.hint ? `it is ${other.got}: ${other.hint}` : `it is ${other.got}` };
+  if (suffix(file.name) === ".zip") return { kind: await zipKind(file) };
+  return kind === "features" ? safetensors(file) : { kind };
 }
 
 async function zipKind(file) {
   const names = new TextDecoder("latin1").decode(await file.slice(-TAIL).arrayBuffer());
-  return /\.(jpe?g|png)/i.test(names) && !/\.(bin|txt|json)/i.test(names) ? "photos" : "cameras";
+  const has = suffixes => new RegExp(`[^\\x00-\\x1f](${suffixes.map(one => `\\${one}`).join("|")})`, "i").test(names);
+  if (/(cameras|images)\.(bin|txt)|transforms[^/]*\.json|cameras\.json/.test(names)) return "cameras";
+  if (has(Object.keys(table.kinds).filter(one => table.kinds[one] === "splats"))) return "splats";
+  return has(table.images) ? "photos" : "cameras";
 }
 
 async function safetensors(file) {
@@ -46,7 +52,7 @@ export async function dropped({ items, files }) {
     const inner = await within(entry);
     const cameras = inner.filter(({ path }) => CAMERAS.test(path));
     if (!entry.isDirectory || !cameras.length) return inner.map(({ file }) => file);
-    const splats = inner.filter(({ path }) => SPLATS.test(path)).sort((one, other) => other.file.lastModified - one.file.lastModified);
+    const splats = inner.filter(({ path }) => isSplats(path)).sort((one, other) => other.file.lastModified - one.file.lastModified);
     const packs = inner.filter(({ path }) => PACK.test(path));
     return [await zipped(cameras, `${entry.name}.zip`), ...[...splats.slice(0, 1), ...packs].map(({ file }) => file)];
   }));

@@ -16,7 +16,7 @@ from liftcore.errors import InvalidCameras, InvalidInput, InvalidSplats
 from liftcore.evaluate.inspect import inspect_file
 from liftcore.io.cameras import read_cameras
 from liftcore.io.files import MAX_DIRECTORY_BYTES, open_zip
-from liftcore.io.kinds import SplatFormat, identify, kind_of, wrong_kind
+from liftcore.io.kinds import SplatFormat, identify, kind_of, page_table, wrong_kind
 from liftcore.io.ply import write_splats
 from liftcore.io.splats import read_splats, splat_files
 from liftcore.values.lift_file import input_file
@@ -234,3 +234,8 @@ def test_the_order_is_blamed_only_where_it_is_wrong(tmp_path: Path, capsys: pyte
         assert "the order is" not in said(*files)
     assert "point_cloud.ply" in said(archive, cameras, cameras)
     assert "the order is SPLATS CAMERAS FEATURES" in said(cameras, ply, cameras)
+
+
+def test_the_page_has_the_table_of_this_version() -> None:
+    built = Path(__file__).parents[3] / "service" / "web" / "src" / "kinds.json"
+    assert json.loads(built.read_text()) == page_table(), "make web"
