@@ -162,7 +162,7 @@ def sampled_splats(W: RegionWeights, own: np.ndarray, nodes: np.ndarray, base: i
     entries = np.flatnonzero(own)
     members = number[W.region.numpy()[entries] - base]
     entries, members = entries[members >= 0], members[members >= 0]
-    rows = np.searchsorted(W.indptr.numpy(), entries, side="right") - 1
+    rows = np.repeat(np.arange(W.indptr.shape[0] - 1), W.indptr.diff().numpy())[entries]
     order = np.argsort(members, kind="stable")
     parts = [rows[part[:: max(-(-part.size // MOST_SPLATS), 1)]] for part in _split(order, members, own_nodes.size)]
     return np.cumsum([0, *(part.size for part in parts)]), np.concatenate([np.zeros(0, np.int64), *parts])

@@ -121,7 +121,10 @@ class ViewBlock(NamedTuple):
 def _view_block(job: Job, piece: int) -> ViewBlock:
     numbers, offsets = job.views_of(piece), offsets_of(job)
     parts = [read_view(job.view_file(number)).weights for number in numbers]
-    splats = np.unique(np.concatenate([part.splats.numpy() for part in parts]))
+    seen = np.zeros(job.splats, np.bool_)
+    for part in parts:
+        seen[part.splats.numpy()] = True
+    splats = np.flatnonzero(seen).astype(np.int32)
     rows = [
         SomeRows(
             np.searchsorted(splats, part.splats.numpy()),
@@ -199,7 +202,9 @@ def contain(job: Job, piece: int, threads: int | None) -> None:
     block, groups, nodes = _view_block(job, piece), groups_of(job), mapped(job.folder / NODES)["nodes"]
     own = memberships(block.W, groups, threads).own
     begins, rows = sampled_splats(block.W, own, nodes, block.base)
-    local, numbers = np.unique(rows, return_inverse=True)
+    chosen = np.zeros(block.splats.size, np.bool_)
+    chosen[rows] = True
+    local, numbers = np.flatnonzero(chosen), (np.cumsum(chosen) - 1)[rows]
     tuples, totals = _tuples_of(job, block.splats[local])
     found = node_views(
         sampled_nodes(begins, numbers, tuples, totals, nodes, groups.view.size), nodes, groups, threads
