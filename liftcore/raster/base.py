@@ -91,6 +91,14 @@ class Raster(Protocol):
         """Rows of A for the rays of pixels [n, 2] i32 (x, y) of the full view, whatever the stride."""
         ...
 
+    def footprints(self, camera: Camera, params: CompositingParams) -> Tensor:
+        """Areas [P] f32 that splats may show in the whole view, px^2, at most the image's, before occlusion.
+
+        That of the upright ellipse which spans the same box as the splat's outline, with the opacity's scale and
+        without it; zero where no ray of the view can meet the splat.
+        """
+        ...
+
     def forget(self) -> None:
         """Drop what is kept of the last view for its next product."""
         ...

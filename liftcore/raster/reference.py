@@ -329,6 +329,17 @@ class ReferenceRaster:
         sums = dense_view(self.splats, camera, params).A @ onehot
         return torch.from_numpy(sums.argmax(axis=1).astype(np.int32) - 1).reshape(camera.height, camera.width)
 
+    def footprints(self, camera: Camera, params: CompositingParams) -> Tensor:
+        """Pixels whose ray a splat has an alpha on, whatever lies before it."""
+        y, x = np.mgrid[: camera.height, : camera.width]
+        pixels = np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
+        z = (self.splats.means.double().numpy() @ camera.viewmat[2, :3]) + camera.viewmat[2, 3]
+        ahead = (int(j) for j in np.flatnonzero(z >= NEAR_PLANE))
+        areas = np.zeros(self.splats.count, np.float32)
+        for j in ahead:
+            areas[j] = np.count_nonzero(alphas(self.splats, j, camera, params, pixels)[0])
+        return torch.from_numpy(areas)
+
     def forget(self) -> None:
         """Nothing: no view is kept."""
 

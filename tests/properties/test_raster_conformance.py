@@ -19,7 +19,7 @@ from liftcore.scene.splats import Kernel, Splats
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.views import Regions, ViewFeatures
 from tests.backends import Backend, every_backend
-from tests.scenes import random_camera, random_grid, random_regions, random_splats, scenes
+from tests.scenes import look_at, random_camera, random_grid, random_regions, random_splats, scenes
 
 if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera
@@ -113,6 +113,31 @@ def test_renders_equal_the_oracle(footprint, backend):
         inside = ~view.cut.reshape(camera.height, camera.width)
         assert np.abs(image - expected)[inside].max(initial=0) < INSIDE
         assert (np.abs(image - expected).max(axis=2) > INSIDE).mean() <= max(FLIPS, 1 / inside.size)
+
+
+@every_footprint
+@every_backend
+def test_splats_that_a_ray_meets_have_a_footprint(footprint, backend):
+    @backend.holds(st.data())
+    def check(data) -> None:
+        splats, camera, _, walk = drawn(data, footprint, backend)
+        areas = backend.open(splats).footprints(camera, walk).numpy()
+        view = dense_view(splats, camera, walk)
+        met = (view.A[~view.cut] > 0).any(axis=0)
+        assert (areas[met] > 0).all()
+        assert areas.dtype == np.float32 and areas.max(initial=0) <= camera.width * camera.height
+
+
+@every_backend
+def test_footprint_of_a_ball_is_as_large_as_the_pixels_that_it_holds(backend):
+    splats, camera = random_splats(5, 30, spread=0.4), look_at("v", np.array([0.0, 0.3, -4.0]), 240, 200, 90.0)
+    balls = splats.log_scales[:, :1].expand(-1, 3).contiguous()
+    splats = replace(splats, means=0.2 * splats.means, log_scales=balls)
+    pixels = ReferenceRaster(splats).footprints(camera, CompositingParams()).numpy()
+    areas = backend.open(splats).footprints(camera, CompositingParams()).numpy()
+    large = pixels > 200
+    assert large.any() and np.allclose(areas[large], pixels[large], rtol=0.05)
+    assert not areas[pixels == 0][areas[pixels == 0] > 20].size
 
 
 @every_footprint

@@ -25,7 +25,6 @@ from liftcore.lifting.geometry import Question, question_of
 from liftcore.lifting.warm_up import warm_up_lift
 from liftcore.raster import open_raster
 from liftcore.raster.base import RayRows, ViewWeights
-from liftcore.raster.cpu.project import COLUMNS, Targets, activated, project, view_of
 from liftcore.runtime.device import choose_device
 from liftcore.runtime.one_thread import one_thread
 from liftcore.scene.cameras import Camera, Cameras
@@ -35,7 +34,7 @@ from liftcore.solve.codebook import ViewCodebook
 from liftcore.solve.rays import Readout, SampledRays
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.pack import pair, read_features
-from liftcore.values.region_weights import RegionWeights, run_each
+from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import LiftSettings
 
 WEIGHED = 8  # views of a piece: some seconds of work, which is what a worker that dies loses
@@ -156,18 +155,12 @@ def seen_splats(job: Job, cameras: list[Camera], threads: int | None) -> tuple[S
     if job.splats <= job.selected:
         return scene, torch.arange(job.splats, dtype=torch.int32)
     params, seen = job.settings.lift_params, np.zeros(job.splats, bool)
-    views = [view_of(camera, params) for camera in cameras]
-
-    def look(first: int, last: int) -> None:
-        some = activated(_rows(scene, slice(first, last)), params.opacity_logit_scale)
-        count = last - first
-        room = np.empty((count, COLUMNS[job.kernel])), np.empty(count, np.float32), np.empty(count, np.int32)
-        targets = Targets(*room)
-        for view in views:
-            found = project((0, count), some, view, job.kernel, params.antialiased, targets)
-            seen[first + targets.ids[:found]] = True
-
-    run_each(look, [(first, min(first + STEP, job.splats)) for first in range(0, job.splats, STEP)], threads)
+    device = choose_device(job.settings.device)
+    for first in range(0, job.splats, STEP):
+        last = min(first + STEP, job.splats)
+        raster = open_raster(_rows(scene, slice(first, last)), device, threads)
+        for camera in cameras:
+            seen[first:last] |= raster.footprints(camera, params).numpy() > 0
     ids = np.flatnonzero(seen).astype(np.int32)
     ids = ids if ids.size else np.zeros(1, np.int32)
     return _rows(scene, torch.from_numpy(ids).long()), torch.from_numpy(ids)

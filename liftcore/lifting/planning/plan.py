@@ -184,7 +184,7 @@ def plan_lift(
     features = views.features
     names = views.names
     cameras = [views.cameras[name] for name in names]
-    seen = visibility(splats, cameras, settings.lift_params)
+    seen = visibility(splats, cameras, settings.lift_params, device, threads)
     short = [] if apart else check_card(device, splats.count, settings.device)
     device = CPU if short else device
     raster, seconds, wrong = None, None, list[str]()

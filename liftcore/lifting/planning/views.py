@@ -35,7 +35,6 @@ Vectors are compared in PILOT_CHANNELS random projections.
 """
 
 import heapq
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -44,8 +43,9 @@ import torch
 from torch import Tensor
 
 from liftcore.lifting.geometry import weigh_views
+from liftcore.raster import open_raster
 from liftcore.raster.base import Raster
-from liftcore.raster.cpu.project import COLUMNS, EXTENT_X, EXTENT_Y, Targets, activated, project, view_of
+from liftcore.runtime.device import CPU, Device
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import silent
 from liftcore.scene.cameras import Camera
@@ -95,24 +95,19 @@ class Visibility:
         return float(self.in_view.mean()) * self.splats
 
 
-def visibility(splats: Splats, cameras: Sequence[Camera], params: CompositingParams) -> Visibility:
+def visibility(
+    splats: Splats,
+    cameras: Sequence[Camera],
+    params: CompositingParams,
+    device: Device = CPU,
+    threads: int | None = None,
+) -> Visibility:
     """Project evenly spaced splats, SAMPLE at most, into every camera."""
     sample = spread_splats(splats, min(SAMPLE, splats.count))
-    scene, count = activated(sample, params.opacity_logit_scale), sample.count
-    areas = np.zeros((len(cameras), count), np.float32)
-    records = np.empty((count, COLUMNS[splats.kernel]))
-    targets = Targets(records, np.empty(count, np.float32), np.empty(count, np.int32))
+    raster = open_raster(sample, device, threads)
+    areas = np.zeros((len(cameras), sample.count), np.float32)
     for row, camera in zip(areas, cameras, strict=True):
-        found = project(
-            (0, count),
-            scene,
-            view_of(camera, replace(params, stride=1, offset=(0, 0))),
-            splats.kernel,
-            params.antialiased,
-            targets,
-        )
-        outline = math.pi * records[:found, EXTENT_X] * records[:found, EXTENT_Y]
-        row[targets.ids[:found]] = outline.clip(np.finfo(np.float32).tiny, camera.width * camera.height)
+        row[:] = raster.footprints(camera, params).numpy()
     centres = np.array([camera.centre for camera in cameras], np.float64).reshape(-1, 3)
     return Visibility(areas, centres, sample.means.numpy(), splats.count)
 

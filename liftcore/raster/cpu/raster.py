@@ -7,6 +7,7 @@ which share. The compiled kernels release the interpreter lock.
 from __future__ import annotations
 
 import copy
+import math
 import os
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
@@ -40,7 +41,16 @@ from liftcore.raster.cpu.composite import (
     strongest_tiles,
     trace_rays,
 )
-from liftcore.raster.cpu.project import COLUMNS, Targets, activated, project, view_of, with_opacities
+from liftcore.raster.cpu.project import (
+    COLUMNS,
+    EXTENT_X,
+    EXTENT_Y,
+    Targets,
+    activated,
+    project,
+    view_of,
+    with_opacities,
+)
 from liftcore.raster.cpu.tiles import Bands, depth_order
 from liftcore.raster.cpu.weights import entries_of, merged, reading_of, weigh_tiles
 from liftcore.runtime.device import give_back_memory
@@ -191,6 +201,16 @@ class CpuRaster:
         rays = np.ascontiguousarray(places.to(torch.int32).numpy())
         rows = joined_rows([trace_rays(frame, rays) for frame in self._bands(camera, params)])
         return RayRows(*map(torch.from_numpy, rows))
+
+    def footprints(self, camera: Camera, params: CompositingParams) -> Tensor:
+        """Areas of the splats' outlines, [P] f32. See the protocol."""
+        check_params(self.splats.kernel, camera, params)
+        self.forget()  # its projected splats are overwritten
+        ids, rows = self._project(view_of(camera, every_pixel(params)), params)
+        outlines = math.pi * self._projected[rows, EXTENT_X] * self._projected[rows, EXTENT_Y]
+        areas = np.zeros(self.splats.count, np.float32)
+        areas[ids[rows]] = outlines.clip(np.finfo(np.float32).tiny, camera.width * camera.height)
+        return torch.from_numpy(areas)
 
     def forget(self) -> None:
         """Drop the projected view that is kept for the next product."""

@@ -6,6 +6,7 @@ as a matrix (``weights``, ``render``). Sums over tiles are float64 in a fixed or
 another adds to. On tensors of the CPU it runs in Triton's interpreter: so it is tested where there is no card.
 """
 
+import math
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
@@ -31,7 +32,7 @@ from liftcore.raster.cpu.composite import choice_of
 from liftcore.raster.cpu.project import activated, view_of, with_opacities
 from liftcore.raster.gpu import render, weights
 from liftcore.raster.gpu.launching import check_device
-from liftcore.raster.gpu.project import DeviceScene, scene_on, with_opacity
+from liftcore.raster.gpu.project import DeviceScene, project, scene_on, with_opacity
 from liftcore.raster.gpu.render import ray_rows
 from liftcore.raster.gpu.tiles import BLOCK, Frame
 from liftcore.raster.gpu.weights import DeviceReading
@@ -188,6 +189,18 @@ class GpuRaster:
         if places is None:  # not all of them are rays of the strided view
             places, params = pixels, every_pixel(params)
         return ray_rows(self._frame(camera, params), places)
+
+    @_within_memory
+    def footprints(self, camera: Camera, params: CompositingParams) -> Tensor:
+        """Areas of the splats' outlines, [P] f32, on the CPU. See the protocol."""
+        check_params(self.splats.kernel, camera, params)
+        scene, view = self._scene_with(params.opacity_logit_scale), view_of(camera, every_pixel(params))
+        seen = project(scene, view, self.splats.kernel, params.antialiased, max(1, self._block >> 4))
+        outlines = math.pi * seen.outlines.extent_x * seen.outlines.extent_y
+        least, most = torch.finfo(torch.float32).tiny, camera.width * camera.height
+        areas = torch.zeros(self.splats.count, dtype=torch.float32, device=self.device)
+        areas[seen.ids.long()] = outlines.clamp(least, most).float()
+        return areas.cpu()
 
     def forget(self) -> None:
         """Drop the projected view that is kept for the next product."""
