@@ -414,16 +414,19 @@ def _at_nought(model: P) -> P:
 
 def _from_zip(path: Path, beside: Path | None, *, choosing: bool, views: Collection[str]) -> Cameras:
     """The cameras of the preferred model in a zip; with a frame's file in it or ``beside`` it, a transforms first."""
-    with tempfile.TemporaryDirectory(prefix="splatlift-") as folder:
+    try:
+        archive = open_zip(path)
+    except BROKEN_ZIP as error:
+        raise _broken_zip(path, error) from None
+    with archive, tempfile.TemporaryDirectory(prefix="splatlift-") as folder:
         root = Path(folder)
-        names = _unzip(path, root)
+        names = _unzip(archive, path, root)
         try:
-            with open_zip(path) as archive:
-                source = _source_in_zip(names, root, path, beside, views)
-                if source.file is not None:
-                    inner = source.file.parent.relative_to(root).as_posix()
-                    source = replace(source, photos=zipfile.Path(archive, "" if inner == "." else f"{inner}/"))
-                cameras = source.read()
+            source = _source_in_zip(names, root, path, beside, views)
+            if source.file is not None:
+                inner = source.file.parent.relative_to(root).as_posix()
+                source = replace(source, photos=zipfile.Path(archive, "" if inner == "." else f"{inner}/"))
+            cameras = source.read()
         except InvalidCameras as error:
             argument, got, hint = (
                 text.replace(folder, str(path)) for text in (error.argument, error.got, error.hint)
@@ -483,33 +486,39 @@ def _files(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
     """
     files = {}
     for member in archive.infolist():
+        if member.is_dir():
+            continue
         parts = PurePosixPath(member.filename.replace("\\", "/")).parts
         inner = [part for part in parts if part not in ("/", "..")]
-        if inner and not member.is_dir() and not is_system_file(PurePosixPath(*inner)):
+        if inner and not is_system_file(PurePosixPath(*inner)):
             files["/".join(inner)] = member
     return files
 
 
-def _unzip(path: Path, folder: Path) -> list[str]:
+def _unzip(archive: zipfile.ZipFile, path: Path, folder: Path) -> list[str]:
     """Unzip what cameras may be read from, each file at its place; the names of all files in the zip."""
+    count, budget = len(archive.infolist()), MAX_UNZIPPED_BYTES
+    if count > MAX_ZIP_MEMBERS:
+        raise InvalidCameras(str(path), expected=f"at most {MAX_ZIP_MEMBERS} files", got=str(count))
+    files = _files(archive)
     try:
-        with open_zip(path) as archive:
-            count, budget = len(archive.infolist()), MAX_UNZIPPED_BYTES
-            if count > MAX_ZIP_MEMBERS:
-                raise InvalidCameras(str(path), expected=f"at most {MAX_ZIP_MEMBERS} files", got=str(count))
-            files = _files(archive)
-            for name, member in files.items():
-                last = PurePosixPath(name).name
-                if last in (*MODEL_FILES, FRAME_FILE) or _is_transforms(last):
-                    (folder / name).parent.mkdir(parents=True, exist_ok=True)
-                    budget -= _unzip_one(archive, member, folder / name, budget)
-            return list(files)
+        for name, member in files.items():
+            last = PurePosixPath(name).name
+            if last in (*MODEL_FILES, FRAME_FILE) or _is_transforms(last):
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                budget -= _unzip_one(archive, member, folder / name, budget)
     except BROKEN_ZIP as error:
-        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-            expected, hint = f"room in {tempfile.gettempdir()} for what is in the zip", "make room, or set TMPDIR"
-            raise Unavailable(str(path), expected=expected, got="a full disk", hint=hint) from None
-        got = f"one that does not open ({str(error)[:120]})"
-        raise InvalidCameras(str(path), expected="a zip of a COLMAP sparse model", got=got) from None
+        raise _broken_zip(path, error) from None
+    return list(files)
+
+
+def _broken_zip(path: Path, error: Exception) -> InvalidCameras | Unavailable:
+    """The error of a zip that does not open, or does not fit on the disk."""
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        expected, hint = f"room in {tempfile.gettempdir()} for what is in the zip", "make room, or set TMPDIR"
+        return Unavailable(str(path), expected=expected, got="a full disk", hint=hint)
+    got = f"one that does not open ({str(error)[:120]})"
+    return InvalidCameras(str(path), expected="a zip of a COLMAP sparse model", got=got)
 
 
 def _unzip_one(archive: zipfile.ZipFile, member: zipfile.ZipInfo, target: Path, budget: int) -> int:

@@ -82,9 +82,10 @@ def _check_names(path: Path, name: str, fault: type[InvalidInput], length: int) 
     """Refuse headers that say a name twice, of which each reader believes another; safetensors refuses bad JSON."""
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        if len(dict(pairs)) < len(pairs):
+        named = dict(pairs)
+        if len(named) < len(pairs):
             raise fault(name, expected="a header that says each name once", got="one twice")
-        return dict(pairs)
+        return named
 
     with path.open("rb") as handle, suppress(ValueError, RecursionError):
         handle.seek(8)

@@ -27,6 +27,7 @@ MIN_FOCAL, MAX_FOCAL = 1e-3, 1e9  # pixels; float64 squares of what they project
 MAX_OFF_CENTRE = 1e9  # pixels of the principal point
 MAX_REACH = 1e12  # scene units from the origin; float32 has no detail left long before
 MAX_VIEWS = 100_000  # of a scene: many times what anybody lifts, and read and checked in seconds
+FEWER_VIEWS = "lift fewer photos, such as every second one"
 NEAREST = 3  # views named when one is unknown
 NEARLY_ALL = 0.995  # a share that would be told as 100%
 SHOWN = 120  # characters of a name that is unknown
@@ -351,8 +352,8 @@ def check_count(count: int, source: str) -> None:
         InvalidCameras: there are more than MAX_VIEWS.
     """
     if count > MAX_VIEWS:
-        hint = "lift fewer photos, such as every second one"
-        raise InvalidCameras(source, expected=f"at most {MAX_VIEWS} views", got=f"{count} or more", hint=hint)
+        most = f"at most {MAX_VIEWS} views"
+        raise InvalidCameras(source, expected=most, got=f"{count} or more", hint=FEWER_VIEWS)
 
 
 def behind_lens(camera: Camera, distortion: Distortion) -> Camera:

@@ -25,7 +25,7 @@ from liftcore.io.remote import local_path
 from liftcore.io.safetensors_file import MAX_HEADER_BYTES, TYPES, check_header, safetensors_header, tensor_bytes
 from liftcore.runtime.progress import Progress, silent
 from liftcore.runtime.torch_modes import callers_modes
-from liftcore.scene.cameras import Camera
+from liftcore.scene.cameras import FEWER_VIEWS, MAX_VIEWS, Camera
 from liftcore.scene.views import composed, require_pairs
 from liftcore.text.table import TableEncoder
 from liftcore.values.lens import as_pinhole_sees, grid_sides
@@ -38,6 +38,7 @@ FEATURE_TYPES = ("F16", "F32", "BF16")
 PARTS = ("labels", "codebook", "grid")
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 TABLE = "embeddings"
+MAX_TENSORS = 2 * MAX_VIEWS + 1  # of a pack: labels and a codebook a view, and its words
 
 
 @dataclass(frozen=True)
@@ -187,6 +188,9 @@ def read_features(*paths: str | Path) -> Views:
                 raise InvalidFeatures("features", expected="each view in one pack", got=got)
             sources[view] = _Stored(pack, stored)
             channels.setdefault(_check_specs(sources[view]), sources[view].where)
+        if len(sources) > MAX_VIEWS:
+            got = f"{len(sources)} up to {pack.path}"
+            raise InvalidFeatures("features", expected=f"at most {MAX_VIEWS} views", got=got, hint=FEWER_VIEWS)
     if not sources:
         raise InvalidFeatures("features", expected="at least one view", got=f"{len(packs)} packs without any")
     if len(channels) > 1:
@@ -416,7 +420,10 @@ def _open(path: Path) -> _PackFile:
     check_header(path, str(path), InvalidFeatures, expected=expected, hint=hint)
     try:
         handle: Any = safe_open(str(path), framework="pt")
-        slices = {name: handle.get_slice(name) for name in tuple(handle.keys())}
+        if len(names := handle.keys()) > MAX_TENSORS:
+            most = f"at most {MAX_VIEWS} views, of two tensors each"
+            raise InvalidFeatures(str(path), expected=most, got=f"{len(names)} tensors", hint=FEWER_VIEWS)
+        slices = {name: handle.get_slice(name) for name in names}
         specs = {name: TensorSpec(part.get_dtype(), _axes(name, part.get_shape())) for name, part in slices.items()}
         return _PackFile(path, handle, specs, handle.metadata() or {})
     except (SafetensorError, OSError) as error:

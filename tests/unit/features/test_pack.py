@@ -339,3 +339,19 @@ def test_a_pack_with_both_forms_of_a_name_is_refused(tmp_path: Path) -> None:
     save_file({f"{name}/grid": torch.ones(2, 2, 3) for name in (MAC, OTHERS)}, tmp_path / "a.pack")
     with pytest.raises(InvalidFeatures, match=r"each view once.*forms of Unicode"):
         read_features(tmp_path / "a.pack")
+
+
+def test_pack_of_more_views_than_a_scene_has_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("liftcore.values.pack.MAX_TENSORS", 3)
+    path = saved(tmp_path / "large.safetensors", {f"{view}/grid": torch.ones(1, 1, 2) for view in "abcd"})
+    with pytest.raises(InvalidFeatures, match=r"at most \d+ views.*got 4 tensors"):
+        read_features(path)
+
+
+def test_packs_of_more_views_together_than_a_scene_has_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("liftcore.values.pack.MAX_VIEWS", 3)
+    packs = [saved(tmp_path / f"{k}.safetensors", {f"{k}{i}/grid": torch.ones(1, 1, 2) for i in "ab"}) for k in "cd"]
+    with pytest.raises(InvalidFeatures, match=r"at most 3 views, got 4 up to .*d\.safetensors"):
+        read_features(*packs)
