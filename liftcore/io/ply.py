@@ -22,6 +22,7 @@ import numpy as np
 
 from liftcore.errors import InvalidSplats
 from liftcore.io.files import open_regular, whole_file
+from liftcore.scene.harmonics import SH_C0, constant_terms
 from liftcore.scene.kernel import DARK_LOBE, LOBE_COLOURS, Kernel, kernel_named, scale_count
 from liftcore.scene.render_mode import RenderMode, RenderModel, kernel_of_mode, mode_beside, mode_of_comments
 
@@ -46,6 +47,11 @@ UNREAD = {  # columns that change what is rendered and are not read: what the sp
     r"app|appearance|albedo|base_color|roughness|metallic|specular|transient|embedding)(_.*)?",
 }
 NORMALS = ("nx", "ny", "nz")
+CHANNELS = (
+    ("red", "green", "blue"),
+    ("diffuse_red", "diffuse_green", "diffuse_blue"),
+    ("r", "g", "b"),
+)  # of a colour
 SPLAT_PROPERTIES = ("opacity", "scale_0", "rot_0", "f_dc_0", "sh0_0", "packed_position")  # one at least
 SCAFFOLD = ("f_anchor_feat_0", "f_offset_0")  # of Scaffold-GS, whose networks turn anchors into splats
 SPELLING = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"}
@@ -80,6 +86,7 @@ def read_ply(path: Path, kernel: Kernel | str = "auto", *, colour: bool = True) 
 
     With the kernel ``auto`` it is recognised from the properties, and where these leave it open from what the file
     says (`liftcore.scene.render_mode`). Columns that the model does not know are kept as extras in their own type;
+    of files without harmonics, ``red``, ``green`` and ``blue`` are the colour too, the same from everywhere;
     ``double`` columns of the model become float32. Without ``colour`` neither colours nor extras are read or
     allocated, and what comes cannot be written back. A ``filter_3D`` becomes part of scales and opacities, which are
     then written as plain splats; elements behind the vertices are neither read nor written.
@@ -115,6 +122,10 @@ def read_ply(path: Path, kernel: Kernel | str = "auto", *, colour: bool = True) 
     if FILTER in extras:
         lines, layout = (), tuple(name for name in layout if name != FILTER)
         fields |= _filtered(fields["log_scales"], fields["opacity_logits"], extras.pop(FILTER))
+    if colour and "sh" not in fields and (channels := channel_names(header.names)):
+        levels = np.stack([extras[name] for name in channels], axis=1)
+        terms = constant_terms(levels / full_level(levels)).astype(np.float32)
+        fields["sh"] = np.ascontiguousarray(terms[:, None])
     tensors = {name: torch.from_numpy(values) for name, values in extras.items()}
     own = {"layout": layout, "header": lines, "render_mode": mode, "warnings": warnings}
     return Splats(**fields, kernel=kernel, extras=tensors, **own)
@@ -186,7 +197,8 @@ def some_rows(path: Path, kept: np.ndarray) -> Iterator[bytes]:
 def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
     """A PLY whose splats have one colour each, the same from everywhere; all else is of its own bytes.
 
-    Higher harmonics become zero. The lobes of DBS become dark and not zero: a lobe of zeros shines.
+    Higher harmonics become zero. The lobes of DBS become dark and not zero: a lobe of zeros shines. Of files without
+    harmonics, red, green and blue are changed, in their type and unit.
 
     Args:
         path: the file.
@@ -202,8 +214,13 @@ def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
     slots = model_slots(header.names, recognise_kernel(header.names), str(path))
     harmonics = {name: slot.index for name, slot in slots.items() if slot.field == "sh"}
     lobes = {name: slot.index for name, slot in slots.items() if slot.field == "sb_params"}
-    if not harmonics:
+    channels = () if harmonics else channel_names(header.names)
+    if not harmonics and not channels:
         raise InvalidSplats(str(path), expected="colours (f_dc_0, ...) to show scores in", got="a file without any")
+    levels = np.empty((len(colours), len(channels)))
+    if channels:
+        stored = _read_columns(path, header, {}, channels)[1]
+        levels = (0.5 + SH_C0 * colours) * full_level(np.stack([stored[name] for name in channels], axis=1))
     fixed = {name: 0.0 for name, (row, _) in harmonics.items() if row > 0}
     fixed |= {name: DARK_LOBE for name, (_, channel) in lobes.items() if channel < LOBE_COLOURS}
     yield header_bytes(header.lines)
@@ -213,6 +230,9 @@ def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
         for name, (row, channel) in harmonics.items():
             if row == 0:
                 rows[name] = colours[first : first + len(rows), channel]
+        for channel, name in enumerate(channels):
+            column = levels[first : first + len(rows), channel]
+            rows[name] = column if header.dtype[name].kind == "f" else np.rint(column)
         yield rows.tobytes()
 
 
@@ -358,6 +378,22 @@ def recognise_kernel(names: Collection[str], mode: RenderMode | None = None) -> 
     if "scale_1" in names and "scale_2" not in names:
         return Kernel.GAUSSIAN_2D
     return kernel_of_mode(mode)
+
+
+def channel_names(names: Collection[str]) -> tuple[str, ...]:
+    """The columns of red, green and blue, as nerfstudio's ``--ply-color-mode rgb`` writes; none where one lacks."""
+    return next((channels for channels in CHANNELS if set(channels) <= set(names)), ())
+
+
+def full_level(levels: np.ndarray) -> float:
+    """The number that stands for 1 among levels [P, 3] of red, green and blue: the largest of an integer type.
+
+    Floats are 0..1 in most files and 0..255 in some, where most of them are above 1.
+    """
+    if levels.dtype.kind != "f":
+        return float(np.iinfo(levels.dtype).max)
+    finite = levels[np.isfinite(levels)]
+    return 255.0 if finite.size and np.median(finite) > 1 else 1.0
 
 
 def nearest_dialect(names: Collection[str]) -> str:

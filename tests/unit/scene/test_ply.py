@@ -329,6 +329,42 @@ def test_colours_of_every_dialect_are_the_same_from_everywhere(dialect: str, tmp
     assert all(before[name].tobytes() == after[name].tobytes() for name in directions)
 
 
+@pytest.mark.parametrize(
+    ("kind", "full", "channels"),
+    [
+        ("uchar", 255, ("red", "green", "blue")),  # nerfstudio's --ply-color-mode rgb
+        ("ushort", 65_535, ("red", "green", "blue")),
+        ("float", 1, ("diffuse_red", "diffuse_green", "diffuse_blue")),
+        ("float", 255, ("r", "g", "b")),
+    ],
+)
+def test_red_green_and_blue_are_the_colour_where_no_harmonics_are(kind, full, channels, tmp_path: Path) -> None:
+    levels = np.random.default_rng(3).integers(26, 230, (5, 3)) / 255
+    stored = levels * full if kind == "float" else np.rint(levels * full)
+    columns = dict(zip(channels, stored.T, strict=True))
+    types = dict.fromkeys(channels, kind)
+    content = ply_bytes([*DIALECTS["no colour"], *channels], types=types, **columns)
+    path = with_ply(tmp_path, content)
+    splats = read_splats(path)
+    seen = seen_colours(splats, look_at("v", np.array([3.0, 1.0, -4.0]), 8, 8, 8.0))
+    torch.testing.assert_close(seen, torch.from_numpy(levels).float(), atol=2e-5, rtol=0)
+    write_splats(splats, tmp_path / "again.ply")
+    assert (tmp_path / "again.ply").read_bytes() == content
+    wanted = np.random.default_rng(2).integers(0, 256, (5, 3)).astype(np.uint8)
+    wanted[:3] |= 2  # most of them above 1 of 255
+    copy = rows_of(b"".join(recoloured(path, wanted)))
+    shown = np.stack([copy[name] for name in channels], axis=1) / full
+    np.testing.assert_allclose(shown, wanted / 255, atol=1e-5)
+    assert read_splats(path, colour=False).sh is None
+
+
+def test_harmonics_are_the_colour_where_red_green_and_blue_are_too(tmp_path: Path) -> None:
+    channels = ["red", "green", "blue"]
+    content = ply_bytes([*DIALECTS["gsplat"], *channels], types=dict.fromkeys(channels, "uchar"), f_dc_0=np.arange(5))
+    sh = read_splats(with_ply(tmp_path, content)).sh
+    assert sh is not None and sh[:, 0, 0].tolist() == [0, 1, 2, 3, 4]
+
+
 def test_a_file_without_colours_or_with_another_count_is_refused(tmp_path: Path) -> None:
     path = with_ply(tmp_path, ply_bytes(DIALECTS["no colour"]))
     with pytest.raises(InvalidSplats, match="expected colours"):
