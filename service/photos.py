@@ -9,11 +9,12 @@ import zipfile
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from liftcore.errors import InvalidCameras, InvalidPhotos, NotFound
-from liftcore.io.files import is_system_file
+from liftcore.io.files import BROKEN_ZIP, is_system_file, open_zip
 from liftcore.scene.views import cameras_of_views, view_names
 from service import limits
 
@@ -37,7 +38,7 @@ def describe_photos(path: Path) -> dict[str, Any]:
         InvalidPhotos: it is no zip, a photo is none or too large, or it would unpack to much more than it is.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_zip(path) as archive:
             if (size := path.stat().st_size - archive.start_dir) > limits.DIRECTORY_BYTES:
                 expected = f"a zip with a directory of at most {limits.DIRECTORY_BYTES} bytes"
                 raise InvalidPhotos("photos", expected=expected, got=f"{size}", hint="shorter names, and no comments")
@@ -48,7 +49,7 @@ def describe_photos(path: Path) -> dict[str, Any]:
                 _require_photo(archive, member)
     except InvalidCameras as error:  # of names, which are those of views
         raise InvalidPhotos("image name", expected=error.expected, got=error.got) from None
-    except (zipfile.BadZipFile, NotImplementedError, EOFError, OSError, ValueError) as error:
+    except BROKEN_ZIP as error:
         raise InvalidPhotos("photos", expected=EXPECTED, got=f"{error}"[:200] or "a damaged one") from None
     others = len(entries) - len(members)
     warnings = [f"{others} entries are no .jpg, .jpeg or .png and are left alone"] if others else []
@@ -96,14 +97,6 @@ def _require_photo(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> None:
         raise InvalidPhotos(shown, expected=f"sides of at most {SIDE} pixels", got=f"{width}x{height}")
 
 
-def holds_photos(path: Path) -> bool:
-    """Whether a zip holds photos, and no model of cameras beside them."""
-    with zipfile.ZipFile(path) as archive:
-        names = archive.namelist()
-    models = (".bin", ".txt", ".json")
-    return any(map(_media_type, names)) and not any(name.lower().endswith(models) for name in names)
-
-
 @dataclass(frozen=True)
 class PhotoIndex:
     """Where the photos of a checked zip lie."""
@@ -116,12 +109,20 @@ class PhotoIndex:
         return set(cameras_of_views(self.members, views).values())
 
     def open(self, view: str) -> tuple[str, int, Iterator[bytes]] | None:
-        """The media type, the size and the blocks of a view's photo; None when there is none."""
+        """The media type, the size and the blocks of a view's photo; None when there is none.
+
+        Raises:
+            NotFound: the zip is gone, or damaged where the photo begins.
+        """
         name = view if view in self.members else next(iter(cameras_of_views(self.members, [view])), None)
         if name is None:
             return None
-        member = self.members[name]
-        return _media_type(member.filename), member.file_size, self._blocks(member)
+        member, blocks = self.members[name], self._blocks(self.members[name])
+        try:
+            first = next(blocks, b"")
+        except (*BROKEN_ZIP, struct.error) as error:
+            raise _damaged(error) from None
+        return _media_type(member.filename), member.file_size, chain([first], blocks)
 
     def _blocks(self, member: zipfile.ZipInfo) -> Iterator[bytes]:
         # To open the zip would read its whole directory again.
@@ -150,12 +151,16 @@ class PhotoIndexes:
         try:
             with self._turn:
                 return self._of(path, path.stat().st_mtime_ns)  # an upload mends a damaged one in its place
-        except (zipfile.BadZipFile, OSError) as error:
-            hint = "something else wrote there: upload them again"
-            got = str(error)[:80] if isinstance(error, zipfile.BadZipFile) else f"{error.strerror}"
-            raise NotFound("photos", expected="their zip in the data directory", got=got, hint=hint) from None
+        except BROKEN_ZIP as error:
+            raise _damaged(error) from None
+
+
+def _damaged(error: Exception) -> NotFound:
+    got = getattr(error, "strerror", None) or str(error)[:80] or "a damaged one"
+    hint = "something else wrote there: upload them again"
+    return NotFound("photos", expected="their zip in the data directory", got=got, hint=hint)
 
 
 def _index(path: Path, changed: int) -> PhotoIndex:
-    with zipfile.ZipFile(path) as archive:
+    with open_zip(path) as archive:
         return PhotoIndex(path, _members(archive.infolist()))

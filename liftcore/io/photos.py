@@ -17,6 +17,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO, TYPE_CHECKING, NamedTuple
 
 from liftcore.errors import InvalidInput
+from liftcore.io.files import BROKEN_ZIP
 from liftcore.scene.views import IMAGE_SUFFIXES, without_image_suffix
 
 if TYPE_CHECKING:
@@ -133,8 +134,12 @@ class PhotosBeside:
             if (photo := self._photo(folder, place)) is not None:
                 if isinstance(photo, Path):
                     return read_header(photo).stored
-                with photo.open("rb") as packed:
-                    return read_header(packed, str(photo)).stored
+                try:
+                    with photo.open("rb") as packed:
+                        return read_header(packed, str(photo)).stored
+                except BROKEN_ZIP as error:
+                    got = f"one that does not unzip ({str(error)[:120]})"
+                    raise InvalidInput(str(photo), expected="an image", got=got) from None
         return None
 
     def missing(self, file_path: str) -> str:
