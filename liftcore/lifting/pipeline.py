@@ -27,7 +27,6 @@ from liftcore.raster.base import Raster
 from liftcore.runtime.device import Device, choose_device, within_memory
 from liftcore.runtime.progress import Progress, Timings
 from liftcore.runtime.torch_modes import usual_modes
-from liftcore.runtime.version import __version__
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
 from liftcore.solve.aggregate import Aggregation, aggregate
@@ -38,8 +37,6 @@ from liftcore.solve.least_squares import AllRays, reference, refine
 from liftcore.solve.loss import huber_factors
 from liftcore.solve.objects import RegionObjects, object_facts, region_objects
 from liftcore.solve.reweight import Agreement, agreement_factors, agreement_facts, reweighted, whole_regions
-from liftcore.values.lift import LiftMetadata
-from liftcore.values.lift_file import poses_of
 from liftcore.values.lift_views import Given, LiftViews
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import LiftSettings, Preset
@@ -128,17 +125,7 @@ def lift(
         agreement=solution.agreement,
         confidence=agreement.confidence if agreement else None,
         seen=torch.from_numpy(sums > 0),
-        metadata=LiftMetadata(
-            version=__version__,
-            settings=chosen,
-            encoder=found.features.encoder,
-            text_space=found.features.text_space,
-            words=table.words if table else (),
-            views=tuple(found.names),
-            poses=poses_of([found.camera(number) for number in range(len(found))]),
-            certificate=diagnostics,
-            timings=work.timings.seconds,
-        ),
+        metadata=found.metadata(chosen, diagnostics, work.timings.seconds),
         cluster=clusters.clusters if clusters else None,
         cluster_features=clusters.cluster_features if clusters else None,
         embeddings=torch.from_numpy(table.embeddings) if table else None,

@@ -2,8 +2,12 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
+from liftcore.runtime.version import __version__
 from liftcore.scene.cameras import Camera, Cameras
+from liftcore.values.lift import LiftMetadata
+from liftcore.values.lift_file import poses_of
 from liftcore.values.pack import Views, as_views, pair
 from liftcore.values.settings import LiftSettings
 from liftcore.values.views import ViewFeatures
@@ -42,6 +46,23 @@ class LiftViews:
     def __iter__(self) -> Iterator[tuple[Camera, ViewFeatures]]:
         """The views, one in memory at a time."""
         return (self[number] for number in range(len(self)))
+
+    def metadata(
+        self, settings: LiftSettings, diagnostics: dict[str, Any], timings: dict[str, float]
+    ) -> LiftMetadata:
+        """What a lift of these views remembers, of whatever engine."""
+        table = self.features.table
+        return LiftMetadata(
+            version=__version__,
+            settings=settings,
+            encoder=self.features.encoder,
+            text_space=self.features.text_space,
+            words=table.words if table else (),
+            views=tuple(self.names),
+            poses=poses_of([self.camera(number) for number in range(len(self))]),
+            certificate=diagnostics,
+            timings=timings,
+        )
 
     def camera(self, number: int) -> Camera:
         """Of the view of that number."""

@@ -41,7 +41,6 @@ from liftcore.query.result import LiftResult, load_lift
 from liftcore.runtime.device import choose_device
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, Timings
-from liftcore.runtime.version import __version__
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
 from liftcore.solve.aggregate import MASKS_MADE, aggregation_facts, cluster_means
@@ -62,8 +61,6 @@ from liftcore.solve.objects import (
 )
 from liftcore.solve.reweight import SceneAgreement, agreement_facts, whole_regions
 from liftcore.solve.sums import added, unpacked
-from liftcore.values.lift import LiftMetadata
-from liftcore.values.lift_file import poses_of
 from liftcore.values.lift_views import Given, LiftViews
 from liftcore.values.pack import Views, as_views, write_pack
 from liftcore.values.region_weights import MOST_REGIONS
@@ -150,17 +147,7 @@ def lift_in_blocks(
         with timings.step("certify"):
             sums, table = columns.pop("sums").numpy(), found.features.table
             certificate = _certificate(work.job, splats, found, plan, sums, columns["evidence"], notes)
-        metadata = LiftMetadata(
-            version=__version__,
-            settings=settings,
-            encoder=found.features.encoder,
-            text_space=found.features.text_space,
-            words=table.words if table else (),
-            views=job.names,
-            poses=poses_of([found.camera(number) for number in range(len(found))]),
-            certificate=certificate,
-            timings=timings.seconds,
-        )
+        metadata = found.metadata(settings, certificate, timings.seconds)
         if table:
             columns["embeddings"] = torch.from_numpy(table.embeddings)
         write_index(place / "lift", columns, job.solutions, metadata.model_dump_json())
