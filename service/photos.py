@@ -6,7 +6,8 @@ import io
 import struct
 import threading
 import zipfile
-from collections.abc import Collection, Iterator, Mapping
+import zlib
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain
@@ -15,6 +16,7 @@ from typing import Any
 
 from liftcore.errors import InvalidCameras, InvalidPhotos, NotFound
 from liftcore.io.files import BROKEN_ZIP, is_system_file, open_zip
+from liftcore.io.photos import LARGEST_TAG, ORIENTATION, UPRIGHT, PhotoHeader
 from liftcore.scene.views import cameras_of_views, view_names
 from service import limits
 
@@ -164,3 +166,57 @@ def _damaged(error: Exception) -> NotFound:
 def _index(path: Path, changed: int) -> PhotoIndex:
     with open_zip(path) as archive:
         return PhotoIndex(path, _members(archive.infolist()))
+
+
+def in_camera_orientation(
+    photo: Iterator[bytes], camera_size: Callable[[], tuple[int, int] | None]
+) -> tuple[Iterator[bytes], bool]:
+    """The blocks of a JPEG or PNG that a browser shows as its camera sees it, and whether they were changed for it.
+
+    A browser turns a photo as its EXIF asks. Where the camera is of the stored pixels (`liftcore.io.photos`), the tag
+    becomes 1, and no other byte changes but a PNG's checksum.
+
+    Args:
+        camera_size: width and height of the photo's camera; asked for where the photo has an orientation.
+    """
+    from PIL import Image
+
+    first = next(photo, b"")
+    place = _orientation_place(first)
+    if place is None:
+        return chain([first], photo), False
+    content = first + b"".join(photo)
+    (orientation,) = struct.unpack_from(f"{place[1]}H", content, place[0])
+    if not UPRIGHT < orientation <= LARGEST_TAG:
+        return iter([content]), False
+    with Image.open(io.BytesIO(content), formats=[*FORMATS.values()]) as image:  # whose size alone is read
+        header = PhotoHeader(*image.size, orientation)
+    if header.turns_for(camera_size()):
+        return iter([content]), False
+    return iter([_with_upright_tag(content, *place)]), True
+
+
+def _orientation_place(photo: bytes) -> tuple[int, str] | None:
+    """Where the beginning of a JPEG or PNG has its EXIF orientation, of two bytes, and their order; None: nowhere."""
+    is_png = photo.startswith(b"\x89PNG")
+    begin = photo.find(b"eXIf" if is_png else b"Exif\0\0")
+    tiff = begin + (4 if is_png else 6)
+    order = {b"II": "<", b"MM": ">"}.get(photo[tiff : tiff + 2])
+    if begin < 0 or order is None or len(photo) < tiff + 8:
+        return None
+    table = tiff + struct.unpack_from(f"{order}I", photo, tiff + 4)[0]
+    entries = struct.unpack_from(f"{order}H", photo, table)[0] if table + 2 <= len(photo) else 0
+    places = range(table + 2, min(table + 2 + 12 * entries, len(photo) - 11), 12)
+    tags = (place for place in places if struct.unpack_from(f"{order}H", photo, place)[0] == ORIENTATION)
+    return next(((place + 8, order) for place in tags), None)
+
+
+def _with_upright_tag(photo: bytes, place: int, order: str) -> bytes:
+    changed = bytearray(photo)
+    struct.pack_into(f"{order}H", changed, place, UPRIGHT)
+    if photo.startswith(b"\x89PNG"):  # whose chunks end with a checksum of their name and content
+        begin = photo.find(b"eXIf")
+        end = begin + 4 + struct.unpack_from(">I", photo, begin - 4)[0]
+        if end + 4 <= len(photo):
+            struct.pack_into(">I", changed, end, zlib.crc32(changed[begin:end]))
+    return bytes(changed)

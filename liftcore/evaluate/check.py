@@ -110,6 +110,7 @@ def check_scene(
     wrong: list[str] = []
     contradicting = rendering_warnings(splats.render_mode, trained.antialiased, splats.kernel)
     notes = [f"splats: {text}" for text in (*contradicting, *splats.warnings)]
+    notes += [f"cameras: {text}" for text in cameras.warnings]
     if trained.antialiased:
         notes.append(f"splats: rendered antialiased: {rendering_reason(splats.render_mode, True)}")
     photos = photos or {}

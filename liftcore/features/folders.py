@@ -72,6 +72,9 @@ def grids_of(files: Mapping[str, Path], layout: Layout = "hwc") -> ViewFolder[Fe
     def read(view: str) -> FeatureGrid:
         first = layout == "chw" or files[view].stem.endswith(CHANNELS_FIRST)
         grid = read_floats(files[view], "F, h, w" if first else "h, w, F")
+        if first and len(grid) == 1:  # a batch of one flat list [1, F, N], or one channel: nothing tells which
+            hint = "of a flat list of cells save array.reshape(F, h, w); of one channel array.reshape(h, w, 1) as hwc"
+            raise InvalidFeatures(str(files[view]), expected="[F, h, w]", got=f"{list(grid.shape)}", hint=hint)
         return FeatureGrid(grid.transpose(1, 2, 0) if first else grid, where=f"view {view!r}")
 
     return ViewFolder(files, read)
@@ -111,6 +114,8 @@ def mask_ids(stored: np.ndarray, rows: int, path: Path) -> np.ndarray:
         InvalidFeatures: other axes, an id without a vector, or one that is no whole number.
     """
     shape, stored = list(stored.shape), without_unit_axes(stored, 3)
+    if stored.ndim == 3 and stored.shape[-1] == 1 < len(stored):  # [H, W, 1]: no photo is a pixel wide
+        stored = stored[..., 0]
     if stored.ndim not in (2, 3):
         raise InvalidFeatures(str(path), expected="mask ids [L, H, W]", got=str(shape))
     low, high = float(stored.min()), float(stored.max())
@@ -118,6 +123,10 @@ def mask_ids(stored: np.ndarray, rows: int, path: Path) -> np.ndarray:
     if not (low >= NO_LABEL and high < rows):
         got = f"ids from {low:g} to {high:g}"
         hint = "ids are counted on over the levels; those of each level alone must be shifted first"
+        if low == 0 and high == rows:
+            hint = "id k is of row k of the vectors, and -1 is none: where 0 means none, save ids - 1"
+        elif float(stored.max()) == 255 and len(np.unique(stored)) == 2:
+            hint = "masks, a plane each, are booleans: numpy.save(name, masks > 0)"
         raise InvalidFeatures(str(path), expected=f"ids in -1..{rows - 1}", got=got, hint=hint)
     labels = stored.astype(np.int32)
     if stored.dtype.kind == "f" and not np.array_equal(labels, stored):

@@ -234,10 +234,10 @@ def picture_labels(path: Path, rows: int, unlabelled: int) -> np.ndarray:
 
 
 def _planes(stored: np.ndarray) -> np.ndarray:
-    """Masks [M, H, W] of such with an axis of length 1 before it, or, as SAM's predictor has them, behind M."""
+    """Masks [M, H, W] of such with an axis of length 1 before it, behind M as SAM's predictor has them, or last."""
     found = without_unit_axes(stored, 4)
-    if found.ndim == 4 and found.shape[1] == 1 and found.dtype.kind == "b":
-        found = found[:, 0]
+    if found.ndim == 4 and 1 in (found.shape[1], found.shape[3]) and found.dtype.kind == "b":
+        found = found[:, 0] if found.shape[1] == 1 else found[..., 0]
     return without_unit_axes(found, 3)
 
 

@@ -145,12 +145,17 @@ def read_floats(path: Path, axes: str) -> np.ndarray:
     """
     stored = open_array(path)
     found = without_unit_axes(stored, len(axes.split()))
+    if found.ndim == 3 and found.shape[1] == 1 and axes == "M, F":  # a vector each of M batches of one
+        found = found[:, 0]
     if found.ndim != len(axes.split()) or found.dtype.kind != "f" or found.dtype.itemsize > 8:
         got, hint = f"{stored.dtype} {list(stored.shape)}", ""
         if found.ndim > len(axes.split()):
             hint = f"a file is of one view: save each of the {len(found)} under its own name"
+            hint = f"{hint}, or take the last axis off: array[..., 0]" if found.shape[-1] == 1 else hint
         elif found.ndim < len(axes.split()):
             hint = f"give it its axes before it is saved: array.reshape({axes})"
+        elif found.dtype.kind in "iu":
+            hint = "save what the integers stand for, times their scale: array.astype(numpy.float32)"
         raise InvalidFeatures(str(path), expected=f"floats [{axes}]", got=got, hint=hint)
     with np.errstate(over="ignore"):  # becomes infinite, and is refused as such where values are made
         return found.astype(np.float16 if found.dtype.itemsize == 2 else np.float32)

@@ -39,6 +39,7 @@ from liftcore.query.terms import Example, Query, Region, Vector, parse_example
 from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Kernel
+from liftcore.scene.views import cameras_of_views
 from liftcore.text import OWN_WORDS, RememberingEncoder, TextEncoder, open_encoder
 from service.child import fault_of, own_stdout
 from service.encoders import encoder_version
@@ -277,7 +278,11 @@ class Answers:
         return _file(npy(layer_colours(self._scene(request), request["what"])), request)
 
     def _views(self, request: dict[str, Any]) -> Frame:
-        cameras, first, count = self._scene(request).cameras, request["first"], request["count"]
+        cameras = self._scene(request).cameras
+        if "view" in request:
+            found = cameras_of_views([request["view"]], cameras).values()
+            return Frame({"views": [describe_view(cameras[name], name) for name in found], "more": False})
+        first, count = request["first"], request["count"]
         names = list(itertools.islice(cameras, first, first + count))
         more = first + count < len(cameras)
         return Frame({"views": [describe_view(cameras[name], name) for name in names], "more": more})

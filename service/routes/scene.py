@@ -12,6 +12,7 @@ from liftcore.errors import NotFound
 from service import limits, models
 from service.content import TAGGED, Limit, kept, unchanged
 from service.encoders import encoder_label
+from service.photos import in_camera_orientation
 from service.routes.queries import (
     NO_ENCODER,
     NPY,
@@ -60,8 +61,16 @@ def colours(lift: str, request: Request, deps: Deps, ask: Ask, what: Layer = "pc
 
 
 @router.get("/photo", responses=PHOTO | TAGGED, response_class=Response)
-def photo(lift: str, view: View, request: Request, deps: Deps) -> Response:
-    """The photo of a view, as it was uploaded."""
+def photo(lift: str, view: View, request: Request, deps: Deps, ask: Ask) -> Response:
+    """The photo of a view, as it was uploaded.
+
+    Where its camera is of the stored pixels, an EXIF orientation becomes 1, so that no browser turns the photo.
+    """
+
+    def camera_size() -> tuple[int, int] | None:
+        cameras = ask(scene_request("views", found, deps) | {"view": view}).header["views"]
+        return (cameras[0]["width"], cameras[0]["height"]) if cameras else None
+
     found = deps.store.lifts.get(deps.owner, lift)
     zipped = None if found.photos is None else deps.store.assets.get(deps.owner, found.photos)
     opened = None if zipped is None else deps.photos.of(zipped.path).open(view)
@@ -69,7 +78,8 @@ def photo(lift: str, view: View, request: Request, deps: Deps) -> Response:
         got, hint = f"none of {view!r}"[:200], "PUT /assets/photos, then PATCH /lifts/{lift} with its id"
         raise NotFound("view", expected="a view of which the lift has a photo", got=got, hint=hint)
     media_type, size, blocks = opened
-    etag = f'"{hashlib.sha256(f"{zipped.id} {view}".encode()).hexdigest()}"'
+    blocks, is_changed = in_camera_orientation(blocks, camera_size)
+    etag = f'"{hashlib.sha256(f"{zipped.id} {view} {is_changed}".encode()).hexdigest()}"'
     headers = kept(etag) | {"Content-Length": str(size)}
     return unchanged(request, etag) or StreamingResponse(blocks, media_type=media_type, headers=headers)
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
-from PIL import Image
+from PIL import Image, ImageOps
 from safetensors import safe_open
 from safetensors.numpy import load, save
 
@@ -86,6 +86,35 @@ def test_photos_are_shown_as_they_were_uploaded(client: TestClient, lift: dict[s
     assert assert_problem(client.patch(at, json={"photos": lift["splats"]}))["status"] == 404
     assert client.patch(at, json={"photos": None}).json()["photos"] is None
     assert client.delete(f"/assets/{asset['id']}").status_code == 204
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG"])
+def test_photo_is_served_in_the_orientation_of_its_camera(
+    client: TestClient, lift: dict[str, Any], kind: str
+) -> None:
+    stored, asked = Image.new("RGB", (WIDTH, HEIGHT)), Image.Exif()
+    stored.paste((250, 0, 0), (0, 0, WIDTH // 2, HEIGHT))
+    asked[0x0112] = 6  # turn it clockwise
+    files = {}
+    for view, image in {"left": stored, "middle": stored.transpose(Image.Transpose.ROTATE_90)}.items():
+        content = io.BytesIO()
+        image.save(content, kind, exif=asked)
+        files[view] = content.getvalue()
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        for view, photo in files.items():
+            archive.writestr(f"{view}.{'jpg' if kind == 'JPEG' else 'png'}", photo)
+    asset = client.put("/assets/photos", content=content.getvalue()).json()
+    at = f"/lifts/{lift['id']}"
+    client.patch(at, json={"photos": asset["id"]})
+    for view, photo in files.items():
+        shown = Image.open(io.BytesIO(client.get(f"{at}/photo", params={"view": view}).content))
+        assert shown.size == Image.open(io.BytesIO(photo)).size
+        shown.load()
+        turned = ImageOps.exif_transpose(shown)
+        assert turned.size == (WIDTH, HEIGHT)
+        assert np.abs(np.asarray(turned, np.int64) - np.asarray(stored, np.int64)).max() < 60
+    assert client.get(f"{at}/photo", params={"view": "middle"}).content == files["middle"]
 
 
 def test_directory_of_photos_is_read_once_for_all_that_ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -163,7 +163,7 @@ def test_settings_of_the_service_that_are_told_exist_and_have_that_default() -> 
     assert {"DATA", "HOST", "KEYS", "TEXT_SPACES"} <= told.keys()
     for name, shown in told.items():
         default = ServiceSettings.model_fields[name.lower()].get_default(call_default_factory=True)
-        assert shown.split(" (")[0].strip("`") == ("-" if default in (None, ()) else str(default)), name
+        assert shown.split(" (")[0].strip("`") == ("-" if default in (None, (), "") else str(default)), name
     named = {name.lower() for page in PAGES for name in re.findall(r"SPLATLIFT_([A-Z_]+)", text(page))}
     assert named - {"key"} <= ServiceSettings.model_fields.keys()
 

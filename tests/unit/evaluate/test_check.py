@@ -64,6 +64,11 @@ def test_what_belongs_together_is_healthy(scene: StillLife, photos, grids) -> No
     assert found.features["neighbouring_cells"] > found.features["[F, h, w]"] and found.worst is not None
 
 
+def test_what_the_reader_of_cameras_says_is_noted(scene: StillLife) -> None:
+    cameras = Cameras(scene.cameras.values(), warnings=["sparse/1 was read, and sparse/0 was not"])
+    assert "cameras: sparse/1 was read, and sparse/0 was not" in check_scene(scene.splats, cameras).notes
+
+
 def test_cameras_of_another_scale_are_told_by_the_photos(scene: StillLife, photos) -> None:
     moved = []
     for camera in scene.cameras.values():

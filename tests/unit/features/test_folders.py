@@ -14,6 +14,7 @@ from safetensors.numpy import save_file
 
 from liftcore.errors import InvalidFeatures
 from liftcore.features.folders import Layout, array_views, files_below, langsplat_views
+from liftcore.features.masks import mask_views
 from liftcore.io.npy import open_npy
 from liftcore.values.pack import read_features, write_pack
 from liftcore.values.views import FeatureGrid, Regions
@@ -226,6 +227,27 @@ def test_other_axes_are_told_with_a_way_on(stored: np.ndarray, message: str, tmp
     np.save(tmp_path / "a.npy", stored)
     with pytest.raises(InvalidFeatures, match=message):
         array_views(tmp_path, "chw")["a"]
+
+
+@pytest.mark.parametrize("layout", ["hwc", "chw"])
+@pytest.mark.parametrize("stored", [np.ones((1, 192, 24), np.float32), np.ones((1, 24, 192), np.float32)])
+def test_flat_lists_of_cells_are_no_maps(stored: np.ndarray, layout: Layout, tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", stored)
+    with pytest.raises(InvalidFeatures, match=r"h, w.*reshape"):
+        array_views(tmp_path, layout)["a"]
+
+
+def test_masks_and_vectors_may_have_a_unit_axis_behind(tmp_path: Path) -> None:
+    masks = np.zeros((2, 5, 6), bool)
+    masks[0, 1:3, 1:3] = masks[1, 3:, 4:] = True
+    ids = np.where(masks.any(axis=0), masks.argmax(axis=0), -1)
+    for name, stored in {"a": masks[..., None], "b": masks[:, None], "c": ids[..., None], "d": ids}.items():
+        np.save(tmp_path / f"{name}_masks.npy", stored)
+        np.save(tmp_path / f"{name}.npy", np.eye(2, dtype=np.float32)[:, None])
+    views = mask_views(tmp_path)
+    for name in views:
+        assert views[name].labels.tolist() == ids[None].tolist()
+        assert views[name].codebook.tolist() == np.eye(2).tolist()
 
 
 class _Code:
