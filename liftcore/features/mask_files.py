@@ -7,11 +7,17 @@ is negative. From the fourth on, a number is the difference to the one two befor
 cocodataset/cocoapi, ``common/maskApi.c`` (``rleToString``, ``rleFrString``).
 
 A polygon is a list of parts, ``[[x1, y1, x2, y2, ...], ...]`` in pixels of the image, whose union is the mask; or, as
-LabelMe and ISAT write it, the points ``[[x, y], ...]`` of one part.
+LabelMe and ISAT write it, the points ``[[x, y], ...]`` of one part; or several rings, of which a pixel is inside that
+lies in an odd number of them (``exterior`` and ``interior`` of Supervisely, ``paths`` of Darwin).
+
+LabelMe and Supervisely keep pictures of a part of the image too, as PNGs in base64 with the place of their corner.
 """
 
+import base64
+import io
 import json
 import warnings
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -26,7 +32,7 @@ from liftcore.errors import InvalidFeatures
 from liftcore.scene.cameras import MAX_SIDE
 
 LABELS = "a PNG of one channel, 8 or 16 bits of grey or a palette"
-BINARY = "a PNG without transparency, of one value beside black"
+BINARY = "a PNG without transparent pixels, of one value beside black"
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_HEADER_BYTES = 26  # up to the depth and the kind of colours
 PNG_KINDS = {
@@ -45,8 +51,11 @@ MOST_GROUPS = 7  # 35 bits: differences of lengths in an image of MAX_SIDE squar
 MAX_PIXELS = 178_956_970  # as many as Pillow opens
 MOST_CROSSINGS = 1 << 24  # of columns of pixels by the edges of a polygon
 MAX_COORDINATE = 1e6  # pixels; what lies beyond is no place on an image
+CIRCLE_CORNERS = 64
+TOO_LARGE = Image.DecompressionBombError
+MAX_PICTURE_BYTES = 64 << 20  # of a PNG of a mask
 RECORD_LISTS = ("annotations", "shapes", "objects", "predictions")  # COCO's, LabelMe's, ISAT's, Roboflow's
-SEGMENTATIONS = ("segmentation", "points", "rle", "mask")  # of a record
+SEGMENTATIONS = ("segmentation", "polygon", "points", "segments", "rle", "mask")  # of a record
 
 
 def label_png(path: Path) -> tuple[np.ndarray, dict[str, str]]:
@@ -77,14 +86,18 @@ def binary_picture(path: Path, unlabelled: int | None = None) -> tuple[np.ndarra
     Raises:
         InvalidFeatures: no PNG, one with transparency, or one of more values.
     """
-    with _opened(path, BINARY, _refuse_transparency) as image:
-        values = np.asarray(image)
+    with _opened(path, BINARY, lambda *_: None) as image:
+        is_opaque = image.mode in ("RGBA", "LA") and image.getchannel("A").getextrema()[0] == 255
+        if not is_opaque:
+            _refuse_transparency(0, "colours with transparency" if image.mode in ("RGBA", "LA") else "", path)
+        values = np.asarray(image.convert("RGB") if is_opaque else image)
     grey = values.max(axis=2) if values.ndim == 3 else values
     void = np.zeros(grey.shape, bool) if unlabelled is None else grey == unlabelled
     inside = (grey != 0) & ~void
     told = grey[inside]
     if len(told) and told.min() != told.max():
-        got, hint = f"values from {told.min()} to {told.max()} beside it", "label pictures need their --names"
+        got = f"values from {told.min()} to {told.max()} beside it"
+        hint = "label pictures need their --names; of a mask with soft edges save where it is at least half"
         raise InvalidFeatures(str(path), expected="one value beside 0, a mask", got=got, hint=hint)
     return inside, void
 
@@ -220,17 +233,88 @@ def read_mask(record: Any, size: tuple[int, int] | None, where: str) -> StoredMa
         InvalidFeatures: as `read_runs` and `read_polygons`, or polygons of an image of no known size.
     """
     found = record if isinstance(record, dict) else {}
+    bitmap, shape = found.get("bitmap"), found.get("shape_type")
+    if shape == "mask" or isinstance(bitmap, dict):
+        corner = bitmap.get("origin") if isinstance(bitmap, dict) else (found.get("points") or [None])[0]
+        content = bitmap.get("data") if isinstance(bitmap, dict) else found.get("mask")
+        return _placed_picture(content, corner, _known_size(size, where), where)
     segmentation = next((found[key] for key in SEGMENTATIONS if found.get(key) is not None), None)
     if segmentation is None or segmentation == []:
         return None
-    if not isinstance(segmentation, list):
+    rings = _rings(segmentation)
+    if rings is None and not isinstance(segmentation, list):
         return RunMask(*read_runs(segmentation, where))
-    parts = read_polygons(segmentation, where)
+    parts = read_polygons(segmentation, where) if rings is None else [_joined(rings, where)]
+    parts = [_circle(parts[0])] if shape == "circle" and parts and len(parts[0]) == 2 else parts
+    corners = np.concatenate([part.reshape(-1) for part in parts])
+    if len(corners) >= 6 and 0 <= corners.min() <= corners.max() <= 1 and (size is None or max(size) > 2):
+        hint = "multiply x by the image's width and y by its height"
+        raise InvalidFeatures(where, expected="a polygon in pixels", got="one in shares of the image", hint=hint)
+    return PolygonMask(_known_size(size, where), tuple(parts))
+
+
+def _known_size(size: tuple[int, int] | None, where: str) -> tuple[int, int]:
     if size is None:
         hint = "give the image's width and height, or masks as run lengths"
         raise InvalidFeatures(where, expected="the size of the image of a polygon", got="none", hint=hint)
     check_size(size, where)
-    return PolygonMask(size, tuple(parts))
+    return size
+
+
+def _rings(segmentation: Any) -> list[Any] | None:
+    """The rings of an object of them, the outer one first; None of what is no such object."""
+    if not isinstance(segmentation, dict):
+        return None
+    if isinstance(segmentation.get("paths"), list):
+        return segmentation["paths"]
+    if all(isinstance(segmentation.get(axis), list) for axis in "xy"):  # Ultralytics's
+        return [[list(point) for point in zip(segmentation["x"], segmentation["y"], strict=False)]]
+    inner = segmentation.get("interior")
+    return (
+        [segmentation["exterior"], *(inner if isinstance(inner, list) else [])]
+        if "exterior" in segmentation
+        else None
+    )
+
+
+def _joined(rings: Sequence[Any], where: str) -> np.ndarray:
+    """[n, 2] f64: one outline along all rings, and back along the lines between them, which then count twice."""
+    outlines = [part for ring in rings for part in read_polygons(ring, where) if len(part)]
+    closed = [np.concatenate([part, part[:1], outlines[0][:1]]) for part in outlines]
+    return np.concatenate(closed) if closed else np.zeros((0, 2))
+
+
+def _circle(points: np.ndarray) -> np.ndarray:
+    """[n, 2] f64, the outline of a circle of a centre and a point on it [2, 2]."""
+    centre, rim = points
+    angles = np.linspace(0, 2 * np.pi, CIRCLE_CORNERS, endpoint=False)
+    return centre + np.hypot(*(rim - centre)) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+
+def _placed_picture(content: Any, corner: Any, size: tuple[int, int], where: str) -> RunMask:
+    """The mask of a PNG in base64, perhaps deflated, whose corner (x, y) lies on a pixel of the image."""
+    try:
+        packed = base64.b64decode(content, validate=True)
+        unpacker = zlib.decompressobj()
+        png = packed if packed.startswith(PNG_SIGNATURE) else unpacker.decompress(packed, MAX_PICTURE_BYTES)
+        with Image.open(io.BytesIO(png), formats=["PNG"]) as image:
+            if image.width * image.height > MAX_PIXELS:
+                raise ValueError(f"{image.width}x{image.height} pixels")
+            is_alpha = image.mode in ("LA", "RGBA")
+            inside = np.asarray(image.getchannel("A") if is_alpha else image.convert("L")) > 0
+        left, top = (round(float(place)) for place in corner)
+    except (TypeError, ValueError, OverflowError, zlib.error, OSError, SyntaxError, TOO_LARGE) as error:
+        got, expected = str(error)[:80] or "none", "a PNG in base64 and its corner (x, y)"
+        raise InvalidFeatures(where, expected=expected, got=got) from None
+    height, width = size
+    if not (top >= 0 and top + inside.shape[0] <= height and left >= 0 and left + inside.shape[1] <= width):
+        got = f"{inside.shape[1]} x {inside.shape[0]} pixels at ({left}, {top})"
+        raise InvalidFeatures(where, expected=f"a picture within {width} x {height} pixels", got=got)
+    whole = np.zeros(size, bool)
+    whole[top : top + inside.shape[0], left : left + inside.shape[1]] = inside
+    flat = np.concatenate([[False], whole.T.reshape(-1)])
+    changes = np.flatnonzero(flat[1:] != flat[:-1])
+    return RunMask(size, np.diff(np.concatenate([[0], changes, [whole.size]])))
 
 
 def read_polygons(segmentation: Any, where: str) -> list[np.ndarray]:

@@ -16,6 +16,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
+from urllib.parse import parse_qs, unquote, urlsplit
 
 import numpy as np
 
@@ -34,12 +35,15 @@ from liftcore.text.table import plain
 
 PHRASE_KEYS = (
     *("phrase", "prompt", "text", "label", "class_name", "category_name", "text_input", "noun_phrase"),
-    *("category", "class"),
+    *("category", "class", "classTitle", "name"),
 )  # of a record
 IMAGE_KEYS = ("image_path", "imagePath", "file_name")  # of the document of an image
-SIZE_KEYS = (("img_height", "img_width"), ("imageHeight", "imageWidth"), ("height", "width"))
+SIZE_KEYS = (
+    *(("img_height", "img_width"), ("imageHeight", "imageWidth"), ("imgHeight", "imgWidth"), ("height", "width")),
+)
 ISAT_BACKGROUND = "__background__"
 TRACKED_PREFIX = "mask_"  # of Grounded SAM 2, before the name of the image
+AS_COCO = "export COCO's JSON (instances)"
 VOID = None  # in place of a phrase: nobody decided what is there
 # Roboflow's name of a photo: IMG_0000_jpg.rf.0123456789abcdef0123456789abcdef.jpg of IMG_0000.jpg.
 ROBOFLOW = re.compile(r"_(?:jpe?g|png|bmp|webp|tiff?|heic|avif|mpo|dng)\.rf\.[0-9A-Za-z_-]+(?=\.[a-z]+$)", re.I)
@@ -96,6 +100,9 @@ def read_mask_document(path: Path, names: Mapping[int, str], *, unannotated_nega
         InvalidFeatures: no such document, or a record without a phrase, of an unknown image, or with a broken mask.
     """
     content = read_mask_json(path)
+    if (other := _other_program(content)) is not None:
+        expected, got = "COCO's JSON, or records with masks and phrases", other[0]
+        raise InvalidFeatures(str(path), expected=expected, got=got, hint=other[1])
     document = MaskDocument(path, [])
     if isinstance(content, dict) and isinstance(content.get("labels"), dict) and "mask_name" in content:
         document.images = [_tracked(content, path)]
@@ -113,16 +120,41 @@ def read_mask_document(path: Path, names: Mapping[int, str], *, unannotated_nega
     return document
 
 
+def _other_program(content: Any) -> tuple[str, str] | None:
+    """What a document of another program is, and what to do with it; None where it may be one that is read."""
+    first = next(iter(content if isinstance(content, list) else content.values()), None) if content else None
+    first = first if isinstance(first, dict) else {}
+    own = content if isinstance(content, dict) else {}
+    if "_via_img_metadata" in own or {"filename", "regions"} <= first.keys():
+        return "annotations of VGG Image Annotator, which have no size of their images", f"{AS_COCO} from it"
+    if isinstance(content, list) and "data" in first and {"annotations", "completions"} & first.keys():
+        return "tasks of Label Studio", f"{AS_COCO} from it"
+    if "items" in own and "categories" in own:
+        return "a data set of Datumaro", f"{AS_COCO}: datum convert -f coco_instances"
+    if isinstance(content, list) and {"value", "label"} == first.keys():
+        hint = "take Grounded SAM 2, or write each mask as PHRASE/VIEW.png"
+        return "the names of Grounded SAM's mask.jpg, a picture in colours that has lost their ids", hint
+    return None
+
+
 def stated_size(content: Any) -> tuple[int, int] | None:
-    """Height and width of an image that a document, or its ``image`` or ``info``, states; None where none does."""
+    """Height and width of an image that a document, or what it says of its image, states; None where none does."""
     if not isinstance(content, dict):
         return None
-    for place in (content, content.get("image"), content.get("info")):
+    slots = content["item"].get("slots") if isinstance(content.get("item"), dict) else None  # of Darwin
+    for place in (content, *(content.get(key) for key in ("image", "info", "size")), *(slots or [])[:1]):
         for keys in SIZE_KEYS:
-            height, width = (place.get(key) if isinstance(place, dict) else None for key in keys)
-            if isinstance(height, int | float) and isinstance(width, int | float) and height % 1 == width % 1 == 0:
-                return int(height), int(width)
+            height, width = (_side(place.get(key) if isinstance(place, dict) else None) for key in keys)
+            if height is not None and width is not None:
+                return height, width
     return None
+
+
+def _side(stated: Any) -> int | None:
+    """A whole number of pixels, if only as a text."""
+    stated = int(stated) if isinstance(stated, str) and stated.isdecimal() and len(stated) < 10 else stated
+    is_whole = isinstance(stated, int | float) and not isinstance(stated, bool) and stated % 1 == 0
+    return int(stated) if is_whole else None
 
 
 def image_of(name: str) -> str:
@@ -136,7 +168,7 @@ def _stated_image(content: Any) -> str | None:
     image, info = content.get("image"), content.get("info")
     stated = [content.get(key) for key in IMAGE_KEYS]
     stated += [image, *(image.get(key) for key in ("file_name", "path"))] if isinstance(image, dict) else [image]
-    stated += [info.get("name")] if isinstance(info, dict) else []
+    stated += [one.get("name") for one in (info, content.get("item")) if isinstance(one, dict)]
     return next((name for name in stated if isinstance(name, str) and name.strip()), None)
 
 
@@ -157,12 +189,16 @@ def _add_record(
     """Add a record of a mask to its image; where it has a box alone, what is inside is undecided."""
     if not isinstance(record, dict):
         raise InvalidFeatures(where, expected="a mask with a phrase", got=type(record).__name__)
-    is_box = record.get("shape_type") not in (None, "polygon")  # of LabelMe, whose two points are corners
+    # Of LabelMe, whose two points are corners.
+    is_box = record.get("shape_type") not in (None, "polygon", "mask", "circle")
     mask = None if is_box else read_mask(record, size, where)
     phrase = _phrase_of(record, category, image or {})
     if phrase is None:
-        expected = f"a phrase ({', '.join(PHRASE_KEYS[:5])} or a category)"
-        raise InvalidFeatures(where, expected=expected, got="none", hint="'splatlift pack masks' needs none")
+        expected, hint = f"a phrase ({', '.join(PHRASE_KEYS[:5])} or a category)", "'splatlift pack masks' needs none"
+        if "category_id" in record:
+            hint = "put results of COCO as 'annotations' into a JSON with its 'images' and 'categories'"
+            raise InvalidFeatures(where, expected=expected, got="a category_id without categories", hint=hint)
+        raise InvalidFeatures(where, expected=expected, got="none", hint=hint)
     if phrase == ISAT_BACKGROUND:
         return
     found.phrases.append(phrase)
@@ -262,10 +298,18 @@ def _image_name(image: Mapping[str, Any], path: Path) -> str:
     if isinstance(original, str) and original.strip():
         return original
     if isinstance(image.get("file_name"), str):
-        return image_of(image["file_name"])
+        return image_of(_path_of(image["file_name"]))
     if isinstance(image.get("coco_url"), str):  # LVIS's
         return PurePosixPath(image["coco_url"]).name
     raise InvalidFeatures(f"{path} images", expected="a file_name of each", got="none")
+
+
+def _path_of(name: str) -> str:
+    """The path of a URL, as Label Studio has some, decoded; another name as it is."""
+    if "://" in name or name.startswith("/data/"):
+        parts = urlsplit(name)
+        return unquote(parse_qs(parts.query).get("d", [parts.path])[0])
+    return name
 
 
 def _frames(content: Mapping[str, Any], path: Path) -> dict[str, Any]:
@@ -332,6 +376,8 @@ def _by_id(content: Any, key: str) -> dict[Any, dict[str, Any]]:
 
 def _id(entry: Mapping[str, Any], key: str) -> int | str | None:
     number = entry.get(key)
+    if isinstance(number, str) and number.isdecimal() and str(int(number[:20])) == number:  # a number as a text
+        return int(number)
     return number if isinstance(number, int | str) else None
 
 

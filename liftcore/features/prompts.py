@@ -19,6 +19,7 @@ mask, and all that no mask covers in a view that was not searched for every phra
 """
 
 import json
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -31,6 +32,7 @@ from liftcore.errors import InvalidFeatures
 from liftcore.features.folders import ViewFolder, files_below
 from liftcore.features.mask_files import binary_picture, label_png, panoptic_png
 from liftcore.features.mask_json import (
+    AS_COCO,
     VOID,
     IdObjects,
     MaskDocument,
@@ -50,6 +52,16 @@ MOST_PHRASES = 4_096
 LEGEND = "legend"  # the text of a label picture that names its values
 LAYOUTS = "PHRASE/VIEW.png, VIEW.json with run lengths or polygons, or label pictures VIEW.png with --names"
 PICTURE = ".png"
+LABELMAP = re.compile(r":[0-9]+,[0-9]+,[0-9]+:.*$")  # what CVAT writes behind a name: its colour, parts and actions
+NUMBERED = re.compile(r"([0-9]{1,6})\s*[,:;=\t]\s*(.*\S)")
+HEADER = re.compile(r"\w+\s*[,:;=\t]\s*\w+")
+OTHER_FILES = {
+    **dict.fromkeys((".jpg", ".jpeg"), "JPEG blurs the edges of masks: write them as PNG"),
+    **dict.fromkeys((".bmp", ".tif", ".tiff", ".webp", ".gif"), "convert them to PNG"),
+    **dict.fromkeys((".pt", ".pth"), "save them as .npy: numpy.save(name, mask.cpu().numpy())"),
+    ".txt": f"of labels of YOLO {AS_COCO}",
+    ".xml": f"of annotations of CVAT or VOC {AS_COCO}",
+}
 MASK_DATA = "mask_data"  # of Grounded SAM 2's tracking, beside json_data
 
 Folders = Literal["phrases", "views"]
@@ -183,15 +195,19 @@ def prompt_views(
         if unlabelled is not None:
             raise InvalidFeatures("--unlabelled", expected="pictures, whose values it is of", got=documents[0].name)
         warnings += _add_documents(index, read, folder, [*arrays, *pictures])
-    elif pictures and (names is not None or LEGEND in label_texts(pictures[0])):
-        for path in pictures:
+    elif (arrays and not pictures and names is not None) or (
+        pictures and (names is not None or LEGEND in label_texts(pictures[0]))
+    ):
+        for path in pictures or arrays:
             _add_labels(index, path, _view_of(path, folder), named, unlabelled)
     elif pictures or any(len(path.relative_to(folder).parts) > 1 for path in arrays):
         for path in pictures or arrays:
             _add_binary(index, path, path.relative_to(folder), folders, unlabelled)
     else:
-        hint = "ids need their names: give the folder that holds json_data too" if arrays else ""
-        got = f"{len(files)} other files"
+        suffix, count = Counter(path.suffix.lower() for path in files).most_common(1)[0] if files else ("", 0)
+        hint = OTHER_FILES.get(suffix, "")
+        hint = "ids need their names: give --names, or the folder that holds json_data too" if arrays else hint
+        got = f"{len(files)} other files" + (f", {count} of them {suffix}" if suffix else "")
         raise InvalidFeatures(str(folder), expected=f"one of {LAYOUTS}", got=got, hint=hint)
     seen_in = Counter(phrase for view in index.views.values() for phrase in view.phrases)
     order = sorted(seen_in)
@@ -256,8 +272,8 @@ def _binary(path: Path, unlabelled: int | None) -> tuple[np.ndarray, np.ndarray]
     void = np.zeros(values.shape, bool) if unlabelled is None else values == unlabelled
     inside = (values != 0) & ~void
     if len(told := np.unique(values[inside])) > 1:
-        got = f"values from {told[0]} to {told[-1]} beside it"
-        raise InvalidFeatures(str(path), expected="one value beside 0, a mask", got=got)
+        got, hint = f"values from {told[0]} to {told[-1]} beside it", "of scores or logits save where they are high"
+        raise InvalidFeatures(str(path), expected="one value beside 0, a mask", got=got, hint=hint)
     return inside, void
 
 
@@ -269,8 +285,9 @@ def _ids(path: Path) -> np.ndarray:
 
 
 def _plane(values: np.ndarray, path: Path) -> np.ndarray:
-    """[h, w] of an array with axes of length 1 before."""
-    found = without_unit_axes(values, 2)
+    """[h, w] of an array with axes of length 1 before, or one behind."""
+    found = without_unit_axes(values, 3)
+    found = found[..., 0] if found.ndim == 3 and found.shape[-1] == 1 else without_unit_axes(found, 2)
     if found.ndim != 2:
         got = f"{values.dtype} {list(values.shape)}"
         raise InvalidFeatures(str(path), expected="a mask or ids [h, w]", got=got)
@@ -293,7 +310,7 @@ def _add_binary(index: _MaskIndex, path: Path, inner: Path, folders: Folders, un
 
 
 def _add_labels(index: _MaskIndex, path: Path, name: str, names: Mapping[int, str], unlabelled: int | None) -> None:
-    values, texts = label_png(path)
+    values, texts = label_png(path) if path.suffix.lower() == PICTURE else (_ids(path), {})
     phrases: dict[int, str | None] = dict(names or _numbered(_parsed(texts.get(LEGEND, "null")), f"{path} legend"))
     if unlabelled is not None:
         phrases[unlabelled] = VOID
@@ -324,7 +341,22 @@ def _names(path: Path) -> dict[int, str]:
         raise InvalidFeatures("--names", expected="a file of names", got=str(error)[:120]) from None
     if path.suffix.lower() == ".json":
         return _numbered(_parsed(text), str(path))
-    return {value: line.strip() for value, line in enumerate(text.splitlines(), start=1) if line.strip()}
+    return _listed(text.splitlines())
+
+
+def _listed(lines: Sequence[str]) -> dict[int, str]:
+    """Names by their values, of lines: the k-th names the value k, unless the lines have numbers of their own.
+
+    A first line ``background`` (``_background_`` of LabelMe) names 0. Lines that begin with ``#`` are none, nor is
+    LabelMe's ``__ignore__``; of CVAT's ``labelmap.txt``, ``red mug:128,0,0::``, the name counts.
+    """
+    named = [line.strip() for line in lines if not line.lstrip().startswith("#") and line.strip() != "__ignore__"]
+    named = [LABELMAP.sub("", line) for line in named]
+    values = [NUMBERED.match(line) for line in named if line]
+    if values[1:] and all(values[1:]) and (values[0] or HEADER.fullmatch(named[0])):  # which may be "id,name"
+        return {int(found[1]): found[2] for found in values if found}
+    first = 0 if named and named[0].strip("_").lower() == "background" else 1
+    return {value: line for value, line in enumerate(named, start=first) if line}
 
 
 def _parsed(text: str) -> Any:
@@ -335,7 +367,17 @@ def _parsed(text: str) -> Any:
 
 
 def _numbered(told: Any, where: str) -> dict[int, str]:
-    """Names by their values, of JSON from values to names or of a list, whose first names the value 1."""
+    """Names by their values, of JSON from values to names or from names to values, or of a list.
+
+    The first of a list names the value 1, unless it is of COCO's categories, ``id`` and ``name``. Hugging Face's
+    ``id2label`` counts where there is one.
+    """
+    told = told.get("id2label", told) if isinstance(told, dict) else told
+    is_inverse = isinstance(told, dict) and not any(str(name).strip().isdecimal() for name in told)
+    if is_inverse and told and all(type(value) is int for value in told.values()):
+        told = {value: name for name, value in told.items()}
+    elif isinstance(told, list) and told and all(isinstance(one, dict) for one in told):
+        told = {one.get("id"): one.get("name") for one in told}
     if isinstance(told, list):
         told = dict(enumerate(told, start=1))
     try:
@@ -462,11 +504,12 @@ def _document_warnings(documents: Sequence[MaskDocument], views: Mapping[tuple[P
                 f"{missing} of {len(listed)} images of {document.path.name} have no annotation and are left out; "
                 "with --unannotated negative they show none of its phrases"
             )
-        if document.boxes:
-            warnings.append(
-                f"{document.boxes} annotations of {document.path.name} have a box or less and no mask: what lies in "
-                "the boxes has no label; make masks of them, with SAM say"
-            )
+    if boxes := [document for document in documents if document.boxes]:
+        some = boxes[0].path.name if len(boxes) == 1 else f"{len(boxes)} files ({boxes[0].path.name}, ...)"
+        warnings.append(
+            f"{sum(document.boxes for document in boxes)} annotations of {some} have a box or less and no mask: what "
+            "lies in the boxes has no label; make masks of them, with SAM say"
+        )
     several = Counter(view for (_, image), view in views.items() if image is not None)
     alone = {
         views[document.path, image.image]

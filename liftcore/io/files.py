@@ -23,7 +23,10 @@ BROKEN_ZIP = (
     *(NotImplementedError, OSError, RuntimeError, ValueError),
 )
 # What Windows, macOS and Synology put beside files, in lower case; all else that is theirs begins with a dot.
-SYSTEM_FILES = frozenset(("thumbs.db", "ehthumbs.db", "desktop.ini", "__macosx", "@eadir", "$recycle.bin"))
+SYSTEM_FILES = frozenset((
+    "thumbs.db", "ehthumbs.db", "desktop.ini", "__macosx", "@eadir", "$recycle.bin", "#recycle", "@recycle",
+    "lost+found", "system volume information",
+))  # fmt: skip
 MAX_DIRECTORY_BYTES = 16 << 20  # of a zip's list of files, of which zipfile makes an object each
 _END = struct.Struct("<4s4H2LH")  # of a zip: its list's size is the sixth field
 _END64_LOCATOR = struct.Struct("<4sLQL")
@@ -37,7 +40,7 @@ def is_system_file(path: PurePath) -> bool:
     It is too where a folder on the way is (``__MACOSX/IMG.png``).
     """
     inner = (part for part in path.parts if part not in (".", ".."))
-    return any(part.startswith(".") or part.lower() in SYSTEM_FILES for part in inner)
+    return any(part.startswith((".", "~$")) or part.lower() in SYSTEM_FILES for part in inner)
 
 
 def visible_files(folder: Path, pattern: str = "*") -> list[Path]:

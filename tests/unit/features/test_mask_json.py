@@ -416,3 +416,32 @@ def test_strange_values_are_refused_or_passed_over(strange: Any, tmp_path: Path)
     found = prompt_views(write(tmp_path / "shapes", a=document))
     assert found.table.words == ("red mug",) and found.views["a"].labels.max() <= 1
     assert [*prompt_views(write(tmp_path / "coco", a=data_set)).views] == ["0"]
+
+
+@pytest.mark.parametrize("key", ["points", "polygon"])
+def test_rings_within_an_outline_are_holes(key: str, tmp_path: Path) -> None:
+    outer, hole = ([[low, low], [high, low], [high, high], [low, high]] for low, high in ((0, 6), (2, 4)))
+    rings = {"exterior": outer, "interior": [hole, [[0, 0], [1, 0], [1, 1], [0, 1]]]}
+    as_paths = {"paths": [[{"x": x, "y": y} for x, y in ring] for ring in (outer, hole, rings["interior"][1])]}
+    record = {"phrase": "mug", key: rings if key == "points" else as_paths}
+    write(tmp_path, a={"height": HEIGHT, "width": WIDTH, "annotations": [record]})
+    expected = np.zeros((HEIGHT, WIDTH), bool)
+    expected[:6, :6] = True
+    expected[2:4, 2:4] = expected[0, 0] = False
+    assert np.array_equal(prompt_views(tmp_path).views["a"].labels[0].numpy() == 0, expected)
+
+
+@pytest.mark.parametrize("content", ["", "!", "AAAA", 3, None])
+def test_pictures_in_a_record_that_do_not_open_are_told(content: Any, tmp_path: Path) -> None:
+    shape = {"label": "mug", "shape_type": "mask", "points": [[0, 0], [1, 1]], "mask": content}
+    write(tmp_path, a={"imageHeight": HEIGHT, "imageWidth": WIDTH, "shapes": [shape]})
+    with pytest.raises(InvalidFeatures, match="a PNG in base64"):
+        prompt_views(tmp_path)
+
+
+def test_urls_of_images_are_named_by_their_decoded_paths(tmp_path: Path) -> None:
+    document = coco((0, 1, MUG_POLYGON), (1, 1, MUG_POLYGON), images=2)
+    document["images"][0]["file_name"] = "/data/upload/3/K%C3%BCche_0.jpg"
+    document["images"][1]["file_name"] = "https://host/photos/K%C3%BCche_1.jpg?token=1"
+    views = prompt_views(write(tmp_path, a=document)).views
+    assert [view.rsplit("/", 1)[-1] for view in views] == ["K\u00fcche_0", "K\u00fcche_1"]

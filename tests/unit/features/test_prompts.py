@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import json
+import zlib
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -98,6 +100,55 @@ def with_legend(view: str) -> bytes:
     return content.getvalue()
 
 
+def corner_of(mask: np.ndarray) -> tuple[list[int], str]:
+    """Corner (x, y) of the smallest picture of a mask, and that as a PNG in base64."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    content = io.BytesIO()
+    Image.fromarray(mask[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]).save(content, "PNG")
+    return [int(columns[0]), int(rows[0])], base64.b64encode(content.getvalue()).decode()
+
+
+def frame(mask: np.ndarray) -> list[list[float]]:
+    """The outline of a mask that is a rectangle."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    (top, bottom), (left, right) = (rows[[0, -1]] + [0, 1]).tolist(), (columns[[0, -1]] + [0, 1]).tolist()
+    return [[left, top], [right, top], [right, bottom], [left, bottom]]
+
+
+def programs() -> dict[str, dict[str, Any]]:
+    """Files of annotation programs, an image each."""
+    found: dict[str, dict[str, Any]] = {"LabelMe": {}, "Supervisely": {}, "Darwin": {}, "Cityscapes": {}}
+    for view, masks in MASKS.items():
+        height, width = next(iter(masks.values())).shape
+        shapes, objects, annotations, polygons = [], [], [], []
+        for phrase, mask in masks.items():
+            corner, png = corner_of(mask)
+            shapes.append({"label": phrase, "shape_type": "mask", "points": [corner, corner], "mask": png})
+            packed = base64.b64encode(zlib.compress(base64.b64decode(png))).decode()
+            bitmap = {"geometryType": "bitmap", "bitmap": {"data": packed, "origin": corner}}
+            rings = {"geometryType": "polygon", "points": {"exterior": frame(mask), "interior": []}}
+            objects.append({"classTitle": phrase, **(rings if objects else bitmap)})
+            paths = [[{"x": x, "y": y} for x, y in frame(mask)]]
+            annotations.append({"name": phrase, "polygon": {"paths": paths}})
+            polygons.append({"label": phrase, "polygon": frame(mask)})
+        size = {"height": height, "width": width}
+        item = {"name": f"{view}.jpg", "slots": [size]}
+        found["LabelMe"][f"{view}.json"] = {"shapes": shapes, "imageHeight": height, "imageWidth": width}
+        found["Supervisely"][f"{view}.jpg.json"] = {"size": size, "objects": objects}
+        found["Darwin"][f"{view}.json"] = {"item": item, "annotations": annotations}
+        found["Cityscapes"][f"{view}.json"] = {"imgHeight": height, "imgWidth": width, "objects": polygons}
+    return found
+
+
+NAMES = {  # the same names for values 1 and 2
+    "labelmap.txt": "# label:color_rgb:parts:actions\nbackground:0,0,0::\nred_apple:128,0,0::\nLamp:0,128,0::\n",
+    "lines.txt": "red_apple\nLamp\n",
+    "labels.txt": "__ignore__\n_background_\nred_apple\nLamp\n",
+    "numbers.csv": "id,name\n1,red_apple\n2,Lamp\n",
+    "inverse.json": {"red_apple": 1, "Lamp": 2},
+    "config.json": {"id2label": {"0": "background", "1": "red_apple", "2": "Lamp"}},
+    "categories.json": [{"id": 2, "name": "Lamp"}, {"id": 1, "name": "red_apple"}],
+}
 LABELS = {**{f"{view}.png": numbered(view) for view in MASKS}, "names.json": {7: "red_apple", 14: "Lamp"}}
 COLOURS = {name: np.repeat(mask[..., None] // 255, 3, axis=2) for name, mask in binary("{view}/{phrase}").items()}
 KINDS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
@@ -109,7 +160,10 @@ KINDS: dict[str, tuple[dict[str, Any], dict[str, str]]] = {
     "SA-Co's pairs": (pairs(), {}),
     "label PNGs": (LABELS, {"names": "names.json"}),
     "label PNGs with a legend": ({f"{view}.png": with_legend(view) for view in MASKS}, {}),
-}
+    **{name: (files, {}) for name, files in programs().items()},
+    **{name: ({**{f"{view}.png": numbered(view) // 7 for view in MASKS}, name: names}, {"names": name})
+       for name, names in NAMES.items()},
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -197,7 +251,7 @@ def test_names_that_do_not_fit_their_pictures_are_told(names: str, message: str,
         ({"a.txt": "x"}, "got 1 other files"),
         ({"a.png": MASKS["left"]["Lamp"]}, "in no phrase's folder and without names"),
         ({"mug/a.png": numbered("left")}, r"one value beside 0, a mask, got values from 7 to 14"),
-        ({"mug/a.png": np.zeros((2, 2, 4), np.uint8)}, "colours with transparency"),
+        ({"mug/a.png": np.full((2, 2, 4), 9, np.uint8)}, "colours with transparency"),
         ({"mug/a.png": "x"}, "no PNG"),
         ({"mug/a.png": np.zeros((2, 2), np.uint8)}, "1 to 4096 phrases with masks, got 0 of 1"),
         ({"mug/a.png": MASKS["left"]["Lamp"], "a.json": "[]"}, "got a.json and a.png; name the file of names"),
@@ -206,6 +260,14 @@ def test_names_that_do_not_fit_their_pictures_are_told(names: str, message: str,
             {"a.json": '[{"phrase": "mug", "segmentation": [[0, 0, 4, 0, 4, 4]]}]'},
             "the size of the image of a polygon",
         ),
+        (
+            {"a.json": [{"phrase": "mug", "segmentation": [[0, 0, 0.4, 0, 0.4, 0.4]]}]},
+            "a polygon in pixels, got one in shares of the image",
+        ),
+        ({"a.json": [{"category_id": 1, "segmentation": [[0, 0, 4, 0, 4, 4]]}]}, "beside|its 'images'|size"),
+        ({"a.json": {"a.jpg1": {"filename": "a.jpg", "regions": []}}}, "VGG Image Annotator.*COCO"),
+        ({"a.json": [{"id": 1, "data": {}, "annotations": []}]}, "Label Studio.*COCO"),
+        ({"lamp/a.jpg": "x"}, "1 of them .jpg; JPEG"),
         ({"a.json": '{"images": [{"id": 1}], "annotations": []}'}, "a file_name of each"),
         ({"a.json": '{"images": [{"id": 1, "file_name": "a"}], "annotations": [{}]}'}, "an image_id of the file"),
         ({"a.json": "[3]"}, "a mask with a phrase, got int"),
