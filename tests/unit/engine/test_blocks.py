@@ -137,6 +137,28 @@ def test_lift_goes_on_from_the_pieces_in_its_folder(scene: dict[str, Any], tmp_p
     assert_same(other, in_blocks(LocalEngine(1), scene, settings))
 
 
+@pytest.mark.slow
+def test_other_engines_go_on_from_the_pieces_of_each_stage(scene: dict[str, Any], tmp_path: Path) -> None:
+    write_pack(tmp_path / "pack.safetensors", scene["views"], {})
+    stored = {**scene, "views": lc.read_features(tmp_path / "pack.safetensors")}
+    folder, settings = tmp_path / "work", LiftSettings.of(preset="default")
+    stopped = []
+    for number, stage in enumerate(("geometry", "gather", "objects", "consensus", "robust", "solve")):
+
+        def stop(name: str, done: int, total: int, unit: str, at: str = stage) -> None:
+            if name == at and done >= 1:
+                stopped.append(at)
+                raise InterruptedError
+
+        with pytest.raises(InterruptedError):
+            in_blocks((LocalEngine(1), Shuffled(2))[number % 2], stored, settings, folder=folder, progress=stop)
+    assert stopped == ["geometry", "gather", "objects", "consensus", "robust", "solve"]
+    found = in_blocks(Shuffled(2), stored, settings, folder=folder)
+    whole = lc.lift(*scene.values(), settings)
+    assert_same(found, whole)
+    assert found.diagnostics["reweighting"] == whole.diagnostics["reweighting"]
+
+
 @pytest.mark.parametrize(
     ("asked", "got"),
     [
