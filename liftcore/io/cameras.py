@@ -13,7 +13,7 @@ import tempfile
 import zipfile
 from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from pathlib import Path, PurePath, PurePosixPath
 from typing import TypeVar
@@ -26,8 +26,17 @@ from liftcore.io.json_file import read_json
 from liftcore.io.kinds import wrong_kind
 from liftcore.io.photos import PhotosBeside
 from liftcore.io.remote import local_path
-from liftcore.io.transforms import FRAME_FILE, OF_NERFSTUDIO, is_export, parse_export, parse_transforms, read_frame
+from liftcore.io.transforms import (
+    FISHEYE,
+    FRAME_FILE,
+    OF_NERFSTUDIO,
+    is_export,
+    parse_export,
+    parse_transforms,
+    read_frame,
+)
 from liftcore.scene.cameras import Cameras, cameras_from
+from liftcore.scene.distortion import Fisheye
 from liftcore.scene.views import cameras_of_views
 
 TRANSFORMS, TRAINED_ON = "transforms.json", "transforms_train.json"
@@ -52,7 +61,7 @@ class CameraSource:
     model: Path | None = None  # a folder
     file: Path | None = None  # a JSON document or a zip
     frame: Path | None = None  # a FRAME_FILE
-    data: Path | None = None  # the transforms.json with the intrinsics of nerfstudio's camera export
+    data: Path | None = None  # a transforms.json or a COLMAP model, with the intrinsics of nerfstudio's camera export
     photos: zipfile.Path | None = None  # the folder of the file in the zip that it is from; None: that on the disk
     warnings: tuple[str, ...] = ()  # of what lies beside and is not read
 
@@ -60,7 +69,8 @@ class CameraSource:
     def files(self) -> list[Path]:
         """All files that are read."""
         cameras = [self.file] if self.file else model_files(self.model) if self.model else []
-        return cameras + [path for path in (self.frame, self.data) if path]
+        data = [] if self.data is None else model_files(self.data) if self.data.is_dir() else [self.data]
+        return cameras + ([self.frame] if self.frame else []) + data
 
     def read(self) -> Cameras:
         """The cameras, in the frame of the splats where a file tells it.
@@ -94,10 +104,28 @@ class CameraSource:
         photos = PhotosBeside(self.photos or Path(os.path.abspath(self.file)).parent)
         with cameras_from(source):
             if is_export(document):
-                return parse_export(document, source, read_json(self.data) if self.data else None, photos)
+                return parse_export(document, source, _intrinsics_in(self.data) if self.data else None, photos)
             if isinstance(document, list):
                 return parse_inria(document, source)
             return parse_transforms(document, source, photos)
+
+
+def _intrinsics_in(data: Path) -> object:
+    """A transforms.json, or the intrinsics of a COLMAP model's images as such a document has them, without poses."""
+    if data.is_file():
+        return read_json(data)
+    frames = []
+    for name, camera in read_colmap(data).items():
+        lens = camera.lens
+        whole = lens or camera
+        frame = {"file_path": name, "w": whole.width, "h": whole.height, "fl_x": whole.fx, "fl_y": whole.fy}
+        frame |= {"cx": whole.cx, "cy": whole.cy}
+        if lens is not None:
+            frame |= {key: value for key, value in asdict(lens.distortion).items() if value}
+            frame["camera_model"] = FISHEYE if isinstance(lens.distortion, Fisheye) else "OPENCV"
+        frames.append(frame)
+    own = [{key: value for key, value in frame.items() if key != "file_path"} for frame in frames]
+    return {"frames": frames, **(own[0] if all(one == own[0] for one in own) else {})}
 
 
 def read_cameras(path: Path | str, *, choosing: bool = True, views: Collection[str] = ()) -> Cameras:
@@ -217,6 +245,27 @@ def choose_model(models: Sequence[Path], scene: Path, views: Collection[str]) ->
     return best, (f"{told(best)} was read, and {', '.join(others[:SHOWN])}{more} {were}: {frames}",)
 
 
+def _better_models(model: Path, cameras: Collection[str], views: Collection[str]) -> tuple[str, ...]:
+    """A warning where another COLMAP model of the scene has cameras of more views than the one that was named."""
+    paired = len(cameras_of_views(views, cameras))
+    if paired == len(views):
+        return ()
+    whole = Path(os.path.abspath(model))
+    scene, found = _scene_of(whole), list[str]()
+    for other in _models_below(scene)[:MOST_MODELS]:
+        if scene / other == whole:
+            continue
+        with suppress(InvalidCameras):
+            names = read_image_names(scene / other)
+            if (more := len(cameras_of_views(views, names))) > paired:
+                found.append(f"{other} ({len(names)} images) has cameras of {more}")
+    if not found:
+        return ()
+    name = whole.relative_to(scene).as_posix()
+    told = f"{name} was read, and has cameras of {paired} of the {len(views)} views; {', '.join(found[:SHOWN])}"
+    return (f"{told}: the splats must be those of the one that is read",)
+
+
 def has_nerfstudio_beside(path: Path) -> bool:
     """Whether poses of nerfstudio's own frame lie beside the COLMAP model that is read from a folder, file or zip."""
     source = camera_source(path)
@@ -249,6 +298,8 @@ def _from_folder(folder: Path, *, choosing: bool, views: Collection[str]) -> Cam
         got = "a folder without any of them" + (" at the usual places" if others else "")
         raise InvalidCameras(str(folder), expected=FORMATS, got=got, hint=hint)
     cameras = source.read()
+    if source.model is not None and not source.warnings:
+        cameras.warnings += _better_models(source.model, cameras, views)
     if choosing and source.model is not None and cameras.distorted:
         others = [folder / model for model in _models_below(folder) if folder / model != source.model]
         straight = [str(model) for model in others if _is_undistorted(model)]
@@ -275,7 +326,10 @@ def _refuse_both(source: str, read: str, undistorted: list[str], choose: str) ->
 def _of_document(path: Path, folder: Path | None = None) -> CameraSource:
     """The source of a JSON file, or of a zip; of one that nobody named, but its ``folder``, others are told."""
     data = path.with_name(TRANSFORMS)
-    has_data = path != data and data.is_file() and _begins_a_list(path)
+    may_export = path != data and path.name.startswith("transforms") and _begins_a_list(path)
+    models = _usual_models(path.parent) if may_export and not data.is_file() else []
+    if models:
+        data = choose_model(models, path.parent, ())[0]
     others = (
         sorted(other.name for other in folder.glob("transforms*.json") if other not in (path, data)) if folder else []
     )
@@ -284,7 +338,7 @@ def _of_document(path: Path, folder: Path | None = None) -> CameraSource:
     return CameraSource(
         file=path,
         frame=_frame_in(path.parent),
-        data=data if has_data else None,
+        data=data if may_export and (models or data.is_file()) else None,
         warnings=(told,) if told and read != TRANSFORMS else (),
     )
 

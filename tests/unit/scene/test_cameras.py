@@ -411,6 +411,9 @@ def test_of_several_models_the_one_of_the_views_is_read_and_else_the_largest(
         assert told in inspect_file(path)["warnings"] or views
     assert other_models(path) == []
     assert len(read_cameras(scene / place.format(0))) == 2  # what is named is read
+    if place != "{}":
+        [told] = read_cameras(scene / place.format(0), views=["IMG_0", "IMG_5"]).warnings
+        assert re.search(rf"cameras of 1 of the 2 views; .*{place.format(1)} \(6 images\) has cameras of 2", told)
     assert read_cameras(scene / place.format(0)).warnings == ()
 
 

@@ -494,6 +494,18 @@ def test_an_export_of_nerfstudio_has_poses_of_the_splats_and_intrinsics_of_the_d
     assert camera_input(path).sha256 != before.sha256
 
 
+def test_an_export_of_nerfstudio_takes_intrinsics_of_the_colmap_model_beside_it(
+    run: Path, model: Path, expected: Cameras, tmp_path: Path
+) -> None:
+    shutil.copytree(model, tmp_path / "sparse/0")
+    path = exported(expected, tmp_path / "transforms_train.json")
+    for given in (path, tmp_path):
+        assert_same(read_cameras(given), expected)
+    before = camera_input(path)
+    (tmp_path / "sparse/0/images.bin").write_bytes((tmp_path / "sparse/0/images.bin").read_bytes() + b"more")
+    assert camera_input(path).sha256 != before.sha256
+
+
 def test_the_frame_of_a_run_does_not_move_its_export_again(run: Path, expected: Cameras) -> None:
     path = exported(expected, run / "transforms_train.json")
     for given in (path, run, zipped(run)):
