@@ -125,13 +125,18 @@ def check_scene(
     shown = [name for name in names if name in alike]
     pictures = {name: _photo(files[name], sizes[name], photo_size(cameras[name]), whole[name]) for name in shown}
     raster, views, renders = CpuRaster(splats, threads=None), [], {}
+    unfilled: dict[str, np.ndarray] = {}
     for number, name in enumerate(names):
-        row_sum, renders[name] = _render(raster, splats, cameras[name], trained)
-        views.append(_against(name, row_sum, renders[name] if splats.sh is not None else None, pictures))
+        renders[name], unfilled[name] = _render(raster, splats, cameras[name], trained)
         progress("check", number + 1, len(names), "views")
+    background = _background(renders, unfilled, pictures)
+    for name in names:
+        renders[name] = (renders[name] + background * unfilled[name]).clip(0.0, 1.0)
+        row_sum = 1.0 - float(unfilled[name].mean())
+        views.append(_against(name, row_sum, renders[name] if splats.sh is not None else None, pictures))
     in_view = visibility(splats, list(cameras.values()), trained).seen_share
     wrong += _wrong_cameras(views, in_view)
-    wrong += _unlike_photos(views, pictures, renders, headers, _Scaled(raster, splats, cameras, trained))
+    wrong += _unlike_photos(views, pictures, renders, headers, _Scaled(raster, splats, cameras, trained, background))
     figures: dict[str, float] = {}
     if features is not None:
         figures, told = _check_features(features, cameras, files, whole)
@@ -186,11 +191,25 @@ def _some(names: Sequence[str], count: int) -> list[str]:
     return [names[int(place)] for place in places]
 
 
-def _render(raster: CpuRaster, splats: Splats, camera: Camera, params: CompositingParams) -> tuple[float, np.ndarray]:
-    """The mean row sum of a view and its colours [H, W, 3] f32 in 0..1, in the pixels of its photo."""
+def _render(
+    raster: CpuRaster, splats: Splats, camera: Camera, params: CompositingParams
+) -> tuple[np.ndarray, np.ndarray]:
+    """A view over black [H, W, 3] f32 in the pixels of its photo, and what splats leave of each ray [H, W, 1] f32."""
     values = torch.cat([seen_colours(splats, camera), torch.ones(splats.count, 1)], dim=1)
     image = in_photo(camera, lambda of: raster.render(of, values, params)).numpy()
-    return float(image[..., 3].mean()), image[..., :3].clip(0.0, 1.0)
+    return image[..., :3], 1.0 - image[..., 3:]
+
+
+def _background(
+    renders: Mapping[str, np.ndarray], unfilled: Mapping[str, np.ndarray], pictures: Mapping[str, np.ndarray]
+) -> float:
+    """White (1) where it makes renders more like their photos, as captures without a background have; else 0."""
+    gains = [
+        _psnr((renders[name] + unfilled[name]).clip(0, 1), photo) - _psnr(renders[name].clip(0, 1), photo)
+        for name, photo in pictures.items()
+        if photo.shape == renders[name].shape
+    ]
+    return float(bool(gains) and _median(gains) > 0)
 
 
 def _photo_of(camera: Camera, panorama: Camera | None) -> tuple[int, int]:
@@ -265,12 +284,15 @@ class _Scaled:
     splats: Splats
     cameras: Cameras
     params: CompositingParams
+    background: float  # 0, black, or 1, white
 
     def render(self, view: str, factor: float) -> np.ndarray:
         """[H, W, 3] f32 in 0..1, of a view."""
         camera, scale = self.cameras[view], np.ones((4, 4))
         scale[:3, 3] = factor
-        return _render(self.raster, self.splats, camera.replace(viewmat=camera.viewmat * scale), self.params)[1]
+        moved = camera.replace(viewmat=camera.viewmat * scale)
+        render, unfilled = _render(self.raster, self.splats, moved, self.params)
+        return (render + self.background * unfilled).clip(0.0, 1.0)
 
 
 def _unlike_photos(
@@ -284,8 +306,10 @@ def _unlike_photos(
     compared = {
         view.view: (view.psnr, view.others) for view in views if view.psnr is not None and view.others is not None
     }
-    if not compared or _median([own - other for own, other in compared.values()]) >= LEAST_GAIN:
+    if not compared:
         return []
+    if _median([own - other for own, other in compared.values()]) >= LEAST_GAIN:
+        return _some_turned(compared, pictures, renders)
     own = {name: psnr for name, (psnr, _) in compared.items()}
     gain = _median([psnr - other for psnr, other in compared.values()])
     told = f"photos: renders are hardly more like their own photos ({_median(list(own.values())):.1f} dB)"
@@ -298,6 +322,30 @@ def _unlike_photos(
     )
     unknown = "splats, cameras and photos are not of one scene in one frame, or photos and cameras not of each other"
     return [f"{told}; {cause or unknown}"]
+
+
+def _some_turned(
+    compared: Mapping[str, tuple[float, float]], pictures: Mapping[str, np.ndarray], renders: Mapping[str, np.ndarray]
+) -> list[str]:
+    """A sentence for each turn that makes single photos like their renders, among others that are like them."""
+    turned: dict[int, list[str]] = {}
+    for name, (own, other) in compared.items():
+        if own - other >= LEAST_GAIN:
+            continue
+        ways = {tag: np.asarray(_turn(pictures[name], way)) for tag, way in TURNS.items()}
+        gains = {
+            tag: _psnr(renders[name], picture) - max(own, other)
+            for tag, picture in ways.items()
+            if picture.shape == renders[name].shape
+        }
+        best = max(gains, key=lambda tag: gains[tag])
+        if gains[best] >= LEAST_GAIN:
+            turned.setdefault(best, []).append(name)
+    return [
+        f"photos: {len(names)} of the {len(compared)} that were compared ({some_of(names)}) are {HOW_TURNED[tag]}: "
+        "take the photos that cameras were made of"
+        for tag, names in sorted(turned.items())
+    ]
 
 
 def _turned_photos(

@@ -26,6 +26,11 @@ if TYPE_CHECKING:
 ORIENTATION = 0x0112  # EXIF's tag
 NAMED = 3  # photos in a warning
 UPRIGHT, LARGEST_TAG, LEAST_SIDEWAYS = 1, 8, 5  # its values; from 5 on, turning a photo swaps its sides
+UNREAD = {  # what to do with images that Pillow does not open
+    **dict.fromkeys((".heic", ".heif"), "convert HEIC to JPEG, without a turn of its own: heif-convert IN OUT.jpg"),
+    **dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw"), "develop raw photos to JPEG or PNG"),
+    ".exr": "convert it to 8 bits, with the colours that the splats were trained on",
+}
 FIRST_SUFFIXES = (".png", ".jpg", ".jpeg")  # of photos of one name, as Blender's scripts and trainers look for them
 
 
@@ -97,7 +102,8 @@ def read_header(photo: Path | IO[bytes], name: str = "") -> PhotoHeader:
             with Image.open(photo) as image:
                 return header_of(image)
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError, EOFError):
-        raise InvalidInput(source, expected="an image", got="a file that does not open as one") from None
+        hint = UNREAD.get(PurePosixPath(source).suffix.lower(), "")
+        raise InvalidInput(source, expected="an image", got="a file that does not open as one", hint=hint) from None
 
 
 def header_of(image: Image.Image) -> PhotoHeader:

@@ -17,7 +17,7 @@ from torch import Tensor
 from liftcore.errors import InvalidInput
 from liftcore.features.encoders import ImageEncoder, Pixels
 from liftcore.features.folders import files_below, grids_of
-from liftcore.io.photos import ORIENTATION, UPRIGHT, PhotoHeader, Reading, header_of
+from liftcore.io.photos import ORIENTATION, UNREAD, UPRIGHT, PhotoHeader, Reading, header_of
 from liftcore.runtime.progress import Progress, silent
 from liftcore.scene.views import IMAGE_SUFFIXES, without_image_suffix
 from liftcore.values.pack import write_pack
@@ -192,7 +192,10 @@ def read_image(path: Path, size: tuple[int, int] | None = None) -> tuple[Image.I
         most = 2 * (Image.MAX_IMAGE_PIXELS or 0)
         raise InvalidInput(str(path), expected=f"an image of at most {most} pixels", got="a larger one") from None
     except UnidentifiedImageError:
-        raise InvalidInput(str(path), expected="an image", got="a file that Pillow does not know") from None
+        hint = UNREAD.get(path.suffix.lower(), "")
+        raise InvalidInput(
+            str(path), expected="an image", got="a file that Pillow does not know", hint=hint
+        ) from None
     except (OSError, SyntaxError, ValueError, EOFError) as error:  # Pillow's kinds for files that are cut or broken
         raise InvalidInput(str(path), expected="a whole image", got=str(error)[:160]) from None
 

@@ -148,6 +148,30 @@ def test_the_cause_of_photos_unlike_their_renders_is_named(what: str, scene: Sti
     assert "positions times" not in told and "frame" not in told
 
 
+def test_single_photos_that_are_turned_are_named(scene: StillLife, photos, tmp_path) -> None:
+    for number, (name, path) in enumerate(photos.items()):
+        image = Image.open(path)
+        (image.transpose(Image.Transpose.ROTATE_180) if number == 1 else image).save(tmp_path / f"{name}.png")
+    found = check_scene(scene.splats, scene.cameras, {name: tmp_path / f"{name}.png" for name in photos})
+    [told] = found.wrong
+    assert f"1 of the {len(photos)}" in told and repr(list(photos)[1]) in told and "180 degrees" in told
+
+
+@pytest.mark.parametrize("transparent", [True, False])
+def test_photos_without_a_background_are_healthy(transparent: bool, scene: StillLife, photos, tmp_path) -> None:
+    raster = CpuRaster(scene.splats)
+    for name, camera in scene.cameras.items():
+        ones = torch.ones(scene.splats.count, 1)
+        filled = raster.render(camera, ones, CompositingParams()).clamp(0, 1).numpy()
+        shown = np.asarray(Image.open(photos[name]), np.float32)
+        over_white = Image.fromarray((shown + 255 * (1 - filled)).clip(0, 255).astype(np.uint8))
+        straight = np.concatenate([shown / np.maximum(filled, 1e-3), 255 * filled], axis=2).clip(0, 255)
+        image = Image.fromarray(straight.astype(np.uint8), "RGBA") if transparent else over_white
+        image.save(tmp_path / f"{name}.png")
+    found = check_scene(scene.splats, scene.cameras, {name: tmp_path / f"{name}.png" for name in photos})
+    assert found.wrong == () and min(view.psnr for view in found.views) > 30
+
+
 def test_photos_of_another_scene_blame_no_scale_and_no_turn(scene: StillLife, photos, tmp_path) -> None:
     names, rng = list(photos), np.random.default_rng(3)
     others = {name: photos[names[(k + 1) % len(names)]] for k, name in enumerate(names)}
