@@ -2,6 +2,7 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
+TORCH = $$(sed -nE 's/^(torch(vision)?==[^ ]*).*/\1/p' requirements.lock)
 READY := .venv/.ready
 SHARED := ../shared/data
 SCENE ?=
@@ -48,7 +49,7 @@ gpu:  ## all that a card is for: CUDA's torch, conformance, speed, accuracy, gsp
 	@nvidia-smi -L 2>/dev/null | grep -q GPU || { echo "make gpu: nvidia-smi lists no card here, so nothing was run" >&2; exit 2; }
 	@$(MAKE) --no-print-directory setup
 	@$(BIN)/python -c 'import sys, torch; sys.exit(torch.version.cuda is None)' || { echo "installing torch's CUDA build" \
-	&& $(BIN)/python -m pip install --quiet --force-reinstall $(CUDA_TORCH_PIP) $$(sed -nE 's/^(torch(vision)?==[^ ]*).*/\1/p' requirements.lock) \
+	&& $(BIN)/python -m pip install --quiet --force-reinstall $(CUDA_TORCH_PIP) $(TORCH) \
 	&& awk '/^[a-z]/ { kept = !/^(torch|torchvision|triton)==/ } kept' requirements.lock \
 	| $(BIN)/python -m pip install --quiet --require-hashes -r /dev/stdin; }
 	@$(BIN)/python -m tests.benchmarks.gpu --look
@@ -87,14 +88,16 @@ bench: $(READY)
 setup: $(READY)
 
 # torch and torchvision first, from one index: each build of the one loads beside its own build of the other alone,
-# and the lock has digests of PyPI's.
+# and the lock has digests of PyPI's. What they need has digests in the lock, but for the libraries of a CUDA build,
+# which come last.
 $(READY): requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "splatlift needs Python 3.11 or later")'
 	@echo "making .venv: a few minutes, once"
 	[ -x $(BIN)/python ] || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet $(TORCH_PIP) $$(sed -nE 's/^(torch(vision)?==[^ ]*).*/\1/p' requirements.lock)
+	$(BIN)/python -m pip install --quiet --no-deps $(TORCH_PIP) $(TORCH)
 	awk '/^[a-z]/ { kept = !/^(torch|torchvision)==/ } kept' requirements.lock \
-	| $(BIN)/python -m pip install --quiet --require-hashes -r /dev/stdin
+	| $(BIN)/python -m pip install --quiet --no-deps --require-hashes -r /dev/stdin
+	$(BIN)/python -m pip install --quiet $(TORCH_PIP) $(TORCH)
 	$(BIN)/python -m pip install --quiet --no-deps -e .
 	@$(BIN)/python -c "import torchvision" 2>/dev/null || echo "torchvision does not load beside this torch: scripts that" \
 	"import open_clip or segment-anything need both of one index (TORCH_PIP='--index-url ...'); splatlift does without"

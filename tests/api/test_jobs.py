@@ -195,7 +195,7 @@ def test_job_and_lift_keep_what_the_plan_warned_of(client: TestClient, uploaded:
     assert client.delete(f"{job['links']['self']}?with_lift=true").status_code == 204
 
 
-def test_job_tells_of_every_stage_and_its_plan_comes_before_the_walk(
+def test_job_tells_of_every_stage_and_its_plan_comes_with_the_first_views(
     client: TestClient, lift: dict[str, Any]
 ) -> None:
     story = events(client.get(f"{lift['links']['job']}/events").text)
@@ -204,7 +204,7 @@ def test_job_tells_of_every_stage_and_its_plan_comes_before_the_walk(
     assert stages == ["read", "digest", "compile", "plan", "geometry: 3 views", "solve", "certify", "save"]
     (planned_at,) = (number for number, name, _ in story if name == "plan")
     at = {line: number for number, line in lines}
-    assert at["plan"] < planned_at < at["geometry: 3 views"]
+    assert at["plan"] < at["geometry: 3 views"] < planned_at < at["solve"]
     job = client.get(lift["links"]["job"]).json()
     assert job in client.get("/jobs").json()["jobs"]
     first, *_ = job["plan"].pop("summary")
