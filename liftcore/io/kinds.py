@@ -121,6 +121,20 @@ _TABLE_OF_MATCHES = FileKind(
     None, "a database of COLMAP or another program", "of COLMAP give the folder of the model, such as sparse/0"
 )
 
+# Of programs that find cameras, by what their files begin with.
+_CAMERA_TEXTS = {
+    "Bundler": re.compile(rb"# bundle file"),
+    "VisualSFM": re.compile(rb"nvm_v3"),
+    "Metashape": re.compile(rb"(<\?xml[^>]*>\s*)?<document[^>]*>\s*<chunk"),
+    "RealityScan": re.compile(rb"#(name|cameras)\b[^\n]*(,alt|,heading|,yaw|[0-9]\n)"),
+}
+_CAMERA_KEYS = {  # of its JSON
+    "OpenMVG": {"sfm_data_version"},
+    "Meshroom": {"views", "poses", "featuresFolders"},
+    "OpenSfM": {"cameras", "shots"},
+    "Record3D": {"K", "poses"},
+}
+_POSES = "poses_bounds.npy"  # of LLFF
 # By the bytes at a place of a file. Of two that fit the first counts.
 _MAGIC: tuple[tuple[int, bytes, FileKind], ...] = (
     (0, LFS_POINTER, FileKind(None, "a Git LFS pointer, which stands for the file", LFS_HINT)),
@@ -302,6 +316,7 @@ def _file_rules(path: Path, head: bytes, size: int) -> Iterator[FileKind | None]
     yield _colmap_part(path) if path.name in (*MODEL_FILES, *_COLMAP_POINTS) else None
     yield _ply(head) if head[:4] in (b"ply\n", b"ply\r") else None
     yield _splats_as(SplatFormat.SPZ) if begins_like_spz(head) else None
+    yield _cameras_of("LLFF") if path.name == _POSES else None
     yield _zip(path) if head[:2] == b"PK" and zipfile.is_zipfile(path) else None
     damaged = FileKind(None, "a zip that is cut short or damaged", "copy or download it again")
     yield damaged if head[:4] == b"PK\3\4" else None
@@ -388,12 +403,20 @@ def _is_ksplat(head: bytes, size: int) -> bool:
     return 0 < sections <= most_sections and 0 < splats <= most_splats and level <= 2 and splats < size
 
 
+def _cameras_of(program: str) -> FileKind:
+    hint = "export a COLMAP model from it, or a transforms.json, of the cameras that the splats were trained on"
+    return FileKind(None, f"cameras of {program}", hint)
+
+
 def _by_text(path: Path, head: bytes, size: int) -> FileKind | None:
     """What a text is: JSON, a page, a mesh, COLMAP's text, or a server's error."""
     start = head[:HEAD_BYTES].lstrip(b"\xef\xbb\xbf \t\r\n")
     lower, suffix = start.lower(), path.suffix.lower()
     if start[:1] in (b"{", b"["):
         return _json(path, size)
+    for program, beginning in _CAMERA_TEXTS.items():
+        if beginning.match(lower):
+            return _cameras_of(program)
     if lower.startswith((b"<!doctype html", b"<html", b"<head", b"<!--")):
         is_viewer = suffix in (".html", ".htm") or (size > HEAD_BYTES and b"splat" in head.lower())
         return _VIEWER if is_viewer else _WEB_PAGE
@@ -443,6 +466,7 @@ def _list_rules(document: list[Any]) -> Iterator[FileKind | None]:
     first = document[0] if document and isinstance(document[0], dict) else {}
     is_cameras = not document or first.keys() & {"img_name", "transform", "file_path"}
     yield FileKind("cameras", "cameras") if is_cameras else None
+    yield _cameras_of("OpenSfM") if _CAMERA_KEYS["OpenSfM"] <= first.keys() else None
     hint = "'splatlift pack masks' or 'splatlift pack prompts' makes a feature pack of its folder"
     yield FileKind(None, "masks as JSON", hint) if "segmentation" in first else None
     yield FileKind(None, "a JSON list of something else", recognised=False)
@@ -454,6 +478,8 @@ def _object_rules(document: dict[str, Any], path: Path) -> Iterator[FileKind | N
     is_streamed = keys >= {"tree", "filenames"} or path.name == LOD_META
     yield _streamed(f"a streamed SOG ({LOD_META})", path) if is_streamed else None
     yield FileKind("cameras", "cameras") if "frames" in keys else None
+    program = next((name for name, own in _CAMERA_KEYS.items() if own <= keys), None)
+    yield _cameras_of(program) if program else None
     frame = FileKind(None, f"the frame of a nerfstudio run ({FRAME_FILE})", "give the cameras that it belongs to")
     yield frame if keys >= {"transform", "scale"} else None
     is_gltf = "asset" in keys and keys & {"buffers", "accessors", "scenes", "meshes"}

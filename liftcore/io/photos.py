@@ -130,8 +130,8 @@ class PhotosBeside:
         self._folder = folder
         self._names: dict[str, dict[str, list[str]]] = {}
 
-    def size(self, file_path: str) -> tuple[int, int] | None:
-        """Width and height in stored pixels of the photo of such a path, with or without a suffix; None: not there.
+    def header(self, file_path: str) -> PhotoHeader | None:
+        """The header of the photo of such a path, with or without a suffix; None: not there.
 
         Raises:
             InvalidInput: it does not open as an image.
@@ -139,10 +139,10 @@ class PhotosBeside:
         for folder, place in self._places(file_path):
             if (photo := self._photo(folder, place)) is not None:
                 if isinstance(photo, Path):
-                    return read_header(photo).stored
+                    return read_header(photo)
                 try:
                     with photo.open("rb") as packed:
-                        return read_header(packed, str(photo)).stored
+                        return read_header(packed, str(photo))
                 except BROKEN_ZIP as error:
                     got = f"one that does not unzip ({str(error)[:120]})"
                     raise InvalidInput(str(photo), expected="an image", got=got) from None

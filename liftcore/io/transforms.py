@@ -19,7 +19,7 @@ import numpy as np
 from liftcore.errors import InvalidCameras, InvalidInput
 from liftcore.io.colmap import PANORAMA, Intrinsics, distortion_of
 from liftcore.io.json_file import FORMATS, entry, matrix, number, pixels, read_json
-from liftcore.io.photos import PhotosBeside
+from liftcore.io.photos import PhotoHeader, PhotosBeside
 from liftcore.scene.cameras import (
     Camera,
     Cameras,
@@ -178,16 +178,29 @@ def _size(keys: Mapping[str, Any], where: str, photos: PhotosBeside | None) -> t
         return pixels(keys["w"], f"{where} w"), pixels(keys["h"], f"{where} h")
     file_path = str(keys["file_path"])
     try:
-        size = photos.size(file_path) if photos else None
+        header = photos.header(file_path) if photos else None
     except InvalidInput as error:
         got, hint = f"{error.got} ({error.argument})", 'add "w" and "h" at the top level of the file'
         raise InvalidCameras(where, expected="an image size, w and h, or a photo", got=got, hint=hint) from None
-    if size is not None:
-        return size
+    if header is not None:
+        return _size_of_photo(header, keys, where)
     looked = f", and no photo {photos.missing(file_path)}" if photos else ""
     hint = 'add the size of the photos as "w" and "h" at the top level of the file'
     hint = f"put the photos where file_path has them, or {hint}" if photos else hint
     raise InvalidCameras(where, expected="an image size, w and h", got=f"none{looked}", hint=hint)
+
+
+def _size_of_photo(header: PhotoHeader, keys: Mapping[str, Any], where: str) -> tuple[int, int]:
+    """Width and height of a photo as stored, or as its EXIF turns it where that fits the principal point alone."""
+    centre = [number(keys[key], f"{where} {key}") if key in keys else None for key in ("cx", "cy")]
+    cx, cy = centre
+    turns = cx is not None and cy is not None and cx > 0 < cy and header.turns_for((round(2 * cx), round(2 * cy)))
+    width, height = header.turned if turns else header.stored
+    if (cx or 0) >= width or (cy or 0) >= height:
+        expected, hint = f"a principal point within the photo of {width}x{height}", "the photo was made smaller: add"
+        hint = f'{hint} "w" and "h" of the photos that the intrinsics are of at the top level of the file'
+        raise InvalidCameras(f"{where} cx, cy", expected=expected, got=f"{cx}, {cy}", hint=hint)
+    return width, height
 
 
 def _intrinsics(keys: Mapping[str, Any], width: int, height: int, where: str) -> Intrinsics:

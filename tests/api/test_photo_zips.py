@@ -87,7 +87,8 @@ def test_size_of_a_photo_in_a_broken_zip_is_refused_as_an_image(method: str, tmp
         except (zipfile.BadZipFile, NotImplementedError, ValueError):
             continue
         try:
-            outcomes.add(beside.size("a.png"))
+            header = beside.header("a.png")
+            outcomes.add(header and header.stored)
         except InvalidInput as error:
             outcomes.add(error.expected)
     assert "an image" in outcomes

@@ -422,6 +422,16 @@ def test_the_size_of_photos_is_in_their_headers(file_path: str, file: str, tmp_p
         assert (view.fx, view.fy, view.cx, view.cy) == (pytest.approx(15), pytest.approx(15), 15, 10)
 
 
+def test_a_principal_point_tells_whether_a_photo_was_turned_or_made_smaller(tmp_path: Path) -> None:
+    photo(tmp_path / "a.png", (30, 20), orientation=6)
+    path = with_json(tmp_path, {**blender("a"), "cx": 10.2, "cy": 14.7})
+    [view] = read_cameras(path).values()
+    assert (view.width, view.height) == (20, 30)
+    path.write_text(json.dumps({**blender("a"), "cx": 30.0, "cy": 20.0}))
+    with pytest.raises(InvalidCameras, match=r"within the photo of 30x20, got 30\.0, 20\.0; .*made smaller"):
+        read_cameras(path)
+
+
 def test_each_frame_has_the_size_of_its_own_photo(tmp_path: Path) -> None:
     for name, size in (("a", (30, 20)), ("b", (20, 30))):
         photo(tmp_path / f"train/{name}.png", size)
