@@ -22,7 +22,7 @@ from liftcore.io.transforms import FRAME_FILE
 from liftcore.scene.cameras import Cameras, distortion_warning, photo_size
 from liftcore.scene.compositing import ALPHA_FLOOR
 from liftcore.scene.splats import Kernel, Splats
-from liftcore.solve.diagnostics import UNSEEN
+from liftcore.solve.diagnostics import UNSEEN, activation_warnings
 from liftcore.text.table import plain
 from liftcore.values.pack import read_features
 from liftcore.values.views import NO_LABEL, Regions
@@ -45,7 +45,6 @@ OTHER_FRAME = (
     f"nerfstudio trained the splats, put its run's {FRAME_FILE} beside them"
 )
 SHOWN = 3  # names in a warning
-MANY = 100  # splats: what all of so many have in common is no accident
 FLAT = 100  # times thinner than wide: what converters make of discs
 NARROW = 4  # times longer than wide, or wider: photos are not
 UNIT_TOLERANCE = 0.01  # a float16 unit vector of 512 channels is within it
@@ -177,24 +176,11 @@ def _splat_warnings(splats: Splats, scales: Tensor, opacities: Tensor) -> list[s
     }
     warnings = [*splats.warnings]
     warnings += [f"{count} of {splats.count} splats {what}" for what, count in counted.items() if count]
-    warnings += _reading_warnings(splats)
+    warnings += activation_warnings(splats)
     if splats.sh is None:
         warnings.append("no colour: renders in RGB are not possible")
     if splats.kernel is Kernel.GAUSSIAN_3D and bool((scales[:, 2] * FLAT < scales[:, :2].amin(dim=1)).all()):
         warnings.append("every splat is flat along its third axis: if they are discs of 2DGS, lift with kernel=2dgs")
-    return warnings
-
-
-def _reading_warnings(splats: Splats) -> list[str]:
-    """Files that may mean something else than they say."""
-    warnings, many = [], splats.count >= MANY
-    logits = splats.opacity_logits
-    if many and bool(((logits >= 0) & (logits <= 1)).all()):
-        warnings.append(
-            "all opacities lie between 0 and 1, as if they were no logits: sigmoid makes them 0.5 to 0.73"
-        )
-    if many and bool((splats.log_scales > 0).all()):
-        warnings.append("all scales are above 0, as if they were no logarithms: exp makes them larger than 1")
     return warnings
 
 

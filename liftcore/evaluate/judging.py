@@ -8,6 +8,7 @@ from liftcore.errors import InvalidInput, InvalidQuery
 from liftcore.evaluate.labels import LabelledObject, LabelledScene
 from liftcore.evaluate.protocols import SEGMENTERS, EvaluationProtocol, Prediction
 from liftcore.query.scene import QueryScene
+from liftcore.query.scores import DEFAULT_NEGATIVES
 from liftcore.runtime.progress import Progress, silent
 from liftcore.scene.cameras import photo_size
 from liftcore.text import RememberingEncoder, TextEncoder
@@ -199,12 +200,14 @@ def evaluate_scene(
     elif lifted:
         warnings.append(f"{labels.name}: {len(lifted)} of {len(truth)} judged frames were lifted: {_named(lifted)}")
     encoder = RememberingEncoder(encoder)  # each protocol asks for the same words
+    protocols, unmeasured = _measurable(settings, encoder)
+    warnings += [f"{labels.name}: {text}" for text in unmeasured]
     texts, unknown = _readable(truth, encoder)
     if unknown:
         warnings.append(f"{labels.name}: {encoder.name} lacks {_named(unknown)}: left out")
         truth = {view: [thing for thing in things if thing.category in texts] for view, things in truth.items()}
     results = []
-    for protocol in settings.protocols:
+    for protocol in protocols:
         segmenter = SEGMENTERS[protocol](scene, texts, encoder, settings.threshold, settings.negatives)
         rows: list[Judged] = []
         for done, (view, things) in enumerate(truth.items(), start=1):
@@ -212,6 +215,28 @@ def evaluate_scene(
             progress(f"{labels.name} {protocol}", done, len(truth), "frames")
         results.append(SceneResult(labels.name, protocol, tuple(rows)))
     return results, warnings
+
+
+def _measurable(settings: EvaluationSettings, encoder: TextEncoder) -> tuple[list[EvaluationProtocol], list[str]]:
+    """The protocols whose own negatives the encoder reads, and a warning of one that is left out.
+
+    Raises:
+        InvalidQuery: none is left.
+    """
+    lacking: list[str] = []
+    for text in () if settings.negatives else DEFAULT_NEGATIVES:
+        try:
+            encoder.encode([text])
+        except InvalidQuery:
+            lacking.append(text)
+    protocols = [one for one in settings.protocols if not (lacking and one is EvaluationProtocol.P1)]
+    if len(protocols) == len(settings.protocols):
+        return protocols, []
+    expected = f"an encoder that reads its negatives ({', '.join(DEFAULT_NEGATIVES)})"
+    got, hint = f"{encoder.name} without {_named(lacking)}", "give --negative words that it has, or another encoder"
+    if not protocols:
+        raise InvalidQuery("encoder of P1", expected=expected, got=got, hint=hint)
+    return protocols, [f"P1 is left out: it needs {expected}, got {got}; {hint}"]
 
 
 def _readable(

@@ -14,7 +14,7 @@ from liftcore.lifting.geometry import weigh_views
 from liftcore.raster import check_given, open_raster
 from liftcore.runtime.device import choose_device
 from liftcore.runtime.progress import Progress, silent
-from liftcore.runtime.torch_modes import usual_modes
+from liftcore.runtime.torch_modes import callers_modes, usual_modes
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.compositing import CompositingParams, check_antialiased
 from liftcore.scene.splats import Splats, shared_tensor
@@ -31,24 +31,26 @@ def render(
     params: CompositingParams | None = None,
     *,
     normalise: bool = False,
-    device: str = "auto",
+    device: str | torch.device = "auto",
     threads: int | None = None,
 ) -> Tensor:
     """Composite values on splats front to back, as a rasterizer does colours: ``A X``.
 
     Args:
-        values: [P] or [P, F] of any numbers or booleans, a row a splat, in the splats' order.
+        values: [P] or [P, F] of any numbers or booleans, a row a splat, in the splats' order; without gradients.
         params: how rays meet splats; None: as they were trained (`Splats.antialiased`), with the field's other
             constants. The scale of the opacity logits is 1; the background is zero.
         normalise: whether pixels are divided by the sum of their weights, where that is not zero.
-        device: ``auto``, ``cpu`` or ``cuda``. threads: of the CPU; the number changes no bit.
+        device: ``auto``, ``cpu`` or ``cuda``; also ``cuda:0``, if that card is current. threads: of the CPU; the
+        number changes no bit.
 
     Returns:
         [H, W] or [H, W, F] f32, on the CPU.
 
     Raises:
         InvalidSplats, InvalidCameras: splats or camera are something else, such as a path or a name.
-        InvalidSettings: values have another number of rows than there are splats, or threads are no number.
+        InvalidSettings: values have another number of rows than there are splats, or a gradient, or threads are no
+            number.
         Unavailable: there is no such device.
     """
     splats = check_given(splats, threads)
@@ -59,6 +61,7 @@ def render(
     if not isinstance(camera, Camera):
         got, hint = repr(camera)[:80], "cameras[name] is the camera of a view"
         raise InvalidCameras("camera", expected="a Camera", got=got, hint=hint)
+    _refuse_gradients(values)
     try:
         given = shared_tensor(values).cpu()
     except (TypeError, ValueError) as error:
@@ -76,6 +79,17 @@ def render(
     return (image[:, :, 0] if given.ndim == 1 else image).cpu()
 
 
+def _refuse_gradients(values: Tensor | np.ndarray) -> None:
+    with callers_modes():
+        recorded = torch.is_grad_enabled()
+    if recorded and isinstance(values, Tensor) and values.requires_grad:
+        hint = (
+            "give values.detach(), or render in torch.no_grad(); A itself, to differentiate through, is "
+            "region_weights(...) of a label a pixel"
+        )
+        raise InvalidSettings("values", expected="numbers without a gradient", got="requires_grad=True", hint=hint)
+
+
 @usual_modes()
 def region_weights(
     splats: Splats,
@@ -89,13 +103,17 @@ def region_weights(
 ) -> RegionWeights:
     """What each region, or cell of a grid, of each view weighs at each splat: ``W = A^T S``, without any feature.
 
+    Where each pixel of a view has a label of its own, S is the identity and W is A itself, transposed: a column of W
+    holds what each splat shows of one pixel.
+
     Args:
         splats, cameras, views, preset, threads, settings: as `lift` has them. All views are weighed, whatever the
             settings' coverage. A label on several levels is a region each time.
 
     Returns:
-        W on the CPU, a row a splat: in memory, or in mapped files where it is large. Rows of ``W E`` over the sums of
-        rows of W are the features that `lift` finds.
+        W on the CPU, a row a splat: in memory, or in mapped files where it is large. Rows of ``W E``, of the views'
+        codebooks E, over the sums of rows of W are the features that `lift` finds with ``row-sum``. Presets that
+        reweight, as ``default`` does, weigh entries of this W further, by how well views agree.
 
     Raises:
         InvalidFeatures, InvalidSettings, Unavailable: as `lift` has it.

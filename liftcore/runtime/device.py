@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 
 from liftcore.errors import InvalidSettings, Unavailable
+from liftcore.runtime.device_name import device_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -110,13 +111,16 @@ def indexed(place: torch.device) -> torch.device:
     return place
 
 
-def choose_device(asked: str) -> Device:
+def choose_device(name: str | torch.device) -> Device:
     """The device that ``auto``, ``cpu`` or ``cuda`` stands for here; ``auto`` takes a card where one can be used.
+
+    The current card may also be named by its number, ``cuda:0``.
 
     Raises:
         InvalidSettings: another name.
         Unavailable: ``cuda`` was asked for and cannot be had.
     """
+    asked = device_name(name)
     if asked not in ("auto", "cpu", "cuda"):
         raise InvalidSettings("device", expected="'auto', 'cpu' or 'cuda'", got=repr(asked)[:80])
     if asked == "cpu":

@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, Va
 from pydantic_core import PydanticCustomError
 
 from liftcore.errors import InvalidSettings
+from liftcore.runtime.device_name import device_name
 from liftcore.runtime.nearest import nearest
 from liftcore.scene.compositing import MOST_OF_A_RAY, CompositingParams, Selection, Weighting, check_antialiased
 
@@ -191,6 +192,8 @@ class LiftSettings(BaseModel):
     def _fill_from_preset_and_speed(cls, values: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
         if not isinstance(values, dict):
             return handler(values)
+        if "device" in values:
+            values = values | {"device": device_name(values["device"])}
         preset, speed = values.get("preset", Preset.DEFAULT), values.get("speed", Speed.EXACT)
         weights = _PRESETS[Preset(preset)] if isinstance(preset, str) and preset in set(Preset) else {}
         effort = _SPEEDS[Speed(speed)] if isinstance(speed, str) and speed in set(Speed) else {}

@@ -172,3 +172,21 @@ def test_what_cannot_be_judged_exits_2_with_one_line(
     status, out, err = run(capsys, "evaluate", "lerf-ovs", *given, "--data", folder / "lerf_ovs")
     assert (status, out) == (2, "")
     assert message in err and err.count("\n") == 1
+
+
+def test_protocol_whose_own_negatives_a_table_lacks_is_left_out_and_said(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    vectors, words = load_file(folder / "words.safetensors")["embeddings"], WORDS
+    rows = [row for row, word in enumerate(words) if word != "object"]
+    small = tmp_path / "small.safetensors"
+    save_file({"embeddings": vectors[rows]}, small, metadata={"words": json.dumps([words[row] for row in rows])})
+    lift = folder / "kitchen.lift.safetensors"
+    arguments = ["lerf-ovs", lift, "--data", folder / "lerf_ovs", "--table", small]
+    document = evaluate(capsys, *arguments)
+    assert [row["protocol"] for row in document["measured"]] == ["P2", "P3", "own"]
+    assert any("P1 is left out" in warning and "without object" in warning for warning in document["warnings"])
+    status, _, err = run(capsys, "evaluate", *arguments, "--protocol", "P1")
+    assert status == 2 and "--negative" in err
+    document = evaluate(capsys, *arguments, "--negative", "book", "--protocol", "P1")
+    assert [row["protocol"] for row in document["measured"]] == ["P1"]

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import torch
 
 import liftcore as lc
 from liftcore.lifting.files import lift_files
-from tests.scenes import observed, write_scene
+from tests.scenes import observed, random_splats, write_scene
 
 PUBLIC = """
     Camera Cameras Catalogue CompositingParams FeatureGrid FoundObject InvalidCameras InvalidFeatures InvalidInput
@@ -266,6 +267,49 @@ def test_render_refuses_the_name_of_a_camera_and_an_unknown_device(scene):
     assert lc.render(splats, cameras["v0"], swapped).shape == (cameras["v0"].height, cameras["v0"].width)
     with pytest.raises(lc.InvalidCameras, match=r"camera: expected a Camera, got 'v0'; cameras\[name\]"):
         lc.render(splats, "v0", torch.ones(splats.count))  # pyright: ignore[reportArgumentType]
+
+
+def test_render_refuses_to_drop_a_gradient_that_is_recorded(scene):
+    _, splats, cameras, _ = scene
+    values = torch.ones(splats.count, 2, requires_grad=True)
+    with pytest.raises(lc.InvalidSettings, match=r"values: .*gradient.*values\.detach\(\)"):
+        lc.render(splats, cameras["v0"], values)
+    plain = lc.render(splats, cameras["v0"], values.detach())
+    for mode in (torch.no_grad(), torch.inference_mode()):
+        with mode:
+            assert torch.equal(lc.render(splats, cameras["v0"], values), plain)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="with a GPU these calls run on it")
+def test_the_current_card_may_be_named_by_its_number(scene):
+    _, splats, cameras, views = scene
+    for device in ("cuda:0", torch.device("cuda:0"), torch.device("cuda")):
+        with pytest.raises(lc.Unavailable, match="device"):
+            lc.render(splats, cameras["v0"], torch.ones(splats.count), device=device)
+        with pytest.raises(lc.Unavailable, match="device"):
+            lc.lift(splats, cameras, views, device=device)
+    for call in (lc.lift, lc.plan):
+        with pytest.raises(lc.InvalidSettings, match=r"cuda:0, the card that is current, got 'cuda:3'.*CUDA_VISIBLE"):
+            call(splats, cameras, views, device="cuda:3")
+
+
+def test_splats_of_activated_opacities_and_scales_are_told_in_the_plan(scene):
+    _, _, cameras, views = scene
+    splats = random_splats(3, 200, spread=1.5)
+    opacities, scales = torch.sigmoid(splats.opacity_logits), splats.log_scales.exp()
+    told = lc.plan(replace(splats, opacity_logits=opacities, log_scales=scales), cameras, views).told
+    assert any("no logits" in text for text in told) and any("no logarithms" in text for text in told)
+    assert not any("as if they were no" in text for text in lc.plan(splats, cameras, views).told)
+
+
+def test_region_weights_of_a_label_a_pixel_are_the_weights_of_rays(scene):
+    _, splats, cameras, _ = scene
+    camera = cameras["v0"]
+    labels = np.arange(camera.height * camera.width).reshape(1, camera.height, camera.width)
+    W = lc.region_weights(splats, {"v0": camera}, {"v0": lc.Regions(labels, np.ones((labels.size, 1), np.float32))})
+    values = np.random.default_rng(0).normal(size=splats.count)
+    image = lc.render(splats, camera, values).numpy().ravel()
+    np.testing.assert_allclose(W.matrix(splats.count).T @ values, image, atol=1e-4)
 
 
 @pytest.mark.parametrize("engine", [None, lc.LocalEngine(1)])
