@@ -7,7 +7,7 @@ what it is and what to do.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,7 +23,7 @@ from liftcore.io.quantised import Fields
 from liftcore.io.ranks import rank_files
 from liftcore.io.remote import local_path
 from liftcore.io.sog import is_bundled, read_sog, sog_files
-from liftcore.io.splat import read_splat, splat_blocks
+from liftcore.io.splat import ROW, read_splat, splat_blocks
 from liftcore.io.spz import read_spz, spz_blocks
 from liftcore.scene.harmonics import constant_terms
 from liftcore.scene.kernel import Kernel, kernel_named
@@ -107,13 +107,20 @@ def format_of(path: Path) -> SplatFormat:
     raise InvalidSplats(str(path), expected=EXPECTED, got=found.name, hint=hint)
 
 
-def splat_count(path: Path) -> int | None:
-    """P of a PLY by its header alone; None of another format, which is counted when it is read.
-
-    Raises:
-        InvalidSplats: the header is malformed, or it is of no format of splats.
-    """
-    return ply.read_header(path).count if format_of(path) is SplatFormat.PLY else None
+def quick_count(path: Path) -> int | None:
+    """P of a file by its header or size alone; None where it must be read to be counted, or does not open."""
+    with suppress(InvalidSplats, OSError):
+        match format_of(path):
+            case SplatFormat.PLY:
+                return ply.read_header(path).count
+            case SplatFormat.SPLAT:
+                return path.stat().st_size // ROW.itemsize
+            case SplatFormat.COMPRESSED_PLY:
+                elements = ply.parse_elements(ply.read_head(path)[0], str(path))[1]
+                return next((one.count for one in elements if one.name == "vertex"), None)
+            case _:
+                pass
+    return None
 
 
 def splat_files(path: Path) -> list[Path]:

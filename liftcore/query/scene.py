@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from liftcore.errors import InvalidLift, InvalidQuery, InvalidSplats
-from liftcore.io.splats import splat_count
+from liftcore.io.splats import quick_count
 from liftcore.query.scores import mean_direction, norms_of
 from liftcore.scene.kernel import Kernel
 from liftcore.text.table import TableEncoder, own_words
@@ -87,12 +87,15 @@ class QueryScene:
             path: the lift. splats, cameras: where these lie now, if they moved since the lift.
 
         Raises:
-            InvalidLift: the file is missing or is not a lift.
+            InvalidLift: the file is missing, is not a lift, or has other rows than ``splats``, where these are
+                counted without reading them.
         """
         scene = cls.__new__(cls)
         arrays, scene._told = read_lift(path)
         scene._hold(arrays)
         scene.path, scene._moved = path, {"splats": splats, "cameras": cameras}
+        if splats is not None and splats.exists():
+            scene._require_rows(quick_count(splats))
         return scene
 
     @cached_property
@@ -100,11 +103,18 @@ class QueryScene:
         """How the lift was made, with its files where they are now; read when first asked for.
 
         Raises:
-            InvalidLift: the metadata are none of a lift.
+            InvalidLift: the metadata are none of a lift, or the lift has not a row for each of the splats that they
+                name.
         """
-        from liftcore.values.lift_file import parse_metadata
+        from liftcore.values.lift_file import input_file, parse_metadata
 
         metadata = parse_metadata(self._told, self.path)
+        splats = Path(metadata.splats.path)
+        if metadata.splats.path and self._moved["splats"] is None and splats.exists():
+            count = quick_count(splats)
+            # Another file may lie there now, which says nothing of this lift.
+            if count not in (None, len(self.features)) and input_file(splats).sha256 == metadata.splats.sha256:
+                self._require_rows(count)
         files = {
             name: getattr(metadata, name).model_copy(update={"path": str(place)})
             for name, place in self._moved.items()
@@ -214,7 +224,7 @@ class QueryScene:
             InvalidLift: it moved, is another than the one that was lifted, or has another number of splats.
         """
         path = self._unchanged("splats", self.metadata.splats)
-        self._require_rows(splat_count(path))
+        self._require_rows(quick_count(path))
         return path
 
     def _require_rows(self, splats: int | None) -> None:

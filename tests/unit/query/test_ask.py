@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from liftcore.errors import InvalidLift, InvalidQuery, NotFound, SplatliftError
+from liftcore.io.splats import some_rows
 from liftcore.query.ask import answers, ask, question, top
 from liftcore.query.directions import directions
 from liftcore.query.result import LiftResult, load_lift
@@ -22,6 +23,7 @@ from liftcore.query.scene import QueryScene
 from liftcore.query.terms import Example, OneSplat, Pixel, Query, Region, Vector, parse_example, read_vector
 from liftcore.query.threshold import find_threshold
 from liftcore.values.lift_file import save_lift
+from service.queries.answers import open_scene
 from tests.api.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH
 
 COUNT = 3 * SPLATS_A_CLUSTER
@@ -301,3 +303,23 @@ def test_lift_read_as_arrays_and_as_tensors_is_one(scene: QueryScene, tmp_path: 
     save_lift(replace(scene.lift, cluster=clusters, cluster_features=rows), tmp_path / "clustered")
     opened = QueryScene.open(tmp_path / "clustered")
     assert opened.cluster is not None and opened.cluster.tolist() == clusters.tolist()
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".splat"])
+def test_a_lift_with_other_rows_than_its_splats_answers_nothing(
+    suffix: str, lift_tiny: Callable[..., Path], tmp_path: Path
+) -> None:
+    path = lift_tiny(tmp_path)
+    lift, splats = load_lift(path), tmp_path / f"other{suffix}"
+    rows = ("features", "evidence", "agreement", "seen", "confidence", "cluster", "object")
+    cropped = {name: getattr(lift, name)[:-1] for name in rows if getattr(lift, name) is not None}
+    save_lift(replace(lift, **cropped), tmp_path / "cropped.lift")
+    ask(QueryScene.open(path), Query((OneSplat(0),)))
+    with pytest.raises(InvalidLift, match="a row for each of its"):
+        ask(QueryScene.open(tmp_path / "cropped.lift"), Query((OneSplat(0),)))  # scores alone, without places
+    splats.write_bytes(b"".join(some_rows(tmp_path / "s.ply", np.arange(len(lift.features)) > 0, suffix)))
+    request = {"lift": str(path), "splats": str(splats), "cameras": str(tmp_path / "c.json")}
+    with pytest.raises(InvalidLift, match="a row for each of its"):
+        open_scene(request)
+    (tmp_path / "s.ply").write_bytes(splats.read_bytes())  # another file lies there now: places alone are lost
+    ask(QueryScene.open(path), Query((OneSplat(0),)))
