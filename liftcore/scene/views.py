@@ -9,8 +9,9 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import PurePosixPath
+from urllib.parse import unquote
 
 from liftcore.errors import InvalidCameras, InvalidFeatures
 
@@ -88,9 +89,35 @@ def require_pairs(views: Collection[str], cameras: Collection[str]) -> dict[str,
             "features",
             expected="views named like the cameras",
             got=f"views {some_of(views)} and cameras {some_of(cameras)}, none in common",
-            hint=NAMED_AFTER,
+            hint=_difference(views, cameras) or NAMED_AFTER,
         )
     return pairs
+
+
+def _difference(views: Collection[str], cameras: Collection[str]) -> str:
+    """How names would pair, of the ways in which programs change them; empty where none pairs most of them."""
+    names = [composed(view) for view in views]
+    before, behind = _shared_start(names), _shared_start([name[::-1] for name in names])[::-1]
+    ways: dict[str, Callable[[str], str]] = {
+        "in capital letters": str.casefold,
+        "in kinds of spaces": lambda name: " ".join(name.split()),
+        "in leading zeros of numbers": lambda name: re.sub(r"0+(?=[0-9])", "", name),
+        "in characters written as %XX": unquote,
+        f"by {behind!r}, with which views end": lambda name: name.removesuffix(behind),
+        f"by {before!r}, with which views begin": lambda name: name.removeprefix(before),
+    }
+    for how, changed in ways.items():
+        paired = cameras_of_views({changed(view) for view in views}, {changed(camera) for camera in cameras})
+        if 2 * len(paired) > min(len(views), len(cameras)):
+            return f"they differ {how}: rename the files of the features, and pack them again"
+    return ""
+
+
+def _shared_start(names: Sequence[str]) -> str:
+    """What all of several names begin with."""
+    first, last = min(names, default=""), max(names, default="")  # which differ before any others do
+    same = next((k for k, (one, other) in enumerate(zip(first, last, strict=False)) if one != other), len(first))
+    return first[:same] if len(names) > 1 else ""
 
 
 def some_of(names: Collection[str]) -> str:

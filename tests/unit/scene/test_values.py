@@ -13,14 +13,14 @@ import pytest
 import torch
 from camera_files import IMAGES, binary_files, text_files, with_json, write_files
 
-from liftcore.errors import InvalidCameras, InvalidSplats, NotFound
+from liftcore.errors import InvalidCameras, InvalidFeatures, InvalidSplats, NotFound
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.transforms import transforms_of
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
-from liftcore.scene.views import cameras_of_views, view_names
+from liftcore.scene.views import cameras_of_views, require_pairs, view_names
 
 K = np.array([[50.0, 0.0, 32.0], [0.0, 51.0, 24.0], [0.0, 0.0, 1.0]])
 
@@ -220,3 +220,20 @@ def test_names_pair_as_they_are_or_by_their_last_part_where_it_is_one_of_a_kind(
     assert cameras_of_views(views, cameras) == pairs
     back = {camera: view for view, camera in pairs.items()}
     assert cameras_of_views(cameras, views) == back
+
+
+@pytest.mark.parametrize(
+    ("views", "cameras", "how"),
+    [
+        (["img_1", "img_2"], ["IMG_1", "IMG_2"], "capital letters"),
+        (["frame_1", "frame_2"], ["frame_0001", "frame_0002"], "leading zeros"),
+        (["K%C3%BCche_1", "K%C3%BCche_2"], ["K\u00fcche_1", "K\u00fcche_2"], "%XX"),
+        (["9.41 PM", "9.42 PM"], ["9.41\u202fPM", "9.42\u202fPM"], "spaces"),
+        (["IMG_1_mask", "IMG_2_mask"], ["IMG_1", "IMG_2"], "'_mask', with which views end"),
+        (["mask_1a", "mask_2b"], ["1a", "2b"], "'mask_', with which views begin"),
+        (["left", "right"], ["IMG_1", "IMG_2"], "a view is named after its image"),
+    ],
+)
+def test_names_that_do_not_pair_say_how_they_differ(views: list[str], cameras: list[str], how: str) -> None:
+    with pytest.raises(InvalidFeatures, match=f"none in common; .*{how}"):
+        require_pairs(views, cameras)
