@@ -118,7 +118,8 @@ def _array(tensors: dict[str, Any], name: str, path: Path) -> np.ndarray:
             else "none"
         )
         raise InvalidSplats(f"{path} {name}", expected="floats, a row a splat", got=got, hint=EXPORT_PLY)
-    return found.detach().to(torch.float32).numpy()
+    doubled = name == GSPLAT["means"] and found.dtype == torch.float64  # of map coordinates float32 would lose digits
+    return found.detach().to(torch.float64 if doubled else torch.float32).numpy()
 
 
 def _is_stored(tensor: Any) -> bool:

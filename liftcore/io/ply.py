@@ -87,7 +87,8 @@ def read_ply(path: Path, kernel: Kernel | str = "auto", *, colour: bool = True) 
     With the kernel ``auto`` it is recognised from the properties, and where these leave it open from what the file
     says (`liftcore.scene.render_mode`). Columns that the model does not know are kept as extras in their own type;
     of files without harmonics, ``red``, ``green`` and ``blue`` are the colour too, the same from everywhere;
-    ``double`` columns of the model become float32. Without ``colour`` neither colours nor extras are read or
+    ``double`` columns of the model become float32, positions about an origin near them where that would round them
+    coarsely (`Splats`). Without ``colour`` neither colours nor extras are read or
     allocated, and what comes cannot be written back. A ``filter_3D`` becomes part of scales and opacities, which are
     then written as plain splats; elements behind the vertices are neither read nor written.
 
@@ -132,7 +133,7 @@ def read_ply(path: Path, kernel: Kernel | str = "auto", *, colour: bool = True) 
 
 
 def read_places(path: Path) -> np.ndarray:
-    """[P, 3] f32, the means alone of a file that `read_ply` takes, in its frame and unit; without torch."""
+    """[P, 3] f32 (f64 of doubles), the means alone of what `read_ply` takes, in the file's frame; without torch."""
     header = read_header(path)
     return _read_columns(path, header, {axis: Slot("means", (k,)) for k, axis in enumerate("xyz")}, ())[0]["means"]
 
@@ -158,7 +159,8 @@ def ply_blocks(splats: Splats) -> Iterator[bytes]:
         header = parse_header(header_bytes(splats.header), "header")
         source = header if header.names == splats.layout else None
     codes = {name: source.dtype[name].str[1:] if source else "f4" for name in layout}
-    codes |= {name: columns[name].dtype.str[1:] for name in layout if name in splats.extras}
+    positions = () if source else "xyz"  # doubles where there is an origin
+    codes |= {name: columns[name].dtype.str[1:] for name in layout if name in splats.extras or name in positions}
     lines = ["ply", "format binary_little_endian 1.0"]
     if splats.render_mode is not None and (mode := WRITTEN_MODE.get(splats.render_mode.model)):
         lines.append(f"comment SplatRenderMode: {mode}")
@@ -284,12 +286,17 @@ def _blocks(path: Path, header: PlyHeader) -> Iterator[tuple[int, np.ndarray]]:
 def _read_columns(
     path: Path, header: PlyHeader, slots: Mapping[str, Slot], others: Sequence[str]
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """The model's fields as f32, and the other columns in their own type."""
+    """The model's fields as f32, means of doubles as f64, and the other columns in their own type."""
     shapes: dict[str, tuple[int, ...]] = {}
     for slot in slots.values():
         corner = shapes.get(slot.field, (0,) * len(slot.index))
         shapes[slot.field] = tuple(max(side, i + 1) for side, i in zip(corner, slot.index, strict=True))
-    fields = {field: np.empty((header.count, *shape), np.float32) for field, shape in shapes.items()}
+    means = [name for name, slot in slots.items() if slot.field == "means"]
+    doubled = {"means"} if any(header.dtype[name] == np.float64 for name in means) else set[str]()
+    fields = {
+        field: np.empty((header.count, *shape), np.float64 if field in doubled else np.float32)
+        for field, shape in shapes.items()
+    }
     extras = {name: np.empty(header.count, header.dtype[name]) for name in others}
     targets = {name: fields[slot.field][(slice(None), *slot.index)] for name, slot in slots.items()} | extras
     table = np.memmap(path, header.dtype, "r", header.data_offset, (header.count,))
@@ -336,12 +343,14 @@ def _columns_of(splats: Splats, layout: Sequence[str]) -> dict[str, np.ndarray]:
     columns: dict[str, np.ndarray] = {}
     for name in layout:
         if name in slots:
-            values = getattr(splats, slots[name].field)
+            field = slots[name].field
+            values = splats.positions() if field == "means" else getattr(splats, field)
             index = slots[name].index
             if values is None or any(i >= n for i, n in zip(index, values.shape[1:], strict=True)):
                 expected, hint = "columns of the splats", "clear the layout"
                 raise InvalidSplats("layout", expected=expected, got=repr(name), hint=hint)
-            columns[name] = values.cpu().numpy()[(slice(None), *index)]
+            values = values if isinstance(values, np.ndarray) else values.cpu().numpy()
+            columns[name] = values[(slice(None), *index)]
         elif name in splats.extras:
             columns[name] = splats.extras[name].cpu().numpy()
         elif name not in NORMALS:

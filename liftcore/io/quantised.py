@@ -1,8 +1,8 @@
 """What formats of quantised splats share: fields decoded in blocks, and how bytes say opacities, colours, rotations.
 
-A reader gives the fields of `Splats` by their names: ``means`` [P, 3], ``quats`` [P, 4] (w x y z), ``log_scales``
-[P, 3], ``opacity_logits`` [P] and ``sh`` [P, K, 3], all f32. A writer takes any splats as 3D Gaussians
-(`gaussian_rows`).
+A reader gives the fields of `Splats` by their names: ``means`` [P, 3], f64 where they are decoded so, and f32
+``quats`` [P, 4] (w x y z), ``log_scales`` [P, 3], ``opacity_logits`` [P] and ``sh`` [P, K, 3]. A writer takes any
+splats as 3D Gaussians (`gaussian_rows`).
 """
 
 from __future__ import annotations
@@ -36,11 +36,14 @@ def decoded(count: int, shapes: Mapping[str, tuple[int, ...]], decode: Callable[
         count: P. shapes: field -> its shape behind P.
         decode: rows -> those fields of these rows.
     """
-    fields = {name: np.empty((count, *shape), np.float32) for name, shape in shapes.items()}
+    fields: Fields = {}
     with np.errstate(over="ignore", invalid="ignore"):  # what is beyond float32 is infinite, and refused as such
         for first in range(0, count, BLOCK_ROWS):
             rows = slice(first, min(first + BLOCK_ROWS, count))
             for name, values in decode(rows).items():
+                if name not in fields:
+                    dtype = np.float64 if name == "means" and values.dtype == np.float64 else np.float32
+                    fields[name] = np.empty((count, *shapes[name]), dtype)
                 fields[name][rows] = values
     return fields
 
@@ -75,7 +78,7 @@ def smallest_three(parts: np.ndarray, largest: np.ndarray) -> np.ndarray:
 class GaussianRows:
     """Some splats after activation."""
 
-    means: np.ndarray  # [n, 3] f32
+    means: np.ndarray  # [n, 3] f32, about the splats' origin
     scales: np.ndarray  # [n, 3] f32, above zero or zero
     quats: np.ndarray  # [n, 4] f64, unit, w x y z
     opacities: np.ndarray  # [n] f32 in 0..1

@@ -27,6 +27,7 @@ from liftcore.io.splat import ROW, read_splat, splat_blocks
 from liftcore.io.spz import read_spz, spz_blocks
 from liftcore.scene.harmonics import constant_terms
 from liftcore.scene.kernel import Kernel, kernel_named
+from liftcore.scene.origin import lies_apart
 from liftcore.scene.render_mode import kernel_of_mode
 
 if TYPE_CHECKING:
@@ -77,15 +78,21 @@ def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool
         return Splats(**fields, kernel=chosen)
 
 
-def read_places(path: Path) -> np.ndarray:
-    """[P, 3] f32, the means alone of a file that `read_splats` takes, in its frame and unit. Only checkpoints need
-    torch for that, which takes a second to import. Places that are no number become the first that is.
+def read_places(path: Path, kernel: Kernel | str = "auto") -> np.ndarray:
+    """[P, 3] f32 or f64, the means alone of what `read_splats` reads, as `Splats.positions` has them.
+
+    Only checkpoints and scenes in map coordinates need torch for that, which takes a second to import. Places that
+    are no number become the first that is.
 
     Raises:
         InvalidSplats: the file is of no format of splats.
     """
     found = format_of(path)
     places = ply.read_places(path) if found is SplatFormat.PLY else _READERS[found](path, colour=False)["means"]
+    if lies_apart(places):
+        return read_splats(path, kernel, colour=False).positions()
+    with np.errstate(over="ignore"):
+        places = places.astype(np.float32, copy=False)
     finite = np.isfinite(places).all(axis=1)
     if not finite.all():
         places[~finite] = places[finite.argmax()]

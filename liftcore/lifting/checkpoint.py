@@ -30,6 +30,7 @@ from liftcore.errors import InvalidInput
 from liftcore.io.safetensors_file import tensor_bytes
 from liftcore.raster.base import RayRows, ViewWeights
 from liftcore.runtime.version import __version__
+from liftcore.scene.origin import FILE_ORIGIN
 from liftcore.values.region_weights import FORMAT, MEMORY_LIMIT, RegionWeights
 from liftcore.values.views import Regions
 
@@ -67,6 +68,7 @@ class Checkpoint:
         digest.update(splats.kernel.value.encode())
         for part in (splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.beta):
             digest.update(b"" if part is None else tensor_bytes(part))
+        digest.update(b"" if splats.origin == FILE_ORIGIN else repr(splats.origin).encode())
         return replace(self, identity=digest.hexdigest())
 
     def answers(self, raster: Raster, requests: Iterable[ViewRequest]) -> Generator[ViewWeights]:

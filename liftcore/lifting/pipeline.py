@@ -125,7 +125,7 @@ def lift(
         agreement=solution.agreement,
         confidence=agreement.confidence if agreement else None,
         seen=torch.from_numpy(sums > 0),
-        metadata=found.metadata(chosen, diagnostics, work.timings.seconds),
+        metadata=found.metadata(chosen, splats.origin, diagnostics, work.timings.seconds),
         cluster=clusters.clusters if clusters else None,
         cluster_features=clusters.cluster_features if clusters else None,
         embeddings=torch.from_numpy(table.embeddings) if table else None,

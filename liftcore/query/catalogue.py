@@ -19,6 +19,7 @@ from liftcore.errors import InvalidQuery, NotFound
 from liftcore.query.objects import largest_box
 from liftcore.query.scene import QueryScene, as_numpy
 from liftcore.query.scores import cosines, norms_of
+from liftcore.scene.origin import MAP_REACH
 
 if TYPE_CHECKING:
     from liftcore.query.ask import Point
@@ -147,7 +148,8 @@ def table_csv(found: Catalogue) -> bytes:
     for one in found.objects:
         low, high = one.box
         named = "" if one.name is None else one.name, "" if one.score is None else f"{one.score:.6g}"
-        numbers = (f"{value:.9g}" for value in (one.share, *one.centre, *low, *high))
+        digits = 9 if max(map(abs, (*low, *high))) < MAP_REACH else 15  # as many as the boxes' numbers have
+        numbers = (f"{value:.{digits}g}" for value in (one.share, *one.centre, *low, *high))
         writer.writerow([one.id, *named, one.splats, *numbers, " ".join(one.views)])
     return content.getvalue().encode()
 

@@ -46,7 +46,7 @@ def labels(scene: QueryScene, segmentation: Segmentation) -> Labels:
     Raises:
         InvalidLift: the splats moved or changed since the lift.
     """
-    values, means = segmentation.values, as_numpy(scene.splats.means)
+    values = segmentation.values
     instances, told = np.zeros(len(values), np.int32), list[dict[str, Any]]()
     evidence = scene.evidence.astype(np.float64)
     for value, named in enumerate(segmentation.found, 1):
@@ -60,7 +60,7 @@ def labels(scene: QueryScene, segmentation: Segmentation) -> Labels:
             instances[own] = len(told) + 1
             one = {"instance_id": len(told) + 1, "class_id": value, "name": named.word, "splats": len(own)}
             one |= {"score": float(np.average(segmentation.score[own], weights=mine))}
-            told.append(one | _boxes(means[own].astype(np.float64), mine))
+            told.append(one | _boxes(scene.splats.positions(own).astype(np.float64), mine))
     columns = {"class_id": values.astype(np.int32), "instance_id": instances, "score": segmentation.score}
     if scene.confidence is not None:
         columns["confidence"] = np.where(values > 0, as_numpy(scene.confidence), 0).astype(np.float32)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.scene import QueryScene, as_numpy
+from liftcore.query.scene import QueryScene
 from liftcore.scene.touching import touching
 
 if TYPE_CHECKING:
@@ -69,10 +69,10 @@ def objects(scene: QueryScene, answer: "Answer") -> Objects:
     places = np.full(len(sums), -1, np.int32)
     places[kept] = np.arange(len(kept))
     numbers[rows] = places[groups]
-    means, found = as_numpy(scene.splats.means), []
+    found = []
     for number in range(len(kept)):
         inside = numbers[rows] == number
-        box = trimmed_box(means[rows[inside]], weights[inside])
+        box = trimmed_box(scene.splats.positions(rows[inside]), weights[inside])
         found.append(
             FoundObject(
                 splats=int(inside.sum()),
@@ -91,7 +91,7 @@ def largest_box(splats: "Splats", rows: np.ndarray, weights: np.ndarray) -> "tup
     Args:
         splats: the scene. rows: [n] i64, at least one; more than are grouped have the box of all. weights: [n].
     """
-    means = as_numpy(splats.means)[rows]
+    means = splats.positions(rows)
     if len(rows) > MOST_SPLATS:
         return trimmed_box(means, weights)
     groups = touching(splats, rows)
@@ -103,7 +103,7 @@ def trimmed_box(means: np.ndarray, weights: np.ndarray) -> "tuple[Point, Point]"
     """The corners between which all but a thousandth of the weight at each end lies, axis by axis.
 
     Args:
-        means: [n, 3] f32, at least one. weights: [n], at least zero.
+        means: [n, 3] f32 or f64, at least one. weights: [n], at least zero.
     """
     corners = np.empty((2, 3))
     for axis in range(3):

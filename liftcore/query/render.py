@@ -172,7 +172,7 @@ def expected_depth(scene: QueryScene, view: str | Camera) -> tuple[np.ndarray, n
     Raises:
         NotFound, InvalidQuery, InvalidLift: as `render` does.
     """
-    pose = torch.from_numpy(scene.camera(view).viewmat[2].copy())
+    pose = torch.from_numpy(scene.camera(view).about(scene.splats.origin).viewmat[2].copy())
     depths = (scene.splats.means.double() @ pose[:3] + pose[3]).to(torch.float32)
     values = torch.stack([depths, torch.ones_like(depths)], dim=1)
     image = scene.image(view, lambda camera: scene.raster.render(camera, values, _as_trained(scene)))

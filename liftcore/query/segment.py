@@ -125,7 +125,6 @@ def segment(
     if len(set(words)) < len(words):
         twice = next(word for place, word in enumerate(words) if word in words[:place])
         raise InvalidQuery("words", expected="every word once", got=f"{twice!r} twice")
-    means = as_numpy(scene.splats.means)
     weights = np.where(scene.seen, scene.evidence, 0.0).astype(np.float64)
     weights = weights if weights.any() else scene.seen.astype(np.float64)
     thresholds, answered = np.empty(len(words)), np.empty(len(words))
@@ -163,7 +162,7 @@ def segment(
             score=float(np.average(named.score[mine], weights=weights[mine])),
             margin=float(np.average(margin[mine], weights=weights[mine])),
             threshold=float(thresholds[row]),
-            box=trimmed_box(means[mine], weights[mine]),
+            box=trimmed_box(scene.splats.positions(mine), weights[mine]),
         )
         for row in np.unique(labels[labels != NO_WORD]).tolist()
         if weights[mine := np.flatnonzero(labels == row)].any()

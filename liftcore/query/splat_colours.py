@@ -40,7 +40,7 @@ def seen_colours(splats: Splats, camera: Camera) -> Tensor:
     """
     if splats.sh is None:
         return torch.full((splats.count, 3), NO_COLOUR)
-    centre = torch.from_numpy(np.asarray(camera.centre, dtype=np.float32))
+    centre = torch.from_numpy(np.asarray(camera.about(splats.origin).centre, dtype=np.float32))
     directions = torch.nn.functional.normalize(splats.means - centre, dim=1)
     basis = _sh_basis(directions, min(splats.sh_degree or 0, 3))
     colours = torch.einsum("pk,pkc->pc", basis, splats.sh[:, : basis.shape[1]])

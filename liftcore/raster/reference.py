@@ -58,7 +58,14 @@ def camera_axes(splats: Splats, j: int, camera: Camera) -> np.ndarray:
 
 def camera_mean(splats: Splats, j: int, camera: Camera) -> np.ndarray:
     """[3] f64, the centre of splat j in the camera's frame."""
-    return camera.viewmat[:3, :3] @ splats.means[j].double().numpy() + camera.viewmat[:3, 3]
+    pose = camera.about(splats.origin).viewmat
+    return pose[:3, :3] @ splats.means[j].double().numpy() + pose[:3, 3]
+
+
+def camera_depths(splats: Splats, camera: Camera) -> np.ndarray:
+    """[P] f64, the depths of the splats' centres along the camera's axis."""
+    axis = camera.about(splats.origin).viewmat[2]
+    return splats.means.double().numpy() @ axis[:3] + axis[3]
 
 
 def projected_gaussian(splats: Splats, j: int, camera: Camera) -> tuple[np.ndarray, np.ndarray, float]:
@@ -165,7 +172,7 @@ def dense_view(splats: Splats, camera: Camera, params: CompositingParams) -> Den
     y, x = np.mgrid[: camera.height, : camera.width]
     pixels = np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
     rays = pixels.shape[0]
-    z = (splats.means.double().numpy() @ camera.viewmat[2, :3]) + camera.viewmat[2, 3]
+    z = camera_depths(splats, camera)
     A = np.zeros((rays, splats.count))
     cut = np.zeros(rays, bool)
     T = np.ones(rays)
@@ -215,7 +222,7 @@ def counted_weights(
     A: np.ndarray, splats: Splats, camera: Camera, params: CompositingParams, weighting: Weighting
 ) -> tuple[np.ndarray, np.ndarray]:
     """A' [H * W, P], the weights of A [H * W, P] that count, to their power; and the rays [H * W] hard to decide."""
-    depths = splats.means.double().numpy() @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
+    depths = camera_depths(splats, camera)
     order = np.argsort(depths.astype(np.float32), kind="stable")
     w = A[:, order]  # near to far
     if weighting.selection is Selection.TOP_K:
@@ -259,7 +266,7 @@ def _centres(
 ) -> tuple[np.ndarray, np.ndarray]:
     """[H * W, P] bool: the strided ray nearest to the splat's projected centre; and rays of centres near a border."""
     counts, cut = np.zeros_like(A, bool), np.zeros_like(A, bool)
-    pose = camera.viewmat
+    pose = camera.about(splats.origin).viewmat
     for j, mean in enumerate(splats.means.double().numpy()):
         x, y, z = pose[:3, :3] @ mean + pose[:3, 3]
         if z <= 0:
@@ -333,7 +340,7 @@ class ReferenceRaster:
         """Pixels whose ray a splat has an alpha on, whatever lies before it."""
         y, x = np.mgrid[: camera.height, : camera.width]
         pixels = np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
-        z = (self.splats.means.double().numpy() @ camera.viewmat[2, :3]) + camera.viewmat[2, 3]
+        z = camera_depths(self.splats, camera)
         ahead = (int(j) for j in np.flatnonzero(z >= NEAR_PLANE))
         areas = np.zeros(self.splats.count, np.float32)
         for j in ahead:

@@ -13,6 +13,7 @@ import numpy as np
 from liftcore.errors import InvalidCameras, NotFound
 from liftcore.runtime.nearest import nearest
 from liftcore.scene.distortion import MAX_SIDE, Distortion, Lens, Rectangle, shared_lens
+from liftcore.scene.origin import FILE_ORIGIN, MAP_REACH, Origin
 from liftcore.scene.panorama import TURNS, Face
 from liftcore.scene.views import cameras_of_views, composed, without_image_suffix
 
@@ -172,7 +173,19 @@ class Camera:
     @property
     def centre(self) -> np.ndarray:
         """[3] f64, the camera's centre in the world frame."""
-        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+        rotation, translation = self.viewmat[:3, :3], self.viewmat[:3, 3]
+        centre = -rotation.T @ translation
+        if np.abs(translation).max() > MAP_REACH:  # there a rotation of float32 digits, turned back, misses by metres
+            centre = np.linalg.solve(rotation, -translation)
+        return centre
+
+    def about(self, origin: Origin) -> Camera:
+        """The same camera in the world frame less an origin: a point p - origin lies where p did."""
+        if origin == FILE_ORIGIN:
+            return self
+        pose = self.viewmat.copy()
+        pose[:3, 3] += pose[:3, :3] @ origin
+        return replace(self, viewmat=pose)
 
 
 def _matrix(values: Any) -> np.ndarray:

@@ -7,6 +7,7 @@ is no number becomes grey. Both are counted in ``warnings``.
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -16,10 +17,11 @@ import torch
 
 from liftcore.errors import InvalidSplats
 from liftcore.scene.kernel import DARK_LOBE, LOBE_COLOURS, Kernel, kernel_named, scale_count
+from liftcore.scene.origin import FILE_ORIGIN, Origin, float32_step, local_origin, usual_size
 from liftcore.scene.render_mode import RenderMode, RenderModel, render_mode_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from torch import Tensor
 
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
 
 SH_ROWS = (1, 4, 9, 16, 25)  # (degree + 1)^2
 _BEYOND = {"opacity_logits": (True, True), "log_scales": (True, False)}  # whether -inf and +inf have a meaning
+ROUNDED = 0.25  # of a splat's size: a coarser float32 has moved splats visibly
 _GEOMETRY = ("means", "quats", "log_scales", "opacity_logits", "beta")  # what rays meet; all else is colour
 
 
@@ -43,6 +46,11 @@ class Splats:
 
     ``render_mode`` decides the setting ``antialiased`` of lifts and renders where that is left at auto.
 
+    Means are about ``origin``. Without one it is chosen: zeros, so that they stay as they came, but for scenes so far
+    from zero that float32 would round them coarsely, such as in map coordinates, whose means come in the file's frame
+    (float64 loses nothing) and are kept about an origin near them (`liftcore.scene.origin`). With one they come
+    relative to it; zeros count as none where they come in float64.
+
     ``layout``, ``extras`` and ``header`` keep what the file had beyond the model (normals, SAGA's ``mask``,
     comments), so that writing gives back what was read.
 
@@ -50,7 +58,7 @@ class Splats:
         InvalidSplats: an array has another shape or holds no floats, or no splat is finite; the error names it.
     """
 
-    means: Tensor  # [P, 3] f32, world frame, scene units
+    means: Tensor  # [P, 3] f32, world frame less the origin, scene units
     quats: Tensor  # [P, 4] f32, w x y z, may be unnormalised; zero counts as identity
     log_scales: Tensor  # [P, 3] f32 ([P, 2] for 2DGS), log of scene units
     opacity_logits: Tensor  # [P] f32 (of [P] or [P, 1]), theta in alpha = sigmoid(theta)
@@ -62,6 +70,7 @@ class Splats:
     layout: tuple[str, ...]  # the file's property names in order; () = the kernel's usual layout
     header: tuple[str, ...]  # the file's header lines verbatim; () = made from the layout
     render_mode: RenderMode | None  # how they were trained, where that is said; of a str, the model's name
+    origin: Origin  # [3] f64, world frame, scene units; zeros but for scenes in map coordinates
     warnings: tuple[str, ...]  # of what in these splats, or in their file, is not as it should be
 
     def __init__(  # noqa: PLR0913 - a field each
@@ -79,6 +88,7 @@ class Splats:
         layout: tuple[str, ...] = (),
         header: tuple[str, ...] = (),
         render_mode: RenderMode | str | None = None,
+        origin: Sequence[float] | None = None,
         warnings: tuple[str, ...] = (),
     ) -> None:
         kernel = kernel_named(kernel)
@@ -100,13 +110,15 @@ class Splats:
             for name, (values, shape) in shapes.items()
             if values is not None
         }
+        origin, rounding = _moved_to_origin(columns, means, origin)
         columns, repairs = _repaired(columns)
         for name in shapes:
             object.__setattr__(self, name, columns.get(name))
         fixed = {"kernel": kernel, "extras": dict(extras or {}), "layout": tuple(layout), "header": tuple(header)}
         mode = render_mode_of(render_mode)
         doubts = _doubts(mode, kernel)
-        fixed |= {"render_mode": mode, "warnings": tuple(dict.fromkeys((*warnings, *repairs, *doubts)))}
+        told = tuple(dict.fromkeys((*warnings, *repairs, *doubts, *rounding)))
+        fixed |= {"render_mode": mode, "origin": origin, "warnings": told}
         for name, value in fixed.items():
             object.__setattr__(self, name, value)
         if self.sh is not None and self.sh.shape[1] not in SH_ROWS:
@@ -121,6 +133,11 @@ class Splats:
             return self
         columns = {name: value.cpu() for name, value in vars(self).items() if isinstance(value, torch.Tensor)}
         return replace(self, **columns, extras={name: column.cpu() for name, column in self.extras.items()})
+
+    def positions(self, rows: Any = slice(None)) -> np.ndarray:
+        """The means [n, 3] of these rows, or of all, in the world frame: f32, or f64 where an origin is added."""
+        means = self.means.detach().cpu().numpy()[rows]
+        return means if self.origin == FILE_ORIGIN else means.astype(np.float64) + self.origin
 
     @property
     def count(self) -> int:
@@ -137,6 +154,31 @@ class Splats:
     def sh_degree(self) -> int | None:
         """The degree of the spherical harmonics, None without colour."""
         return None if self.sh is None else int(self.sh.shape[1] ** 0.5) - 1
+
+
+def _moved_to_origin(
+    columns: dict[str, Tensor], means: Array, origin: Sequence[float] | None
+) -> tuple[Origin, list[str]]:
+    """The origin of the means, which are moved to it where it is chosen here; a warning where they came rounded."""
+    given = shared_tensor(means)
+    if origin is not None and (any(origin) or given.dtype != torch.float64):
+        try:
+            x, y, z = (float(value) for value in origin)
+        except (TypeError, ValueError):
+            x = y = z = math.nan
+        if not all(map(math.isfinite, (x, y, z))):
+            raise InvalidSplats("origin", expected="three finite numbers", got=repr(origin)[:80])
+        return (x, y, z), []
+    chosen = local_origin(given, columns["log_scales"])
+    if chosen == FILE_ORIGIN:
+        return chosen, []
+    offset = torch.tensor(chosen, dtype=torch.float64, device=given.device)
+    columns["means"] = (given.double() - offset).to(torch.float32)
+    step = float32_step(max(map(abs, chosen)))
+    if given.dtype == torch.float64 or step <= ROUNDED * usual_size(columns["log_scales"]):
+        return chosen, []
+    what = f"positions came in float32, which tells {step:.2g} scene units apart where the splats lie"
+    return chosen, [f"{what}, {max(map(abs, chosen)):.3g} from the origin of their file: store them as doubles"]
 
 
 def _doubts(mode: RenderMode | None, kernel: Kernel) -> list[str]:

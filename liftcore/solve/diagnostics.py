@@ -233,7 +233,8 @@ def order_warnings(splats: Splats, views: Sequence[Camera]) -> list[str]:
     means = splats.means[::step].double().numpy()
     coarse = []
     for camera in views:
-        z = means @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
+        axis = camera.about(splats.origin).viewmat[2]
+        z = means @ axis[:3] + axis[3]
         ahead = z > 0
         blur = math.sqrt(LOW_PASS) * z / max(camera.fx, camera.fy)
         steps = np.spacing(z.astype(np.float32))

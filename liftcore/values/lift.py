@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict
 
+from liftcore.scene.origin import FILE_ORIGIN, Origin
 from liftcore.scene.views import composed
 from liftcore.text.table import TableEncoder, own_words
 from liftcore.values.settings import LiftSettings
@@ -49,6 +50,7 @@ class LiftMetadata(BaseModel):
     words: tuple[str, ...] = ()  # that its packs brought: it is asked in these without an encoder
     views: tuple[Annotated[str, AfterValidator(composed)], ...]  # the views that were lifted
     poses: str = ""  # of their cameras (`liftcore.values.lift_file.poses_of`); "" in older lifts
+    origin: Origin = FILE_ORIGIN  # of the splats (`Splats.origin`), and of the positions in ``.splat`` and ``.spz``
     certificate: dict[str, Any]
     timings: dict[str, float]  # seconds a stage
 

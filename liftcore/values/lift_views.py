@@ -6,6 +6,7 @@ from typing import Any
 
 from liftcore.runtime.version import __version__
 from liftcore.scene.cameras import Camera, Cameras
+from liftcore.scene.origin import Origin
 from liftcore.values.lift import LiftMetadata
 from liftcore.values.lift_file import poses_of
 from liftcore.values.pack import Views, as_views, pair
@@ -48,9 +49,9 @@ class LiftViews:
         return (self[number] for number in range(len(self)))
 
     def metadata(
-        self, settings: LiftSettings, diagnostics: dict[str, Any], timings: dict[str, float]
+        self, settings: LiftSettings, origin: Origin, diagnostics: dict[str, Any], timings: dict[str, float]
     ) -> LiftMetadata:
-        """What a lift of these views remembers, of whatever engine."""
+        """What a lift of these views remembers, of whatever engine; the origin is the splats'."""
         table = self.features.table
         return LiftMetadata(
             version=__version__,
@@ -60,6 +61,7 @@ class LiftViews:
             words=table.words if table else (),
             views=tuple(self.names),
             poses=poses_of([self.camera(number) for number in range(len(self))]),
+            origin=origin,
             certificate=diagnostics,
             timings=timings,
         )

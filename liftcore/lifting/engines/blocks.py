@@ -169,6 +169,7 @@ def seen_splats(job: Job, cameras: list[Camera], threads: int | None) -> tuple[S
 def write_scene(splats: Splats, path: Path) -> None:
     """Write the geometry of splats for workers to map."""
     tensors = {name: getattr(splats, name) for name in ("means", "quats", "log_scales", "opacity_logits", "beta")}
+    tensors["origin"] = torch.tensor(splats.origin, dtype=torch.float64)
     write_tensors(path, {name: tensor.cpu() for name, tensor in tensors.items() if tensor is not None}, {})
 
 
@@ -188,13 +189,14 @@ def file_version(path: Path) -> tuple[int, int]:
 def _scene(path: Path, _version: tuple[int, int], kernel: Kernel) -> Splats:
     found = {name: torch.from_numpy(array) for name, array in map_tensors(path)[0].items()}
     means, quats, log_scales, logits = (found[name] for name in ("means", "quats", "log_scales", "opacity_logits"))
-    return Splats(means, quats, log_scales, logits, kernel, beta=found.get("beta"))
+    origin = found["origin"].tolist()
+    return Splats(means, quats, log_scales, logits, kernel, beta=found.get("beta"), origin=origin)
 
 
 def _rows(splats: Splats, rows: slice | Tensor) -> Splats:
     beta = None if splats.beta is None else splats.beta[rows]
     parts = splats.means[rows], splats.quats[rows], splats.log_scales[rows], splats.opacity_logits[rows]
-    return Splats(*parts, splats.kernel, beta=beta)
+    return Splats(*parts, splats.kernel, beta=beta, origin=splats.origin)
 
 
 _packs = lru_cache(maxsize=1)(read_features)  # whose headers are read once a worker

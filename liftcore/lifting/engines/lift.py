@@ -147,7 +147,7 @@ def lift_in_blocks(
         with timings.step("certify"):
             sums, table = columns.pop("sums").numpy(), found.features.table
             certificate = _certificate(work.job, splats, found, plan, sums, columns["evidence"], notes)
-        metadata = found.metadata(settings, certificate, timings.seconds)
+        metadata = found.metadata(settings, splats.origin, certificate, timings.seconds)
         if table:
             columns["embeddings"] = torch.from_numpy(table.embeddings)
         write_index(place / "lift", columns, job.solutions, metadata.model_dump_json())

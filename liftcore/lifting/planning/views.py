@@ -71,7 +71,7 @@ class Visibility:
     """How large the sampled splats are in each view."""
 
     areas: np.ndarray  # [V, n] f32, px^2 of the footprint's outline, at most the image's; 0 where it is not in it
-    centres: np.ndarray  # [V, 3] f64, of the cameras
+    centres: np.ndarray  # [V, 3] f64, of the cameras, about the splats' origin as the means are
     means: np.ndarray  # [n, 3] f32, of the splats
     splats: int  # P, of which n are sampled evenly
 
@@ -108,7 +108,7 @@ def visibility(
     areas = np.zeros((len(cameras), sample.count), np.float32)
     for row, camera in zip(areas, cameras, strict=True):
         row[:] = raster.footprints(camera, params).numpy()
-    centres = np.array([camera.centre for camera in cameras], np.float64).reshape(-1, 3)
+    centres = np.array([camera.about(splats.origin).centre for camera in cameras], np.float64).reshape(-1, 3)
     return Visibility(areas, centres, sample.means.numpy(), splats.count)
 
 

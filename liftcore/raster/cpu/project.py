@@ -32,6 +32,7 @@ from liftcore.scene.quaternions import rotation_rows
 
 if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera
+    from liftcore.scene.origin import Origin
     from liftcore.scene.splats import Splats
 
 # Columns of a projected splat. PLAIN is the opacity without the logits' scale, FADE is -log2(OPACITY); LEAN is dy at
@@ -52,7 +53,7 @@ LARGEST_BETA = 1e30  # such a kernel is a point; larger ones would leave float32
 class Scene(NamedTuple):
     """The splats, activated, as the compiled code takes them: numbers of one kind lie side by side, for vectors."""
 
-    means: np.ndarray  # [3, P] f32, world
+    means: np.ndarray  # [3, P] f32, world less the splats' origin
     axes: np.ndarray  # [3, 3, P] f64 ([3, 2, P] for 2DGS), scaled axes in columns, world
     opacity: np.ndarray  # [P] f64, sigmoid(opacity_logit_scale theta)
     fade: np.ndarray  # [P] f64, -log2 of it
@@ -64,7 +65,7 @@ class Scene(NamedTuple):
 class View(NamedTuple):
     """A camera as the compiled code takes it, for the pixels that a stride leaves."""
 
-    pose: np.ndarray  # [3, 4] f64, world to camera
+    pose: np.ndarray  # [3, 4] f64, world less the splats' origin to camera
     intrinsics: np.ndarray  # [4] f64, fx fy cx cy, pixels
     limits: np.ndarray  # [4] f64, x/z and y/z bounds for the Jacobian: -x +x -y +y
     width: int
@@ -80,13 +81,17 @@ class Targets(NamedTuple):
     ids: np.ndarray  # [P] i32
 
 
-def view_of(camera: Camera, params: CompositingParams) -> View:
+def view_of(camera: Camera, params: CompositingParams, origin: Origin) -> View:
     """The camera for the rays that the stride leaves, with its Jacobian limits: 1.3 times the half field.
 
     With ``u' = (u - offset - 1/2) / n + 1/2``, whole numbers and a half fall on each other, so the rays of the
     strided view are rays of the full one, and its A are rows of the full A: a projected covariance, low-pass
     included, shrinks by ``n^2`` as its distances do. The limits are those of the full view, measured from each side's
     edge.
+
+    Args:
+        camera: in the world frame. params: the stride and its offset. origin: of the splats, which the pose is then
+            about: nothing of it is rounded to float32 before.
     """
     margin_x = FIELD_MARGIN * 0.5 * camera.width / camera.fx
     margin_y = FIELD_MARGIN * 0.5 * camera.height / camera.fy
@@ -104,7 +109,7 @@ def view_of(camera: Camera, params: CompositingParams) -> View:
     if n > 1:
         intrinsics = np.array([camera.fx / n, camera.fy / n, cx, cy])
     width, height = -(-(camera.width - left) // n), -(-(camera.height - top) // n)
-    pose = np.ascontiguousarray(camera.viewmat[:3])
+    pose = np.ascontiguousarray(camera.about(origin).viewmat[:3])
     return View(pose, intrinsics, limits, width, height, LOW_PASS / n**2)
 
 

@@ -206,7 +206,7 @@ class CpuRaster:
         """Areas of the splats' outlines, [P] f32. See the protocol."""
         check_params(self.splats.kernel, camera, params)
         self.forget()  # its projected splats are overwritten
-        ids, rows = self._project(view_of(camera, every_pixel(params)), params)
+        ids, rows = self._project(view_of(camera, every_pixel(params), self.splats.origin), params)
         outlines = math.pi * self._projected[rows, EXTENT_X] * self._projected[rows, EXTENT_Y]
         areas = np.zeros(self.splats.count, np.float32)
         areas[ids[rows]] = outlines.clip(np.finfo(np.float32).tiny, camera.width * camera.height)
@@ -222,7 +222,7 @@ class CpuRaster:
         if self._kept is None or self._kept[0] != key:
             check_params(self.splats.kernel, camera, params)
             self.forget()  # before the next, so that one view's memory is the most ever held
-            view = view_of(camera, params)
+            view = view_of(camera, params, self.splats.origin)
             self._kept = key, self._bin(view, params, *self._project(view, params))
         return self._kept[1]
 

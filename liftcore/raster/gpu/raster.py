@@ -194,7 +194,8 @@ class GpuRaster:
     def footprints(self, camera: Camera, params: CompositingParams) -> Tensor:
         """Areas of the splats' outlines, [P] f32, on the CPU. See the protocol."""
         check_params(self.splats.kernel, camera, params)
-        scene, view = self._scene_with(params.opacity_logit_scale), view_of(camera, every_pixel(params))
+        scene = self._scene_with(params.opacity_logit_scale)
+        view = view_of(camera, every_pixel(params), self.splats.origin)
         seen = project(scene, view, self.splats.kernel, params.antialiased, max(1, self._block >> 4))
         outlines = math.pi * seen.outlines.extent_x * seen.outlines.extent_y
         least, most = torch.finfo(torch.float32).tiny, camera.width * camera.height
@@ -213,7 +214,7 @@ class GpuRaster:
         check_params(self.splats.kernel, camera, params)
         self._kept = None  # before, so that one frame's memory is the most ever held
         scene = self._scene_with(params.opacity_logit_scale)
-        frame = Frame(scene, view_of(camera, params), self.splats.kernel, params, self._block)
+        frame = Frame(scene, view_of(camera, params, self.splats.origin), self.splats.kernel, params, self._block)
         self._kept = camera, params, frame
         return frame
 

@@ -1,0 +1,255 @@
+"""Scenes in map coordinates: as good as at the origin, with every place in the frame of their files."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import liftcore as lc
+from liftcore.evaluate.inspect import describe_cameras, describe_splats
+from liftcore.io.ply import write_splats
+from liftcore.io.splat import splat_blocks
+from liftcore.io.splats import read_places, read_splats, some_rows, with_columns
+from liftcore.io.spz import spz_blocks
+from liftcore.lifting.engines.base import LocalEngine
+from liftcore.lifting.engines.lift import lift_in_blocks
+from liftcore.lifting.planning.views import visibility
+from liftcore.query.ask import ask, top
+from liftcore.query.catalogue import catalogue, table_csv
+from liftcore.query.labels import labels
+from liftcore.query.objects import objects
+from liftcore.query.render import expected_depth, render
+from liftcore.query.scene import QueryScene
+from liftcore.query.segment import segment
+from liftcore.query.terms import Query, Vector
+from liftcore.raster.reference import dense_view
+from liftcore.scene.cameras import Camera, Cameras, viewmat_of
+from liftcore.scene.compositing import CompositingParams
+from liftcore.scene.kernel import Kernel
+from liftcore.scene.origin import FILE_ORIGIN
+from liftcore.scene.splats import Splats
+from liftcore.values.lift import LiftMetadata
+from liftcore.values.lift_file import open_lift, save_lift
+from liftcore.values.settings import LiftSettings
+from tests.scenes import look_at, random_camera, random_regions, random_splats, splats_at
+
+UTM = np.array([500_000.25, 5_400_000.5, 300.125])
+ROUNDING = 2e-5  # of float32 about an origin near the splats, in scene units; half a metre about the file's
+
+
+def moved(splats: Splats, offset: np.ndarray = UTM) -> Splats:
+    return replace(splats, means=splats.means.double() + torch.from_numpy(offset))
+
+
+def moved_camera(camera: Camera, offset: np.ndarray = UTM) -> Camera:
+    pose = camera.viewmat.copy()
+    pose[:3, 3] -= pose[:3, :3] @ offset
+    return camera.replace(viewmat=pose)
+
+
+def scene_of(kernel: Kernel) -> tuple[Splats, list[Camera], dict[str, Any]]:
+    cameras = [random_camera(k, 32 + 5 * k, 24 + 3 * k, name=f"v{k}") for k in range(4)]
+    return (
+        random_splats(3, 300, kernel=kernel),
+        cameras,
+        {one.name: random_regions(k) for k, one in enumerate(cameras)},
+    )
+
+
+def moved_back(splats: Splats, offset: np.ndarray = UTM) -> Splats:
+    """The same splats at the origin, with the bits that they have about their own."""
+    means = splats.means.double() + torch.tensor(splats.origin, dtype=torch.float64) - torch.from_numpy(offset)
+    return replace(splats, means=means.float(), origin=FILE_ORIGIN)
+
+
+@pytest.mark.parametrize("kernel", list(Kernel))
+def test_a_moved_scene_has_the_same_features_pictures_and_plan(kernel: Kernel) -> None:
+    splats, cameras, views = scene_of(kernel)
+    there, there_cameras = moved(splats), [moved_camera(camera) for camera in cameras]
+    settings = LiftSettings.of(dtype="float32", robust_steps=1)
+    here = lc.lift(splats, Cameras(cameras), views, settings)
+    far = lc.lift(there, Cameras(there_cameras), views, settings)
+    assert far.metadata.origin == there.origin != FILE_ORIGIN
+    assert np.abs(np.array(there.origin) - UTM).max() < 4
+    assert torch.equal(far.seen, here.seen)
+    apart = (far.features - here.features).norm(dim=1) / here.features.norm(dim=1).clamp_min(1e-9)
+    assert float(apart[here.seen].quantile(0.95)) < 1e-3  # rays at the edge of a splat may fall on its other side
+    assert torch.allclose(far.evidence, here.evidence, rtol=1e-2, atol=1e-2)
+    first, second = QueryScene(here, splats, Cameras(cameras)), QueryScene(far, there, Cameras(there_cameras))
+    for name in ("v0", "v3"):
+        for one, other in zip(expected_depth(first, name), expected_depth(second, name), strict=True):
+            assert np.mean(~np.isclose(one, other, atol=1e-3)) < 0.01
+        pictures = (render(scene, name, "rgb").astype(int) for scene in (first, second))
+        assert np.abs(next(pictures) - next(pictures)).mean() < 0.1
+    params = CompositingParams()
+    near, away = (visibility(of, these, params) for of, these in ((splats, cameras), (there, there_cameras)))
+    assert np.allclose(near.areas, away.areas, rtol=1e-2, atol=1e-2)
+    assert np.allclose(near.centres - near.means[:4], away.centres - away.means[:4], atol=1e-4)
+
+
+@pytest.mark.parametrize("kernel", list(Kernel))
+def test_the_plain_raster_sees_a_moved_scene_as_it_stood(kernel: Kernel) -> None:
+    splats, camera = random_splats(5, 60, kernel=kernel), random_camera(5)
+    there = moved(splats)
+    here = dense_view(moved_back(there), camera, CompositingParams())
+    far = dense_view(there, moved_camera(camera), CompositingParams())
+    sure = ~(here.cut | far.cut)
+    assert sure.mean() > 0.5
+    assert np.allclose(far.A[sure], here.A[sure], atol=1e-4)
+
+
+@pytest.mark.parametrize("kernel", list(Kernel))
+def test_an_offset_that_float64_holds_leaves_every_bit(kernel: Kernel) -> None:
+    # Cameras along the axes, whose poses an offset of whole numbers moves without rounding.
+    offset = np.array([524_288.0, 4_194_304.0, 8_192.0])
+    splats, cameras, views = scene_of(kernel)
+    centres = np.array([(0.0, 0, -4), (4, 0, 0), (0, 0, 4), (-4, 0, 0)])
+    cameras = [look_at(f"v{k}", centre, 32, 24, 30.0) for k, centre in enumerate(centres)]
+    there = moved(splats, offset)
+    lifts = [
+        lc.lift(replace(splats, means=there.means), Cameras(cameras), views),
+        lc.lift(there, Cameras([moved_camera(camera, np.array(there.origin)) for camera in cameras]), views),
+    ]
+    for name in ("features", "evidence", "agreement", "seen"):
+        assert torch.equal(getattr(lifts[0], name), getattr(lifts[1], name)), name
+
+
+def test_scenes_about_their_own_origin_keep_it_and_their_bits() -> None:
+    plain = random_splats(1)
+    near = np.array([40.0, -300.0, 7.0])
+    for splats in (
+        plain,
+        splats_at([[1.0, 2.0, 3.0]]),
+        splats_at([[0.001, 2000.0, 3.0]], log_scales=0.0),
+        replace(plain, means=torch.cat([plain.means[:-1], torch.full((1, 3), 1e7)])),  # a floater
+        replace(plain, means=plain.means + torch.tensor(near, dtype=torch.float32)),
+        replace(plain, means=plain.means * 1e5, log_scales=plain.log_scales + 11.5),  # millimetres of a house
+    ):
+        again = Splats(splats.means.double().numpy(), splats.quats, splats.log_scales, splats.opacity_logits)
+        assert again.origin == FILE_ORIGIN and again.warnings == ()
+        assert torch.equal(again.means, splats.means)
+        assert np.array_equal(again.positions(), splats.means.numpy())
+
+
+def test_an_origin_stays_with_splats_that_are_changed_and_a_broken_one_is_refused() -> None:
+    there = moved(random_splats(2))
+    some = replace(there, **{name: getattr(there, name)[:5] for name in ("means", "quats", "log_scales", "sh")},
+                   opacity_logits=there.opacity_logits[:5])  # fmt: skip
+    assert some.origin == there.origin
+    assert np.array_equal(some.positions(), there.positions()[:5])
+    with pytest.raises(lc.InvalidSplats, match="origin"):
+        replace(there, origin=(1.0, float("nan"), 0.0))
+
+
+def doubles(path: Path, splats: Splats, offset: np.ndarray) -> None:
+    write_splats(moved(splats, offset), path)
+
+
+def floats(path: Path, splats: Splats, offset: np.ndarray) -> None:
+    write_splats(replace(splats, means=(splats.means.double() + torch.from_numpy(offset)).float()), path)
+
+
+def checkpoint(path: Path, splats: Splats, offset: np.ndarray) -> None:
+    means = splats.means.double() + torch.from_numpy(offset)
+    named = {"means": means, "quats": splats.quats, "scales": splats.log_scales, "opacities": splats.opacity_logits}
+    torch.save({"splats": named | {"sh0": splats.sh, "shN": torch.zeros(splats.count, 0, 3)}}, path)
+
+
+def splat(path: Path, splats: Splats, offset: np.ndarray) -> None:
+    shifted = (splats.means.double() + torch.from_numpy(offset)).float()
+    path.write_bytes(b"".join(splat_blocks(replace(splats, means=shifted))))
+
+
+FILES = {"doubles.ply": (doubles, 1e-5), "scene.pt": (checkpoint, 1e-5), "floats.ply": (floats, 0.5),
+         "scene.splat": (splat, 0.5)}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_every_file_gives_the_positions_that_it_holds(name: str, tmp_path: Path) -> None:
+    write, step = FILES[name]
+    splats, path = random_splats(4, 200), tmp_path / name
+    write(path, splats, UTM)
+    read = read_splats(path)
+    wanted = splats.means.double().numpy() + UTM
+    assert read.origin != FILE_ORIGIN and np.abs(read.means.numpy()).max() < 16
+    assert np.abs(read.positions() - wanted).max() <= step
+    assert np.array_equal(read_places(path), read.positions())
+    assert any("float32" in warning for warning in read.warnings) == (step > 0.1)
+    described = describe_splats(read)
+    assert np.abs(np.array(described["box"]) - [wanted.min(axis=0), wanted.max(axis=0)]).max() <= step
+    assert described["origin"] == list(read.origin)
+    # What is written is in the same frame: doubles, or the file's own bytes.
+    kept = np.arange(200) % 3 == 0
+    (tmp_path / "some.ply").write_bytes(b"".join(some_rows(path, kept)))
+    assert np.abs(read_splats(tmp_path / "some.ply").positions() - read.positions()[kept]).max() <= ROUNDING
+    numbers = {"object": np.arange(200, dtype=np.int32)}
+    (tmp_path / "more.ply").write_bytes(b"".join(with_columns(path, numbers)))
+    assert np.abs(read_splats(tmp_path / "more.ply").positions() - read.positions()).max() <= ROUNDING
+    # The formats of viewers are about the origin: they have no room for it.
+    for suffix, blocks in ((".splat", splat_blocks), (".spz", spz_blocks)):
+        (tmp_path / f"again{suffix}").write_bytes(b"".join(blocks(read)))
+        again = read_splats(tmp_path / f"again{suffix}")
+        assert again.origin == FILE_ORIGIN and torch.allclose(again.means, read.means, atol=1e-5)
+
+
+def test_cameras_whose_rotation_has_few_digits_stand_where_their_file_says() -> None:
+    camera = random_camera(9)
+    rotation = camera.viewmat[:3, :3].T.astype(np.float32).astype(np.float64)
+    rotation[:, 0] *= 1 + 1e-5  # as of a file with five digits
+    there = camera.replace(viewmat=viewmat_of(rotation, UTM))
+    assert np.abs(there.centre - UTM).max() < 1e-6
+    assert np.abs(there.about((500_000.0, 5_400_000.0, 256.0)).centre - (0.25, 0.5, 44.125)).max() < 1e-2
+    assert there.about(FILE_ORIGIN) is there
+    assert np.allclose(describe_cameras(Cameras([there]))["box"], [UTM, UTM], atol=1e-6, rtol=0)
+
+
+def asked_of(splats: Splats, cameras: Cameras, views: dict[str, Any]) -> dict[str, Any]:
+    """Every answer that has a place in it: boxes and points [n, 3], and the rows that they are of."""
+    lift = lc.lift(splats, cameras, views, LiftSettings.of(dtype="float32"))
+    scene = QueryScene(lift, splats, cameras)
+    vectors = np.eye(6, dtype=np.float32)[:2]
+    answer = ask(scene, Query((Vector(tuple(vectors[0].tolist())),), threshold=0.2, absent="keep"))
+    best, parts = top(answer, scene, 5), objects(scene, answer)
+    words = segment(scene, ["one", "two"], vectors)
+    told = labels(scene, words).document
+    whole = replace(lift, object=torch.arange(len(lift.features)).int() % 2, object_views=torch.zeros(2, 5).int())
+    things = catalogue(QueryScene(whole, splats, cameras))
+    rows = [line.split(",")[5:14] for line in table_csv(things).decode().splitlines()[1:]]
+    return {
+        "top": [one.position for one in best.best],
+        "box": best.box,
+        "objects": [point for one in parts.found for point in (one.centre, *one.box)],
+        "words": [point for one in words.found for point in one.box],
+        "labels": [one["oriented_box"]["centre"] for one in told["instances"]],
+        "catalogue": [point for one in things.objects for point in (one.centre, *one.box)],
+        "table": np.array(rows, float).reshape(-1, 3),
+    }
+
+
+def test_every_answer_with_a_place_is_in_the_frame_of_the_file() -> None:
+    splats, cameras, views = scene_of(Kernel.GAUSSIAN_3D)
+    here = asked_of(splats, Cameras(cameras), views)
+    far = asked_of(moved(splats), Cameras([moved_camera(camera) for camera in cameras]), views)
+    for name, places in here.items():
+        assert len(places) and np.abs(np.array(far[name]) - np.array(places) - UTM).max() < 1e-3, name
+
+
+def test_a_lift_in_blocks_and_its_file_keep_the_origin(tmp_path: Path) -> None:
+    splats, cameras, views = scene_of(Kernel.GAUSSIAN_3D)
+    there, cameras = moved(splats), [moved_camera(camera) for camera in cameras]
+    settings = LiftSettings.of(preset="row-sum")
+    one = lc.lift(there, Cameras(cameras), views, settings)
+    other = lift_in_blocks(
+        LocalEngine(), there, Cameras(cameras), views, settings, on_plan=lambda _: None, selected=9
+    )
+    assert torch.equal(one.features, other.features) and one.metadata.origin == other.metadata.origin
+    save_lift(other, tmp_path / "scene.lift")
+    assert open_lift(tmp_path / "scene.lift").metadata.origin == there.origin
+    told = one.metadata.model_dump()
+    del told["origin"]  # as a lift of before has it
+    assert LiftMetadata(**told).origin == FILE_ORIGIN
