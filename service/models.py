@@ -24,6 +24,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError
 
 from liftcore.scene.distortion import MAX_SIDE
+from liftcore.scene.origin import FILE_ORIGIN
 from liftcore.values.settings import LiftSettings
 from service import limits
 
@@ -333,6 +334,9 @@ class LiftResult(BaseModel):
     words: list[str] = Field(description="that its packs brought: it is asked in these without an encoder")
     views: list[str] = Field(description="the views that were lifted; very many are at links.views alone")
     view_count: int = Field(description="how many these are")
+    origin: tuple[float, float, float] = Field(
+        FILE_ORIGIN, description="of the positions of its `.splat` and `.spz`; zeros but in map coordinates"
+    )
     certificate: dict[str, Any]
     timings: dict[str, float] = Field(description="seconds a stage")
     created: float

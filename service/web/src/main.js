@@ -236,6 +236,7 @@ async function appear(mine) {
 }
 
 function stand(parameters) {
+  viewer.origin = lift.origin;
   viewer.settle(look.views);
   if (look.view) viewer.to(look.view, true);
   const camera = (parameters.get("camera") || "").split(",").map(Number);
@@ -310,7 +311,7 @@ function pointing(canvas, built) {
 
 function hit(found, less) {
   if (!found) return tell("There is no splat there.");
-  return pointed(`splat:${found.splat}`, less, found.point.toArray());
+  return pointed(`splat:${found.splat}`, less, found.at);
 }
 
 // Somebody points at a thing: more of it, or with the panel of names what it is.

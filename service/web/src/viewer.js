@@ -40,6 +40,7 @@ export class Viewer {
     this.boxes = new THREE.Group();
     this.scene.add(this.boxes);
     this.middle = new THREE.Vector3();
+    this.origin = [0, 0, 0];
     this.reach = 1;
     this.spark = new SparkRenderer({
       renderer: this.renderer, preBlurAmount: 0.3, blurAmount: 0, sortRadial: false, maxStdDev: 3, minAlpha: 1 / 255,
@@ -93,8 +94,22 @@ export class Viewer {
     gl.deleteSync(fence);
   }
 
+  // A point of the lift's frame in that of the splats, which are about an origin, and back: cards compute in float32.
+  local(point) {
+    return new THREE.Vector3(...point.map((value, axis) => value - this.origin[axis]));
+  }
+
+  world(point) {
+    return point.map((value, axis) => value + this.origin[axis]);
+  }
+
+  // A view of the lift's frame among the splats.
+  pose({ viewmat }) {
+    return poseOf(viewmat.slice(0, 3).map(row => [...row.slice(0, 3), row[3] + along(row, this.origin)]));
+  }
+
   place(point) {
-    const there = new THREE.Vector3(...point).project(this.camera);
+    const there = this.local(point).project(this.camera);
     const { clientWidth: width, clientHeight: height } = this.canvas;
     return { x: (there.x + 1) / 2 * width, y: (1 - there.y) / 2 * height, before: there.z < 1 };
   }
@@ -169,7 +184,7 @@ export class Viewer {
   // Which way is up, and what all the views look at. Cameras are seldom rolled: up is the mean of their own, but for
   // what of it lies along their horizontal axes. The focus is the point nearest to their lines of sight.
   settle(views) {
-    const poses = views.map(poseOf);
+    const poses = views.map(view => this.pose(view));
     const mean = poses.reduce((sum, pose) => sum.add(pose.up), new THREE.Vector3());
     this.up = mean.applyMatrix3(outer(poses.map(pose => pose.right), 1, 0.002 * poses.length).invert()).normalize();
     if (this.up.lengthSq() < 0.5) this.up.set(0, 0, 1);
@@ -190,7 +205,7 @@ export class Viewer {
   }
 
   to(view, quick) {
-    const pose = poseOf(view);
+    const pose = this.pose(view);
     const depth = this.focus.clone().sub(pose.position).dot(pose.forward);
     const target = pose.position.clone().addScaledVector(pose.forward, depth > 0 ? depth : this.reach);
     this.lens = { halfWidth: view.width / 2 / view.fx, halfHeight: view.height / 2 / view.fy };
@@ -201,9 +216,9 @@ export class Viewer {
   // Look at a box or a point: from where one is, or from a view that shows it. That view itself shows a box which no
   // picture nearer by would hold.
   toBox({ low, high }, view = null) {
-    const box = new THREE.Box3(new THREE.Vector3(...low), new THREE.Vector3(...high));
+    const box = new THREE.Box3(this.local(low), this.local(high));
     const sphere = box.getBoundingSphere(new THREE.Sphere());
-    const away = view ? poseOf(view).position.sub(sphere.center) : this.camera.position.clone().sub(this.controls.target);
+    const away = view ? this.pose(view).position.sub(sphere.center) : this.camera.position.clone().sub(this.controls.target);
     const angle = this.camera.fov * Math.PI / 360;
     const far = 1.9 * Math.max(sphere.radius, this.reach / 100) / Math.sin(Math.min(angle, Math.atan(Math.tan(angle) * this.camera.aspect)));
     if (view && far > away.length()) return this.to(view);
@@ -288,7 +303,7 @@ export class Viewer {
         best = place;
       }
     }
-    return best < 0 ? null : { splat: this.row(best), point: hit.point };
+    return best < 0 ? null : { splat: this.row(best), point: hit.point, at: this.world(hit.point.toArray()) };
   }
 
   // The middle of the splats of each value, from a value a row of the file: medians, as strays count for nothing.
@@ -296,10 +311,10 @@ export class Viewer {
     const rows = Array.from({ length: most + 1 }, () => []);
     const every = Math.max(1, Math.floor(this.count / SAMPLE));
     for (let place = 0; place < this.count; place += every) rows[values[this.row(place)]].push(place);
-    return rows.map(places => (places.length ? [0, 1, 2].map(axis => {
-      const along = places.map(place => this.floats[8 * place + axis]).sort((a, b) => a - b);
-      return along[along.length >> 1];
-    }) : null));
+    return rows.map(places => (places.length ? this.world([0, 1, 2].map(axis => {
+      const sorted = places.map(place => this.floats[8 * place + axis]).sort((a, b) => a - b);
+      return sorted[sorted.length >> 1];
+    })) : null));
   }
 
   // This camera as the service draws it, in a picture so many pixels wide at most.
@@ -311,6 +326,7 @@ export class Viewer {
     this.camera.updateMatrixWorld();
     const m = this.camera.matrixWorldInverse.elements; // column by column, OpenGL's axes
     const viewmat = [0, 1, 2, 3].map(row => [0, 1, 2, 3].map(column => (row === 1 || row === 2 ? -1 : 1) * m[4 * column + row]));
+    for (const row of viewmat.slice(0, 3)) row[3] -= along(row, this.origin);
     return { width, height, fx: height / 2 / Math.tan(this.camera.fov * Math.PI / 360), viewmat };
   }
 
@@ -319,7 +335,7 @@ export class Viewer {
     for (const line of this.boxes.children) line.geometry.dispose();
     this.boxes.clear();
     for (const { low, high, colour, strong } of boxes) {
-      const box = new THREE.Box3(new THREE.Vector3(...low), new THREE.Vector3(...high));
+      const box = new THREE.Box3(this.local(low), this.local(high));
       const line = new THREE.Box3Helper(box, new THREE.Color(colour));
       Object.assign(line.material, { depthTest: false, transparent: true, opacity: strong ? 1 : 0.45 });
       line.renderOrder = 10;
@@ -335,9 +351,14 @@ export class Viewer {
 }
 
 // OpenCV's axes: x right, y down, z forward.
-function poseOf({ viewmat: m }) {
+function poseOf(m) {
   const position = new THREE.Vector3(...[0, 1, 2].map(axis => -(m[0][axis] * m[0][3] + m[1][axis] * m[1][3] + m[2][axis] * m[2][3])));
   return { position, right: new THREE.Vector3(m[0][0], m[0][1], m[0][2]), forward: new THREE.Vector3(m[2][0], m[2][1], m[2][2]), up: new THREE.Vector3(-m[1][0], -m[1][1], -m[1][2]) };
+}
+
+// The first three numbers of a row times a point.
+function along(row, point) {
+  return row[0] * point[0] + row[1] * point[1] + row[2] * point[2];
 }
 
 // sign * sum of v v^T + ridge * I, of vectors of the world.
