@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from liftcore.text import TextEncoder
 
 
+LOCAL_SUFFIXES = (".splat", ".spz")  # of files whose positions are about the splats' origin
 OUTPUTS = ("object", "coloured", "scores", "mask", "attention", "overlay")  # options that name a file to write
 
 
@@ -101,6 +102,8 @@ def run(options: argparse.Namespace) -> int:
         found = objects(scene, answer)
         document |= {"objects": [asdict(thing) for thing in found.found], "strays": found.strays}
     document["files"] = write_files(files, _contents(options, scene, answer, seen, view))
+    if options.object is not None and options.object.suffix.lower() in LOCAL_SUFFIXES and any(scene.splats.origin):
+        document["origin"] = scene.splats.origin
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
 
@@ -234,6 +237,8 @@ def _lines(document: dict[str, Any]) -> Iterable[str]:
     if document.get("strays"):
         yield f"  {document['strays']} splats are strays: single or in specks, and of no object"
     yield from (f"  {kind}: {path}" for kind, path in document["files"].items())
+    if "origin" in document:
+        yield f"  positions in its format are less the origin of map coordinates, {place_of(document['origin'])}"
 
 
 def place_of(point: tuple[float, ...]) -> str:

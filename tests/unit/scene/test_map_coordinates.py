@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from liftcore.io.splats import read_places, read_splats, some_rows, with_columns
 from liftcore.io.spz import spz_blocks
 from liftcore.lifting.engines.base import LocalEngine
 from liftcore.lifting.engines.lift import lift_in_blocks
+from liftcore.lifting.files import lift_files
 from liftcore.lifting.planning.views import visibility
 from liftcore.query.ask import ask, top
 from liftcore.query.catalogue import catalogue, table_csv
@@ -36,7 +38,9 @@ from liftcore.scene.splats import Splats
 from liftcore.values.lift import LiftMetadata
 from liftcore.values.lift_file import open_lift, save_lift
 from liftcore.values.settings import LiftSettings
+from tests.api.tiny_scene import cameras_document, make_scene, ply, splat_rows
 from tests.scenes import look_at, random_camera, random_regions, random_splats, splats_at
+from tests.unit.command_line import run
 
 UTM = np.array([500_000.25, 5_400_000.5, 300.125])
 ROUNDING = 2e-5  # of float32 about an origin near the splats, in scene units; half a metre about the file's
@@ -253,3 +257,52 @@ def test_a_lift_in_blocks_and_its_file_keep_the_origin(tmp_path: Path) -> None:
     told = one.metadata.model_dump()
     del told["origin"]  # as a lift of before has it
     assert LiftMetadata(**told).origin == FILE_ORIGIN
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The lift of a scene of files at the origin, and of the same moved: a PLY of doubles and a transforms.json."""
+    lifts = {}
+    for name, offset in (("here", np.zeros(3)), ("far", UTM)):
+        folder, tiny = tmp_path_factory.mktemp(name), make_scene()
+        rows = splat_rows()
+        doubled = rows.astype("f8")
+        doubled[:, :3] += offset
+        (folder / "s.ply").write_bytes(
+            ply(rows).split(b"end_header")[0].replace(b"float", b"double") + b"end_header\n"
+        )
+        with (folder / "s.ply").open("ab") as file:
+            file.write(doubled.tobytes())
+        document = cameras_document()
+        for frame in document["frames"]:
+            pose = np.array(frame["transform_matrix"])
+            pose[:3, 3] += offset
+            frame["transform_matrix"] = pose.tolist()
+        (folder / "c.json").write_text(json.dumps(document))
+        (folder / "f.st").write_bytes(tiny.features)
+        lift = lift_files(folder / "s.ply", folder / "c.json", [folder / "f.st"], LiftSettings.of(preset="row-sum"))
+        save_lift(lift, folder / "scene.lift")
+        lifts[name] = folder / "scene.lift"
+    return lifts
+
+
+def test_the_command_line_tells_places_in_the_frame_of_the_file(
+    tiny: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = ["--like", "left:16,12", "--threshold", "0.5", "--top", "3", "--objects"]
+    told = {}
+    for name, lift in tiny.items():
+        status, out, err = run(capsys, "query", lift, *asked, "--object", tmp_path / f"{name}.ply", "--json")
+        assert (status, err) == (0, "")
+        told[name] = json.loads(out)
+    here, far = ([*(one["position"] for one in found["top"]), *found["box"], *found["objects"][0]["box"]]
+                 for found in told.values())  # fmt: skip
+    assert np.abs(np.array(far) - np.array(here) - UTM).max() < ROUNDING
+    assert [one["splat"] for one in told["far"]["top"]] == [one["splat"] for one in told["here"]["top"]]
+    positions = [read_splats(tmp_path / f"{name}.ply").positions() for name in told]
+    assert np.abs(positions[1] - positions[0] - UTM).max() < ROUNDING
+    status, out, _ = run(capsys, "query", tiny["far"], *asked, "--object", tmp_path / "far.splat")
+    assert status == 0 and "5400000" in out.splitlines()[-1]
+    assert np.abs(read_splats(tmp_path / "far.splat").means.numpy()).max() < 16
+    status, out, _ = run(capsys, "inspect", tiny["far"].parent / "s.ply", "--json")
+    assert status == 0 and np.abs(np.array(json.loads(out)["box"]) - UTM).max() < 8
