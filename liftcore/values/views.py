@@ -19,6 +19,7 @@ NO_LABEL = -1  # a pixel that a level leaves unlabelled
 LARGEST = 1e15  # of a feature; float32 sums of squares over all channels stay finite far beyond
 FLATTEST = 16  # times longer than wide, or wider: no photo is, but a list of cells
 MAX_CHANNELS = 1 << 16
+PLANES = "of masks [M, h, w] that do not overlap give numpy.where(masks.any(0), masks.argmax(0), -1), a row a mask"
 INTEGERS = (torch.int32, torch.int16, torch.int64, torch.int8, torch.uint8)
 WIDENED = (torch.uint16, torch.uint32)  # of pictures of 16 bits; torch does hardly anything with these
 Array = Tensor | np.ndarray
@@ -157,9 +158,15 @@ def _labels(values: object, rows: int, where: str) -> Tensor:
     except (TypeError, ValueError):
         raise InvalidFeatures(where, expected="integers [L, h, w]", got=type(values).__name__) from None
     found = without_unit_axes(found.to(torch.int64) if found.dtype in WIDENED else found, 3)
+    if found.ndim == 3 and found.shape[-1] == 1 < len(found):  # [h, w, 1]: no photo is a pixel wide
+        found = found[..., 0]
     if found.ndim not in (2, 3) or not found.numel() or found.dtype not in INTEGERS:
-        raise InvalidFeatures(where, expected="integers [L, h, w], no side empty", got=_kind(found))
+        hint = PLANES if found.dtype == torch.bool else ""
+        raise InvalidFeatures(where, expected="integers [L, h, w], no side empty", got=_kind(found), hint=hint)
     low, high = (int(value) for value in torch.aminmax(found))
+    if found.ndim == 3 and len(found) == rows > 2 and (low, high) == (0, 1):  # would be of the first two rows alone
+        got = f"{_kind(found)} of zeros and ones, a plane for each of the {rows} rows"
+        raise InvalidFeatures(where, expected="integers [L, h, w] of rows", got=got, hint=PLANES)
     if low < NO_LABEL or high >= rows:
         expected = f"rows of its codebook (0..{rows - 1}) or {NO_LABEL} for none"
         got = f"the label {low if low < NO_LABEL else high}"

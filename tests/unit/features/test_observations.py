@@ -167,3 +167,12 @@ def test_packs_tell_before_a_map_is_read_what_size_it_will_have(tmp_path: Path) 
     assert packs["bent"].codebook.shape == (1, 3)
     assert [packs.map_size(name) for name in maps] == [(30, 22), (15, 11), (30, 22)]  # of the photos, as they lie
     assert tuple(packs.specs("plain")["labels"].shape) == (1, 22, 30)
+
+
+def test_masks_in_place_of_labels_are_refused_with_a_way_on() -> None:
+    labels = np.arange(12).reshape(3, 4) % 3
+    planes = labels == np.arange(3)[:, None, None]
+    for masks in (planes, planes.astype(np.uint8)):
+        with pytest.raises(InvalidFeatures, match=r"labels: .*masks\.argmax\(0\)"):
+            Regions(masks, np.eye(3, dtype=np.float32))
+    assert Regions(labels[..., None], np.eye(3, dtype=np.float32)).labels.tolist() == [labels.tolist()]
