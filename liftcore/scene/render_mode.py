@@ -17,6 +17,8 @@ from pathlib import Path
 from liftcore.errors import InvalidSplats
 from liftcore.scene.kernel import Kernel
 
+BY_HAND = "set by hand"  # of `rendering_reason`: the setting was not auto
+
 
 class RenderModel(StrEnum):
     """What a renderer has to do with splats."""
@@ -130,11 +132,11 @@ def mode_beside(path: Path) -> RenderMode | None:
 def rendering_reason(mode: RenderMode | None, antialiased: bool) -> str:
     """Why splats are rendered as they are, in words; ``antialiased`` is what the settings came to."""
     if mode is None:
-        return "set by hand" if antialiased else "nothing says otherwise"
+        return BY_HAND if antialiased else "nothing says otherwise"
     source = mode.source or "render_mode of the splats"
     if (mode.model is RenderModel.ANTIALIASED) is antialiased:
         return f"{source} says so"
-    return f"against {source}"
+    return f"{BY_HAND}, against {source}"
 
 
 def rendering_warnings(mode: RenderMode | None, antialiased: bool, kernel: Kernel) -> list[str]:

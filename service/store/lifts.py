@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from liftcore.errors import NotFound
+from liftcore.scene.render_mode import BY_HAND
 from service.errors import InvalidRequest
 from service.store.assets import own
 from service.store.database import Database, Page, after, insert, page_of, parsed, record_of
@@ -100,7 +101,10 @@ def order_of(metadata: Mapping[str, Any]) -> JobOrder:
     """
     files = (metadata["splats"], metadata["cameras"], *metadata["features"])
     splats, cameras, *features = [f"sha256:{file['sha256']}" for file in files]
-    return JobOrder(splats, cameras, tuple(features), metadata["settings"])
+    settings, plan = dict(metadata["settings"]), dict(metadata["certificate"]).get("plan")
+    if isinstance(plan, Mapping) and BY_HAND not in str(plan.get("rendering", BY_HAND)):
+        settings["antialiased"] = "auto"  # a lift remembers what that came to
+    return JobOrder(splats, cameras, tuple(features), settings)
 
 
 class LiftStore:
