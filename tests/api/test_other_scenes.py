@@ -88,6 +88,39 @@ def test_kernel_that_does_not_fit_the_splats_is_refused_with_the_order(
     assert client.delete(f"/assets/{asset}").status_code == 204
 
 
+def test_a_scene_in_map_coordinates_answers_in_them(client: TestClient, uploaded: Uploaded) -> None:
+    offset, rows, document = (
+        np.array([500_000.25, 5_400_000.5, 300.125]),
+        splat_rows().astype("f8"),
+        cameras_document(),
+    )
+    rows[:, :3] += offset
+    header = ply(splat_rows()).split(b"end_header")[0].replace(b"float", b"double")
+    splats = put(client, AssetKind.SPLATS, header + b"end_header\n" + rows.tobytes())
+    for frame in document["frames"]:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, 3] += offset
+        frame["transform_matrix"] = pose.tolist()
+    cameras = put(client, AssetKind.CAMERAS, json.dumps(document).encode())
+    order = replace(uploaded, splats=splats, cameras=cameras).order(preset="row-sum", certificate_rays=0)
+    job = ended(client, client.post("/lift", json=order).headers["location"])
+    assert job["state"] == "succeeded", job
+    answer = client.get("/query", params={"lift": job["id"], "text": "apple", "threshold": 0.5, "top": 3}).json()
+    for one in answer["top"]:
+        assert np.abs(np.array(one["position"]) - rows[one["splat"], :3]).max() < 1e-5
+    (thing, *_) = client.get(answer["links"]["objects"]).json()["objects"]
+    for box in (answer["box"], thing["box"]):
+        assert (np.array(box["low"]) >= rows[:, :3].min(axis=0) - 1e-5).all()
+        assert (np.array(box["high"]) <= rows[:, :3].max(axis=0) + 1e-5).all()
+    # A viewer's file is about the origin of the lift, and views are in the file's frame.
+    scene = np.frombuffer(client.get(f"/lifts/{job['id']}/splats").content, "<f4").reshape(-1, 8)[:, :3]
+    origin = client.get(f"/lifts/{job['id']}").json()["origin"]
+    assert np.abs(scene + np.array(origin) - rows[:, :3]).max() < 1e-5
+    for view in client.get(f"/lifts/{job['id']}/views").json()["views"]:
+        pose = np.array(view["viewmat"])
+        assert np.abs(-pose[:3, :3].T @ pose[:3, 3] - offset).max() < 8
+
+
 @pytest.mark.parametrize("name", ["degree3.compressed.ply", "degree3.v4.spz", "degree3.sog"])
 def test_formats_that_hold_no_code_are_assets(client: TestClient, name: str) -> None:
     content = (FILES / name).read_bytes()
