@@ -13,6 +13,7 @@ from typing import Any
 from safetensors import SafetensorError, safe_open
 
 from liftcore.errors import InvalidInput
+from liftcore.io.kinds import wrong_kind
 from liftcore.io.safetensors_file import check_header
 from liftcore.text import BUILT_IN, ENCODER_SPECS, NO_WORDS, OWN_WORDS, without_templates
 from service.errors import InvalidRequest, Misconfigured
@@ -125,6 +126,8 @@ def _require_readable(argument: str, path: Path) -> None:
 
 def _require_table(argument: str, path: Path) -> None:
     """Look at the header alone: the values are read, and judged, where the table is opened."""
+    if error := wrong_kind(path, "table", InvalidInput, expected=TABLE):
+        raise Misconfigured(argument, expected=error.expected, got=f"{error.got} at {path}", hint=error.hint)
     try:
         check_header(path, str(path), InvalidInput, expected=TABLE)
         handle: Any

@@ -229,7 +229,7 @@ _STEP = re.compile(r"(?:iteration|point_cloud|export|step|ckpt|splat)s?[_-]?0*([
 _CHECKPOINT = re.compile(r"(^|/)(ckpt_[0-9]+[^/]*\.pt|step-[0-9]+\.ckpt)$")
 _NO_SCENE = re.compile(r"(^|/)(points?3d|sparse_pc|input|fused|dense|mesh|poisson|meshed)[^/]*\.ply$", re.IGNORECASE)
 _OF_FEATURES = re.compile(r"(_features|_filtered|_labels)\.pt$")  # of splat-distiller, beside the checkpoint
-Found = TypeVar("Found", bound=InvalidInput)
+Fault = TypeVar("Fault", bound=InvalidInput)
 
 
 def kind_of(path: Path) -> str | None:
@@ -238,8 +238,8 @@ def kind_of(path: Path) -> str | None:
 
 
 def wrong_kind(
-    path: Path, wanted: str, fault: type[Found], *, argument: str = "", expected: str = ""
-) -> Found | None:
+    path: Path, wanted: str, fault: type[Fault], *, argument: str = "", expected: str = ""
+) -> Fault | None:
     """The error for a file or folder in the place of one of another kind; None where it may be of the wanted kind.
 
     Args:
@@ -251,25 +251,33 @@ def wrong_kind(
         return None
     hint = found.hint
     if found.kind is not None or (wanted == "splats" and found.splats):
-        hint = _instead(path, found, wanted) or hint
+        hint = _replacement_hint(path, found, wanted) or hint
     return fault(argument or str(path), expected=expected or wanted, got=found.name, hint=hint)
 
 
-def _instead(path: Path, found: FileKind, wanted: str) -> str:
-    """What to give in the place of a file or folder of ours."""
+def _replacement_hint(path: Path, found: FileKind, wanted: str) -> str:
+    """The hint of what to give in the place of a file or folder of ours."""
     if wanted == "splats" and found.splats:
         one = found.splats[0]
         if path.is_dir():
             return f"give {path / one}"
         return f"unzip it and give {one}"
-    made = {
+    if found.format is SplatFormat.CHECKPOINT and wanted in ("features", "masks", "table"):
+        return "save its arrays as .npy files ('splatlift pack npy' makes packs of those), or as safetensors"
+    hints = {
         ("features", "photos"): "'splatlift encode IMAGES -o PACK' makes a feature pack of photos",
         ("features", "masks"): "masks to judge by have no vectors; 'splatlift pack' makes feature packs",
+        ("features", "table"): "a table of text embeddings belongs to a query, as --table",
+        ("features", "lift"): "a lift belongs to 'splatlift query'; give the feature packs that it was made of",
+        ("table", "features"): "a table has 'embeddings' [n, F] and the metadata 'words'; a pack's own words answer "
+        "without one",
+        ("table", "lift"): "a table has 'embeddings' [n, F] and the metadata 'words'; a lift's own words answer "
+        "without one",
         ("cameras", "photos"): "give the COLMAP model, transforms.json or cameras.json of these photos",
         ("lift", "features"): "'splatlift lift SPLATS CAMERAS FEATURES -o LIFT' makes a lift of them",
         ("lift", "splats"): "'splatlift lift SPLATS CAMERAS FEATURES -o LIFT' makes a lift of them",
     }
-    return made.get((wanted, found.kind or ""), "")
+    return hints.get((wanted, found.kind or ""), "")
 
 
 def identify(path: Path) -> FileKind:
@@ -302,10 +310,10 @@ def splat_format(path: Path) -> SplatFormat | None:
 def _file(path: Path) -> FileKind:
     with open_regular(path) as handle:
         head, size = handle.read(MAX_HEADER_BYTES), handle.seek(0, 2)
-    return _first(_file_rules(path, head, size))
+    return _first_match(_file_rules(path, head, size))
 
 
-def _first(rules: Iterable[FileKind | None]) -> FileKind:
+def _first_match(rules: Iterable[FileKind | None]) -> FileKind:
     """The first that fits; the last of such rules always does."""
     return next(found for found in rules if found is not None)
 
@@ -336,7 +344,8 @@ def _file_rules(path: Path, head: bytes, size: int) -> Iterator[FileKind | None]
 
 
 def _splats_as(found: SplatFormat) -> FileKind:
-    return FileKind("splats", "splats", format=found)
+    pickled = "a checkpoint or another Python pickle, which may run code when it is opened"
+    return FileKind("splats", pickled if found is SplatFormat.CHECKPOINT else "splats", format=found)
 
 
 def _ply(head: bytes) -> FileKind:
@@ -396,7 +405,7 @@ def _by_magic(head: bytes) -> FileKind | None:
 
 
 def _is_ksplat(head: bytes, size: int) -> bool:
-    """Whether a header of GaussianSplats3D's format fits: version 0.1, sections and splats within their maxima."""
+    """Return whether a header of GaussianSplats3D's format fits: version 0.1, sections and splats within maxima."""
     if len(head) < HEAD_BYTES or head[:2] != b"\0\1":
         return False
     most_sections, sections, most_splats, splats, level = struct.unpack_from("<4IH", head, 4)
@@ -409,7 +418,7 @@ def _cameras_of(program: str) -> FileKind:
 
 
 def _by_text(path: Path, head: bytes, size: int) -> FileKind | None:
-    """What a text is: JSON, a page, a mesh, COLMAP's text, or a server's error."""
+    """The kind of a text: JSON, a page, a mesh, COLMAP's text, or a server's error."""
     start = head[:HEAD_BYTES].lstrip(b"\xef\xbb\xbf \t\r\n")
     lower, suffix = start.lower(), path.suffix.lower()
     if start[:1] in (b"{", b"["):
@@ -425,7 +434,7 @@ def _by_text(path: Path, head: bytes, size: int) -> FileKind | None:
     if re.match(rb"#[^\n]*list with one line of data per", lower):
         return _colmap_part(path)
     is_answer = size < HEAD_BYTES and suffix not in (*_BY_SUFFIX, ".txt", ".yml", ".yaml", ".md", ".csv")
-    return FileKind(None, f"a text that begins with {_shown(start)}", MAYBE_DOWNLOAD) if is_answer else None
+    return FileKind(None, f"a text that begins with {_shorten(start)}", MAYBE_DOWNLOAD) if is_answer else None
 
 
 def _colmap_part(path: Path) -> FileKind:
@@ -437,7 +446,7 @@ def _is_text(head: bytes) -> bool:
     return not any(byte < 9 or 13 < byte < 32 for byte in head[:HEAD_BYTES])
 
 
-def _shown(start: bytes) -> str:
+def _shorten(start: bytes) -> str:
     text = " ".join(start[: 4 * TEXT_SHOWN].decode("utf-8", "replace").split())
     return repr(text[:TEXT_SHOWN])
 
@@ -454,11 +463,11 @@ def _json(path: Path, size: int) -> FileKind:
 
 
 def _document(document: Any, path: Path) -> FileKind:
-    """What a JSON document is, by its keys."""
+    """The kind of a JSON document, by its keys."""
     if isinstance(document, list):
-        return _first(_list_rules(document))
+        return _first_match(_list_rules(document))
     if isinstance(document, dict):
-        return _first(_object_rules(document, path))
+        return _first_match(_object_rules(document, path))
     return FileKind(None, f"JSON ({str(document)[:TEXT_SHOWN]!r})", recognised=False)
 
 
@@ -515,8 +524,8 @@ def _is_sog(path: Path) -> bool:
 def _zip(path: Path) -> FileKind:
     try:
         with open_zip(path) as archive:
-            names = _visible(archive.namelist())
-            return _first(_of_names_in_zip(names, lambda name: _first_bytes(archive, name)))
+            names = _user_files(archive.namelist())
+            return _first_match(_of_names_in_zip(names, lambda name: _first_bytes(archive, name)))
     except BROKEN_ZIP as error:
         return FileKind(None, f"a zip that does not open ({str(error)[:120]})", recognised=False)
 
@@ -526,7 +535,7 @@ def _first_bytes(archive: zipfile.ZipFile, name: str) -> bytes:
         return member.read(MAX_HEADER_BYTES)
 
 
-def _visible(names: Iterable[str]) -> list[str]:
+def _user_files(names: Iterable[str]) -> list[str]:
     """The files but those that systems put there."""
     files = [name for name in names if not name.endswith("/")]
     return [name for name in files if not is_system_file(PurePosixPath(name.replace("\\", "/")))]
@@ -561,7 +570,7 @@ def _zip_with(names: Sequence[str]) -> FileKind:
 
 
 def _begins_with_splats(head: bytes) -> bool:
-    """Whether the first bytes are a PLY's that has splats."""
+    """Return whether the first bytes are a PLY's that has splats."""
     return head[:3] == b"ply" and _ply(head).kind == "splats"
 
 
@@ -588,7 +597,7 @@ def _splat_files(names: Iterable[str], has_splats: Callable[[str], bool]) -> tup
 
 
 def _folder(path: Path) -> FileKind:
-    return _first(_folder_rules(path))
+    return _first_match(_folder_rules(path))
 
 
 def _folder_rules(path: Path) -> Iterator[FileKind | None]:
@@ -630,7 +639,7 @@ def _has_splats(path: Path) -> bool:
 
 
 def _folder_name(names: Sequence[str], splats: Sequence[str]) -> str:
-    """Whose folder it is, as far as that shows, and how many files of splats are in it."""
+    """The trainer of a folder, as far as that shows, and how many files of splats are in it."""
     trainer = next((who for sign, who in _TRAINERS.items() if any(sign in name for name in names)), None)
     if trainer is None and any(re.search(r"(^|/)export_[0-9]+\.ply$", name) for name in names):
         trainer = "Brush"

@@ -16,6 +16,7 @@ from liftcore.text import check_texts
 
 _HALF = re.compile("[\ud800-\udfff]")  # half a surrogate pair, which UTF-8 cannot carry
 _ARTICLES = frozenset({"a", "an", "the"})
+EXPECTED = "a safetensors file with embeddings and words"
 _NEAREST = 5  # words named when one is unknown
 
 
@@ -69,19 +70,27 @@ class TableEncoder:
         Raises:
             InvalidTable: no such file, or not a table.
         """
-        from safetensors import SafetensorError
+        from liftcore.io.kinds import wrong_kind  # here: most tables are ones, and this loads readers of all kinds
 
         name = f"text table {path.name}"
         if not path.is_file():
             raise InvalidTable(name, expected="a file", got=f"nothing at {path}")
-        expected = "a safetensors file with embeddings and words"
-        check_header(path, name, InvalidTable, expected=expected)
+        try:
+            return cls._read(path, name)
+        except InvalidTable as error:
+            raise wrong_kind(path, "table", InvalidTable, argument=name, expected=EXPECTED) or error from None
+
+    @classmethod
+    def _read(cls, path: Path, name: str) -> Self:
+        from safetensors import SafetensorError
+
+        check_header(path, name, InvalidTable, expected=EXPECTED)
         try:
             tensors, metadata = map_tensors(path)
         except (SafetensorError, OSError, ValueError) as error:
-            raise InvalidTable(name, expected=expected, got=str(error)[:120]) from None
+            raise InvalidTable(name, expected=EXPECTED, got=str(error)[:120]) from None
         if "embeddings" not in tensors:
-            raise InvalidTable(name, expected=expected, got="no embeddings")
+            raise InvalidTable(name, expected=EXPECTED, got="no embeddings")
         return cls.of(name, metadata.get("words", "null"), tensors["embeddings"])
 
     @classmethod

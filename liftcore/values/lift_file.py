@@ -22,6 +22,7 @@ import numpy as np
 
 from liftcore.errors import InvalidInput, InvalidLift
 from liftcore.io.files import open_regular, visible_files
+from liftcore.io.kinds import wrong_kind
 from liftcore.io.remote import landing, local_path
 from liftcore.io.safetensors_file import map_tensors
 from liftcore.io.shards import INDEX, SUFFIX, map_shards, write_shards
@@ -83,9 +84,16 @@ def read_lift(path: Path | str) -> tuple[dict[str, np.ndarray], str]:
     Raises:
         InvalidLift: as `open_lift` has it.
     """
+    source = local_path(path)
+    try:
+        return _read_arrays(source, path)
+    except InvalidLift as error:
+        raise wrong_kind(source, "lift", InvalidLift, argument=str(path)) or error from None
+
+
+def _read_arrays(source: Path, path: Path | str) -> tuple[dict[str, np.ndarray], str]:
     from safetensors import SafetensorError
 
-    source = local_path(path)
     try:
         tensors, told = map_shards(source) if (source / INDEX).is_file() else map_tensors(source)
         if "splatlift" not in told:

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from liftcore.errors import InvalidFeatures, InvalidTable, Unavailable
 from liftcore.io.files import whole_file
+from liftcore.io.kinds import wrong_kind
 from liftcore.io.remote import local_path
 from liftcore.io.safetensors_file import MAX_HEADER_BYTES, TYPES, check_header, safetensors_header, tensor_bytes
 from liftcore.runtime.progress import Progress, silent
@@ -417,7 +418,10 @@ def _open(path: Path) -> _PackFile:
     from safetensors import SafetensorError, safe_open
 
     expected, hint = "a feature pack (.safetensors)", "make packs with 'splatlift pack'"
-    check_header(path, str(path), InvalidFeatures, expected=expected, hint=hint)
+    try:
+        check_header(path, str(path), InvalidFeatures, expected=expected, hint=hint)
+    except InvalidFeatures as error:
+        raise wrong_kind(path, "features", InvalidFeatures, expected=expected) or error from None
     try:
         handle: Any = safe_open(str(path), framework="pt")
         if len(names := handle.keys()) > MAX_TENSORS:
@@ -445,9 +449,9 @@ def _views(pack: _PackFile) -> list[str]:
         if key == TABLE and len(pack.specs) > 1:
             continue
         if not view or part not in PARTS:
-            hint = "a table of text embeddings belongs to a query" if key == TABLE else ""
             expected = "tensors 'VIEW/labels' with 'VIEW/codebook', or 'VIEW/grid'"
-            raise InvalidFeatures(str(pack.path), expected=expected, got=repr(key)[:120], hint=hint)
+            error = InvalidFeatures(str(pack.path), expected=expected, got=repr(key)[:120])
+            raise wrong_kind(pack.path, "features", InvalidFeatures, expected=expected) or error
         views[view] = None
     return list(views)
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors.numpy import save
 
 from liftcore.cli import main
 from liftcore.errors import InvalidCameras, InvalidInput, InvalidSplats
@@ -19,7 +20,15 @@ from liftcore.io.files import MAX_DIRECTORY_BYTES, open_zip
 from liftcore.io.kinds import SplatFormat, identify, kind_of, page_table, wrong_kind
 from liftcore.io.ply import write_splats
 from liftcore.io.splats import read_splats, splat_files
+from liftcore.query.result import load_lift
+from liftcore.text import open_encoder
 from liftcore.values.lift_file import input_file
+from liftcore.values.pack import read_features
+from service.encoders import require_encoder_files
+from service.errors import Misconfigured
+from service.models import AssetKind
+from service.settings import ServiceSettings
+from service.uploads import check
 from tests.scenes import random_splats
 
 SOG = Path(__file__).parents[2] / "data" / "splats" / "degree3.sog"
@@ -247,3 +256,40 @@ def test_the_order_is_blamed_only_where_it_is_wrong(tmp_path: Path, capsys: pyte
 def test_the_page_has_the_table_of_this_version() -> None:
     built = Path(__file__).parents[3] / "service" / "web" / "src" / "kinds.json"
     assert json.loads(built.read_text()) == page_table(), "make web"
+
+
+def test_a_file_in_the_place_of_another_kind_is_named_for_what_it_is_everywhere(tmp_path: Path) -> None:
+    rows = np.ones((2, 3), np.float32)
+    write_splats(random_splats(0, 5), tmp_path / "splats")
+    contents = {
+        "cameras": json.dumps({"frames": []}).encode(),
+        "features": save({"v/grid": rows[None]}),
+        "masks": save({"v/mask": np.zeros((2, 2), np.uint8)}),
+        "table": save({"embeddings": rows}, metadata={"words": '["a", "b"]'}),
+        "lift": save({"features": rows}, metadata={"splatlift": "{}"}),
+        "photos": zipped(tmp_path / "zip", {"a.png": b"\x89PNG\r\n"}).read_bytes(),
+        "page": b"<!DOCTYPE html><title>404</title>",
+    }
+    for name, content in contents.items():
+        (tmp_path / name).write_bytes(content)
+    readers = {
+        "splats": read_splats, "cameras": read_cameras, "features": read_features, "lift": load_lift,
+        "table": lambda path: open_encoder(f"table:{path}"),
+    }  # fmt: skip
+    settings = ServiceSettings.model_construct(encoder="", text_spaces={})
+    for name in ("splats", *contents):
+        path = tmp_path / name
+        known = identify(path)
+        for wanted, read in readers.items():
+            if wanted != name:
+                with pytest.raises(InvalidInput) as caught:
+                    read(path)
+                assert caught.value.got == known.name, (name, wanted)
+        if name != "table":
+            with pytest.raises(Misconfigured, match=re.escape(known.name)):
+                require_encoder_files(settings.model_copy(update={"encoder": f"table:{path}"}))
+        for kind in (*AssetKind, "lift"):
+            if kind != name:
+                reply = check.run(kind, str(path))
+                assert reply["event"] == "invalid" and known.name in reply["fault"]["got"], (name, kind)
+                assert known.kind is None or f"/{known.kind}" in reply["fault"]["hint"], (name, kind)
