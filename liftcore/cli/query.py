@@ -156,6 +156,7 @@ def _document(answer: Answer, seen: ViewMask | None, encoder: TextEncoder | None
         "threshold": answer.threshold,
         "threshold_method": answer.threshold_method,
         "explanation": answer.explanation,
+        "clear": answer.clear and answer.count > 0,
         "present": answer.presence.present,
         "presence": answer.presence.presence,
         "why": answer.presence.why,

@@ -159,11 +159,24 @@ def nearer_counts(
     """
     if not len(others):
         return np.zeros(len(features), np.int64), np.zeros(len(features), np.int64)
-    own, near = cosines(features, norms, directions), cosines(features, norms, others)
+    own, near = products(features, norms, directions, others)
     plain = (near >= own.max(axis=1, keepdims=True)).sum(axis=1)
     own -= directions @ mean
     near -= others @ mean
     return plain, (near >= own.max(axis=1, keepdims=True)).sum(axis=1)
+
+
+def products(
+    features: np.ndarray, norms: np.ndarray, directions: np.ndarray, others: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The cosines [n, p] and [n, m] f32 of some splats with some words and with many others, by one matrix product.
+
+    Of some thousands of splats and a thousand words it takes a fifth of what `cosines` does, whose bits depend on no
+    other row. Arguments as of `nearer_counts`; a zero row has zeros.
+    """
+    unit = features.astype(np.float32) / np.maximum(norms, np.finfo(np.float32).tiny)[:, None]
+    along = unit @ np.concatenate([directions, others]).T
+    return along[:, : len(directions)], along[:, len(directions) :]
 
 
 NOT_IN_WORDS = Presence(None, None, "Nothing was asked in words: what an example shows is not questioned.")

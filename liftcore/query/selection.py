@@ -21,8 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from liftcore.query.presence import References, nearer_counts
-from liftcore.query.scores import cosines
+from liftcore.query.presence import References, nearer_counts, products
 from liftcore.query.threshold import LEAST_SHARE
 
 if TYPE_CHECKING:
@@ -34,7 +33,7 @@ MOST = 2 / 3  # of a thing: it is mostly selected
 SOME = 1 / 3  # of a thing, below which its mean says nothing of what was asked
 LEAST_FIRST = 0.1  # of the evidence at which the word is the nearest of all, that a clear answer selects
 SAME_WORD = 1 - 1e-4  # cosine from which two words of a table are one
-_AT_ONCE = 1 << 14  # splats that are compared with a pack's words at once
+_AT_ONCE = 1 << 13  # splats that are compared with a pack's words at once
 
 
 @dataclass(frozen=True)
@@ -117,9 +116,8 @@ def nearer_than_rivals(scene: QueryScene, selected: np.ndarray, rivals: Rivals) 
     rows = np.flatnonzero(selected)
     for first in range(0, len(rows), _AT_ONCE):
         some = rows[first : first + _AT_ONCE]
-        own = cosines(scene.features[some], scene.norms[some], rivals.directions).max(axis=1)
-        others = cosines(scene.features[some], scene.norms[some], rivals.vectors).max(axis=1)
-        kept[some] = others <= own
+        own, others = products(scene.features[some], scene.norms[some], rivals.directions, rivals.vectors)
+        kept[some] = others.max(axis=1) <= own.max(axis=1)
     return kept
 
 

@@ -123,6 +123,7 @@ class Answers:
             "query": self._query,
             "objects": self._objects,
             "scores": self._scores,
+            "selection": self._selection,
             "mask": self._mask,
             "attention": self._attention,
             "render": self._render,
@@ -251,6 +252,9 @@ class Answers:
 
     def _scores(self, request: dict[str, Any]) -> Frame:
         return _file(npy(self._answer(request).scores), request)
+
+    def _selection(self, request: dict[str, Any]) -> Frame:
+        return _file(npy(self._answer(request).selected), request)
 
     def _mask(self, request: dict[str, Any]) -> Frame:
         return _file(mask_png(self._look(request).mask), request)

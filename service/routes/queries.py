@@ -33,7 +33,9 @@ NUMBER_BYTES = 24  # of a number in JSON, at most
 NO_ENCODER: dict[str, Any] = {"encoder": None, "encoder_version": None}  # of a question without words
 REGION = "region:"  # what needs the lift's feature packs begins with it
 MEDIA_TYPES = {"scores": "application/x-npy", "mask": "image/png", "attention": "image/png", "render": "image/png"}
-MEDIA_TYPES["layer"] = MEDIA_TYPES["word_labels"] = MEDIA_TYPES["scores"]  # these are arrays
+MEDIA_TYPES["selection"] = MEDIA_TYPES["layer"] = MEDIA_TYPES["word_labels"] = MEDIA_TYPES[
+    "scores"
+]  # these are arrays
 MEDIA_TYPES["word_map"] = MEDIA_TYPES["word_picture"] = MEDIA_TYPES["region_mask"] = MEDIA_TYPES["mask"]
 MEDIA_TYPES["catalogue"] = MEDIA_TYPES["segment"] = "application/json"
 MEDIA_TYPES["splats"] = MEDIA_TYPES["scene"] = BINARY
@@ -102,6 +104,12 @@ def scores(asked: Annotated[models.Asked, Query()], request: Request, deps: Deps
     return _entity("scores", asked, request, deps, ask)
 
 
+@router.get("/query/selection", responses=NPY | TAGGED, response_class=Response)
+def selection(asked: Annotated[models.Asked, Query()], request: Request, deps: Deps, ask: Ask) -> Response:
+    """Which splats were selected: .npy, bool [P]. By `auto` they are not just those at or above the threshold."""
+    return _entity("selection", asked, request, deps, ask)
+
+
 @router.get("/query/mask", responses=PNG | TAGGED, response_class=Response)
 def mask(asked: Annotated[models.AskedInView, Query()], request: Request, deps: Deps, ask: Ask) -> Response:
     """Where it is in a view: a PNG, white where it is."""
@@ -124,6 +132,12 @@ def splats(asked: Annotated[models.AskedForSplats, Query()], request: Request, d
 def scores_by_body(deps: Deps, ask: Ask, asked: models.AskedInBody = QUERY_BODY) -> Response:
     """The score of every splat, for a query in a body."""
     return _content("scores", asked, deps, ask)
+
+
+@router.post("/query/selection", responses=NPY, response_class=Response, openapi_extra=BODY)
+def selection_by_body(deps: Deps, ask: Ask, asked: models.AskedInBody = QUERY_BODY) -> Response:
+    """Which splats were selected, for a query in a body."""
+    return _content("selection", asked, deps, ask)
 
 
 @router.post("/query/mask", responses=PNG, response_class=Response, openapi_extra=BODY)
@@ -246,7 +260,7 @@ def made(deps: AppState, wanted: dict[str, Any], lift: LiftRecord, ask: Ask, hea
             name, size = f"{wanted['what']}-{lift.id}.ply", deps.store.assets.get(deps.owner, lift.splats).bytes
         case "scene":
             name, size = f"scene-{lift.id}.splat", ROW_BYTES * lift.count
-        case "scores" | "layer" | "word_labels" if SCORE_BYTES * lift.count > PIPE_BYTES:
+        case "scores" | "selection" | "layer" | "word_labels" if SCORE_BYTES * lift.count > PIPE_BYTES:
             size = SCORE_BYTES * lift.count
         case "catalogue" if wanted["means"]:
             size = NUMBER_BYTES * lift.channels * wanted["count"]

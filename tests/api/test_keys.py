@@ -118,7 +118,9 @@ def naming(method: str, path: str, job: str, asset: str, house: Guarded) -> list
         own = {"/render": {"view": "left"}, "/query/what": {"example": "splat:1"}}
         return [{"json": own.get(path, {"words": ["apple"], "view": "left"}) | {"lift": job}}]
     if path.startswith("/query") or path == "/render":
-        without_view = dict.fromkeys(("/query/scores", "/query/splats", "/query/objects"), ("view",))
+        without_view = dict.fromkeys(
+            ("/query/scores", "/query/selection", "/query/splats", "/query/objects"), ("view",)
+        )
         unknown = ({"/render": ("text",)} | without_view).get(path, ()) if method == "GET" else ()
         asked = {name: value for name, value in ASKING.items() if name not in unknown} | {"lift": job}
         return [{"json": asked | {"text": ["apple"]}} if method == "POST" else {"params": asked}]

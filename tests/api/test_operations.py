@@ -369,7 +369,11 @@ def test_no_route_touches_files_or_the_database_on_the_event_loop(
             where = address(path, lift["id"], "splats" if method == "PUT" else uploaded.cameras)
             body = {"json": bodies.get(path, {**asked, "text": ["apple"]})} if method == "POST" else {}
             known = set(asked) if path.startswith("/query") else {"lift", "view"} if path == "/render" else set()
-            known -= {"view"} if path in ("/query/scores", "/query/splats", "/query/objects") else set()
+            known -= (
+                {"view"}
+                if path in ("/query/scores", "/query/selection", "/query/splats", "/query/objects")
+                else set()
+            )
             how: dict[str, Any] = {"content": scene.splats} if method == "PUT" else body
             client.request(method, where, params={name: asked[name] for name in known if method == "GET"}, **how)
         client.delete(address("/jobs/{job}", "0" * 32, ""))

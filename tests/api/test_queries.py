@@ -116,6 +116,7 @@ def test_vector_is_asked_by_post_and_so_is_all_that_belongs_to_it(client: TestCl
     asked = {"like": "region:left:0:2", "unlike": "middle:6,12", "lift": lift["id"]}
     by_get = array(client.get("/query/scores", params=asked).content)
     np.testing.assert_allclose(array(client.post(answer["links"]["scores"], json=body).content), by_get, atol=1e-5)
+    assert array(client.post("/query/selection", json=body).content).sum() == answer["count"]
     for name in ("mask", "attention"):
         assert picture(client.post(answer["links"][name], json=body).content).shape[:2] == (HEIGHT, WIDTH)
     found, coloured = (client.post(answer["links"][name], json=body) for name in ("object", "coloured"))
@@ -193,7 +194,7 @@ def test_every_question_has_a_tag_of_its_own(client: TestClient, lift: dict[str,
     changes: list[dict[str, Any]] = [
         {}, {"like": "middle:25,12"}, {"unlike": "middle:6,12"}, {"keep": "largest"}, {"instances": 2},
         {"text": "lamp"}, {"path": "/query/splats", "what": "object"}, {"path": "/query/splats", "what": "scores"},
-        {"path": "/query/scores"},
+        {"path": "/query/scores"}, {"path": "/query/selection"},
     ]  # fmt: skip
     assert len({tag(**change) for change in changes}) == len(changes)
 

@@ -88,6 +88,14 @@ def test_slider_repaints_without_a_request(page: Browser) -> None:
     assert len(columns(page, AMBER)) == lit
 
 
+def test_what_lights_up_is_what_is_selected(page: Browser) -> None:
+    # Of `auto` words beside the question decide too: the page takes the selection, whatever the threshold lets pass.
+    passed = "splatlift.ask.painted()[0].scores.filter(score => score >= splatlift.ask.now.cut - 1e-6).length"
+    ask(page, "lamp")
+    assert page.value(passed) == page.value("splatlift.ask.now.answer.count") > 0
+    assert any("/query/selection" in address for address in page.asked)
+
+
 def test_several_words_have_a_colour_each(page: Browser) -> None:
     ask(page, "lamp, apple")
     assert min(columns(page, AMBER)) > 50 > max(columns(page, SKY))

@@ -1,6 +1,6 @@
 // The panel of asking: words and examples, each a question with a colour; what they found, and where to cut.
 import { at, count, el, percent, plural, tell } from "./dom.js";
-import { countFrom, drawHistogram, histogram } from "./histogram.js";
+import { countFrom, drawHistogram, histogram, passing } from "./histogram.js";
 import { COLOURS, rgb } from "./painter.js";
 import { bytes, json, npy, words } from "./service.js";
 
@@ -148,14 +148,16 @@ export class Ask {
   async answer(question, mine) {
     try {
       const automatic = { ...question, threshold: "auto" };
-      const [answer, scores] = await Promise.all([
+      const [answer, scores, selected] = await Promise.all([
         json(`/query?${this.parameters(question, { top: 1 })}`),
         bytes(`/query/scores?${this.parameters(automatic)}`).then(npy),
+        question.threshold === "auto" ? bytes(`/query/selection?${this.parameters(question)}`).then(npy) : null,
       ]);
       if (mine !== this.turn) return;
       const { min = 0, max = 0 } = answer.statistics;
       const cut = answer.threshold.value ?? Infinity;
-      Object.assign(question, { answer, scores, low: min, high: max, cut, count: answer.count, bins: histogram(scores, min, max) });
+      const shown = selected ? passing(scores, selected, cut) : scores;
+      Object.assign(question, { answer, scores, shown, low: min, high: max, cut, count: answer.count, bins: histogram(scores, min, max) });
       if (question.threshold === "auto") question.auto = answer.threshold.value;
       else if (question.auto === undefined) question.auto = await this.automaticCut(question);
     } catch (problem) {
@@ -199,6 +201,7 @@ export class Ask {
     const question = this.now;
     if (!question?.answer) return;
     question.cut = question.threshold = value;
+    question.shown = question.scores;
     question.anyway = true;
     question.count = countFrom(question.scores, value);
     question.things = [];
@@ -215,6 +218,7 @@ export class Ask {
     now.anyway = true;
     if (now.answer.present === false) {
       now.cut = now.threshold = now.answer.statistics.q99;
+      now.shown = now.scores;
       now.count = countFrom(now.scores, now.cut);
     }
     this.show();
@@ -240,7 +244,7 @@ export class Ask {
   // What the viewer paints: the questions that have an answer, each with its cut.
   painted() {
     return this.questions.filter(question => question.answer && lit(question))
-      .map(({ scores, cut, high, low, colour }) => ({ scores, cut, high, low, rgb: rgb(colour) }));
+      .map(question => ({ question, scores: question.shown, cut: question.cut, high: question.high, rgb: rgb(question.colour) }));
   }
 
   heated() {

@@ -20,6 +20,12 @@ export function countFrom(scores, cut) {
   return found;
 }
 
+// Scores that pass a cut where splats are selected, and nowhere else: the automatic answer is more than its threshold.
+export function passing(scores, selected, cut) {
+  const least = atLeast(cut);
+  return scores.map((score, place) => selected[place] ? Math.max(score, least) : score < least ? score : UNKNOWN);
+}
+
 // The bars of a histogram with what is cut off pale, and a mark where the automatic cut is.
 export function drawHistogram(canvas, { bins, low, high, cut, auto, colour }) {
   const ratio = devicePixelRatio || 1;

@@ -37,7 +37,7 @@ const things = new Things({ changed: () => repaint(), fly: (box, view) => (look.
 
 look.asked = view => {
   const question = ask.painted().length ? ask.now : null;
-  if (!question?.answer || !ask.painted().some(({ scores }) => scores === question.scores)) return names.map(view);
+  if (!question?.answer || !ask.painted().some(one => one.question === question)) return names.map(view);
   return { path: `/query/mask?${ask.parameters(question, { view })}`, paint: mask => veiled(mask, rgb(question.colour)) };
 };
 look.masks = masks;

@@ -78,7 +78,7 @@ export class Painter {
     return { gsplat: made.outputs.gsplat };
   }
 
-  // questions: [{scores, cut, high, low, rgb}] that light up; the one that a splat passes by most has it. heat: one of
+  // questions: [{scores, cut, high, rgb}] that light up; the one that a splat passes by most has it. heat: one of
   // them, whose scores are shown instead, or null. layer: {colours: u8 [P, 3], cover: 0..1} beneath, or null.
   paint(questions, { heat = null, layer = null, hide = false } = {}) {
     const heated = heat ? questions.findIndex(({ scores }) => scores === heat.scores) : -1;
