@@ -4,8 +4,9 @@ A histogram says where scores part, not whether what lies above is what was aske
 held to other words. Two kinds of them compete:
 
 - **Reference words** (`liftcore.query.presence`) say of each splat whether the word is among the nearest. Of the
-  splats at or above the threshold, by evidence, the word must be among the nearest for a half at least; else the
-  threshold is sought again from the score on where that holds.
+  splats at or above the threshold, by evidence, the word must be among the nearest for four fifths at least; else
+  the threshold is sought again from the score on where that holds. (A thing beside it that is alike and no larger
+  would pass for it with a half.)
 - **The other words of a pack** or of a short table are all that its author distinguishes: where one of them is
   nearer, a splat is not selected.
 
@@ -27,7 +28,7 @@ from liftcore.query.threshold import LEAST_SHARE
 if TYPE_CHECKING:
     from liftcore.query.scene import QueryScene
 
-HALF = 0.5  # of the selected evidence, at which the word must be among the nearest; .5 to .9 give the same masks
+NEAR = 0.8  # of the selected evidence, at which the word must be among the nearest; with .5 two things pass for one
 SAMPLED = 256  # splats of each octave of the ranking that are looked at: a million splats have twelve octaves
 MOST = 2 / 3  # of a thing: it is mostly selected
 SOME = 1 / 3  # of a thing, below which its mean says nothing of what was asked
@@ -78,7 +79,7 @@ class Rivals:
 class Contest:
     """How a ranking of splats stands beside other words."""
 
-    lowest: float  # the least score down to which the word is among the nearest for half of the evidence
+    lowest: float  # the least score down to which the word is among the nearest for NEAR of the evidence
     first: float  # share, of the evidence at which the word is the nearest of all, at or above a threshold
 
 
@@ -103,7 +104,7 @@ def contest(scene: QueryScene, scores: np.ndarray, weights: np.ndarray, threshol
     ranked = np.argsort(ahead[:best], kind="stable")
     middle = ahead[ranked[np.searchsorted(np.cumsum(counts[ranked]), counts[:best].sum() / 2)]]
     near = np.cumsum(np.where(ahead <= max(rivals.allowed, int(middle)), counts, 0.0))
-    held = np.flatnonzero(near >= HALF * sums)
+    held = np.flatnonzero(near >= NEAR * sums)
     above = scores[rows] >= np.float32(threshold)
     first = np.where(ahead == 0, counts, 0.0)
     share = float(first[above].sum() / first.sum()) if first.any() else 1.0
