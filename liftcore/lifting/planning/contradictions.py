@@ -156,7 +156,7 @@ def agreement_of(geometry: Geometry) -> ViewAgreement:
 
 
 def _agreement_of(geometry: Geometry) -> float | None:
-    W, books = geometry.weights, geometry.codebook.views
+    W, books = geometry.weights.cpu(), geometry.codebook.views
     mass = torch.zeros(sum(book.regions for book in books)).index_add_(0, W.region.long(), W.weight)
     if not bool(mass.any()):
         return None
