@@ -4,7 +4,7 @@ A histogram says where scores part, not whether what lies above is what was aske
 held to other words. Two kinds of them compete:
 
 - **Reference words** (`liftcore.query.presence`) say of each splat whether the word is among the nearest. Of the
-  splats at or above the threshold, by evidence, the word must be among the nearest for four fifths at least; else
+  splats at or above the threshold, by evidence, the word must be among the nearest for nine tenths at least; else
   the threshold is sought again from the score on where that holds. (A thing beside it that is alike and no larger
   would pass for it with a half.)
 - **The other words of a pack** or of a short table are all that its author distinguishes: where one of them is
@@ -28,7 +28,7 @@ from liftcore.query.threshold import LEAST_SHARE
 if TYPE_CHECKING:
     from liftcore.query.scene import QueryScene
 
-NEAR = 0.8  # of the selected evidence, at which the word must be among the nearest; with .5 two things pass for one
+NEAR = 0.9  # of the selected evidence, at which the word must be among the nearest; with .5 two things pass for one
 SAMPLED = 256  # splats of each octave of the ranking that are looked at: a million splats have twelve octaves
 MOST = 2 / 3  # of a thing: it is mostly selected
 SOME = 1 / 3  # of a thing, below which its mean says nothing of what was asked
