@@ -17,7 +17,7 @@ from liftcore.scene.splats import shared_tensor
 
 NO_LABEL = -1  # a pixel that a level leaves unlabelled
 LARGEST = 1e15  # of a feature; float32 sums of squares over all channels stay finite far beyond
-FLATTEST = 32  # times longer than wide, or wider: no photo is, but a list of cells (7 x 7 are the fewest)
+FLATTEST = 20  # times longer than wide, or wider: no photo is, but a list of cells or of channels
 MAX_CHANNELS = 1 << 16
 PLANES = "of masks [M, h, w] that do not overlap give numpy.where(masks.any(0), masks.argmax(0), -1), a row a mask"
 INTEGERS = (torch.int32, torch.int16, torch.int64, torch.int8, torch.uint8)
