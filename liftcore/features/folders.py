@@ -26,6 +26,7 @@ LABELS, CODEBOOK = "_s.npy", "_f.npy"  # of LangSplat
 
 Layout = Literal["hwc", "chw"]
 V_co = TypeVar("V_co", bound=ViewFeatures, covariant=True)
+FLATTEST = 16  # times longer than wide, or wider: no photo is, but a list of cells or of channels
 
 
 class ViewFolder(Mapping[str, V_co]):
@@ -75,7 +76,16 @@ def grids_of(files: Mapping[str, Path], layout: Layout = "hwc") -> ViewFolder[Fe
         if first and len(grid) == 1:  # a batch of one flat list [1, F, N], or one channel: nothing tells which
             hint = "of a flat list of cells save array.reshape(F, h, w); of one channel array.reshape(h, w, 1) as hwc"
             raise InvalidFeatures(str(files[view]), expected="[F, h, w]", got=f"{list(grid.shape)}", hint=hint)
-        return FeatureGrid(grid.transpose(1, 2, 0) if first else grid, where=f"view {view!r}")
+        grid = grid.transpose(1, 2, 0) if first else grid
+        height, width, channels = grid.shape
+        if max(height, width) > FLATTEST * min(height, width):
+            got = f"{height} x {width} cells in {list(grid.shape)}"
+            hint = (
+                f"give a flat list of cells its rows and columns, array.reshape(h, w, {channels}), without the class"
+            )
+            hint = f"{hint} token; where channels come first, array.reshape(F, h, w).transpose(1, 2, 0)"
+            raise InvalidFeatures(f"view {view!r} grid", expected="a map [h, w, F] of a photo", got=got, hint=hint)
+        return FeatureGrid(grid, where=f"view {view!r}")
 
     return ViewFolder(files, read)
 

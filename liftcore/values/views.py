@@ -17,7 +17,6 @@ from liftcore.scene.splats import shared_tensor
 
 NO_LABEL = -1  # a pixel that a level leaves unlabelled
 LARGEST = 1e15  # of a feature; float32 sums of squares over all channels stay finite far beyond
-FLATTEST = 20  # times longer than wide, or wider: no photo is, but a list of cells or of channels
 MAX_CHANNELS = 1 << 16
 PLANES = "of masks [M, h, w] that do not overlap give numpy.where(masks.any(0), masks.argmax(0), -1), a row a mask"
 INTEGERS = (torch.int32, torch.int16, torch.int64, torch.int8, torch.uint8)
@@ -93,12 +92,6 @@ class FeatureGrid:
     def __init__(self, grid: Array, *, where: str = "") -> None:
         where = f"{where} grid".strip()
         found = _features(grid, "h, w, F", where)
-        height, width = found.shape[:2]
-        if max(height, width) > FLATTEST * min(height, width):
-            got = f"{height} x {width} cells in {_kind(found)}"
-            hint = f"give a flat list of cells its rows and columns, array.reshape(h, w, {found.shape[2]}), without"
-            hint = f"{hint} the class token; where channels come first, array.reshape(F, h, w).transpose(1, 2, 0)"
-            raise InvalidFeatures(where, expected="a map [h, w, F] of a photo", got=got, hint=hint)
         object.__setattr__(self, "grid", found)
 
     def cpu(self) -> Self:
