@@ -154,7 +154,7 @@ def test_other_engines_go_on_from_the_pieces_of_each_stage(scene: dict[str, Any]
             in_blocks((LocalEngine(1), Shuffled(2))[number % 2], stored, settings, folder=folder, progress=stop)
     assert stopped == ["geometry", "gather", "objects", "consensus", "robust", "solve"]
     found = in_blocks(Shuffled(2), stored, settings, folder=folder)
-    whole = lc.lift(*scene.values(), settings)
+    whole = lc.lift(**scene, preset=settings)
     assert_same(found, whole)
     assert found.diagnostics["reweighting"] == whole.diagnostics["reweighting"]
 
