@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import JSONResponse
 
+from liftcore.scene.origin import FILE_ORIGIN
 from service import limits, models
 from service.content import FILE, TAGGED, Cursor, Limit, StoredFile, file_answer, kept, listed, unchanged
 from service.requests import described_body, json_body
@@ -109,7 +110,7 @@ def shape_lift(lift: LiftRecord) -> models.LiftResult:
     own = f"/lifts/{lift.id}"
     links = {"self": own, "job": f"/jobs/{lift.id}", "features": f"{own}/features"}
     links |= {"views": f"{own}/views", "objects": f"{own}/objects", "query": f"/query?lift={lift.id}&text="}
-    told = {"views": [], "words": [], **lift.metadata, **vars(lift), "links": links}
+    told = {"views": [], "words": [], "origin": FILE_ORIGIN, **lift.metadata, **vars(lift), "links": links}
     return models.LiftResult(**{name: told[name] for name in models.LiftResult.model_fields})
 
 
