@@ -23,7 +23,6 @@ from liftcore.cli.options import (
 from liftcore.cli.reply import free_outputs, reply, writing
 from liftcore.errors import InvalidQuery
 from liftcore.io.files import whole_file
-from liftcore.scene.origin import MAP_REACH
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -244,6 +243,8 @@ def _lines(document: dict[str, Any]) -> Iterable[str]:
 
 def place_of(point: tuple[float, ...]) -> str:
     """A point for people, with four digits; of map coordinates, which all begin alike, with about three decimals."""
+    from liftcore.scene.origin import MAP_REACH
+
     reach = max(map(abs, point))
     digits = 4 if reach < MAP_REACH else 4 + int(math.log10(reach))
     return f"({', '.join(f'{value:.{digits}g}' for value in point)})"
