@@ -101,7 +101,8 @@ def order_of(metadata: Mapping[str, Any]) -> JobOrder:
     """
     files = (metadata["splats"], metadata["cameras"], *metadata["features"])
     splats, cameras, *features = [f"sha256:{file['sha256']}" for file in files]
-    settings, plan = dict(metadata["settings"]), dict(metadata["certificate"]).get("plan")
+    settings, certificate = dict(metadata["settings"]), metadata.get("certificate")
+    plan = certificate.get("plan") if isinstance(certificate, Mapping) else None
     if isinstance(plan, Mapping) and BY_HAND not in str(plan.get("rendering", BY_HAND)):
         settings["antialiased"] = "auto"  # a lift remembers what that came to
     return JobOrder(splats, cameras, tuple(features), settings)
