@@ -334,8 +334,11 @@ class LiftResult(BaseModel):
     words: list[str] = Field(description="that its packs brought: it is asked in these without an encoder")
     views: list[str] = Field(description="the views that were lifted; very many are at links.views alone")
     view_count: int = Field(description="how many these are")
-    origin: tuple[float, float, float] = Field(
-        FILE_ORIGIN, description="of the positions of its `.splat` and `.spz`; zeros but in map coordinates"
+    origin: list[float] = Field(
+        list(FILE_ORIGIN),
+        min_length=3,
+        max_length=3,
+        description="of the positions of its `.splat` and `.spz`; zeros but in map coordinates",
     )
     certificate: dict[str, Any]
     timings: dict[str, float] = Field(description="seconds a stage")
