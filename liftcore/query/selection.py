@@ -79,7 +79,7 @@ class Rivals:
 class Contest:
     """How a ranking of splats stands beside other words."""
 
-    lowest: float  # the least score down to which the word is among the nearest for NEAR of the evidence
+    lowest: float  # at or above it the word is among the nearest for NEAR of the evidence, at the next less it is not
     first: float  # share, of the evidence at which the word is the nearest of all, at or above a threshold
 
 
@@ -108,7 +108,11 @@ def contest(scene: QueryScene, scores: np.ndarray, weights: np.ndarray, threshol
     above = scores[rows] >= np.float32(threshold)
     first = np.where(ahead == 0, counts, 0.0)
     share = float(first[above].sum() / first.sum()) if first.any() else 1.0
-    return Contest(float(scores[rows[held[-1]]]) if held.size else float(scores[rows[0]]), share)
+    last = int(held[-1]) if held.size else 0
+    lowest = scores[rows[last]]
+    if held.size and last + 1 < len(rows):
+        lowest = min(lowest, np.nextafter(scores[rows[last + 1]], np.float32(np.inf)))
+    return Contest(float(lowest), share)
 
 
 def nearer_than_rivals(scene: QueryScene, selected: np.ndarray, rivals: Rivals) -> np.ndarray:

@@ -119,6 +119,9 @@ def test_a_scene_in_map_coordinates_answers_in_them(client: TestClient, uploaded
     for view in client.get(f"/lifts/{job['id']}/views").json()["views"]:
         pose = np.array(view["viewmat"])
         assert np.abs(-pose[:3, :3].T @ pose[:3, 3] - offset).max() < 8
+    assert client.delete(job["links"]["self"], params={"with_lift": True}).status_code == 204
+    for asset in (splats, cameras):
+        assert client.delete(f"/assets/{asset}").status_code == 204
 
 
 @pytest.mark.parametrize("name", ["degree3.compressed.ply", "degree3.v4.spz", "degree3.sog"])

@@ -180,7 +180,7 @@ def _crowd(logit: float) -> Callable[[Kernel], Found]:
 # fmt: off
 PLACES: tuple[Extreme, ...] = (
     walked("world coordinates of 1e7, the camera beside them", _far_away(1e7), like=_far_away(0.0),
-        told="where float32 is coarse"),
+        told="positions came in float32"),
     # The order is lost, as the lift tells.
     Extreme("a camera 1e7 from splats a tenth apart", _unordered, bound=0.75, told="float32 depths cannot order"),
     walked("depth ties", at(MIDDLE * 6),
