@@ -11,9 +11,10 @@ from torch import Tensor
 
 from liftcore.errors import InvalidCameras, InvalidSettings
 from liftcore.lifting.geometry import weigh_views
+from liftcore.lifting.pipeline import solved_weights
 from liftcore.raster import check_given, open_raster
 from liftcore.runtime.device import choose_device
-from liftcore.runtime.progress import Progress, silent
+from liftcore.runtime.progress import Progress, Timings, silent
 from liftcore.runtime.torch_modes import callers_modes, usual_modes
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.compositing import CompositingParams, check_antialiased
@@ -97,23 +98,27 @@ def region_weights(
     views: Given,
     preset: Preset | str | LiftSettings = Preset.DEFAULT,
     *,
+    reweight: bool = False,
     progress: Progress = silent,
     threads: int | None = None,
     **settings: Any,
 ) -> RegionWeights:
-    """What each region, or cell of a grid, of each view weighs at each splat: ``W = A^T S``, without any feature.
+    """The weight of each region, or cell of a grid, of each view at each splat: ``W = A^T S``.
 
     Where each pixel of a view has a label of its own, S is the identity and W is A itself, transposed: a column of W
-    holds what each splat shows of one pixel.
+    holds the weight of each splat on the ray of one pixel.
 
     Args:
         splats, cameras, views, preset, threads, settings: as `lift` has them. All views are weighed, whatever the
             settings' coverage. A label on several levels is a region each time.
+        reweight: False: W by geometry alone, which reads no feature. True: W as `lift` solves with it, reweighted by
+            what features of other views say (``robust_steps``, ``consensus``, ``reliability``, ``loss``); sums of
+            rows stay the same but for ``loss=huber``.
 
     Returns:
         W on the CPU, a row a splat: in memory, or in mapped files where it is large. Rows of ``W E``, of the views'
-        codebooks E, over the sums of rows of W are the features that `lift` finds with ``row-sum``. Presets that
-        reweight, as ``default`` does, weigh entries of this W further, by how well views agree.
+        codebooks E, over the sums of rows of W are the features that `lift` finds with the same settings where it is
+        reweighted, before least squares (``cg_steps``) and aggregation; else those of ``row-sum``.
 
     Raises:
         InvalidFeatures, InvalidSettings, Unavailable: as `lift` has it.
@@ -124,4 +129,7 @@ def region_weights(
     found = LiftViews.of(views, cameras, chosen)
     own = chosen.model_copy(update={"certificate_rays": 0})
     raster = open_raster(splats, choose_device(chosen.device), threads)
-    return weigh_views(raster, splats.count, found, own, progress, by_rows=True, threads=threads).weights.cpu()
+    geometry = weigh_views(raster, splats.count, found, own, progress, by_rows=True, threads=threads)
+    if not reweight:
+        return geometry.weights.cpu()
+    return solved_weights(geometry, splats, own, Timings(progress), threads)[0].cpu()

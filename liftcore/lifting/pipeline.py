@@ -161,6 +161,43 @@ def plan(
     return plan_lift(splats, found, chosen, choose_device(chosen.device), threads, look=True)
 
 
+def solved_weights(
+    geometry: Geometry, splats: Splats, settings: LiftSettings, timings: Timings, threads: int | None
+) -> tuple[RegionWeights, Agreement | None]:
+    """W as it is solved: steps give factors of W's entries, and so does a loss that is not of squares.
+
+    Raises:
+        InvalidSettings: consensus is asked for, and no view has masks.
+    """
+    W, consensus = geometry.weights, None
+    if settings.asks_consensus(bool((geometry.levels >= 0).any())):
+        with timings.stage("consensus"):
+            W = W.cpu()
+            found = mask_consensus(W, geometry.levels, threads, means=splats.means)
+            consensus = torch.from_numpy(found)
+    agreement = None
+    with timings.stage("robust"):
+        if settings.robust_steps:
+            W = W.cpu()
+            agreement = agreement_factors(
+                W,
+                geometry.codebook,
+                settings.robust_steps,
+                timings.progress,
+                means=splats.means,
+                threads=threads,
+                reliability=whole_regions(settings.reliability, geometry.levels),
+                consensus=consensus,
+            )
+            W = reweighted(W, agreement.factors)
+    if settings.loss == "huber":
+        with timings.stage("loss"):
+            W = W.cpu()
+            factors = huber_factors(W, geometry.codebook, timings.progress, means=splats.means, threads=threads)
+            W = reweighted(W, factors)
+    return W, agreement
+
+
 def log_warnings(plan: Plan) -> None:
     """Log what the plan has to say of this machine, which no certificate keeps: equal inputs give equal lifts."""
     for warning in plan.warnings:
@@ -276,37 +313,8 @@ class _Lift:
             return region_objects(geometry.weights.cpu(), geometry.levels, geometry.evidence().numpy(), self.threads)
 
     def reweight(self, geometry: Geometry) -> tuple[RegionWeights, Agreement | None]:
-        """W as it is solved: steps give factors of W's entries, and so does a loss that is not of squares.
-
-        Raises:
-            InvalidSettings: consensus is asked for, and no view has masks.
-        """
-        W, settings, consensus = geometry.weights, self.settings, None
-        if settings.asks_consensus(bool((geometry.levels >= 0).any())):
-            with self.timings.stage("consensus"):
-                W = W.cpu()
-                found = mask_consensus(W, geometry.levels, self.threads, means=self.splats.means)
-                consensus = torch.from_numpy(found)
-        agreement = None
-        with self.timings.stage("robust"):
-            if settings.robust_steps:
-                W = W.cpu()
-                agreement = agreement_factors(
-                    W,
-                    geometry.codebook,
-                    settings.robust_steps,
-                    self.progress,
-                    means=self.splats.means,
-                    threads=self.threads,
-                    reliability=whole_regions(settings.reliability, geometry.levels),
-                    consensus=consensus,
-                )
-                W = reweighted(W, agreement.factors)
-        if settings.loss == "huber":
-            with self.timings.stage("loss"):
-                W, how = W.cpu(), {"means": self.splats.means, "threads": self.threads}
-                W = reweighted(W, huber_factors(W, geometry.codebook, self.progress, **how))
-        return W, agreement
+        """W as it is solved (`solved_weights`)."""
+        return solved_weights(geometry, self.splats, self.settings, self.timings, self.threads)
 
     def solve(self, W: RegionWeights, geometry: Geometry, plan: Plan) -> Solution:
         """The closed form."""

@@ -138,6 +138,19 @@ def test_region_weights_times_codebooks_are_the_lift(scene):
     assert torch.equal(again.weight, found.weight) and torch.equal(again.region, found.region)
 
 
+@pytest.mark.parametrize("settings", [{}, {"preset": "row-sum", "loss": "huber"}])
+def test_reweighted_region_weights_times_codebooks_are_the_lift_of_any_preset(scene, settings):
+    _, splats, cameras, views = scene
+    found = lc.region_weights(splats, cameras, views, reweight=True, **settings)
+    plain = lc.region_weights(splats, cameras, views, **settings)
+    W = found.matrix(splats.count)
+    E = np.concatenate([views[name].codebook.double().numpy() for name in found.views])
+    made = lc.lift(splats, cameras, views, dtype="float32", **settings)
+    seen = made.seen.numpy()
+    np.testing.assert_allclose(made.features.numpy()[seen], (W @ E)[seen] / W.sum(axis=1)[seen, None], atol=1e-5)
+    assert torch.equal(found.region, plain.region) and not torch.equal(found.weight, plain.weight)
+
+
 def test_every_stage_is_told_in_order_and_the_plan_after_the_first_views(tmp_path):
     splats, cameras, pack = write_scene(tmp_path, 3)
     said = []
