@@ -9,13 +9,13 @@ In a label picture where 0 means unlabelled, as most programs have it, value v i
 does (255, 65535), value v is mask v. Whoever takes the one for the other is one off in every mask, so with 0 the
 values must end at the number of vectors.
 
-Masks that overlap become levels of labels that do not (`layered`).
+Masks that overlap become levels of labels that do not (`label_levels`).
 
 segment-anything's ``SamAutomaticMaskGenerator`` and SA-1B keep a list of objects whose ``segmentation`` is run
 lengths (`liftcore.features.mask_files`), alone or under ``annotations``. Mask k is the list's k-th.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -31,13 +31,12 @@ from liftcore.features.mask_files import (
 )
 from liftcore.features.mask_json import stated_size
 from liftcore.io.npy import NUMBERS, open_array, read_floats, without_unit_axes
-from liftcore.values.views import NO_LABEL, Regions
+from liftcore.values.views import NO_LABEL, Regions, label_levels
 
 VECTORS = ".npy"
 ARRAY, RUNS, PICTURE = "_masks.npy", ".json", ".png"
 ZIPPED_ARRAY = "_masks.npz"
 OVERLAP = "photos belong in another folder than their masks"
-MAX_LEVELS = 32  # a hierarchy of four partitions, with masks 1 to 4 pixels over their neighbours, took 13 to 18
 
 
 def mask_files(folder: Path) -> dict[str, Path]:
@@ -141,7 +140,7 @@ def _labels(path: Path, rows: int, unlabelled: int) -> np.ndarray:
     if path.suffix.lower() == PICTURE:
         return picture_labels(path, rows, unlabelled)
     if path.suffix.lower() == RUNS:
-        return layered(sam_masks(path, rows), str(path))
+        return label_levels(sam_masks(path, rows), str(path))
     stored = _planes(open_array(path, kinds=NUMBERS + "b"))
     got = f"{stored.dtype} {list(stored.shape)}"
     if stored.dtype.kind != "b":
@@ -156,56 +155,7 @@ def _labels(path: Path, rows: int, unlabelled: int) -> np.ndarray:
     if len(stored) != rows:
         hint = "row k of the vectors is of mask k, and masks come first: [M, H, W]"
         raise InvalidFeatures(str(path), expected=f"{rows} masks, one a vector", got=got, hint=hint)
-    return layered(list(stored), str(path))  # planes of the mapped file, not read yet
-
-
-def layered(masks: Sequence[np.ndarray], where: str) -> np.ndarray:
-    """[L, h, w] i32: label k where mask k is, -1 for none; an empty mask has no label.
-
-    The largest mask comes first, of equals the one that was given first, and each goes to the first level on which
-    none of its pixels is taken. No pixel of any mask is lost, and what lies alone is on level 0. A lift that takes
-    levels as rows of their own asks only which masks lie on a pixel, so there their level does not matter.
-
-    Args:
-        masks: [h, w] bool each, at least one, all of one size; each is asked for twice. where: named in the error.
-
-    Raises:
-        InvalidFeatures: they take more than MAX_LEVELS levels.
-    """
-    boxes, areas = zip(*map(_extent, masks), strict=True)
-    # Space for all levels that there may be: pages of those that are never written take no memory.
-    labels = np.empty((min(MAX_LEVELS, len(masks)), *masks[0].shape), np.int32)
-    labels[0] = NO_LABEL
-    used = 1
-    for number in sorted(range(len(masks)), key=lambda number: -areas[number]):
-        if not areas[number]:
-            break
-        inside, windows = masks[number][boxes[number]], labels[:, *boxes[number]]
-        level = next((k for k in range(used) if not ((windows[k] != NO_LABEL) & inside).any()), used)
-        if level == MAX_LEVELS:
-            depth = np.zeros(masks[0].shape, np.int32)
-            for mask in masks:
-                depth += mask
-            raise InvalidFeatures(
-                where,
-                expected=f"masks that lie on {MAX_LEVELS} levels without overlap",
-                got=f"{len(masks)} masks, up to {depth.max()} of them over one pixel",
-                hint="leave out those that are nearly the same, as SamAutomaticMaskGenerator does by box_nms_thresh",
-            )
-        if level == used:
-            labels[level] = NO_LABEL
-            used += 1
-        windows[level][inside] = number
-    return labels[:used]
-
-
-def _extent(mask: np.ndarray) -> tuple[tuple[slice, slice], int]:
-    """The rows and columns between which a mask's pixels lie, and how many it has."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    if not len(rows):
-        return (slice(0), slice(0)), 0
-    box = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
-    return box, int(np.count_nonzero(mask[box]))
+    return label_levels(list(stored), str(path))  # planes of the mapped file, not read yet
 
 
 def picture_labels(path: Path, rows: int, unlabelled: int) -> np.ndarray:

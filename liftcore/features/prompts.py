@@ -41,12 +41,11 @@ from liftcore.features.mask_json import (
     tracked_view,
     views_of_images,
 )
-from liftcore.features.masks import layered
 from liftcore.io.files import visible_files
 from liftcore.io.npy import ARRAYS, NUMBERS, open_array, without_unit_axes
 from liftcore.scene.views import composed, without_image_suffix
 from liftcore.text.table import TableEncoder, plain
-from liftcore.values.views import NO_LABEL, Regions
+from liftcore.values.views import NO_LABEL, Regions, label_levels
 
 MOST_PHRASES = 4_096
 LEGEND = "legend"  # the text of a label picture that names its values
@@ -251,7 +250,7 @@ def _regions(name: str, view: _View, rows: Mapping[str, int], vectors: np.ndarra
         elif (key := plain(phrase)) in view.phrases:
             masks[key] = masks[key] | mask if key in masks else mask
     if masks:
-        labels = layered(list(masks.values()), str(view.file))
+        labels = label_levels(list(masks.values()), str(view.file))
     else:
         labels = np.full((1, 1, 1) if void is None else (1, *void.shape), NO_LABEL, np.int32)
     if view.was_searched(rows):

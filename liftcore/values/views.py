@@ -4,6 +4,7 @@ S is never built. A region map says for every pixel which codebook row each leve
 read by bilinear interpolation, four rows a pixel.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self, TypeVar
 
@@ -18,7 +19,8 @@ from liftcore.scene.splats import shared_tensor
 NO_LABEL = -1  # a pixel that a level leaves unlabelled
 LARGEST = 1e15  # of a feature; float32 sums of squares over all channels stay finite far beyond
 MAX_CHANNELS = 1 << 16
-PLANES = "of masks [M, h, w] that do not overlap give numpy.where(masks.any(0), masks.argmax(0), -1), a row a mask"
+PLANES = "masks [M, h, w], a plane for each row of vectors, are Regions.from_masks(masks.astype(bool), vectors)"
+MAX_LEVELS = 32  # a hierarchy of four partitions, with masks 1 to 4 pixels over their neighbours, took 13 to 18
 INTEGERS = (torch.int32, torch.int16, torch.int64, torch.int8, torch.uint8)
 WIDENED = (torch.uint16, torch.uint32)  # of pictures of 16 bits; torch does hardly anything with these
 Array = Tensor | np.ndarray
@@ -58,6 +60,57 @@ class Regions:
         object.__setattr__(self, "codebook", rows)
         object.__setattr__(self, "labels", _labels(labels, len(rows), f"{where} labels".strip()))
 
+    @classmethod
+    def from_masks(
+        cls,
+        masks: Array | Sequence[Array],
+        vectors: Array,
+        levels: Sequence[int] | None = None,
+        *,
+        where: str = "",
+    ) -> Self:
+        """Regions of masks that may overlap, as SAM gives them, with a vector each.
+
+        A pixel under several masks has a label of each, on a level of its own: it reads all their vectors, and none
+        of them is lost. An empty mask is on no pixel.
+
+        Args:
+            masks: [M, H, W] of booleans, or a sequence of M of [H, W]; also [M, 1, H, W], as SAM's predictor gives
+                them. They need not have the photo's size.
+            vectors: [M, F] of floats, row k of mask k.
+            levels: M whole numbers from 0 on, the level of each mask, such as SAM's sub-part, part and whole; masks
+                of one level must not overlap. None: large masks first, each on the first level that has room for it
+                (`label_levels`). The setting ``levels`` of a lift can take one of them alone.
+            where: what errors name before the argument.
+
+        Raises:
+            InvalidFeatures: masks that are no booleans, of another number than the vectors, or in which two of a
+                level overlap; or as the constructor has it.
+        """
+        named = f"{where} masks".strip()
+        try:
+            tensors = [mask for mask in masks if isinstance(mask, Tensor)] if isinstance(masks, Sequence) else []
+            planes = (torch.stack(tensors) if tensors else shared_tensor(masks)).cpu()
+        except (TypeError, ValueError, RuntimeError) as error:
+            got = f"{type(masks).__name__} ({str(error)[:80]})"
+            raise InvalidFeatures(named, expected="booleans [M, H, W]", got=got) from None
+        planes = planes[:, 0] if planes.ndim == 4 and planes.shape[1] == 1 else without_unit_axes(planes, 3)
+        if planes.ndim != 3 or planes.dtype != torch.bool or not planes.numel():
+            hint = "masks of numbers are booleans by masks > 0.5" if planes.dtype != torch.bool else ""
+            expected = "booleans [M, H, W], at least one mask and no side empty"
+            raise InvalidFeatures(named, expected=expected, got=_kind(planes), hint=hint)
+        codebook = _features(vectors, "M, F", f"{where} vectors".strip())
+        if len(codebook) != len(planes):
+            expected, got = f"{len(codebook)} masks, one a vector", f"{len(planes)} of shape {list(planes.shape[1:])}"
+            raise InvalidFeatures(named, expected=expected, got=got, hint="row k of the vectors is of mask k")
+        planes = planes.numpy()
+        labels = label_levels(list(planes), named) if levels is None else _levels_of(planes, levels, where)
+        return cls.unchecked(torch.from_numpy(labels).to(codebook.device), codebook)
+
+    def __repr__(self) -> str:
+        sizes = f"labels={list(self.labels.shape)}, codebook={list(self.codebook.shape)}"
+        return f"Regions({sizes} {_dtype_name(self.codebook)}, on {self.codebook.device})"
+
     def cpu(self) -> Self:
         """The same with its tensors on the CPU."""
         return self.unchecked(self.labels.cpu(), self.codebook.cpu())
@@ -94,6 +147,9 @@ class FeatureGrid:
         found = _features(grid, "h, w, F", where)
         object.__setattr__(self, "grid", found)
 
+    def __repr__(self) -> str:
+        return f"FeatureGrid({list(self.grid.shape)} {_dtype_name(self.grid)}, on {self.grid.device})"
+
     def cpu(self) -> Self:
         """The same with its tensor on the CPU."""
         return self.unchecked(self.grid.cpu())
@@ -112,6 +168,74 @@ class FeatureGrid:
 
 
 ViewFeatures = Regions | FeatureGrid
+
+
+def label_levels(masks: Sequence[np.ndarray], where: str) -> np.ndarray:
+    """[L, h, w] i32: label k where mask k is, -1 for none; an empty mask has no label.
+
+    The largest mask comes first, of equals the one that was given first, and each goes to the first level on which
+    none of its pixels is taken. No pixel of any mask is lost, and what lies alone is on level 0. A lift that takes
+    levels as rows of their own asks only which masks lie on a pixel, so there their level does not matter.
+
+    Args:
+        masks: [h, w] bool each, at least one, all of one size; each is asked for twice. where: named in the error.
+
+    Raises:
+        InvalidFeatures: they take more than MAX_LEVELS levels.
+    """
+    boxes, areas = zip(*map(_extent, masks), strict=True)
+    # Space for all levels that there may be: pages of those that are never written take no memory.
+    labels = np.empty((min(MAX_LEVELS, len(masks)), *masks[0].shape), np.int32)
+    labels[0] = NO_LABEL
+    used = 1
+    for number in sorted(range(len(masks)), key=lambda number: -areas[number]):
+        if not areas[number]:
+            break
+        inside, windows = masks[number][boxes[number]], labels[:, *boxes[number]]
+        level = next((k for k in range(used) if not ((windows[k] != NO_LABEL) & inside).any()), used)
+        if level == MAX_LEVELS:
+            depth = np.zeros(masks[0].shape, np.int32)
+            for mask in masks:
+                depth += mask
+            raise InvalidFeatures(
+                where,
+                expected=f"masks that lie on {MAX_LEVELS} levels without overlap",
+                got=f"{len(masks)} masks, up to {depth.max()} of them over one pixel",
+                hint="leave out those that are nearly the same, as SamAutomaticMaskGenerator does by box_nms_thresh",
+            )
+        if level == used:
+            labels[level] = NO_LABEL
+            used += 1
+        windows[level][inside] = number
+    return labels[:used]
+
+
+def _extent(mask: np.ndarray) -> tuple[tuple[slice, slice], int]:
+    """The rows and columns between which a mask's pixels lie, and how many it has."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        return (slice(0), slice(0)), 0
+    box = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+    return box, int(np.count_nonzero(mask[box]))
+
+
+def _levels_of(masks: np.ndarray, levels: Sequence[int], where: str) -> np.ndarray:
+    """[L, h, w] i32 of masks [M, h, w] bool on the levels that the caller names."""
+    named, expected = f"{where} levels".strip(), f"{len(masks)} whole numbers in 0..{MAX_LEVELS - 1}, one a mask"
+    numbers = np.asarray(levels)
+    if numbers.shape != masks.shape[:1] or numbers.dtype.kind not in "iu":
+        raise InvalidFeatures(named, expected=expected, got=repr(levels)[:80])
+    if not 0 <= int(numbers.min()) <= int(numbers.max()) < MAX_LEVELS:
+        raise InvalidFeatures(named, expected=expected, got=f"{int(numbers.min())}..{int(numbers.max())}")
+    labels = np.full((int(numbers.max()) + 1, *masks.shape[1:]), NO_LABEL, np.int32)
+    for number, level in enumerate(numbers.tolist()):
+        own = labels[level][masks[number]]
+        if (own != NO_LABEL).any():
+            got = f"mask {number} over mask {int(own.max())} on level {level}"
+            hint = "leave levels out, and each overlap gets a level of its own"
+            raise InvalidFeatures(named, expected="masks of a level that do not overlap", got=got, hint=hint)
+        labels[level][masks[number]] = number
+    return labels
 
 
 def check_finite(values: Tensor, where: str) -> None:
@@ -168,4 +292,8 @@ def _labels(values: object, rows: int, where: str) -> Tensor:
 
 
 def _kind(tensor: Tensor) -> str:
-    return f"{str(tensor.dtype).removeprefix('torch.')} {list(tensor.shape)}"
+    return f"{_dtype_name(tensor)} {list(tensor.shape)}"
+
+
+def _dtype_name(tensor: Tensor) -> str:
+    return str(tensor.dtype).removeprefix("torch.")

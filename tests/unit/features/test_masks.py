@@ -15,9 +15,9 @@ from PIL import Image
 
 from liftcore.errors import InvalidFeatures
 from liftcore.features.mask_files import mask_of_runs, read_runs
-from liftcore.features.masks import MAX_LEVELS, layered, mask_views
+from liftcore.features.masks import mask_views
 from liftcore.values.pack import read_features, write_pack
-from liftcore.values.views import Regions
+from liftcore.values.views import MAX_LEVELS, Regions, label_levels
 from tests.run_lengths import compressed, lengths_of, sam_records
 
 LABELS = np.array([[-1, 0, 0, 2], [1, 1, -1, 2], [1, 1, -1, -1]])
@@ -288,7 +288,7 @@ def boxes(draw: st.DrawFn) -> np.ndarray:
 
 @given(boxes())
 def test_every_mask_is_whole_on_one_level(masks: np.ndarray) -> None:
-    labels = layered(list(masks), "a.json")
+    labels = label_levels(list(masks), "a.json")
     assert labels.dtype == np.int32 and labels.shape[1:] == masks.shape[1:]
     for number, mask in enumerate(masks):
         here = labels == number
@@ -301,20 +301,20 @@ def test_largest_masks_come_first_and_of_equals_the_first() -> None:
     masks = np.zeros((4, 1, 6), bool)
     for number, (start, end) in enumerate([(0, 2), (0, 4), (2, 4), (3, 5)]):
         masks[number, 0, start:end] = True
-    assert layered(list(masks), "a.json").tolist() == [
+    assert label_levels(list(masks), "a.json").tolist() == [
         [[1, 1, 1, 1, -1, -1]],
         [[0, 0, 2, 2, -1, -1]],
         [[-1, -1, -1, 3, 3, -1]],
     ]
     masks = np.concatenate([np.eye(5, dtype=bool)[:, None], np.zeros((2, 1, 5), bool)])
-    assert layered(list(masks), "a.json").tolist() == [[[0, 1, 2, 3, 4]]]
-    assert layered([np.zeros((2, 2), bool)], "a.json").tolist() == [[[-1, -1], [-1, -1]]]
+    assert label_levels(list(masks), "a.json").tolist() == [[[0, 1, 2, 3, 4]]]
+    assert label_levels([np.zeros((2, 2), bool)], "a.json").tolist() == [[[-1, -1], [-1, -1]]]
 
 
 def test_too_many_masks_over_a_pixel_are_told_with_their_number() -> None:
     masks = [np.ones((2, 2), bool)] * MAX_LEVELS
-    assert len(layered(masks, "a.json")) == MAX_LEVELS
+    assert len(label_levels(masks, "a.json")) == MAX_LEVELS
     with pytest.raises(
         InvalidFeatures, match=r"a\.json: .*33 masks, up to 33 of them over one pixel; .*box_nms_thresh"
     ):
-        layered([*masks, np.ones((2, 2), bool)], "a.json")
+        label_levels([*masks, np.ones((2, 2), bool)], "a.json")

@@ -1,0 +1,64 @@
+"""Regions of masks that may overlap: no pixel of any mask is lost, and wrong masks are refused by their name."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import liftcore as lc
+from tests.scenes import random_camera, random_splats
+
+OVERLAPPING = np.array([[[1, 1, 0, 0]], [[0, 1, 1, 0]], [[0, 0, 0, 1]], [[0, 0, 0, 0]]], dtype=bool)  # [4, 1, 4]
+VECTORS = np.eye(4, 3, dtype=np.float32)
+
+
+@pytest.mark.parametrize(
+    "form", [np.asarray, torch.from_numpy, list, lambda masks: list(torch.from_numpy(masks)), lambda m: m[:, None]]
+)
+def test_each_pixel_has_a_label_of_each_mask_that_it_lies_under(form: Any) -> None:
+    regions = lc.Regions.from_masks(form(OVERLAPPING), VECTORS)
+    assert torch.equal(regions.codebook, torch.from_numpy(VECTORS))
+    for number, mask in enumerate(OVERLAPPING):
+        on = (regions.labels == number).numpy()
+        assert np.array_equal(on.any(axis=0), mask) and on.sum() == mask.sum()
+    assert regions.labels.shape == (2, 1, 4)
+
+
+def test_overlapping_masks_lift_as_the_sum_of_what_each_says() -> None:
+    splats, camera = random_splats(1), random_camera(1)
+    rng = np.random.default_rng(0)
+    masks = rng.random((5, 9, 11)) < 0.4
+    both = lc.Regions.from_masks(masks, rng.normal(size=(5, 6)))
+    W = lc.region_weights(splats, {"v0": camera}, {"v0": both}, "row-sum").matrix(splats.count)
+    for number in range(5):
+        alone = lc.Regions.from_masks(masks[number : number + 1], np.ones((1, 6)))
+        column = lc.region_weights(splats, {"v0": camera}, {"v0": alone}, "row-sum").matrix(splats.count)
+        np.testing.assert_allclose(W[:, [number]].toarray(), column.toarray(), rtol=1e-6)
+
+
+def test_levels_that_are_named_are_kept() -> None:
+    regions = lc.Regions.from_masks(OVERLAPPING, VECTORS, levels=[0, 2, 0, 1])
+    assert regions.labels.tolist() == [[[0, 0, -1, 2]], [[-1, -1, -1, -1]], [[-1, 1, 1, -1]]]
+
+
+@pytest.mark.parametrize(
+    ("masks", "vectors", "levels", "message"),
+    [
+        (OVERLAPPING.astype(np.float32), VECTORS, None, r"masks: expected booleans \[M, H, W\].*got float32.*> 0.5"),
+        (OVERLAPPING[0, 0], VECTORS, None, r"masks: expected booleans \[M, H, W\].*got bool \[4\]"),
+        (OVERLAPPING[:0], VECTORS, None, "masks: expected booleans .* at least one mask"),
+        ("masks.npy", VECTORS, None, "masks: expected booleans"),
+        ([np.ones((2, 2), bool), np.ones((2, 3), bool)], VECTORS, None, "masks: expected booleans"),
+        ([torch.ones(3, 3).bool(), torch.ones(2, 2).bool()], VECTORS, None, "masks: expected booleans"),
+        (OVERLAPPING[:3], VECTORS, None, r"masks: expected 4 masks, one a vector, got 3 .*row k of the vectors"),
+        (OVERLAPPING, VECTORS.astype(int), None, r"vectors: expected floats \[M, F\], got int64"),
+        (OVERLAPPING, VECTORS, [0, 0, 0, 0], "levels: .* do not overlap, got mask 1 over mask 0 on level 0"),
+        (OVERLAPPING, VECTORS, [0, 1], "levels: expected 4 whole numbers"),
+        (OVERLAPPING, VECTORS, [0, -1, 0, 0], "levels: expected 4 whole numbers in 0..31, .*got -1..0"),
+        (OVERLAPPING, VECTORS, [0.5, 1, 0, 0], "levels: expected 4 whole numbers"),
+    ],
+)
+def test_wrong_masks_are_refused_by_their_name(masks: Any, vectors: Any, levels: Any, message: str) -> None:
+    with pytest.raises(lc.InvalidFeatures, match=message):
+        lc.Regions.from_masks(masks, vectors, levels)
