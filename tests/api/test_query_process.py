@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import socket
+import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -149,6 +150,14 @@ def test_key_has_a_share_of_the_places(start: Start, of_a_key: int, waiting: int
     until(lambda: calls.worker.waiting == waiting - 1)
 
 
+def stop(worker: QueryClient) -> subprocess.Popen[bytes]:
+    """Stop its process, as a debugger does."""
+    process = worker._process
+    assert process is not None
+    os.kill(process.pid, signal.SIGSTOP)
+    return process
+
+
 def test_every_call_has_one_time_for_waiting_and_answer(start: Start, tmp_path: Path) -> None:
     worker = start(seconds=4.0)  # a process begins within it, on a busy machine too
     calls = Calls(worker)
@@ -159,13 +168,22 @@ def test_every_call_has_one_time_for_waiting_and_answer(start: Start, tmp_path: 
     assert worker.call({"operation": "query", "name": "next", "after": "at once"}) == Frame({"name": "next"})
 
 
-def test_process_that_reads_nothing_holds_the_turn_no_longer(start: Start) -> None:
+def test_process_that_is_stopped_is_replaced(start: Start) -> None:
+    worker = start(seconds=60.0)
+    request = {"operation": "query", "name": "x", "after": "at once"}
+    worker.call(request)
+    process = stop(worker)
+    until(lambda: not worker.alive())
+    assert worker.call(request) == Frame({"name": "x"})
+    assert process.poll() is not None
+
+
+def test_process_that_reads_nothing_holds_the_turn_no_longer(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
     worker = start(seconds=4.0)
     request = {"operation": "query", "name": "x", "after": "at once"}
     worker.call(request)
-    process = worker._process
-    assert process is not None
-    os.kill(process.pid, signal.SIGSTOP)
+    monkeypatch.setattr(client, "is_stopped", lambda pid: False)  # it is stopped as soon as it was looked at
+    stop(worker)
     with pytest.raises(TimedOut):
         worker.call(request | {"padding": "x" * 1_000_000})  # more than a pipe holds
     assert worker.call(request) == Frame({"name": "x"})
