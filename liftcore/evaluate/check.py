@@ -44,7 +44,7 @@ from liftcore.scene.panorama import with_panoramas
 from liftcore.scene.render_mode import rendering_reason, rendering_warnings
 from liftcore.scene.splats import Splats
 from liftcore.scene.views import cameras_of_views, some_of
-from liftcore.solve.diagnostics import activation_warnings, is_stretched, shape_warnings
+from liftcore.solve.diagnostics import is_stretched, shape_warnings
 from liftcore.values.lens import photo_as_pinhole_sees
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.pack import Views, pair
@@ -109,7 +109,7 @@ def check_scene(
     trained = CompositingParams(antialiased=settings.antialiased is True)
     wrong: list[str] = []
     contradicting = rendering_warnings(splats.render_mode, trained.antialiased, splats.kernel)
-    notes = [f"splats: {text}" for text in (*contradicting, *splats.warnings, *activation_warnings(splats))]
+    notes = [f"splats: {text}" for text in (*contradicting, *splats.warnings)]
     notes += [f"cameras: {text}" for text in cameras.warnings]
     if trained.antialiased:
         notes.append(f"splats: rendered antialiased: {rendering_reason(splats.render_mode, True)}")

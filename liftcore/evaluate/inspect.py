@@ -22,7 +22,7 @@ from liftcore.io.transforms import FRAME_FILE
 from liftcore.scene.cameras import Cameras, distortion_warning, photo_size
 from liftcore.scene.compositing import ALPHA_FLOOR
 from liftcore.scene.splats import Kernel, Splats
-from liftcore.solve.diagnostics import UNSEEN, activation_warnings
+from liftcore.solve.diagnostics import UNSEEN
 from liftcore.text.table import plain
 from liftcore.values.pack import read_features
 from liftcore.values.views import NO_LABEL, Regions
@@ -177,7 +177,6 @@ def _splat_warnings(splats: Splats, scales: Tensor, opacities: Tensor) -> list[s
     }
     warnings = [*splats.warnings]
     warnings += [f"{count} of {splats.count} splats {what}" for what, count in counted.items() if count]
-    warnings += activation_warnings(splats)
     if splats.sh is None:
         warnings.append("no colour: renders in RGB are not possible")
     if splats.kernel is Kernel.GAUSSIAN_3D and bool((scales[:, 2] * FLAT < scales[:, :2].amin(dim=1)).all()):

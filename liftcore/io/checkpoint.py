@@ -78,13 +78,10 @@ def _read_one(path: Path, *, colour: bool) -> dict[str, np.ndarray]:
     fields = {field: _array(tensors, name, path) for field, name in GSPLAT.items()}
     fields["opacity_logits"] = fields["opacity_logits"].reshape(len(fields["opacity_logits"]), -1)[:, 0]
     if colour and names[0] in tensors:
-        first, rest = (_array(tensors, name, path) for name in names)
-        try:
-            fields["sh"] = np.concatenate([first.reshape(len(first), 1, 3), rest.reshape(len(rest), -1, 3)], axis=1)
-        except ValueError:
-            got = f"{list(first.shape)} and {list(rest.shape)}"
-            argument = f"{path} {' and '.join(names)}"
-            raise InvalidSplats(argument, expected="shapes [P, 1, 3] and [P, K, 3]", got=got) from None
+        from liftcore.scene.splats import joined_harmonics
+
+        first, rest = (torch.from_numpy(_array(tensors, name, path)) for name in names)
+        fields["sh"] = joined_harmonics(first, rest, (f"{path} {names[0]}", names[1])).numpy()
     return fields
 
 

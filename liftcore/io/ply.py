@@ -23,7 +23,7 @@ import numpy as np
 from liftcore.errors import InvalidSplats
 from liftcore.io.files import open_regular, whole_file
 from liftcore.scene.harmonics import SH_C0, constant_terms
-from liftcore.scene.kernel import DARK_LOBE, LOBE_COLOURS, Kernel, kernel_named, scale_count
+from liftcore.scene.kernel import DARK_LOBE, LOBE_COLOURS, NORMALS, Kernel, kernel_named, scale_count
 from liftcore.scene.render_mode import RenderMode, RenderModel, kernel_of_mode, mode_beside, mode_of_comments
 
 if TYPE_CHECKING:
@@ -46,7 +46,6 @@ UNREAD = {  # columns that change what is rendered and are not read: what the sp
     "have colours that depend on more, and are rendered with the harmonics alone": r"(sb_params|f?_?asg|sg|f_app|"
     r"app|appearance|albedo|base_color|roughness|metallic|specular|transient|embedding)(_.*)?",
 }
-NORMALS = ("nx", "ny", "nz")
 CHANNELS = (
     ("red", "green", "blue"),
     ("diffuse_red", "diffuse_green", "diffuse_blue"),

@@ -174,12 +174,7 @@ def some_rows(path: Path, kept: np.ndarray, suffix: str = ".ply") -> Iterator[by
     if write is ply.ply_blocks and format_of(path) is SplatFormat.PLY:
         return ply.some_rows(path, kept)
     splats = _of_count(path, len(kept))
-    import torch
-
-    rows = torch.from_numpy(np.flatnonzero(kept))
-    fields = ("means", "quats", "log_scales", "opacity_logits", "beta", "sh", "sb_params")
-    values = {name: getattr(splats, name)[rows] for name in fields if getattr(splats, name) is not None}
-    return write(replace(splats, **values, extras={}, layout=(), header=()))
+    return write(replace(splats[kept], extras={}, layout=(), header=()))
 
 
 def with_columns(path: Path, columns: Mapping[str, np.ndarray]) -> Iterator[bytes]:

@@ -21,6 +21,7 @@ from liftcore.io.colmap import PANORAMA, Intrinsics, distortion_of
 from liftcore.io.json_file import FORMATS, entry, matrix, number, pixels, read_json
 from liftcore.io.photos import PhotoHeader, PhotosBeside
 from liftcore.scene.cameras import (
+    CAMERA_AXES,
     Camera,
     Cameras,
     InvalidPose,
@@ -64,7 +65,6 @@ LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])  # of a rigid pose
 OF_NERFSTUDIO = ("applied_transform", "ply_file_path")  # what its own converter writes, and others do not
 EXPORTED = ("file_path", "transform")  # of each camera of an export
 FOCALS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
-OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0])  # a camera's y up and z back become down and ahead
 
 
 def parse_transforms(document: Any, source: str, photos: PhotosBeside | None = None) -> Cameras:
@@ -146,7 +146,7 @@ def transforms_of(cameras: Mapping[str, Camera]) -> dict[str, Any]:
     frames = []
     for name, camera in cameras.items():
         pose = np.linalg.inv(camera.viewmat)
-        pose[:3, :3] *= OPENGL_TO_OPENCV
+        pose[:3, :3] *= CAMERA_AXES["opengl"]
         lens = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy}
         lens |= {"cx": camera.cx, "cy": camera.cy}
         frames.append({"file_path": f"{name}.png", "transform_matrix": pose.tolist(), **lens})
@@ -164,7 +164,7 @@ def _cameras(name: str, keys: ChainMap[str, Any], source: str, photos: PhotosBes
     if len(given) == 4 and np.abs(given[3] - LAST_ROW).max() > 1e-6:
         got = " ".join(f"{value:g}" for value in given[3])
         raise InvalidPose(f"{where} transform_matrix", expected="0 0 0 1 as the last row", got=got)
-    pose = viewmat_of(given[:3, :3] * OPENGL_TO_OPENCV, given[:3, 3])
+    pose = viewmat_of(given[:3, :3] * CAMERA_AXES["opengl"], given[:3, 3])
     if panorama:
         return faces_of(name, width, height, pose)
     intrinsics = _intrinsics(keys, width, height, where)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 
@@ -15,14 +15,24 @@ from liftcore.runtime.nearest import nearest
 from liftcore.scene.distortion import MAX_SIDE, Distortion, Lens, Rectangle, shared_lens
 from liftcore.scene.origin import FILE_ORIGIN, MAP_REACH, Origin
 from liftcore.scene.panorama import TURNS, Face
+from liftcore.scene.similarity import Similarity
 from liftcore.scene.views import cameras_of_views, composed, without_image_suffix
 
 if TYPE_CHECKING:  # torch is taken, and not loaded for it
     from torch import Tensor
 
+    from liftcore.scene.similarity import Numbers
+
     Matrix = np.ndarray | Tensor | Sequence[Sequence[float]]
 
 R = TypeVar("R")
+Convention = Literal["opencv", "opengl", "blender"]
+CAMERA_AXES = {  # convention -> the signs that turn a camera's axes into OpenCV's
+    "opencv": np.array([1.0, 1.0, 1.0]),
+    "opengl": np.array([1.0, -1.0, -1.0]),  # y up and z back become down and ahead
+    "blender": np.array([1.0, -1.0, -1.0]),
+}
+NAME_SHOWN = 40  # characters of a name, of its end, in what prints of a camera
 ROUNDING = 1e-6  # of the last row of a pose
 MIN_FOCAL, MAX_FOCAL = 1e-3, 1e9  # pixels; float64 squares of what they project stay finite
 MAX_OFF_CENTRE = 1e9  # pixels of the principal point
@@ -106,6 +116,66 @@ class Camera:
         """A camera of its intrinsics in pixels, the principal point from the left and top edge of the image."""
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         return cls(viewmat, K, width, height, lens=lens, name=name)
+
+    @classmethod
+    def from_camera_to_world(
+        cls,
+        pose: Matrix,
+        K: Matrix,
+        width: int,
+        height: int,
+        *,
+        convention: Convention,
+        name: str = "",
+    ) -> Camera:
+        """A camera of its pose in the world, whose axes follow a named convention.
+
+        Args:
+            pose: [4, 4] or [3, 4] camera to world, rigid: the columns are the camera's axes and its centre.
+            K: [3, 3] pixels. width: pixels. height: pixels.
+            convention: of the camera's axes. ``opencv``: x right, y down, z ahead (COLMAP, gsplat); ``opengl``, the
+                same as ``blender``: x right, y up, z back (NeRF, nerfstudio's transforms.json). It has no default, as
+                either would be wrong for half of all files without any error.
+
+        Raises:
+            InvalidCameras: an unknown convention, or as the constructor has it.
+        """
+        if not isinstance(convention, str) or convention not in CAMERA_AXES:
+            expected, got = " or ".join(map(repr, CAMERA_AXES)), repr(convention)[:80]
+            raise InvalidCameras(f"camera {name!r} convention", expected=expected, got=got)
+        given = _matrix(pose)
+        if given.shape not in ((4, 4), (3, 4)):
+            expected, got = "a finite 4x4 or 3x4 matrix", f"shape {list(given.shape)}"
+            raise InvalidCameras(f"camera {name!r} pose", expected=expected, got=got)
+        viewmat = viewmat_of(given[:3, :3] * CAMERA_AXES[convention], given[:3, 3])
+        if len(given) == 4:
+            viewmat[3] = given[3]  # refused if it is no pose's
+        return cls(viewmat, K, width, height, name=name)
+
+    def transformed(
+        self,
+        matrix: Numbers | None = None,
+        *,
+        scale: float = 1.0,
+        rotation: Numbers | None = None,
+        translation: Numbers | None = None,
+    ) -> Camera:
+        """The camera in another frame of the world, ``p' = scale R p + translation`` (`Splats.transformed`).
+
+        Raises:
+            InvalidInput: it is no similarity.
+        """
+        move = Similarity.of(matrix, scale, rotation, translation)
+        turn = self.viewmat[:3, :3] @ move.rotation.T
+        pose = np.eye(4)
+        pose[:3, :3] = turn
+        pose[:3, 3] = move.scale * self.viewmat[:3, 3] - turn @ move.translation
+        return replace(self, viewmat=pose)
+
+    def __repr__(self) -> str:
+        focal, name = f"fx={self.fx:.6g}, fy={self.fy:.6g}", repr(self.name[-NAME_SHOWN:])
+        lens = ", distorted" if self.lens else ", of a panorama" if self.face else ""
+        return f"Camera({name}, {self.width}x{self.height}, {focal}, cx={self.cx:.6g}, cy={self.cy:.6g}{lens})"
 
     def replace(self, **changes: Any) -> Camera:
         """The same camera with other fields, or with another ``fx``, ``fy``, ``cx`` or ``cy``."""
@@ -278,6 +348,26 @@ class Cameras(Mapping[str, Camera]):
 
     def __len__(self) -> int:
         return len(self._by_name)
+
+    def __repr__(self) -> str:
+        some = ", ".join(repr(name[-NAME_SHOWN:]) for name in list(self)[:2]) + (", ..." if len(self) > 2 else "")
+        return f"Cameras({len(self)} views: {some})"
+
+    def transformed(
+        self,
+        matrix: Numbers | None = None,
+        *,
+        scale: float = 1.0,
+        rotation: Numbers | None = None,
+        translation: Numbers | None = None,
+    ) -> Cameras:
+        """All cameras in another frame of the world (`Camera.transformed`).
+
+        Raises:
+            InvalidInput: it is no similarity.
+        """
+        move = {"matrix": matrix, "scale": scale, "rotation": rotation, "translation": translation}
+        return Cameras([camera.transformed(**move) for camera in self.values()], warnings=self.warnings)
 
     @property
     def distorted(self) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ from enum import StrEnum
 from liftcore.errors import InvalidSplats
 
 LOBE_COLOURS = 3  # r g b, the first of the six numbers of a spherical beta lobe
+NORMALS = ("nx", "ny", "nz")  # columns of files, which no kernel reads
 DARK_LOBE = -10.0  # r g b of a lobe that adds nothing: its softplus of sharpness 10 ln 2 is 1e-31, and of zero 0.1
 
 

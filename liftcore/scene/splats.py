@@ -16,14 +16,19 @@ import numpy as np
 import torch
 
 from liftcore.errors import InvalidSplats
-from liftcore.scene.kernel import DARK_LOBE, LOBE_COLOURS, Kernel, kernel_named, scale_count
+from liftcore.scene.harmonics import SH_C0, band_rotation
+from liftcore.scene.kernel import DARK_LOBE, LOBE_COLOURS, NORMALS, Kernel, kernel_named, scale_count
 from liftcore.scene.origin import FILE_ORIGIN, Origin, float32_step, local_origin, usual_size
 from liftcore.scene.render_mode import RenderMode, RenderModel, render_mode_of
+from liftcore.scene.rows import Rows, chosen_rows
+from liftcore.scene.similarity import Similarity
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from torch import Tensor
+
+    from liftcore.scene.similarity import Numbers
 
     Array = Tensor | np.ndarray
 
@@ -31,6 +36,7 @@ if TYPE_CHECKING:
 SH_ROWS = (1, 4, 9, 16, 25)  # (degree + 1)^2
 _BEYOND = {"opacity_logits": (True, True), "log_scales": (True, False)}  # whether -inf and +inf have a meaning
 ROUNDED = 0.25  # of a splat's size: a coarser float32 has moved splats visibly
+MANY = 100  # splats: what all of so many have in common is no accident
 _GEOMETRY = ("means", "quats", "log_scales", "opacity_logits", "beta")  # what rays meet; all else is colour
 
 
@@ -53,6 +59,8 @@ class Splats:
 
     ``layout``, ``extras`` and ``header`` keep what the file had beyond the model (normals, SAGA's ``mask``,
     comments), so that writing gives back what was read.
+
+    ``splats[keep]`` has the rows that a mask [P], a slice or row numbers choose, with all their columns.
 
     Raises:
         InvalidSplats: an array has another shape or holds no floats, or no splat is finite; the error names it.
@@ -116,7 +124,7 @@ class Splats:
             object.__setattr__(self, name, columns.get(name))
         fixed = {"kernel": kernel, "extras": dict(extras or {}), "layout": tuple(layout), "header": tuple(header)}
         mode = render_mode_of(render_mode)
-        doubts = _doubts(mode, kernel)
+        doubts = [*_doubts(mode, kernel), *_activation_warnings(columns)]
         told = tuple(dict.fromkeys((*warnings, *repairs, *doubts, *rounding)))
         fixed |= {"render_mode": mode, "origin": origin, "warnings": told}
         for name, value in fixed.items():
@@ -126,6 +134,123 @@ class Splats:
         if (kernel is Kernel.BETA) != (beta is not None):
             got = f"{'none' if beta is None else 'values'} with kernel {kernel}"
             raise InvalidSplats("beta", expected="one value a splat for DBS and none for other kernels", got=got)
+
+    @classmethod
+    def from_gsplat(
+        cls,
+        means: Array,
+        quats: Array,
+        scales: Array,
+        opacities: Array,
+        colors: Array | None = None,
+        *,
+        activated: bool,
+        kernel: Kernel | str = Kernel.GAUSSIAN_3D,
+        sh0: Array | None = None,
+        shN: Array | None = None,
+        features_dc: Array | None = None,
+        features_rest: Array | None = None,
+        render_mode: RenderMode | str | None = None,
+    ) -> Splats:
+        """Splats of the tensors of gsplat or nerfstudio, by their names there.
+
+        With ``activated=False`` they are parameters of a training: ``from_gsplat(**splats, activated=False)`` of
+        gsplat's trainer, ``from_gsplat(**model.gauss_params, activated=False)`` of nerfstudio's splatfacto. With
+        ``activated=True`` they are what ``gsplat.rasterization`` takes.
+
+        Args:
+            means: [P, 3], the frame of the training. quats: [P, 4] w x y z, of any length.
+            scales: [P, 3]; lengths where activated, else their logarithms. 2DGS takes the first two.
+            opacities: [P] or [P, 1]; in 0..1 where activated, else logits.
+            colors: [P, 3] RGB in 0..1, or [P, K, 3] spherical harmonics; or in place of it
+            sh0, shN: [P, 1, 3] and [P, K - 1, 3], gsplat's; or features_dc, features_rest: [P, 3] and [P, K - 1, 3],
+                nerfstudio's.
+            activated: whether scales and opacities are lengths and opacities, not logarithms and logits.
+
+        Raises:
+            InvalidSplats: scales or opacities cannot be what ``activated`` says, colours come twice, or an array has
+                another shape; the error names it. What may be and is unlikely is in ``warnings``.
+        """
+        scales, opacities = _floats("scales", scales), _floats("opacities", opacities)
+        if activated:
+            scales = _in_range("scales", scales, math.inf, "lengths of zero or more").log()
+            opacities = _in_range("opacities", opacities, 1.0, "opacities in 0..1").double().logit().float()
+        kernel = kernel_named(kernel)
+        if scales.ndim == 2 and scales.shape[1] == 3:
+            scales = scales[:, : scale_count(kernel)]
+        given = {"colors": colors, "sh0": sh0, "features_dc": features_dc}
+        first = {name: _floats(name, values) for name, values in given.items() if values is not None}
+        if len(first) > 1:
+            raise InvalidSplats(list(first)[1], expected="colours once", got=" and ".join(first))
+        sh = first.get("colors")
+        if sh is not None:
+            sh = (sh[:, None] - 0.5) / SH_C0 if sh.ndim == 2 else sh
+        elif "sh0" in first:
+            sh = joined_harmonics(first["sh0"], shN, ("sh0", "shN"))
+        elif "features_dc" in first:
+            sh = joined_harmonics(first["features_dc"], features_rest, ("features_dc", "features_rest"))
+        try:
+            return cls(means, quats, scales, opacities, kernel, sh=sh, render_mode=render_mode)
+        except InvalidSplats as error:
+            name = {"log_scales": "scales", "opacity_logits": "opacities"}.get(error.argument, error.argument)
+            raise InvalidSplats(name, expected=error.expected, got=error.got, hint=error.hint) from None
+
+    def __repr__(self) -> str:
+        colour = "no colour" if self.sh is None else f"sh degree {self.sh_degree}"
+        about = "" if self.origin == FILE_ORIGIN else f", about {tuple(round(value, 1) for value in self.origin)}"
+        return f"Splats({self.count} of {self.kernel}, {colour}{about}, on {self.means.device})"
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, keep: Rows) -> Splats:
+        """The splats that a mask [P], a slice or row numbers [n] choose; all columns, extras and the origin follow.
+
+        Raises:
+            InvalidInput: they choose no splat, or are none of these (`liftcore.scene.rows`).
+        """
+        rows = chosen_rows(keep, self.count).to(self.means.device)
+        columns = {name: value[rows] for name, value in vars(self).items() if isinstance(value, torch.Tensor)}
+        extras = {name: column[rows.to(column.device)] for name, column in self.extras.items()}
+        return replace(self, **columns, extras=extras)
+
+    def transformed(
+        self,
+        matrix: Numbers | None = None,
+        *,
+        scale: float = 1.0,
+        rotation: Numbers | None = None,
+        translation: Numbers | None = None,
+    ) -> Splats:
+        """The splats in another frame, ``p' = scale R p + translation``: places, sizes, turns and colours.
+
+        Spherical harmonics of all degrees, the lobes of DBS and normals turn with them, so that cameras moved alike
+        (`Camera.transformed`) see the same.
+
+        Args:
+            matrix: [4, 4], (s R | t); or its parts,
+            scale: above zero. rotation: [3, 3], or a quaternion [4] w x y z. translation: [3], scene units.
+
+        Raises:
+            InvalidInput: it is no similarity, such as a reflection or a scale for each axis.
+        """
+        move = Similarity.of(matrix, scale, rotation, translation)
+        turn, place = torch.from_numpy(move.rotation), self.means.device
+        fields: dict[str, Any] = {"log_scales": (self.log_scales.double() + math.log(move.scale)).float()}
+        fields["means"] = torch.from_numpy(move.points(self.positions().astype(np.float64))).to(place)
+        if move.rotation.tolist() != np.eye(3).tolist():
+            fields["quats"] = _turned_quats(self.quats, move.rotation)
+            if self.sh is not None:
+                fields["sh"] = _turned_harmonics(self.sh, move.rotation)
+            if self.sb_params is not None:
+                fields["sb_params"] = _turned_lobes(self.sb_params, turn.to(place))
+            if set(NORMALS) <= self.extras.keys():
+                normals = torch.stack([self.extras[name].double() for name in NORMALS], dim=1)
+                columns = (normals @ turn.T.to(normals.device)).unbind(dim=1)
+                kinds = [self.extras[name].dtype for name in NORMALS]
+                own = {name: one.to(kind) for name, one, kind in zip(NORMALS, columns, kinds, strict=True)}
+                fields["extras"] = {**self.extras, **own}
+        return replace(self, **fields, origin=None)
 
     def cpu(self) -> Splats:
         """The same with its tensors on the CPU."""
@@ -179,6 +304,87 @@ def _moved_to_origin(
         return chosen, []
     what = f"positions came in float32, which tells {step:.2g} scene units apart where the splats lie"
     return chosen, [f"{what}, {max(map(abs, chosen)):.3g} from the origin of their file: store them as doubles"]
+
+
+def _activation_warnings(columns: Mapping[str, Tensor]) -> list[str]:
+    """Warnings of numbers that look activated already: a file keeps logits of opacities, and logarithms of scales."""
+    if len(columns["means"]) < MANY:
+        return []
+    logits, warnings = columns["opacity_logits"], []
+    logits = logits[~logits.isneginf()]
+    if len(logits) and bool(((logits >= 0) & (logits <= 1)).all()):
+        warnings.append(
+            "all opacities lie between 0 and 1, as if they were no logits: sigmoid makes them 0.5 to 0.73; if they "
+            "are opacities o, give log(o / (1 - o))"
+        )
+    if bool((columns["log_scales"] > 0).all()):
+        warnings.append(
+            "all scales are above 0, as if they were no logarithms: exp makes them larger than 1; if they are "
+            "lengths, give their logarithms"
+        )
+    return warnings
+
+
+def _in_range(name: str, values: Tensor, most: float, expected: str) -> Tensor:
+    """Activated values, of which none but NaN may lie outside; NaN stays, as everywhere."""
+    if bool(((values < 0) | (values > most)).any()):
+        low, high = (float(one) for one in torch.aminmax(values[~values.isnan()]))
+        hint = "parameters of a training, which are logarithms and logits, come with activated=False"
+        raise InvalidSplats(
+            name, expected=f"{expected}, as activated=True says", got=f"{low:.3g}..{high:.3g}", hint=hint
+        )
+    return values
+
+
+def joined_harmonics(first: Tensor, rest: Array | None, names: tuple[str, str]) -> Tensor:
+    """[P, K, 3] f32 of the constant terms [P, 3] or [P, 1, 3] and all others [P, K - 1, 3], or None.
+
+    Args:
+        names: of both, for errors.
+
+    Raises:
+        InvalidSplats: they have other shapes.
+    """
+    higher = first[:0] if rest is None else _floats(names[1], rest)
+    try:
+        higher = first.new_zeros(len(first), 0, 3) if rest is None else higher
+        return torch.cat([first.reshape(len(first), 1, 3), higher.reshape(len(higher), -1, 3)], dim=1)
+    except (RuntimeError, TypeError):
+        got = f"{list(first.shape)} and {list(higher.shape)}"
+        expected = "shapes [P, 1, 3] and [P, K, 3]"
+        raise InvalidSplats(" and ".join(names), expected=expected, got=got) from None
+
+
+def _turned_quats(quats: Tensor, rotation: np.ndarray) -> Tensor:
+    """[P, 4] f32, of splats that are turned: the product of a rotation's quaternion and theirs."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat().tolist()
+    product = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float64)
+    own = quats.double()
+    largest = own.abs().amax(dim=1, keepdim=True)
+    identity = own.new_tensor([1.0, 0.0, 0.0, 0.0])
+    return (torch.where(largest > 0, own, identity) @ product.T.to(own.device)).float()
+
+
+def _turned_harmonics(sh: Tensor, rotation: np.ndarray) -> Tensor:
+    """[P, K, 3] f32, coefficients of colours that are turned with the scene, band by band."""
+    bands = [sh[:, :1]]
+    for band in range(1, int(sh.shape[1] ** 0.5)):
+        turn = torch.from_numpy(band_rotation(band, rotation)).to(sh)
+        bands.append(torch.einsum("ij,pjc->pic", turn, sh[:, band**2 : (band + 1) ** 2]))
+    return torch.cat(bands, dim=1)
+
+
+def _turned_lobes(lobes: Tensor, turn: Tensor) -> Tensor:
+    """[P, S, 6] f32, with the directions (theta, phi) of beta lobes turned by [3, 3] f64."""
+    theta, phi = lobes[..., 3].double(), lobes[..., 4].double()
+    towards = torch.stack([theta.sin() * phi.cos(), theta.sin() * phi.sin(), theta.cos()], dim=-1) @ turn.T
+    across = torch.linalg.vector_norm(towards[..., :2], dim=-1)
+    angles = torch.stack(
+        [torch.atan2(across, towards[..., 2]), torch.atan2(towards[..., 1], towards[..., 0])], dim=-1
+    )
+    return torch.cat([lobes[..., :3], angles.float(), lobes[..., 5:]], dim=-1)
 
 
 def _doubts(mode: RenderMode | None, kernel: Kernel) -> list[str]:

@@ -261,26 +261,7 @@ def _some(names: Sequence[str]) -> str:
 FEW_CELLS = 4  # on a side; of fewer a shape says little
 FAR = 2.0  # times wider or narrower than the image: square maps of photos are nearer
 CELL = 1  # cells of a map, and pixels of its image, that rounding to whole ones may add or take on a side
-MANY = 100  # splats: what all of so many have in common is no accident
 TURNED = 1.2  # times nearer to the image's shape when rows and columns are swapped
-
-
-def activation_warnings(splats: Splats) -> list[str]:
-    """Warnings of numbers that look activated already: a file keeps logits of opacities, and logarithms of scales."""
-    if splats.count < MANY:
-        return []
-    logits, warnings = splats.opacity_logits[~splats.opacity_logits.isneginf()], []
-    if len(logits) and bool(((logits >= 0) & (logits <= 1)).all()):
-        warnings.append(
-            "all opacities lie between 0 and 1, as if they were no logits: sigmoid makes them 0.5 to 0.73; if they "
-            "are opacities o, give log(o / (1 - o))"
-        )
-    if bool((splats.log_scales > 0).all()):
-        warnings.append(
-            "all scales are above 0, as if they were no logarithms: exp makes them larger than 1; if they are "
-            "lengths, give their logarithms"
-        )
-    return warnings
 
 
 def shape_warnings(packs: Views, views: Sequence[Camera]) -> list[str]:

@@ -434,3 +434,20 @@ def test_tensors_of_a_training_loop_lift_as_their_files_do(loop: dict[str, Any],
     columns = np.nonzero(np.asarray(loop["mask"]))[1]
     assert len(columns) > 10 and columns.max() < WIDTH / 2  # the cloud on the left was asked for
     assert loop["means"].grad is None
+
+
+def test_tensors_of_gsplat_and_nerfstudio_are_taken_under_their_names(loop: dict[str, Any]) -> None:
+    (example,) = (block for block in blocks(PYTHON, "python") if "from_gsplat(" in block)
+    raw = {"means": loop["means"], "quats": loop["quats"]}
+    raw |= {"scales": loop["log_scales"], "opacities": loop["opacity_logits"]}
+    names = {"lc": lc, "colors": torch.rand(400, 3), "c2w": torch.eye(4), "K": loop["poses"][0][2]}
+    names |= {"trainer": SimpleNamespace(splats=raw), "model": SimpleNamespace(gauss_params=raw)}
+    names |= raw | {"scales": raw["scales"].exp(), "opacities": raw["opacities"].sigmoid()}
+    names |= {"width": WIDTH, "height": HEIGHT}
+    trained = lc.Splats(**{name: loop[name] for name in ("means", "quats", "log_scales", "opacity_logits")})
+    for line in example.splitlines():
+        exec(line, names)
+        splats: lc.Splats = names["splats"]
+        assert torch.allclose(splats.log_scales, trained.log_scales, atol=1e-5)
+        assert torch.allclose(splats.opacity_logits, trained.opacity_logits, atol=1e-4)
+    assert names["camera"].viewmat.diagonal().tolist() == [1, -1, -1, 1]

@@ -38,7 +38,7 @@ from liftcore.scene.render_mode import rendering_reason, rendering_warnings
 from liftcore.scene.splats import Splats
 from liftcore.solve.codebook import TABLE_BYTES
 from liftcore.solve.consensus import BLOCK_ENTRIES
-from liftcore.solve.diagnostics import activation_warnings, shape_warnings
+from liftcore.solve.diagnostics import shape_warnings
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.pack import Views
 from liftcore.values.region_weights import MEMORY_LIMIT
@@ -225,7 +225,6 @@ def plan_lift(
         warnings=(*short, *check_memory(parts, free), *check_weights(in_files)),
         told=(
             *splats.warnings,
-            *activation_warnings(splats),
             *rendering_warnings(splats.render_mode, settings.lift_params.antialiased, splats.kernel),
             *views.cameras.warnings,
             *distortion_warning(cameras),

@@ -1,0 +1,131 @@
+"""Some rows of splats, and splats and cameras in another frame."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+import liftcore as lc
+from liftcore.query.splat_colours import seen_colours
+from liftcore.scene.kernel import Kernel
+from tests.scenes import random_camera, random_splats
+
+TURN = Rotation.from_rotvec([0.4, -1.1, 0.7])
+MOVE: dict[str, Any] = {"scale": 2.5, "rotation": TURN.as_matrix(), "translation": [3.0, -1.0, 7.0]}
+MATRIX = np.block([[2.5 * TURN.as_matrix(), np.array([[3.0], [-1.0], [7.0]])], [np.array([[0.0, 0.0, 0.0, 1.0]])]])
+
+
+def coloured(kernel: Kernel, degree: int = 3) -> lc.Splats:
+    splats = random_splats(5, 60, kernel=kernel)
+    rng = np.random.default_rng(1)
+    sh = torch.tensor(rng.normal(size=(60, (degree + 1) ** 2, 3)), dtype=torch.float32)
+    lobes = torch.tensor(rng.normal(size=(60, 2, 6)), dtype=torch.float32) if kernel is Kernel.BETA else None
+    extras = {name: torch.tensor(rng.normal(size=60)) for name in ("nx", "ny", "nz")} | {"mask": torch.arange(60)}
+    return replace(splats, sh=sh, sb_params=lobes, extras=extras)
+
+
+@pytest.mark.parametrize(
+    "keep",
+    [
+        np.arange(60) % 3 == 1,
+        torch.arange(60) % 3 == 1,
+        list(range(1, 60, 3)),
+        np.arange(1, 60, 3, dtype=np.uint8),
+        torch.arange(-59, 0, 3),
+        slice(1, None, 3),
+    ],
+)
+def test_chosen_rows_have_all_their_columns(keep: Any) -> None:
+    splats = coloured(Kernel.BETA)
+    some = splats[keep]
+    assert len(some) == some.count == 20
+    for name in ("means", "quats", "log_scales", "opacity_logits", "beta", "sh", "sb_params"):
+        assert torch.equal(getattr(some, name), getattr(splats, name)[1::3]), name
+    assert some.extras["mask"].tolist() == list(range(1, 60, 3)) and some.kernel is splats.kernel
+
+
+def test_rows_may_come_in_another_order_and_keep_an_origin_of_map_coordinates() -> None:
+    splats = random_splats(1)
+    far = replace(splats, means=splats.means.double() + torch.tensor([5e5, 5.4e6, 300.0]).double(), origin=None)
+    some = far[::-1]
+    assert some.origin == far.origin != (0, 0, 0)
+    np.testing.assert_array_equal(some.positions(), far.positions()[::-1])
+
+
+@pytest.mark.parametrize(
+    ("keep", "message"),
+    [
+        (np.ones(59, bool), r"keep: expected booleans \[60\], .* got a mask of 59"),
+        (np.zeros(60, bool), "keep: expected at least one row, got none of 60"),
+        ([], "keep: expected at least one row"),
+        ([0, 60], "keep: .* got row 60 of 60"),
+        (7, r"keep: .*, got 7; a single row is keep=\[row\]"),
+        ([0.5], "keep: .* got float64"),
+        ("all", "keep: expected booleans"),
+        (slice("a"), "keep: expected booleans"),
+        (None, "keep: expected booleans"),
+    ],
+)
+def test_what_chooses_no_rows_is_refused(keep: Any, message: str) -> None:
+    with pytest.raises(lc.InvalidInput, match=message):
+        coloured(Kernel.GAUSSIAN_3D)[keep]
+
+
+@pytest.mark.parametrize("kernel", list(Kernel))
+def test_cameras_moved_with_the_splats_see_the_same(kernel: Kernel) -> None:
+    splats, camera = coloured(kernel), random_camera(3)
+    values = np.random.default_rng(2).random((60, 2))
+    moved, seen_from = splats.transformed(**MOVE), camera.transformed(MATRIX)
+    np.testing.assert_allclose(moved.positions(), splats.positions() @ MATRIX[:3, :3].T + MATRIX[:3, 3], atol=1e-4)
+    image, other = lc.render(splats, camera, values), lc.render(moved, seen_from, values)
+    assert float(image.max()) > 0.1 and float((image - other).abs().max()) < 2e-3
+    colours, others = seen_colours(splats, camera), seen_colours(moved, seen_from)
+    assert torch.allclose(colours, others, atol=2e-3) and float(colours.std()) > 0.1
+    normals = [torch.stack([one.extras[name] for name in ("nx", "ny", "nz")], dim=1) for one in (splats, moved)]
+    np.testing.assert_allclose(TURN.apply(normals[0].numpy()), normals[1].numpy(), atol=1e-12)
+    assert lc.Cameras([camera]).transformed(**MOVE)["v0"].centre.tolist() == pytest.approx(seen_from.centre.tolist())
+
+
+def test_moving_back_gives_the_splats_and_a_quaternion_is_a_rotation() -> None:
+    splats = coloured(Kernel.GAUSSIAN_3D)
+    w, *others = np.roll(TURN.as_quat(), 1)
+    moved = splats.transformed(scale=2.5, rotation=[w, *others], translation=torch.tensor([3.0, -1.0, 7.0]))
+    assert torch.allclose(moved.means, splats.transformed(MATRIX).means, atol=1e-5)
+    back = moved.transformed(np.linalg.inv(MATRIX))
+    for name in ("means", "log_scales", "sh"):
+        assert torch.allclose(getattr(back, name), getattr(splats, name), atol=1e-4), name
+    same = splats.transformed(np.eye(4))
+    assert torch.equal(same.means, splats.means) and torch.equal(same.quats, splats.quats)
+
+
+def test_zero_quaternions_turn_as_identities() -> None:
+    splats = replace(random_splats(0, 2), quats=torch.tensor([[0.0, 0, 0, 0], [1.0, 0, 0, 0]]))
+    quats = splats.transformed(rotation=TURN.as_matrix()).quats
+    assert torch.equal(quats[0], quats[1]) and abs(abs(float(quats[0, 0])) - abs(TURN.as_quat()[3])) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"matrix": np.diag([1.0, 1, -1, 1])}, "matrix: expected a rotation times a scale, no reflection"),
+        ({"matrix": np.diag([1.0, 2, 3, 1])}, "matrix: expected a proper rotation"),
+        ({"matrix": np.eye(3)}, r"matrix: expected finite numbers \[4, 4\] or \[3, 4\], got shape \[3, 3\]"),
+        ({"matrix": MATRIX.T}, "matrix: expected 0 0 0 1 as the last row"),
+        ({"matrix": MATRIX, "scale": 2.0}, "matrix: expected a matrix, or the parts of one"),
+        ({"matrix": MATRIX, "rotation": np.eye(3)}, "matrix: expected a matrix, or the parts of one"),
+        ({"scale": 0.0}, "scale: expected a number above zero"),
+        ({"scale": [1, 1, 2]}, "scale: expected a number above zero"),
+        ({"rotation": np.diag([1.0, 1, -1])}, "rotation: expected a proper rotation, got a reflection"),
+        ({"rotation": [0, 0, 0, 0]}, "rotation: expected a quaternion"),
+        ({"translation": [1, 2]}, r"translation: expected finite numbers \[3\], got shape \[2\]"),
+        ({"translation": [1, 2, np.nan]}, "translation: expected finite numbers"),
+        ({"translation": "up"}, "translation: expected finite numbers"),
+    ],
+)
+def test_what_is_no_similarity_is_refused_by_its_name(given: dict[str, Any], message: str) -> None:
+    for value in (random_splats(0), random_camera(0)):
+        with pytest.raises(lc.InvalidInput, match=message):
+            value.transformed(**given)
