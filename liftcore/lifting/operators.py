@@ -11,7 +11,9 @@ from torch import Tensor
 
 from liftcore.errors import InvalidCameras, InvalidSettings
 from liftcore.lifting.geometry import weigh_views
-from liftcore.lifting.pipeline import solved_weights
+from liftcore.lifting.in_memory import InMemory, SceneWeights
+from liftcore.lifting.inputs import LiftInputs
+from liftcore.lifting.pipeline import reweigh
 from liftcore.raster import check_given, open_raster
 from liftcore.runtime.device import choose_device
 from liftcore.runtime.progress import Progress, Timings, silent
@@ -19,7 +21,7 @@ from liftcore.runtime.torch_modes import callers_modes, usual_modes
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.compositing import CompositingParams, check_antialiased
 from liftcore.scene.splats import Splats, shared_tensor
-from liftcore.values.lift_views import Given, LiftViews
+from liftcore.values.lift_views import Given
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import LiftSettings, Preset
 
@@ -123,13 +125,13 @@ def region_weights(
     Raises:
         InvalidFeatures, InvalidSettings, Unavailable: as `lift` has it.
     """
-    chosen = LiftSettings.chosen(preset, settings)
-    splats = check_given(splats, threads)
-    chosen = chosen.for_splats(splats)
-    found = LiftViews.of(views, cameras, chosen)
-    own = chosen.model_copy(update={"certificate_rays": 0})
-    raster = open_raster(splats, choose_device(chosen.device), threads)
-    geometry = weigh_views(raster, splats.count, found, own, progress, by_rows=True, threads=threads)
-    if not reweight:
-        return geometry.weights.cpu()
-    return solved_weights(geometry, splats, own, Timings(progress), threads)[0].cpu()
+    inputs = LiftInputs.of(splats, cameras, views, preset, {**settings, "certificate_rays": 0}, threads)
+    device = choose_device(inputs.settings.device)
+    raster = open_raster(inputs.splats, device, threads)
+    count = inputs.splats.count
+    geometry = weigh_views(raster, count, inputs.views, inputs.settings, progress, by_rows=True, threads=threads)
+    W = SceneWeights(raster, device, None, inputs.views, geometry)
+    if reweight:
+        steps = InMemory(inputs.splats, inputs.settings, Timings(progress), threads)
+        W, _ = reweigh(steps, W, bool((geometry.levels >= 0).any()), inputs.settings, steps.timings)
+    return W.weights.cpu()

@@ -3,45 +3,34 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor
 
 from liftcore.errors import InvalidSettings
+from liftcore.lifting.base import Steps, Support, WeighedViews, Weights
 from liftcore.lifting.checkpoint import Checkpoint
 from liftcore.lifting.engines.base import Engine
-from liftcore.lifting.engines.lift import lift_in_blocks
-from liftcore.lifting.geometry import Geometry, as_read, weigh_views
-from liftcore.lifting.planning.contradictions import contradictions, probe_views
-from liftcore.lifting.planning.plan import TIMED_VIEWS, Plan, plan_lift
+from liftcore.lifting.engines.lift import steps_in_blocks
+from liftcore.lifting.in_memory import InMemory
+from liftcore.lifting.inputs import LiftInputs
+from liftcore.lifting.planning.plan import Plan, plan_lift
 from liftcore.lifting.warm_up import warm_up_lift
 from liftcore.query.result import LiftResult
-from liftcore.raster import check_given, open_raster
-from liftcore.raster.base import Raster
-from liftcore.runtime.device import Device, choose_device, within_memory
+from liftcore.runtime.device import choose_device, within_memory
 from liftcore.runtime.progress import Progress, Timings
 from liftcore.runtime.torch_modes import usual_modes
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
-from liftcore.solve.aggregate import Aggregation, aggregate
-from liftcore.solve.closed_form import Solution, solve, solve_rows
-from liftcore.solve.consensus import mask_consensus
-from liftcore.solve.diagnostics import certify, lift_warnings, measure_samples
-from liftcore.solve.least_squares import AllRays, reference, refine
-from liftcore.solve.loss import huber_factors
-from liftcore.solve.objects import RegionObjects, object_facts, region_objects
-from liftcore.solve.reweight import Agreement, agreement_factors, agreement_facts, reweighted, whole_regions
-from liftcore.values.lift_views import Given, LiftViews
-from liftcore.values.region_weights import RegionWeights
+from liftcore.solve.diagnostics import ViewMeasures, certify, lift_warnings
+from liftcore.solve.objects import object_facts
+from liftcore.solve.reweight import agreement_facts
+from liftcore.values.lift_views import Given
 from liftcore.values.settings import LiftSettings, Preset
 
-LEAST_KEPT = 0.5  # of a splat's weight, in regions that the aggregation kept, for it to be solved for again
 log = logging.getLogger(__name__)
 
 
@@ -90,50 +79,133 @@ def lift(
 
     Source: Splat Feature Solver, Eq. 3 and 6.
     """
-    chosen = LiftSettings.chosen(preset, settings)
-    splats = check_given(splats, threads)
-    chosen = chosen.for_splats(splats)
-    kept, warn = _checkpoint(checkpoint), _WarnOnce()
-    if engine is not None:
-        known = cameras if isinstance(cameras, Cameras) else Cameras(cameras)
-        given = {"progress": progress, "on_plan": on_plan or warn.of_plan, "folder": kept.folder if kept else None}
-        result = lift_in_blocks(engine, splats, known, views, chosen, **given)
-        warn.of(result.diagnostics["warnings"] if on_plan is None else ())
-        return result
-    work = _Lift(splats, chosen, threads, Timings(progress), choose_device(chosen.device))
-    found = LiftViews.of(views, cameras, chosen)
-    plan = work.plan(found)
-    with within_memory(work.device):
-        geometry, plan = work.weigh(found, plan, kept, on_plan or warn.of_plan)
-        things = work.find_objects(geometry)
-        W, agreement = work.reweight(geometry)
-        solution = work.solve(W, geometry, plan)
-        sums = geometry.weights.row_sums().cpu().numpy()
-        X, notes = work.refine(found, geometry, solution.features, sums > 0)
-        clusters = work.aggregate(found, geometry, W, X, sums, notes, agreement, things)
-        if agreement:
-            facts = agreement_facts(geometry.levels, agreement.reliability, agreement.confidence)
-            notes["reweighting"] = facts
-        things = things if chosen.objects else None
-        notes |= {"objects": object_facts(things)} if things else {}
-        diagnostics = work.diagnose(found, geometry, X, sums, plan, notes)
-    warn.of(diagnostics["warnings"] if on_plan is None else ())
-    table = found.features.table
-    made = LiftResult(
+    inputs = LiftInputs.of(splats, cameras, views, preset, settings, threads)
+    checkpoint, warn, timings = _checkpoint(checkpoint), _WarnOnce(), Timings(progress)
+    if engine is None:
+        steps = InMemory(inputs.splats, inputs.settings, timings, threads, checkpoint)
+        result = run(steps, inputs, timings, on_plan or warn.of_plan)
+    else:
+        with steps_in_blocks(engine, inputs, timings, checkpoint.folder if checkpoint else None) as steps:
+            result = run(steps, inputs, timings, on_plan or warn.of_plan)
+    warn.of(result.diagnostics["warnings"] if on_plan is None else ())
+    return result
+
+
+def run(steps: Steps[Weights], inputs: LiftInputs, timings: Timings, on_plan: Callable[[Plan], None]) -> LiftResult:
+    """Take the steps of a lift, whoever holds W and X."""
+    splats, views, settings = inputs.splats, inputs.views, inputs.settings
+    device = choose_device(settings.device)
+    with timings.step("compile"):
+        warm_up_lift(splats.kernel, device, settings)
+    with timings.step("plan"):
+        plan = steps.plan(views, device)
+    if plan.device != device:
+        with timings.step("compile"):
+            warm_up_lift(splats.kernel, plan.device, settings)
+    with within_memory(plan.device):
+        return _run(steps, replace(inputs, views=views.only(plan.views)), plan, timings, on_plan)
+
+
+def _run(
+    steps: Steps[Weights], inputs: LiftInputs, plan: Plan, timings: Timings, on_plan: Callable[[Plan], None]
+) -> LiftResult:
+    """Take the steps after the plan."""
+    settings, views = inputs.settings, inputs.views
+    with timings.stage("geometry"):
+        W, weighed = steps.weigh(views, plan, on_plan)
+    objects = aggregation = None
+    if settings.finds_objects(weighed.masks):
+        with timings.stage("objects"):
+            objects = steps.find_objects(W)
+    W, reliability = reweigh(steps, W, weighed.masks, settings, timings)
+    clusters = objects if settings.clusters_by_masks else None
+    with timings.stage("solve"):
+        X, support = steps.solve(W, clusters)
+    facts = dict[str, Any]()
+    if settings.cg_steps or settings.reference_channels:
+        with timings.stage("rays"):
+            X, least_squares = steps.refine(W, X, support.sums > 0)
+        facts |= least_squares
+    if settings.aggregation:
+        with timings.stage("aggregate"):
+            X, aggregation = steps.aggregate(W, X, clusters)
+        facts["aggregation"] = aggregation.facts
+    if settings.robust_steps:
+        facts["reweighting"] = agreement_facts(weighed.levels, reliability, support.confidence)
+    objects = objects if settings.objects else None
+    if objects:
+        facts["objects"] = object_facts(objects)
+    with timings.step("certify"):
+        measures = steps.measure(W, X)
+        diagnostics = diagnose(inputs, weighed, X.dtype, support, measures, facts)
+    table = views.features.table
+    lift = LiftResult(
         features=X,
-        evidence=geometry.evidence(),
-        agreement=solution.agreement,
-        confidence=agreement.confidence if agreement else None,
-        seen=torch.from_numpy(sums > 0),
-        metadata=found.metadata(chosen, splats.origin, diagnostics, work.timings.seconds),
-        cluster=clusters.clusters if clusters else None,
-        cluster_features=clusters.cluster_features if clusters else None,
+        evidence=support.evidence,
+        agreement=support.agreement,
+        confidence=support.confidence,
+        seen=torch.from_numpy(support.sums > 0),
+        metadata=views.metadata(settings, inputs.splats.origin, diagnostics, timings.seconds),
+        cluster=aggregation.clusters if aggregation else None,
+        cluster_features=aggregation.cluster_features if aggregation else None,
         embeddings=torch.from_numpy(table.embeddings) if table else None,
-        object=torch.from_numpy(things.labels) if things else None,
-        object_views=torch.from_numpy(things.views) if things else None,
+        object=torch.from_numpy(objects.labels) if objects else None,
+        object_views=torch.from_numpy(objects.views) if objects else None,
     )
-    room = plan.features_room
-    return made if room is not None and X.nbytes > room else made.to(work.device.place)  # X in a mapped file stays
+    return steps.deliver(lift, plan)
+
+
+def reweigh(
+    steps: Steps[Weights], W: Weights, masks: bool, settings: LiftSettings, timings: Timings
+) -> tuple[Weights, float | None]:
+    """W as it is solved, and the median reliability of regions, where that is asked for.
+
+    Steps give factors of W's entries, and so does a loss that is not of squares.
+
+    Args:
+        masks: whether any view has masks.
+
+    Raises:
+        InvalidSettings: consensus is asked for, and no view has masks.
+    """
+    reliability = None
+    if settings.asks_consensus(masks):
+        with timings.stage("consensus"):
+            W = steps.compare_masks(W)
+    if settings.robust_steps:
+        with timings.stage("robust"):
+            W, reliability = steps.reweight(W)
+    if settings.loss == "huber":
+        with timings.stage("loss"):
+            W = steps.discount_distance(W)
+    return W, reliability
+
+
+def diagnose(
+    inputs: LiftInputs,
+    weighed: WeighedViews,
+    stored: torch.dtype,
+    support: Support,
+    measures: ViewMeasures,
+    steps: Mapping[str, Mapping[str, Any]],
+) -> dict[str, Any]:
+    """What the lift measured of itself.
+
+    Args:
+        stored: the type of X. steps: what steps that the settings ask for tell of themselves, by their names.
+    """
+    plan, settings = weighed.plan, inputs.settings
+    facts: dict[str, Any] = {
+        "device": plan.device.facts(),
+        "weights_entries": weighed.entries,
+        "views_without_camera": inputs.views.unpaired,
+        "plan": plan.facts(),
+        "views_without_splats": list(weighed.blind),
+    }
+    warnings = lift_warnings(inputs.splats, inputs.views.lifted, support.sums, settings.dtype, stored, facts)
+    warnings += [part["warning"] for part in steps.values() if "warning" in part]
+    facts["warnings"] = [*warnings, *plan.told]
+    return certify(measures, support.sums, support.evidence, settings) | dict(steps) | facts
 
 
 @usual_modes()
@@ -154,48 +226,9 @@ def plan(
     Raises:
         InvalidFeatures, InvalidSettings, Unavailable: as `lift` has it.
     """
-    chosen = LiftSettings.chosen(preset, settings)
-    splats = check_given(splats, threads)
-    chosen = chosen.for_splats(splats)
-    found = LiftViews.of(views, cameras, chosen)
-    return plan_lift(splats, found, chosen, choose_device(chosen.device), threads, look=True)
-
-
-def solved_weights(
-    geometry: Geometry, splats: Splats, settings: LiftSettings, timings: Timings, threads: int | None
-) -> tuple[RegionWeights, Agreement | None]:
-    """W as it is solved: steps give factors of W's entries, and so does a loss that is not of squares.
-
-    Raises:
-        InvalidSettings: consensus is asked for, and no view has masks.
-    """
-    W, consensus = geometry.weights, None
-    if settings.asks_consensus(bool((geometry.levels >= 0).any())):
-        with timings.stage("consensus"):
-            W = W.cpu()
-            found = mask_consensus(W, geometry.levels, threads, means=splats.means)
-            consensus = torch.from_numpy(found)
-    agreement = None
-    with timings.stage("robust"):
-        if settings.robust_steps:
-            W = W.cpu()
-            agreement = agreement_factors(
-                W,
-                geometry.codebook,
-                settings.robust_steps,
-                timings.progress,
-                means=splats.means,
-                threads=threads,
-                reliability=whole_regions(settings.reliability, geometry.levels),
-                consensus=consensus,
-            )
-            W = reweighted(W, agreement.factors)
-    if settings.loss == "huber":
-        with timings.stage("loss"):
-            W = W.cpu()
-            factors = huber_factors(W, geometry.codebook, timings.progress, means=splats.means, threads=threads)
-            W = reweighted(W, factors)
-    return W, agreement
+    inputs = LiftInputs.of(splats, cameras, views, preset, settings, threads)
+    device = choose_device(inputs.settings.device)
+    return plan_lift(inputs.splats, inputs.views, inputs.settings, device, threads, look=True)
 
 
 def log_warnings(plan: Plan) -> None:
@@ -233,207 +266,3 @@ def _checkpoint(given: object) -> Checkpoint | None:
     if isinstance(given, Path | str) and str(given):
         return Checkpoint(Path(given))
     raise InvalidSettings("checkpoint", expected="the path of a folder, or None", got=repr(given)[:80])
-
-
-@dataclass
-class _Lift:
-    """One lift on its way: the steps, and what all of them need."""
-
-    splats: Splats
-    settings: LiftSettings
-    threads: int | None
-    timings: Timings
-    device: Device
-
-    def __post_init__(self) -> None:
-        self.raster: Raster | None = None
-
-    @property
-    def progress(self) -> Progress:
-        return self.timings.progress
-
-    def compile(self) -> None:
-        with self.timings.step("compile"):
-            warm_up_lift(self.splats.kernel, self.device, self.settings)
-
-    def plan(self, views: LiftViews) -> Plan:
-        """The plan, which may leave views out and take another device."""
-        self.compile()
-        with self.timings.step("plan"):
-            plan = plan_lift(self.splats, views, self.settings, self.device, self.threads)
-            views.names = list(plan.views)
-        if plan.device != self.device:
-            self.device = plan.device
-            self.compile()
-        return plan
-
-    def weigh(
-        self, views: LiftViews, plan: Plan, checkpoint: Checkpoint | None, on_plan: Callable[[Plan], None]
-    ) -> tuple[Geometry, Plan]:
-        """W of all views, and sampled rows of A; and the plan with what the first views tell of the others."""
-        self.raster = open_raster(self.splats, self.device, self.threads, plan.kept_on_card)
-        first, begin = probe_views(len(views)), time.perf_counter()
-        plans = [plan]
-
-        def look(geometry: Geometry) -> None:
-            took = time.perf_counter() - begin
-            assert self.raster is not None
-            if views.features.paths:
-                wrong = contradictions(self.raster, views, self.settings, plan.seen_share, geometry)
-                plans.append(replace(plan, told=(*plan.told, *wrong)))
-            if len(views) >= TIMED_VIEWS:
-                plans.append(replace(plans[-1], seconds=took * len(views) / len(first)))
-            on_plan(plans[-1])
-
-        with self.timings.stage("geometry"):
-            geometry = weigh_views(
-                self.raster,
-                self.splats.count,
-                views,
-                self.settings,
-                self.progress,
-                by_rows=self.settings.weighs_rows,
-                checkpoint=checkpoint.of(self.splats, self.device.facts()) if checkpoint else None,
-                device_bytes=plan.kept_on_card,
-                threads=self.threads,
-                first=first,
-                on_first=look,
-            )
-        return geometry, plans[-1]
-
-    def find_objects(self, geometry: Geometry) -> RegionObjects | None:
-        """What masks of many views keep together, or None where they are not looked for.
-
-        Raises:
-            InvalidSettings: objects are asked for, or clusters that masks make, and no view has masks.
-        """
-        if not self.settings.finds_objects(bool((geometry.levels >= 0).any())):
-            return None
-        with self.timings.stage("objects"):
-            return region_objects(geometry.weights.cpu(), geometry.levels, geometry.evidence().numpy(), self.threads)
-
-    def reweight(self, geometry: Geometry) -> tuple[RegionWeights, Agreement | None]:
-        """W as it is solved (`solved_weights`)."""
-        return solved_weights(geometry, self.splats, self.settings, self.timings, self.threads)
-
-    def solve(self, W: RegionWeights, geometry: Geometry, plan: Plan) -> Solution:
-        """The closed form."""
-        with self.timings.stage("solve"):
-            return solve(
-                W,
-                geometry.codebook,
-                getattr(torch, self.settings.dtype),
-                self.progress,
-                means=self.splats.means,
-                threads=self.threads,
-                device=self.device,
-                memory=plan.features_room,
-            )
-
-    def refine(
-        self, views: LiftViews, geometry: Geometry, X: Tensor, seen: np.ndarray
-    ) -> tuple[Tensor, dict[str, Any]]:
-        """X after the conjugate gradient steps that the settings ask for, and what is known of the optimum."""
-        settings, progress, notes = self.settings, self.progress, dict[str, Any]()
-        if not settings.cg_steps and not settings.reference_channels:
-            return X, notes
-        with self.timings.stage("rays"):
-            rays = AllRays(
-                self._raster(),
-                self.splats.count,
-                [views.camera(number) for number in range(len(views))],
-                lambda number: as_read(views[number][1], settings, views.names[number]),
-                settings.lift_params,
-                progress,
-            )
-        if settings.cg_steps:
-            with self.timings.stage("refine"):
-                refinement = refine(rays, X, seen, geometry.books, settings, progress)
-            X, notes["refinement"] = refinement.features, refinement.stats
-        if settings.reference_channels:
-            with self.timings.stage("reference"):
-                notes["reference"] = reference(rays, X, seen, geometry.samples, geometry.books, settings, progress)
-        return X, notes
-
-    def aggregate(
-        self,
-        views: LiftViews,
-        geometry: Geometry,
-        W: RegionWeights,
-        X: Tensor,
-        sums: np.ndarray,
-        notes: dict[str, Any],
-        agreement: Agreement | None,
-        things: RegionObjects | None,
-    ) -> Aggregation | None:
-        """Aggregate X in place, if the settings ask for it."""
-        settings = self.settings
-        if not settings.aggregation:
-            return None
-        with self.timings.stage("aggregate"):
-            evidence, judged = geometry.evidence().numpy(), None
-            if settings.aggregation_guard and agreement and agreement.explained is not None:
-                judged = W.cpu(), agreement.directions, agreement.explained
-            found = aggregate(
-                X,
-                evidence,
-                self.splats,
-                self._raster(),
-                views,
-                settings,
-                self.progress,
-                self.threads,
-                things=things if self.settings.clusters_by_masks else None,
-                judged=judged,
-            )
-        notes["aggregation"] = found.facts
-        if settings.aggregation_resolve:
-            notes["aggregation"]["resolved"] = self._resolve(W.cpu(), geometry, found, X, sums)
-        return found
-
-    def _resolve(
-        self, W: RegionWeights, geometry: Geometry, aggregation: Aggregation, X: Tensor, sums: np.ndarray
-    ) -> float:
-        """Solve again, from the kept regions alone, for splats that took no cluster's feature; their share of all.
-
-        Only those most of whose weight lies in kept regions: it is their neighbours' regions that reach the others.
-        """
-        if all(rows is None for rows in aggregation.kept):
-            return 0.0
-        with self.timings.stage("resolve"):
-            counted = [
-                torch.ones(book.shape[0]) if rows is None else torch.from_numpy(rows).float()
-                for book, rows in zip(geometry.books, aggregation.kept, strict=True)
-            ]
-            fewer = reweighted(W, torch.cat(counted).index_select(0, W.region))
-            most = fewer.row_sums().numpy()
-            chosen = aggregation.own & torch.from_numpy((most > 0) & (most >= LEAST_KEPT * sums))
-            rows = torch.nonzero(chosen)[:, 0]
-            solve_rows(
-                X, rows, fewer, geometry.codebook, self.progress, means=self.splats.means, threads=self.threads
-            )
-            return float(chosen.float().mean())
-
-    def diagnose(
-        self, views: LiftViews, geometry: Geometry, X: Tensor, sums: np.ndarray, plan: Plan, notes: dict[str, Any]
-    ) -> dict[str, Any]:
-        """What the lift measured of itself."""
-        facts: dict[str, Any] = {
-            "device": self.device.facts(),
-            "weights_entries": geometry.weights.region.shape[0],
-            "views_without_camera": views.unpaired,
-            "plan": plan.facts(),
-            "views_without_splats": list(geometry.blind),
-        }
-        lifted = [views.camera(number) for number in range(len(views))]
-        told = lift_warnings(self.splats, lifted, sums, self.settings.dtype, X.dtype, facts)
-        told += [part["warning"] for part in notes.values() if "warning" in part]
-        facts["warnings"] = [*told, *plan.told]
-        with self.timings.step("certify"):
-            measures = measure_samples(geometry.samples, X, geometry.books, self.threads)
-            return certify(measures, sums, geometry.evidence(), self.settings) | notes | facts
-
-    def _raster(self) -> Raster:
-        if self.raster is None:
-            raise RuntimeError("there is no raster before the views are weighed")
-        return self.raster

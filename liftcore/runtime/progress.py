@@ -34,13 +34,17 @@ class Timings:
     def __init__(self, progress: Progress | None = None) -> None:
         self.seconds: dict[str, float] = {}
         self.progress: Progress = progress or silent
+        self._within = 0.0  # seconds of stages within the one that runs
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Time the block, which tells of itself, under that name."""
-        start = time.perf_counter()
+        """Time the block, which tells of itself, under that name; without the stages within it."""
+        start, before = time.perf_counter(), self._within
+        self._within = 0.0
         yield
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+        seconds = time.perf_counter() - start
+        self.seconds[name] = self.seconds.get(name, 0.0) + seconds - self._within
+        self._within = before + seconds
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:

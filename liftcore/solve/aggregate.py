@@ -94,11 +94,12 @@ def aggregate(
     *,
     things: RegionObjects | None = None,
     judged: tuple[RegionWeights, RegionDirections, Tensor] | None = None,
-) -> Aggregation:
-    """Aggregate lifted features, in place.
+) -> tuple[Tensor, Aggregation]:
+    """Lifted features with those of clusters; they are changed in place.
 
     Args:
-        features: [P, F] f16 or f32; rows of splats that take their cluster's feature are overwritten with it.
+        features: [P, F] f16 or f32; rows of splats that take their cluster's feature are overwritten with it, and the
+            same tensor is returned.
         evidence: [P] f64, sums of plain weights.
         views: that were lifted.
         threads: None takes the cores that this process may use. The number changes no bit.
@@ -129,10 +130,12 @@ def aggregate(
     taken, guarded = with_feature(clustering.labels, merged), None
     if judged is not None and clustering.count:
         guarded = guard(taken, clustering.labels, merged, *judged, threads)
-    spread(features, clustering.labels, merged, taken)
+        taken = taken & ~guarded
+    features = spread(features, clustering.labels, merged, taken)
     progress("aggregate", len(names), len(names), "views")
     facts = facts | aggregation_facts(clustering, merged, taken, guarded)
-    return Aggregation(clustering.labels, merged, facts, ~taken, tuple(masks.get(name) for name in names))
+    kept = tuple(masks.get(name) for name in names)
+    return features, Aggregation(clustering.labels, merged, facts, ~taken, kept)
 
 
 def aggregation_facts(
@@ -162,19 +165,14 @@ def guard(
     own: Tensor,
     threads: int | None = None,
 ) -> Tensor:
-    """Take from those that are to take a feature [n] bool what it would explain worse than their own, in place.
+    """Which of the splats that are to take a feature it would explain worse than their own does: [n] bool.
 
     Args:
-        labels, merged: of `explained_by`. W: reweighted, of the same block of splats. own: [n] f32, what their own
-            features explain.
-
-    Returns:
-        [n] bool, the splats that were taken out.
+        taken: [n] bool, those that are to take one. labels, merged: of `explained_by`. W: reweighted, of the same
+            block of splats. own: [n] f32, what their own features explain.
     """
     explained = explained_by(W, directions, labels, merged, threads)
-    guarded = taken & (explained < own - RESOLUTION)  # what differs by less is one vector in float16
-    taken &= ~guarded
-    return guarded
+    return taken & (explained < own - RESOLUTION)  # what differs by less is one vector in float16
 
 
 @one_thread()
@@ -294,11 +292,12 @@ def with_feature(labels: Tensor, merged: Tensor) -> Tensor:
     return known[labels.long()]
 
 
-def spread(features: Tensor, labels: Tensor, merged: Tensor, taken: Tensor) -> None:
-    """Give the splats that are to take one [P] bool their clusters' features."""
+def spread(features: Tensor, labels: Tensor, merged: Tensor, taken: Tensor) -> Tensor:
+    """The features, changed in place: splats that are to take one [P] bool have their clusters'."""
     for first in range(0, features.shape[0], BLOCK):
         rows = first + torch.nonzero(taken[first : first + BLOCK])[:, 0]
         features[rows] = merged[labels[rows].long()]
+    return features
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """The views of a lift: features and cameras, paired by name."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from liftcore.runtime.version import __version__
@@ -16,13 +16,13 @@ from liftcore.values.views import ViewFeatures
 Given = Mapping[str, ViewFeatures] | Iterable[tuple[str, ViewFeatures]]
 
 
-@dataclass
+@dataclass(frozen=True)
 class LiftViews:
     """The views of a lift, features and cameras paired by name; each view is read when it is asked for."""
 
     cameras: Cameras
     features: Views  # paired with the cameras
-    names: list[str]  # that are lifted, in the order of the sums
+    names: tuple[str, ...]  # that are lifted, in the order of the sums
     unpaired: list[str]  # views with features and no camera, which are skipped
 
     @classmethod
@@ -35,7 +35,16 @@ class LiftViews:
         """
         known = cameras if isinstance(cameras, Cameras) else Cameras(cameras)
         features, unpaired = pair(as_views(views), known)
-        return cls(known, features, list(features.views[:: settings.view_stride]), unpaired)
+        return cls(known, features, features.views[:: settings.view_stride], unpaired)
+
+    def only(self, names: Iterable[str]) -> "LiftViews":
+        """Those of these names, in their order."""
+        return replace(self, names=tuple(names))
+
+    @property
+    def lifted(self) -> list[Camera]:
+        """The cameras, in the order of the sums."""
+        return [self.cameras[name] for name in self.names]
 
     def __len__(self) -> int:
         return len(self.names)
@@ -60,7 +69,7 @@ class LiftViews:
             text_space=self.features.text_space,
             words=table.words if table else (),
             views=tuple(self.names),
-            poses=poses_of([self.camera(number) for number in range(len(self))]),
+            poses=poses_of(self.lifted),
             origin=origin,
             certificate=diagnostics,
             timings=timings,

@@ -124,7 +124,7 @@ def weigh(job: Job, piece: int, threads: int | None) -> None:
     if not numbers:
         return
     device = choose_device(job.settings.device)
-    views = LiftViews(job.cameras, pair(_packs(*job.packs), job.cameras)[0], list(job.names), [])
+    views = LiftViews(job.cameras, pair(_packs(*job.packs), job.cameras)[0], job.names, [])
     cameras = [views.camera(number) for number in numbers]
     splats, ids = seen_splats(job, cameras, threads)
     warm_up_lift(job.kernel, device, job.settings)

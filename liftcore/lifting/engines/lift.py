@@ -11,11 +11,11 @@ import hashlib
 import json
 import re
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from torch import Tensor
 from liftcore.errors import InvalidSettings, Unavailable
 from liftcore.io.safetensors_file import map_tensors, write_tensors
 from liftcore.io.shards import ROWS, map_rows, shard_at, write_index
+from liftcore.lifting.base import Steps, Support, WeighedViews
 from liftcore.lifting.checkpoint import Checkpoint
 from liftcore.lifting.engines import steps
 from liftcore.lifting.engines.base import Engine
@@ -36,17 +37,18 @@ from liftcore.lifting.engines.blocks import (
     weigh,
     write_scene,
 )
+from liftcore.lifting.inputs import LiftInputs
 from liftcore.lifting.planning.plan import Plan, plan_lift
 from liftcore.query.result import LiftResult, load_lift
-from liftcore.runtime.device import choose_device
+from liftcore.runtime.device import Device, choose_device
 from liftcore.runtime.one_thread import one_thread
-from liftcore.runtime.progress import Progress, Timings
-from liftcore.scene.cameras import Camera, Cameras
+from liftcore.runtime.progress import Timings
+from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
-from liftcore.solve.aggregate import MASKS_MADE, aggregation_facts, cluster_means
+from liftcore.solve.aggregate import MASKS_MADE, Aggregation, aggregation_facts, cluster_means
 from liftcore.solve.clusters import Clustering
 from liftcore.solve.consensus import mean_share
-from liftcore.solve.diagnostics import ViewMeasures, certify, joined, lift_warnings, measure_view
+from liftcore.solve.diagnostics import ViewMeasures, joined, measure_view
 from liftcore.solve.directions import RegionDirections
 from liftcore.solve.loss import mean_distance
 from liftcore.solve.objects import (
@@ -56,13 +58,12 @@ from liftcore.solve.objects import (
     join,
     node_clusters,
     numbered,
-    object_facts,
     object_numbers,
 )
-from liftcore.solve.reweight import SceneAgreement, agreement_facts, whole_regions
+from liftcore.solve.reweight import SceneAgreement, whole_regions
 from liftcore.solve.sums import added, unpacked
-from liftcore.values.lift_views import Given, LiftViews
-from liftcore.values.pack import Views, as_views, write_pack
+from liftcore.values.lift_views import LiftViews
+from liftcore.values.pack import Views, write_pack
 from liftcore.values.region_weights import MOST_REGIONS
 from liftcore.values.settings import LiftSettings
 
@@ -92,20 +93,17 @@ def check_engine(engine: Engine, settings: LiftSettings, masks: bool) -> None:
     settings.check_blocks(masks)
 
 
-def lift_in_blocks(
+@contextmanager
+def steps_in_blocks(
     engine: Engine,
-    splats: Splats,
-    cameras: Cameras,
-    views: Given,
-    settings: LiftSettings,
-    *,
-    progress: Progress | None = None,
-    on_plan: Callable[[Plan], None],
+    inputs: LiftInputs,
+    timings: Timings,
     folder: Path | None = None,
+    *,
     rows: int = ROWS,
     selected: int = SELECTED,
-) -> LiftResult:
-    """`liftcore.lift` by an engine: each piece is a file in a folder, and X lies in shards that are mapped.
+) -> Iterator[InBlocks]:
+    """The steps of a lift by an engine: each piece is a file in a folder.
 
     Args:
         folder: that all workers share. A lift that was cut off goes on from the pieces there; None: one that is gone
@@ -115,43 +113,10 @@ def lift_in_blocks(
     Raises:
         InvalidSettings: the settings need W or X in one place.
     """
-    timings = Timings(progress)
-    given = as_views(views)
-    found = LiftViews.of(given, cameras, settings)
-    check_engine(engine, settings, any(found.features.is_regions(name) for name in found.names))
-    with timings.step("plan"):
-        plan = plan_lift(splats, found, settings, choose_device(settings.device), apart=True, look=bool(given.paths))
-        found.names = list(plan.views)
-    on_plan(replace(plan, memory=_memory_of_a_worker(plan), weight_bytes=0))
-    with _folder(folder or engine.scratch, kept=folder is not None) as place:
-        with timings.step("share"):
-            packs = given.paths or _packs(given, found, place)
-            job = Job(
-                place,
-                tuple(Path(path).resolve() for path in packs),
-                found.cameras,
-                tuple(found.names),
-                settings,
-                splats.kernel,
-                splats.count,
-                found.features.channels,
-                rows=rows,
-                selected=selected,
-            )
-            _begin(job, splats, given)
-        with timings.stage("geometry"):
-            for done, _ in enumerate(engine.run(weigh, job, job.weighings), start=1):
-                timings.progress("geometry", min(done * WEIGHED, len(job.names)), len(job.names), "views")
-        work = _Steps(engine, job, timings)
-        columns, notes = work.solve()
-        with timings.step("certify"):
-            sums, table = columns.pop("sums").numpy(), found.features.table
-            certificate = _certificate(work.job, splats, found, plan, sums, columns["evidence"], notes)
-        metadata = found.metadata(settings, splats.origin, certificate, timings.seconds)
-        if table:
-            columns["embeddings"] = torch.from_numpy(table.embeddings)
-        write_index(place / "lift", columns, job.solutions, metadata.model_dump_json())
-        return load_lift(place / "lift")  # mapped: the files may lose their names
+    views = inputs.views
+    check_engine(engine, inputs.settings, any(views.features.is_regions(name) for name in views.names))
+    with _folder(folder or engine.scratch, kept=folder is not None) as place, one_thread():
+        yield InBlocks(engine, place, inputs, timings, rows, selected)
 
 
 def _memory_of_a_worker(plan: Plan) -> dict[str, int]:
@@ -222,172 +187,207 @@ def _facts(camera: Camera) -> list[Any]:
     return [camera.name, *size, camera.K.tolist(), camera.viewmat.tolist(), repr(camera.lens or camera.face)]
 
 
-class _Steps:
-    """The steps after the views are weighed, as `liftcore.lift` takes them, by an engine."""
+class InBlocks(Steps[Job]):
+    """Steps by an engine; see the protocol. W is a job, whose files have it, and X lies in shards that are mapped."""
 
-    def __init__(self, engine: Engine, job: Job, timings: Timings) -> None:
-        self.engine, self.timings = engine, timings
-        self.levels, self.entries = _share_regions(job)
-        masks, settings = bool((self.levels >= 0).any()), job.settings
-        self.find_objects, self.ask_consensus = settings.finds_objects(masks), settings.asks_consensus(masks)
-        codebook = steps.codebook_of(job)
-        dtype = getattr(torch, settings.dtype)
-        dtype = torch.float32 if dtype == torch.float16 and not codebook.fits_float16() else dtype
-        self.job = replace(job, dtype=dtype, related=self.find_objects or self.ask_consensus)
+    def __init__(
+        self, engine: Engine, folder: Path, inputs: LiftInputs, timings: Timings, rows: int, selected: int
+    ) -> None:
+        self.engine, self.folder, self.inputs, self.timings = engine, folder, inputs, timings
+        self.rows, self.selected = rows, selected
 
-    def run(self, stage: str, work: Work, pieces: int) -> None:
+    def run(self, stage: str, work: Work, job: Job, pieces: int) -> None:
         """Have a step done for all pieces."""
-        for done, _ in enumerate(self.engine.run(work, self.job, pieces), start=1):
+        for done, _ in enumerate(self.engine.run(work, job, pieces), start=1):
             self.timings.progress(stage, done, pieces, "blocks")
 
-    def pieces(self, step: str, pieces: int) -> Iterator[dict[str, np.ndarray]]:
-        """What a step wrote, one piece mapped at a time."""
-        return (map_tensors(self.job.piece_file(step, number))[0] for number in range(pieces))
+    def plan(self, views: LiftViews, device: Device) -> Plan:
+        look = bool(views.features.paths)
+        return plan_lift(self.inputs.splats, views, self.inputs.settings, device, apart=True, look=look)
 
-    def sums(self, files: Iterable[dict[str, np.ndarray]], shape: tuple[int, int]) -> np.ndarray:
-        """The sums that blocks of splats wrote, added up."""
-        return added((part for arrays in files for part in unpacked(arrays)), shape)
+    def weigh(self, views: LiftViews, plan: Plan, on_plan: Callable[[Plan], None]) -> tuple[Job, WeighedViews]:
+        on_plan(replace(plan, memory=_memory_of_a_worker(plan), weight_bytes=0))
+        with self.timings.step("share"):
+            job = self._share(views)
+        for done, _ in enumerate(self.engine.run(weigh, job, job.weighings), start=1):
+            self.timings.progress("geometry", min(done * WEIGHED, len(job.names)), len(job.names), "views")
+        with self.timings.stage("gather"):
+            weighed, settings = _share_regions(job, plan), job.settings
+            dtype = getattr(torch, settings.dtype)
+            if dtype == torch.float16 and not steps.codebook_of(job).fits_float16():
+                dtype = torch.float32
+            related = settings.finds_objects(weighed.masks) or settings.asks_consensus(weighed.masks)
+            job = replace(job, dtype=dtype, related=related)
+            self._gather(job)
+        return job, weighed
 
-    @one_thread()
-    def solve(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Columns of the lift [P], without X, and what its diagnostics say of the steps."""
-        timings, settings, notes = self.timings, self.job.settings, dict[str, Any]()
-        with timings.stage("gather"):
-            self._gather()
-        found = None
-        if self.find_objects:
-            with timings.stage("objects"):
-                found = self._objects()
-        if self.ask_consensus:
-            with timings.stage("consensus"):
-                self.run("consensus", steps.share, self.job.weighings)
-                parts = [part["told"] for part in self.pieces("share", self.job.weighings)]
-                told, asked = np.sum(parts, axis=0)
-                self.job = replace(self.job, usual_share=mean_share(int(told), int(asked)))
-        reliability = None
-        if settings.robust_steps:
-            with timings.stage("robust"):
-                reliability = self._reweigh()
-        if settings.loss == "huber":
-            with timings.stage("loss"):
-                self.run("loss", steps.measure, self.job.solutions)
-                sums = self.sums(self.pieces("measure", self.job.solutions), (2, 1))
-                self.job = replace(self.job, delta=mean_distance(sums))
-        if settings.aggregation and found:
-            guarded = bool(settings.aggregation_guard and settings.robust_steps)
-            self.job = replace(self.job, clusters=len(found.views), guarded=guarded)
-        with timings.stage("solve"):
-            self.run("solve", steps.solve, self.job.solutions)
-        columns = self._columns("columns")
-        if settings.aggregation and found:
-            with timings.stage("aggregate"):
-                notes["aggregation"] = self._aggregate(found, columns)
-        if settings.robust_steps:
-            notes["reweighting"] = agreement_facts(self.levels, reliability, columns["confidence"])
-        if found and settings.objects:
-            notes["objects"] = object_facts(found)
-            columns |= {"object": torch.from_numpy(found.labels), "object_views": torch.from_numpy(found.views)}
-        return columns, notes
+    def _share(self, views: LiftViews) -> Job:
+        """Write what all workers read."""
+        splats, given, settings = self.inputs.splats, self.inputs.given, self.inputs.settings
+        packs = tuple(Path(path).resolve() for path in given.paths or _packs(given, views, self.folder))
+        job = Job(
+            self.folder,
+            packs,
+            views.cameras,
+            views.names,
+            settings,
+            splats.kernel,
+            splats.count,
+            views.features.channels,
+            rows=self.rows,
+            selected=self.selected,
+        )
+        _begin(job, splats, given)
+        return job
 
-    def _gather(self) -> None:
+    def _gather(self, job: Job) -> None:
         """W by blocks of splats, and what places of the curve mean."""
-        job = self.job
         if job.related:
-            self.run("gather", steps.relate, job.weighings)
+            self.run("gather", steps.relate, job, job.weighings)
             sizes, groups = _share_tuples(job), steps.groups_of(job)
-            if self.find_objects:
+            if job.settings.finds_objects(True):
                 nodes, others = choose_nodes(groups, sizes)
                 steps.write_piece(job.folder / steps.NODES, {"nodes": nodes, "others": others})
-        self.run("gather", steps.gather, job.solutions)
-        bounds = np.concatenate([part["bounds"] for part in self.pieces("rows", job.solutions)])
+        self.run("gather", steps.gather, job, job.solutions)
+        bounds = np.concatenate([part["bounds"] for part in _pieces(job, "rows")])
         if bounds.size:
             bounds = np.stack([bounds.min(axis=0), bounds.max(axis=0)])
         steps.write_piece(job.folder / steps.CURVE, {"bounds": bounds})
 
-    def _objects(self) -> RegionObjects:
-        """The objects of the scene."""
-        job, groups = self.job, steps.groups_of(self.job)
-        nodes, others = (map_tensors(job.folder / steps.NODES)[0][name] for name in ("nodes", "others"))
-        self.run("objects", steps.contain, job.weighings)
-        parts = list(self.pieces("contain", job.weighings))
+    def find_objects(self, W: Job) -> RegionObjects:
+        groups = steps.groups_of(W)
+        nodes, others = (map_tensors(W.folder / steps.NODES)[0][name] for name in ("nodes", "others"))
+        self.run("objects", steps.contain, W, W.weighings)
+        parts = [map_tensors(W.piece_file("contain", number))[0] for number in range(W.weighings)]
         together = NodeViews(*(np.concatenate([part[name] for part in parts]) for name in ("container", "sees")))
         clusters = node_clusters(nodes, groups, together)
         number = int(clusters.max(initial=-1)) + 1
         if number and others.size:
-            self._label(0, clusters=clusters)
-            shares = (part for file in self.pieces("labels-0", job.solutions) for part in unpacked(file))
-            join(clusters, others, shares, number)
-        self._label(1, clusters=clusters)
-        labels, evidence = (
-            np.concatenate([part[name] for part in self.pieces(step, job.solutions)])
-            for step, name in (("labels-1", "labels"), ("rows", "evidence"))
-        )
-        shown = self.sums(self.pieces("labels-1", job.solutions), (1, number * groups.views))
+            self._label(W, 0, clusters)
+            join(clusters, others, (part for file in _pieces(W, "labels-0") for part in unpacked(file)), number)
+        self._label(W, 1, clusters)
+        labels, evidence = _column(W, "labels-1", "labels"), _column(W, "rows", "evidence")
+        shown = _sums(W, "labels-1", (1, number * groups.views))
         place = object_numbers(labels, evidence, number)
-        steps.write_piece(job.folder / steps.CLUSTERS, {"place": place})
+        steps.write_piece(W.folder / steps.CLUSTERS, {"place": place})
         return numbered(labels, clusters, place, shown.reshape(number, groups.views))
 
-    def _label(self, step: int, **shared: np.ndarray) -> None:
-        steps.write_piece(self.job.folder / steps.CLUSTERS, shared)
-        self.job = replace(self.job, step=step)
-        self.run("objects", steps.label, self.job.solutions)
+    def _label(self, job: Job, step: int, clusters: np.ndarray) -> None:
+        steps.write_piece(job.folder / steps.CLUSTERS, {"clusters": clusters})
+        self.run("objects", steps.label, replace(job, step=step), job.solutions)
 
-    def _reweigh(self) -> float | None:
-        """The robust steps but for the last one's factors, which blocks take when they are solved."""
-        codebook, whole = steps.codebook_of(self.job), whole_regions(self.job.settings.reliability, self.levels)
-        totals = self.sums(self.pieces("rows", self.job.solutions), (1, codebook.regions))
-        RegionDirections(codebook, torch.from_numpy(totals[0]), self.entries).save(self.job.folder)
+    def compare_masks(self, W: Job) -> Job:
+        self.run("consensus", steps.share, W, W.weighings)
+        parts = [map_tensors(W.piece_file("share", number))[0]["told"] for number in range(W.weighings)]
+        told, asked = np.sum(parts, axis=0)
+        return replace(W, usual_share=mean_share(int(told), int(asked)))
+
+    def reweight(self, W: Job) -> tuple[Job, float | None]:
+        """See the protocol: all but the last step's factors, which blocks take when they are solved."""
+        codebook, levels = steps.codebook_of(W), steps.mapped(W.folder / steps.REGIONS)["levels"]
+        whole = whole_regions(W.settings.reliability, levels)
+        totals = _sums(W, "rows", (1, codebook.regions))
+        entries = sum(part["region"].size for part in _pieces(W, "rows"))
+        RegionDirections(codebook, torch.from_numpy(totals[0]), entries).save(W.folder)
         scene = None
-        for step in range(self.job.settings.robust_steps):
-            self.job = replace(self.job, step=step, by_region=whole is not None)
-            self.run("robust", steps.compare, self.job.solutions)
-            shape = 2, codebook.regions + 1
-            sums = self.sums(self.pieces(f"cosines-{step}", self.job.solutions), shape)
-            scene = SceneAgreement.of(sums, whole)
-            steps.write_agreement(self.job, step, scene)
-        return scene.reliability if scene else None
+        for step in range(W.settings.robust_steps):
+            self.run("robust", steps.compare, replace(W, step=step, by_region=whole is not None), W.solutions)
+            scene = SceneAgreement.of(_sums(W, f"cosines-{step}", (2, codebook.regions + 1)), whole)
+            steps.write_agreement(W, step, scene)
+        return W, scene.reliability if scene else None
 
-    def _aggregate(self, found: RegionObjects, columns: dict[str, Tensor]) -> dict[str, Any]:
-        """The features of clusters, which splats take; columns of both, and what the diagnostics say of them."""
-        job, clusters = self.job, self.job.clusters
-        clustering = Clustering(torch.from_numpy(found.labels), clusters, {"clustered_by": "graph"})
+    def discount_distance(self, W: Job) -> Job:
+        self.run("loss", steps.measure, W, W.solutions)
+        return replace(W, delta=mean_distance(_sums(W, "measure", (2, 1))))
+
+    def solve(self, W: Job, clusters: RegionObjects | None) -> tuple[Tensor, Support]:
+        job = _with_clusters(W, clusters)
+        self.run("solve", steps.solve, job, job.solutions)
+        sums, evidence = _column(job, "rows", "sums"), _column(job, "rows", "evidence")
+        agreement, robust = _column(job, "columns", "agreement"), job.settings.robust_steps
+        confidence = torch.from_numpy(_column(job, "columns", "confidence")) if robust else None
+        support = Support(sums, torch.from_numpy(evidence), torch.from_numpy(agreement), confidence)
+        return _mapped(job, job.solved_file), support
+
+    def refine(self, W: Job, X: Tensor, seen: np.ndarray) -> NoReturn:
+        """See the protocol: `LiftSettings.check_blocks` has refused what asks for it."""
+        raise AssertionError("least squares need all rays in one place")
+
+    def aggregate(self, W: Job, X: Tensor, clusters: RegionObjects | None) -> tuple[Tensor, Aggregation]:
+        """See the protocol: the features of clusters that masks make."""
+        assert clusters is not None, "check_blocks refuses those of features"
+        job = _with_clusters(W, clusters)
         merged, taken, guarded = torch.zeros(0, job.channels, dtype=job.dtype), torch.zeros(job.splats) > 0, None
-        if clusters:
-            merged = cluster_means(
-                self.sums(self.pieces("columns", job.solutions), (job.channels + 1, clusters)), job.dtype
-            )
+        if job.clusters:
+            merged = cluster_means(_sums(job, "columns", (job.channels + 1, job.clusters)), job.dtype)
             place = map_tensors(job.folder / steps.CLUSTERS)[0]["place"]
             steps.write_piece(job.folder / steps.CLUSTERS, {"place": place, "merged": merged})
-            self.run("aggregate", steps.spread, job.solutions)
-            parts = self._columns("taken")
-            taken, guarded = parts["taken"], parts.get("guarded")
-        columns |= {"cluster": clustering.labels, "cluster_features": merged}
-        return (MASKS_MADE if clusters else {}) | aggregation_facts(clustering, merged, taken, guarded)
+            self.run("aggregate", steps.spread, job, job.solutions)
+            taken = torch.from_numpy(_column(job, "taken", "taken"))
+            guarded = torch.from_numpy(_column(job, "taken", "guarded")) if job.guarded else None
+            X = _mapped(job, job.features_file)
+        clustering = Clustering(torch.from_numpy(clusters.labels), job.clusters, {"clustered_by": "graph"})
+        facts = (MASKS_MADE if job.clusters else {}) | aggregation_facts(clustering, merged, taken, guarded)
+        return X, Aggregation(clustering.labels, merged, facts, ~taken, (None,) * len(job.names))
 
-    def _columns(self, step: str) -> dict[str, Tensor]:
-        """What else is known of all splats [P]."""
-        parts = [
-            {name: array.copy() for name, array in part.items() if not name.startswith("sums/")}
-            for part in self.pieces(step, self.job.solutions)
-        ]
-        return {name: torch.from_numpy(np.concatenate([part[name] for part in parts])) for name in parts[0]}
+    def measure(self, W: Job, X: Tensor) -> ViewMeasures:
+        """See the protocol: a view at a time."""
+        views = (read_view(W.view_file(number)) for number in range(len(W.names)))
+        return joined([measure_view(view.sample, X, view.codebook.rows) for view in views])
+
+    def deliver(self, lift: LiftResult, plan: Plan) -> LiftResult:
+        """See the protocol: a lift in shards, mapped, whose files may lose their names."""
+        columns = {name: part for name, part in vars(lift).items() if isinstance(part, Tensor) and name != "features"}
+        shards = -(-lift.features.shape[0] // self.rows)
+        write_index(self.folder / "lift", columns, shards, lift.metadata.model_dump_json())
+        return load_lift(self.folder / "lift")
 
 
-def _share_regions(job: Job) -> tuple[np.ndarray, int]:
-    """Write the numbers of regions and the codebook of all views; the level of each region, and the entries of W."""
-    counts, levels, entries = [0], list[np.ndarray](), 0
-    for number in range(len(job.names)):
-        found = read_view(job.view_file(number))
-        counts.append(found.codebook.regions)
-        levels.append(found.levels.copy())
-        entries += found.weights.region.shape[0]
+def _with_clusters(job: Job, clusters: RegionObjects | None) -> Job:
+    """The job whose splats may take the features of clusters."""
+    if clusters is None:
+        return job
+    guarded = bool(job.settings.aggregation_guard and job.settings.robust_steps)
+    return replace(job, clusters=len(clusters.views), guarded=guarded)
+
+
+def _pieces(job: Job, step: str) -> Iterator[dict[str, np.ndarray]]:
+    """What a step wrote of blocks of splats, one mapped at a time."""
+    return (map_tensors(job.piece_file(step, number))[0] for number in range(job.solutions))
+
+
+def _sums(job: Job, step: str, shape: tuple[int, int]) -> np.ndarray:
+    """The sums that blocks of splats wrote, added up."""
+    return added((part for arrays in _pieces(job, step) for part in unpacked(arrays)), shape)
+
+
+def _column(job: Job, step: str, name: str) -> np.ndarray:
+    """What a step wrote of all splats [P] under that name."""
+    return np.concatenate([part[name] for part in _pieces(job, step)])
+
+
+def _mapped(job: Job, file: Callable[[int], Path]) -> Tensor:
+    """X [P, F] as it lies in the files of blocks."""
+    return torch.from_numpy(map_rows([shard_at(file(number)) for number in range(job.solutions)]))
+
+
+def _share_regions(job: Job, plan: Plan) -> WeighedViews:
+    """Write the numbers of regions and the codebook of all views."""
+    counts, levels, blind, entries = [0], list[np.ndarray](), list[str](), 0
+    for number, name in enumerate(job.names):
+        view = read_view(job.view_file(number))
+        counts.append(view.codebook.regions)
+        levels.append(view.levels.copy())
+        entries += view.weights.region.shape[0]
+        if not view.weights.evidence.numel():
+            blind.append(name)
     together = {"offsets": np.cumsum(counts), "levels": np.concatenate(levels)}
     if together["offsets"][-1] > MOST_REGIONS:
         got, hint = f"{together['offsets'][-1]} in {len(job.names)} views", "lift fewer views, or smaller maps"
         raise Unavailable("features", expected=f"at most {MOST_REGIONS} regions", got=got, hint=hint)
     steps.write_piece(job.folder / steps.REGIONS, together)
     write_tensors(job.folder / steps.CODEBOOK, _Books(job), {})
-    return together["levels"], entries
+    return WeighedViews(plan, together["levels"], entries, tuple(blind))
 
 
 class _Books(Mapping[str, Tensor]):
@@ -423,36 +423,3 @@ def _share_tuples(job: Job) -> np.ndarray:
     together = {"bases": np.array(bases[:-1]), "parents": np.concatenate(parents), "members": np.concatenate(members)}
     steps.write_piece(job.folder / steps.TUPLES, together)
     return np.concatenate(sizes)
-
-
-@one_thread()
-def _certificate(
-    job: Job,
-    splats: Splats,
-    views: LiftViews,
-    plan: Plan,
-    sums: np.ndarray,
-    evidence: Tensor,
-    notes: dict[str, Any],
-) -> dict[str, Any]:
-    """What the lift measured of itself: a view at a time, on X as it lies in its shards."""
-    shards = [shard_at(job.features_file(number)) for number in range(job.solutions)]
-    X = torch.from_numpy(map_rows(shards))
-    measures, entries, blind = list[ViewMeasures](), 0, []
-    for number, name in enumerate(job.names):
-        found = read_view(job.view_file(number))
-        measures.append(measure_view(found.sample, X, found.codebook.rows))
-        entries += found.weights.region.shape[0]
-        if not found.weights.evidence.numel():
-            blind.append(name)
-    facts: dict[str, Any] = {
-        "device": choose_device(job.settings.device).facts(),
-        "weights_entries": entries,
-        "views_without_camera": views.unpaired,
-        "plan": plan.facts(),
-        "views_without_splats": blind,
-    }
-    lifted = [views.camera(number) for number in range(len(views))]
-    told = lift_warnings(splats, lifted, sums, job.settings.dtype, X.dtype, facts)
-    facts["warnings"] = [*told, *plan.told]
-    return certify(joined(measures), sums, evidence, job.settings) | notes | facts

@@ -425,7 +425,7 @@ def measure(job: Job, piece: int, threads: int | None) -> None:
 
 @one_thread()
 def solve(job: Job, piece: int, threads: int | None) -> None:
-    """Write X of a range of splats, and what supports it: evidence, agreement, confidence, and the sums of W."""
+    """Write X of a range of splats, and what supports it: agreement and confidence."""
     columns_file, features_file = job.columns_file(piece), job.solved_file(piece)
     if columns_file.exists() and features_file.exists():
         return
@@ -437,9 +437,7 @@ def solve(job: Job, piece: int, threads: int | None) -> None:
     rows, device = torch.nonzero(W.indptr.diff())[:, 0], choose_device(settings.device)
     squares = solve_rows(X, rows, W, codebook, means=block.means, threads=threads, device=device)
     write_rows(features_file, X)
-    sums, evidence = torch.from_numpy(block.arrays["sums"]), torch.from_numpy(block.arrays["evidence"])
-    agreement = squares.sqrt().clamp(0.0, 1.0).float()
-    columns = {"evidence": evidence, "agreement": agreement, "seen": sums > 0, "sums": sums}
+    columns = {"agreement": squares.sqrt().clamp(0.0, 1.0).float()}
     if scores is not None:
         columns["confidence"] = scores[0]
     parts = None
@@ -462,12 +460,12 @@ def spread(job: Job, piece: int, threads: int | None) -> None:
     shard = shard_at(job.solved_file(piece))
     X = torch.from_numpy(np.fromfile(shard.path, shard.dtype, offset=shard.begin).reshape(shard.shape))
     taken = with_feature(labels, merged)
-    columns = {"taken": taken}
+    columns = dict[str, Tensor]()
     if job.guarded:
         own = map_tensors(job.piece_file("guard", piece))[0]
         weight, explained = torch.from_numpy(own["weight"]), torch.from_numpy(own["explained"])
         W = replace(block.W, weight=weight)
         columns["guarded"] = guard(taken, labels, merged, W, StoredDirections(job.folder), explained, threads)
-    give_features(X, labels, merged, taken)
-    write_rows(job.features_file(piece), X)
-    write_piece(path, columns)
+        taken = taken & ~columns["guarded"]
+    write_rows(job.features_file(piece), give_features(X, labels, merged, taken))
+    write_piece(path, columns | {"taken": taken})

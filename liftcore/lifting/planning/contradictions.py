@@ -139,7 +139,7 @@ def agreement_of_views(
     Args:
         rays: of all of them, whose sums of weights are taken.
     """
-    few = replace(views, names=_some(views.names, FLOWN))
+    few = views.only(_some(views.names, FLOWN))
     longest = max(max(few.camera(k).width, few.camera(k).height) for k in range(len(few)))
     coarse = {"stride": max(1, longest // SIDE), "certificate_rays": rays, "robust_steps": 0, "consensus": False}
     own = settings.model_copy(update=coarse)

@@ -7,7 +7,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -266,7 +266,7 @@ def _seconds(raster: Raster, views: LiftViews, names: Sequence[str], settings: L
     if len(names) < TIMED_VIEWS:
         return None
     begin = time.perf_counter()
-    one = replace(views, names=[names[len(names) // 2]])
+    one = views.only([names[len(names) // 2]])
     own = settings.model_copy(update={"certificate_rays": 0})
     weigh_views(raster, raster.splats.count, one, own, silent, by_rows=False)
     return len(names) * (time.perf_counter() - begin)

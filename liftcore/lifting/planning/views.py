@@ -245,7 +245,7 @@ def fly_pilot(raster: Raster, views: LiftViews, settings: LiftSettings, seen: Vi
     """Weigh evenly spaced views of those of which ``seen`` tells, two at least."""
     total, count = len(views.names), min(PILOT_VIEWS, len(views.names))
     flown: list[int] = spread(total, count).tolist()
-    chosen = replace(views, names=[views.names[view] for view in flown])
+    chosen = views.only(views.names[view] for view in flown)
     longest = max(max(chosen.camera(k).width, chosen.camera(k).height) for k in range(count))
     coarse = {"stride": max(1, longest // PILOT_SIDE), "certificate_rays": 0, "robust_steps": 0, "consensus": False}
     own = settings.model_copy(update=coarse)

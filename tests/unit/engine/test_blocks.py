@@ -11,9 +11,12 @@ import pytest
 import torch
 
 import liftcore as lc
+from liftcore.lifting import pipeline
 from liftcore.lifting.engines import blocks
 from liftcore.lifting.engines.base import LocalEngine
-from liftcore.lifting.engines.lift import lift_in_blocks
+from liftcore.lifting.engines.lift import steps_in_blocks
+from liftcore.lifting.inputs import LiftInputs
+from liftcore.runtime.progress import Timings
 from liftcore.values.lift_file import ALL
 from liftcore.values.pack import write_pack
 from liftcore.values.settings import LiftSettings
@@ -62,8 +65,9 @@ def scene() -> dict[str, Any]:
 
 
 def in_blocks(engine: Any, scene: dict[str, Any], settings: LiftSettings, **more: Any) -> lc.LiftResult:
-    given = {"on_plan": lambda _: None, "rows": ROWS, "selected": 1000, **more}
-    return lift_in_blocks(engine, scene["splats"], scene["cameras"], scene["views"], settings, **given)
+    inputs, timings = LiftInputs.of(**scene, preset=settings), Timings(more.pop("progress", None))
+    with steps_in_blocks(engine, inputs, timings, **{"rows": ROWS, "selected": 1000, **more}) as steps:
+        return pipeline.run(steps, inputs, timings, lambda _: None)
 
 
 def assert_same(one: lc.LiftResult, other: lc.LiftResult) -> None:

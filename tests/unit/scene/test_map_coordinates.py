@@ -17,9 +17,11 @@ from liftcore.io.ply import write_splats
 from liftcore.io.splat import splat_blocks
 from liftcore.io.splats import read_places, read_splats, some_rows, with_columns
 from liftcore.io.spz import spz_blocks
+from liftcore.lifting import pipeline
 from liftcore.lifting.engines.base import LocalEngine
-from liftcore.lifting.engines.lift import lift_in_blocks
+from liftcore.lifting.engines.lift import steps_in_blocks
 from liftcore.lifting.files import lift_files
+from liftcore.lifting.inputs import LiftInputs
 from liftcore.lifting.planning.views import visibility
 from liftcore.query.ask import ask, top
 from liftcore.query.catalogue import catalogue, table_csv
@@ -30,6 +32,7 @@ from liftcore.query.scene import QueryScene
 from liftcore.query.segment import segment
 from liftcore.query.terms import Query, Vector
 from liftcore.raster.reference import dense_view
+from liftcore.runtime.progress import Timings
 from liftcore.scene.cameras import Camera, Cameras, viewmat_of
 from liftcore.scene.compositing import CompositingParams
 from liftcore.scene.kernel import Kernel
@@ -248,9 +251,9 @@ def test_a_lift_in_blocks_and_its_file_keep_the_origin(tmp_path: Path) -> None:
     there, cameras = moved(splats), [moved_camera(camera) for camera in cameras]
     settings = LiftSettings.of(preset="row-sum")
     one = lc.lift(there, Cameras(cameras), views, settings)
-    other = lift_in_blocks(
-        LocalEngine(), there, Cameras(cameras), views, settings, on_plan=lambda _: None, selected=9
-    )
+    inputs, timings = LiftInputs.of(there, Cameras(cameras), views, settings), Timings()
+    with steps_in_blocks(LocalEngine(), inputs, timings, selected=9) as steps:
+        other = pipeline.run(steps, inputs, timings, lambda _: None)
     assert torch.equal(one.features, other.features) and one.metadata.origin == other.metadata.origin
     save_lift(other, tmp_path / "scene.lift")
     assert open_lift(tmp_path / "scene.lift").metadata.origin == there.origin

@@ -46,7 +46,7 @@ def walks(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     monkeypatch.setattr(CpuRaster, "region_weights", counted)
     monkeypatch.setattr(
-        "liftcore.lifting.pipeline.contradictions", lambda *_: []
+        "liftcore.lifting.in_memory.contradictions", lambda *_: []
     )  # which may look at some views, coarsely
     monkeypatch.setattr("liftcore.lifting.pipeline.choose_device", lambda _: CPU)  # on machines with a card too
     return walked

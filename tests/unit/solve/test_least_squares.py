@@ -198,7 +198,7 @@ def test_float16_features_that_grow_too_large_become_float32():
 
 def test_all_that_was_seen_is_refined_however_faintly(tmp_path, monkeypatch):
     paths, given = write_scene(tmp_path, 7), []
-    monkeypatch.setattr("liftcore.lifting.pipeline.refine", lambda *told: given.append(told[2]) or refine(*told))
+    monkeypatch.setattr("liftcore.lifting.in_memory.refine", lambda *told: given.append(told[2]) or refine(*told))
     made = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(preset="row-sum", cg_steps=1))
     assert np.array_equal(given[0], made.seen.numpy())
     assert (made.evidence[made.seen] < 0.5).any()  # or it would say nothing of faint ones

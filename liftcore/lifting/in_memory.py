@@ -1,0 +1,226 @@
+"""The steps of a lift in one process's memory: W is a matrix of a row a splat, and X a tensor."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from liftcore.lifting.base import Steps, Support, WeighedViews
+from liftcore.lifting.checkpoint import Checkpoint
+from liftcore.lifting.geometry import Geometry, as_read, weigh_views
+from liftcore.lifting.planning.contradictions import contradictions, probe_views
+from liftcore.lifting.planning.plan import TIMED_VIEWS, Plan, plan_lift
+from liftcore.query.result import LiftResult
+from liftcore.raster import open_raster
+from liftcore.raster.base import Raster
+from liftcore.runtime.device import Device
+from liftcore.runtime.progress import Timings
+from liftcore.scene.splats import Splats
+from liftcore.solve.aggregate import Aggregation, aggregate
+from liftcore.solve.closed_form import solve, solve_rows
+from liftcore.solve.consensus import mask_consensus
+from liftcore.solve.diagnostics import ViewMeasures, measure_samples
+from liftcore.solve.least_squares import AllRays, reference, refine
+from liftcore.solve.loss import huber_factors
+from liftcore.solve.objects import RegionObjects, region_objects
+from liftcore.solve.reweight import Agreement, agreement_factors, reweighted, whole_regions
+from liftcore.values.lift_views import LiftViews
+from liftcore.values.region_weights import RegionWeights
+from liftcore.values.settings import LiftSettings
+
+LEAST_KEPT = 0.5  # of a splat's weight, in regions that the aggregation kept, for it to be solved for again
+
+
+@dataclass(frozen=True)
+class SceneWeights:
+    """W of all views, with what it is made of, and what reweighting found."""
+
+    raster: Raster
+    device: Device
+    memory: int | None  # bytes that X may take before it lies in a mapped file; None for no limit
+    views: LiftViews
+    geometry: Geometry  # its W as it is solved
+    sums: np.ndarray | None = None  # [P] f64, of the rows of W as it was weighed; None: W is that
+    consensus: Tensor | None = None  # [nnz] f32, until W is reweighted
+    agreement: Agreement | None = None
+
+    @property
+    def weights(self) -> RegionWeights:
+        """W, a row for every splat."""
+        return self.geometry.weights
+
+    def row_sums(self) -> np.ndarray:
+        """[P] f64, of W as it was weighed."""
+        return self.weights.row_sums().cpu().numpy() if self.sums is None else self.sums
+
+    def times(self, W: RegionWeights, factors: Tensor) -> SceneWeights:
+        """The same with each entry of W times its factor [nnz] f32.
+
+        Args:
+            W: this W on the CPU.
+        """
+        geometry = replace(self.geometry, weights=reweighted(W, factors))
+        return replace(self, geometry=geometry, sums=self.row_sums())
+
+
+@dataclass(frozen=True)
+class InMemory(Steps[SceneWeights]):
+    """Steps of which one process holds all; see the protocol."""
+
+    splats: Splats
+    settings: LiftSettings
+    timings: Timings
+    threads: int | None = None
+    checkpoint: Checkpoint | None = None
+
+    def plan(self, views: LiftViews, device: Device) -> Plan:
+        """See the protocol. Contradictions are told by the views that the lift begins with."""
+        return plan_lift(self.splats, views, self.settings, device, self.threads)
+
+    def weigh(
+        self, views: LiftViews, plan: Plan, on_plan: Callable[[Plan], None]
+    ) -> tuple[SceneWeights, WeighedViews]:
+        raster = open_raster(self.splats, plan.device, self.threads, plan.kept_on_card)
+        first, begin = probe_views(len(views)), time.perf_counter()
+        plans = [plan]
+
+        def look(geometry: Geometry) -> None:
+            took = time.perf_counter() - begin
+            if views.features.paths:
+                wrong = contradictions(raster, views, self.settings, plan.seen_share, geometry)
+                plans.append(replace(plan, told=(*plan.told, *wrong)))
+            if len(views) >= TIMED_VIEWS:
+                plans.append(replace(plans[-1], seconds=took * len(views) / len(first)))
+            on_plan(plans[-1])
+
+        geometry = weigh_views(
+            raster,
+            self.splats.count,
+            views,
+            self.settings,
+            self.timings.progress,
+            by_rows=self.settings.weighs_rows,
+            checkpoint=self.checkpoint.of(self.splats, plan.device.facts()) if self.checkpoint else None,
+            device_bytes=plan.kept_on_card,
+            threads=self.threads,
+            first=first,
+            on_first=look,
+        )
+        W = SceneWeights(raster, plan.device, plan.features_room, views, geometry)
+        return W, WeighedViews(plans[-1], geometry.levels, W.weights.region.shape[0], geometry.blind)
+
+    def find_objects(self, W: SceneWeights) -> RegionObjects:
+        return region_objects(W.weights.cpu(), W.geometry.levels, W.geometry.evidence().numpy(), self.threads)
+
+    def compare_masks(self, W: SceneWeights) -> SceneWeights:
+        weights = W.weights.cpu()
+        shares = mask_consensus(weights, W.geometry.levels, self.threads, means=self.splats.means)
+        return replace(W, geometry=replace(W.geometry, weights=weights), consensus=torch.from_numpy(shares))
+
+    def reweight(self, W: SceneWeights) -> tuple[SceneWeights, float | None]:
+        weights = W.weights.cpu()
+        agreement = agreement_factors(
+            weights,
+            W.geometry.codebook,
+            self.settings.robust_steps,
+            self.timings.progress,
+            means=self.splats.means,
+            threads=self.threads,
+            reliability=whole_regions(self.settings.reliability, W.geometry.levels),
+            consensus=W.consensus,
+        )
+        W = replace(W.times(weights, agreement.factors), consensus=None, agreement=agreement)
+        return W, agreement.reliability
+
+    def discount_distance(self, W: SceneWeights) -> SceneWeights:
+        weights, how = W.weights.cpu(), {"means": self.splats.means, "threads": self.threads}
+        return W.times(weights, huber_factors(weights, W.geometry.codebook, self.timings.progress, **how))
+
+    def solve(self, W: SceneWeights, clusters: RegionObjects | None) -> tuple[Tensor, Support]:
+        solution = solve(
+            W.weights,
+            W.geometry.codebook,
+            getattr(torch, self.settings.dtype),
+            self.timings.progress,
+            means=self.splats.means,
+            threads=self.threads,
+            device=W.device,
+            memory=W.memory,
+        )
+        confidence = W.agreement.confidence if W.agreement else None
+        return solution.features, Support(W.row_sums(), W.geometry.evidence(), solution.agreement, confidence)
+
+    def refine(self, W: SceneWeights, X: Tensor, seen: np.ndarray) -> tuple[Tensor, dict[str, Any]]:
+        settings, progress, books, facts = self.settings, self.timings.progress, W.geometry.books, dict[str, Any]()
+        views = W.views
+        rays = AllRays(
+            W.raster,
+            self.splats.count,
+            views.lifted,
+            lambda number: as_read(views[number][1], settings, views.names[number]),
+            settings.lift_params,
+            progress,
+        )
+        if settings.cg_steps:
+            with self.timings.stage("refine"):
+                refinement = refine(rays, X, seen, books, settings, progress)
+            X, facts["refinement"] = refinement.features, refinement.stats
+        if settings.reference_channels:
+            with self.timings.stage("reference"):
+                facts["reference"] = reference(rays, X, seen, W.geometry.samples, books, settings, progress)
+        return X, facts
+
+    def aggregate(self, W: SceneWeights, X: Tensor, clusters: RegionObjects | None) -> tuple[Tensor, Aggregation]:
+        settings, agreement, judged = self.settings, W.agreement, None
+        if settings.aggregation_guard and agreement and agreement.explained is not None:
+            judged = W.weights.cpu(), agreement.directions, agreement.explained
+        X, found = aggregate(
+            X,
+            W.geometry.evidence().numpy(),
+            self.splats,
+            W.raster,
+            W.views,
+            settings,
+            self.timings.progress,
+            self.threads,
+            things=clusters,
+            judged=judged,
+        )
+        if not settings.aggregation_resolve:
+            return X, found
+        with self.timings.stage("resolve"):
+            X, share = self._resolve(W, X, found)
+        return X, replace(found, facts=found.facts | {"resolved": share})
+
+    def _resolve(self, W: SceneWeights, X: Tensor, aggregation: Aggregation) -> tuple[Tensor, float]:
+        """X, solved again from the kept regions alone for splats that took no cluster's feature; their share of all.
+
+        Only those most of whose weight lies in kept regions: it is their neighbours' regions that reach the others.
+        """
+        if all(rows is None for rows in aggregation.kept):
+            return X, 0.0
+        weights = W.weights.cpu()
+        counted = [
+            torch.ones(book.shape[0]) if rows is None else torch.from_numpy(rows).float()
+            for book, rows in zip(W.geometry.books, aggregation.kept, strict=True)
+        ]
+        fewer = reweighted(weights, torch.cat(counted).index_select(0, weights.region))
+        most = fewer.row_sums().numpy()
+        chosen = aggregation.own & torch.from_numpy((most > 0) & (most >= LEAST_KEPT * W.row_sums()))
+        rows, how = torch.nonzero(chosen)[:, 0], {"means": self.splats.means, "threads": self.threads}
+        solve_rows(X, rows, fewer, W.geometry.codebook, self.timings.progress, **how)
+        return X, float(chosen.float().mean())
+
+    def measure(self, W: SceneWeights, X: Tensor) -> ViewMeasures:
+        return measure_samples(W.geometry.samples, X, W.geometry.books, self.threads)
+
+    def deliver(self, lift: LiftResult, plan: Plan) -> LiftResult:
+        """See the protocol: on the device that lifted, but for an X in a mapped file, which stays there."""
+        room = plan.features_room
+        return lift if room is not None and lift.features.nbytes > room else lift.to(plan.device.place)

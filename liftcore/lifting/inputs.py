@@ -1,0 +1,41 @@
+"""The inputs of a lift, checked and paired."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+from liftcore.raster import check_given
+from liftcore.scene.cameras import Camera, Cameras
+from liftcore.scene.splats import Splats
+from liftcore.values.lift_views import Given, LiftViews
+from liftcore.values.pack import Views, as_views
+from liftcore.values.settings import LiftSettings, Preset
+
+
+@dataclass(frozen=True)
+class LiftInputs:
+    """Splats, views and settings that suit each other."""
+
+    splats: Splats
+    given: Views  # as the caller has them
+    views: LiftViews  # paired with cameras
+    settings: LiftSettings
+
+    @classmethod
+    def of(
+        cls,
+        splats: Splats,
+        cameras: Cameras | Mapping[str, Camera],
+        views: Given,
+        preset: Preset | str | LiftSettings,
+        settings: Mapping[str, Any] = MappingProxyType({}),
+        threads: int | None = None,
+    ) -> LiftInputs:
+        """Check the arguments of `liftcore.lift`, and raise as it does."""
+        chosen = LiftSettings.chosen(preset, settings)
+        splats = check_given(splats, threads)
+        chosen, given = chosen.for_splats(splats), as_views(views)
+        return cls(splats, given, LiftViews.of(given, cameras, chosen), chosen)
