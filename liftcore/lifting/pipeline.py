@@ -145,7 +145,7 @@ def _run(
         agreement=support.agreement,
         confidence=support.confidence,
         seen=torch.from_numpy(support.sums > 0),
-        metadata=views.metadata(settings, inputs.splats.origin, diagnostics, timings.seconds),
+        metadata=views.metadata(settings, inputs.splats, diagnostics, timings.seconds),
         cluster=aggregation.clusters if aggregation else None,
         cluster_features=aggregation.cluster_features if aggregation else None,
         embeddings=torch.from_numpy(table.embeddings) if table else None,

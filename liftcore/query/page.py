@@ -69,9 +69,8 @@ def _splats_file(lift: Lift, splats: Splats | None, folder: Path) -> InputFile:
     if splats is None:
         return _remembered("splats", lift.metadata)
     from liftcore.io.ply import write_splats
-    from liftcore.query.scene import require_lifted
 
-    require_lifted(splats, len(lift.features))
+    lift.require_splats(splats)
     write_splats(splats, folder / "splats.ply")
     return input_file(folder / "splats.ply")
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from liftcore.errors import InvalidLift, InvalidQuery, InvalidSplats
+from liftcore.errors import InvalidLift, InvalidQuery
 from liftcore.io.splats import quick_count
 from liftcore.query.scores import mean_direction, norms_of
 from liftcore.scene.kernel import Kernel
@@ -42,7 +42,7 @@ class QueryScene:
         result: the lift. splats: that were lifted. cameras: of the scene. packs: that were lifted.
 
     Raises:
-        InvalidSplats: other splats than were lifted, by their number.
+        InvalidSplats: other splats than were lifted (`Lift.require_splats`).
     """
 
     features: np.ndarray  # [P, F] f16 or f32; zero rows where not seen
@@ -65,7 +65,7 @@ class QueryScene:
         names = ("features", "evidence", "seen", "cluster", "cluster_features", "confidence", "embeddings")
         names += ("object", "object_views")
         if splats is not None:
-            require_lifted(splats, len(result.features))
+            result.require_splats(splats)
             splats = splats.cpu()
         self._hold({name: as_numpy(getattr(result, name)) for name in names})
         self.path = Path("lift")
@@ -369,19 +369,6 @@ class QueryScene:
             str(self.path), expected=f"the {role} that were lifted at {path}", got="a file with another SHA-256",
             hint=f"the {role} changed since the lift{beside}: {option}restore them, or lift again",
         )  # fmt: skip
-
-
-def require_lifted(splats: Splats, count: int) -> None:
-    """See that splats may be those of a lift.
-
-    Raises:
-        InvalidSplats: they are something else, or another number of them.
-    """
-    from liftcore.scene.splats import Splats
-
-    if not isinstance(splats, Splats) or splats.count != count:
-        got = f"{splats.count} splats" if isinstance(splats, Splats) else f"{type(splats).__name__} {splats!r}"[:80]
-        raise InvalidSplats("splats", expected=f"the {count} Splats that were lifted", got=got)
 
 
 def as_numpy(array: Any) -> Any:

@@ -237,7 +237,12 @@ class Splats:
         move = Similarity.of(matrix, scale, rotation, translation)
         turn, place = torch.from_numpy(move.rotation), self.means.device
         fields: dict[str, Any] = {"log_scales": (self.log_scales.double() + math.log(move.scale)).float()}
-        fields["means"] = torch.from_numpy(move.points(self.positions().astype(np.float64))).to(place)
+        origin = None
+        if self.origin == FILE_ORIGIN:
+            fields["means"] = torch.from_numpy(move.points(self.positions().astype(np.float64))).to(place)
+        else:  # what is near the origin stays near it, and loses no digit
+            fields["means"] = (move.scale * (self.means.double() @ turn.T.to(place))).float()
+            origin = move.points(np.array([self.origin]))[0].tolist()
         if move.rotation.tolist() != np.eye(3).tolist():
             fields["quats"] = _turned_quats(self.quats, move.rotation)
             if self.sh is not None:
@@ -250,7 +255,7 @@ class Splats:
                 kinds = [self.extras[name].dtype for name in NORMALS]
                 own = {name: one.to(kind) for name, one, kind in zip(NORMALS, columns, kinds, strict=True)}
                 fields["extras"] = {**self.extras, **own}
-        return replace(self, **fields, origin=None)
+        return replace(self, **fields, origin=origin)
 
     def cpu(self) -> Splats:
         """The same with its tensors on the CPU."""

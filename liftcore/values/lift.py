@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict
 
+from liftcore.errors import InvalidSplats
 from liftcore.scene.origin import FILE_ORIGIN, Origin
 from liftcore.scene.views import composed
 from liftcore.text.table import TableEncoder, own_words
@@ -18,6 +19,10 @@ from liftcore.values.settings import LiftSettings
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
+
+    from liftcore.scene.rows import Rows
+    from liftcore.scene.similarity import Numbers
+    from liftcore.scene.splats import Splats
 
 FORMAT = "splatlift-lift/1"
 
@@ -32,6 +37,17 @@ class InputFile(BaseModel):
 
 
 NO_FILE = InputFile(path="", sha256="")
+Landmark = tuple[int, float, float, float]  # a row, and its splat's position in the world frame, scene units
+LANDMARKS = 32  # evenly spaced over the rows
+NEAR = 0.01  # of the landmarks' extent: copies that are quantised, or trained a little more, lie nearer
+DIGITS = 9  # of a coordinate
+
+
+def landmarks_of(splats: Splats) -> tuple[Landmark, ...]:
+    """The rows and positions of LANDMARKS splats, evenly spaced over the rows."""
+    rows = sorted({round(k * (splats.count - 1) / (LANDMARKS - 1)) for k in range(LANDMARKS)})
+    places = [[float(f"{x:.{DIGITS}g}") for x in place] for place in splats.positions(rows).tolist()]
+    return tuple((row, x, y, z) for row, (x, y, z) in zip(rows, places, strict=True))
 
 
 class LiftMetadata(BaseModel):
@@ -51,6 +67,7 @@ class LiftMetadata(BaseModel):
     views: tuple[Annotated[str, AfterValidator(composed)], ...]  # the views that were lifted
     poses: str = ""  # of their cameras (`liftcore.values.lift_file.poses_of`); "" in older lifts
     origin: Origin = FILE_ORIGIN  # of the splats (`Splats.origin`), and of the positions in ``.splat`` and ``.spz``
+    landmarks: tuple[Landmark, ...] = ()  # where some splats lie, by which their rows are known; () in older lifts
     certificate: dict[str, Any]
     timings: dict[str, float]  # seconds a stage
 
@@ -96,6 +113,99 @@ class Lift:
         """The words that its packs brought, with their vectors (`.words`, `.encode(words)`); None without any."""
         return own_words(self.metadata.words, None if self.embeddings is None else self.embeddings.cpu().numpy())
 
+    def __len__(self) -> int:
+        """P, the number of rows."""
+        return len(self.features)
+
+    def __getitem__(self, keep: Rows) -> Self:
+        """The lift of the splats that a mask [P], a slice or row numbers [n] choose, as ``splats[keep]`` has them.
+
+        All columns follow. Objects and clusters of which no splat is left go, and the others are numbered anew in
+        their order. It remembers no file of splats, as a file's rows are others. Diagnostics stay those of the whole.
+
+        Raises:
+            InvalidInput: they choose no splat, or are none of these (`liftcore.scene.rows`).
+        """
+        from liftcore.scene.rows import chosen_rows
+
+        rows = chosen_rows(keep, len(self)).to(self.features.device)
+        names = ("features", "evidence", "agreement", "seen", "confidence", "cluster", "object")
+        given = {name: getattr(self, name) for name in names}
+        columns = {name: column[rows] for name, column in given.items() if column is not None}
+        for labels, table in (("cluster", "cluster_features"), ("object", "object_views")):
+            if labels in columns and (values := getattr(self, table)) is not None:
+                columns[labels], columns[table] = _renumbered(columns[labels], values)
+        places = {row: place for row, *place in self.metadata.landmarks}
+        numbered = enumerate(rows.tolist())
+        landmarks = tuple((new, *places[old]) for new, old in numbered if old in places)
+        whole = self.diagnostics.get("cropped_from", len(self))
+        changes = {
+            "splats": NO_FILE,
+            "landmarks": landmarks,
+            "certificate": self.diagnostics | {"cropped_from": whole},
+        }
+        return replace(self, **columns, metadata=self.metadata.model_copy(update=changes))
+
+    def transformed(
+        self,
+        matrix: Numbers | None = None,
+        *,
+        scale: float = 1.0,
+        rotation: Numbers | None = None,
+        translation: Numbers | None = None,
+    ) -> Self:
+        """The lift of splats that were moved alike (`Splats.transformed`), ``p' = scale R p + translation``.
+
+        Features, evidence and objects know no frame and stay. What it remembers of places moves along; it forgets
+        the files of its splats and cameras, which are in the frame of before.
+
+        Raises:
+            InvalidInput: it is no similarity.
+        """
+        import numpy as np
+
+        from liftcore.scene.similarity import Similarity
+
+        move, metadata = Similarity.of(matrix, scale, rotation, translation), self.metadata
+        rows, places = [row for row, *_ in metadata.landmarks], [place for _, *place in metadata.landmarks]
+        moved = move.points(np.array(places).reshape(-1, 3)).tolist()
+        changes = {
+            "splats": NO_FILE,
+            "cameras": NO_FILE,
+            "poses": "",
+            "origin": tuple(move.points(np.array([metadata.origin]))[0].tolist())
+            if any(metadata.origin)
+            else FILE_ORIGIN,
+            "landmarks": tuple((row, *place) for row, place in zip(rows, moved, strict=True)),
+        }
+        return replace(self, metadata=metadata.model_copy(update=changes))
+
+    def require_splats(self, splats: Splats) -> None:
+        """Refuse splats that are not those of the lift, row for row, by their number and where some of them lie.
+
+        Copies that were quantised pass: half of the landmarks must lie within NEAR of their extent.
+
+        Raises:
+            InvalidSplats: they are something else, another number of them, in another order or moved.
+        """
+        from liftcore.scene.splats import Splats
+
+        expected = f"the {len(self)} Splats that were lifted"
+        if not isinstance(splats, Splats):
+            got, hint = f"{type(splats).__name__} {splats!r}"[:80], "read_splats(path) makes them of a file"
+            raise InvalidSplats("splats", expected=expected, got=got, hint=hint)
+        if splats.count != len(self):
+            hint = "crop a lift as its splats: result[keep] and splats[keep]"
+            raise InvalidSplats("splats", expected=expected, got=f"{splats.count} splats", hint=hint)
+        off = _off_landmarks(self.metadata.landmarks, splats)
+        if 2 * off > len(self.metadata.landmarks):
+            raise InvalidSplats(
+                "splats", expected=f"{expected}, row for row",
+                got=f"others: {off} of {len(self.metadata.landmarks)} that were compared lie elsewhere",
+                hint="give the splats of the lift in their order; splats that were cropped or moved go with "
+                "result[keep] and result.transformed(...)",
+            )  # fmt: skip
+
     def to(self, place: torch.device) -> Self:
         """The same with its tensors there; where they are, if there is no room for them."""
         from liftcore.runtime.device import out_of_memory
@@ -115,3 +225,26 @@ class Lift:
         import torch
 
         return self.to(torch.device("cpu"))
+
+
+def _renumbered(labels: Tensor, table: Tensor) -> tuple[Tensor, Tensor]:
+    """Labels [n] of rows of a table [K, ..], -1 for none, and the table without rows that no label names."""
+    import torch
+
+    used, numbers = torch.unique(labels, return_inverse=True)
+    none = int((used < 0).sum())
+    return (numbers - none).clamp_min(-1).to(labels.dtype), table[used[none:].long()]
+
+
+def _off_landmarks(landmarks: tuple[Landmark, ...], splats: Splats) -> int:
+    """How many of the splats lie elsewhere than landmarks say."""
+    import numpy as np
+
+    if not landmarks:
+        return 0
+    places = np.array([place for _, *place in landmarks])
+    rows = np.array([row for row, *_ in landmarks])  # of a lift cropped by other means, perhaps beyond the last
+    found = splats.positions(rows.clip(max=splats.count - 1)).astype(np.float64)
+    low, high = np.quantile(places, (0.1, 0.9), axis=0)  # floaters decide nothing
+    near = NEAR * float((high - low).max()) + float(np.spacing(np.float32(np.abs(places).max())))
+    return int((np.abs(found - places).max(axis=1) > near).sum())

@@ -6,8 +6,8 @@ from typing import Any
 
 from liftcore.runtime.version import __version__
 from liftcore.scene.cameras import Camera, Cameras
-from liftcore.scene.origin import Origin
-from liftcore.values.lift import LiftMetadata
+from liftcore.scene.splats import Splats
+from liftcore.values.lift import LiftMetadata, landmarks_of
 from liftcore.values.lift_file import poses_of
 from liftcore.values.pack import Views, as_views, pair
 from liftcore.values.settings import LiftSettings
@@ -58,9 +58,9 @@ class LiftViews:
         return (self[number] for number in range(len(self)))
 
     def metadata(
-        self, settings: LiftSettings, origin: Origin, diagnostics: dict[str, Any], timings: dict[str, float]
+        self, settings: LiftSettings, splats: Splats, diagnostics: dict[str, Any], timings: dict[str, float]
     ) -> LiftMetadata:
-        """What a lift of these views remembers, of whatever engine; the origin is the splats'."""
+        """What a lift of these views remembers, of whatever engine."""
         table = self.features.table
         return LiftMetadata(
             version=__version__,
@@ -70,7 +70,8 @@ class LiftViews:
             words=table.words if table else (),
             views=tuple(self.names),
             poses=poses_of(self.lifted),
-            origin=origin,
+            origin=splats.origin,
+            landmarks=landmarks_of(splats),
             certificate=diagnostics,
             timings=timings,
         )

@@ -240,7 +240,8 @@ NEAR, FAR = 2.0, 5.0
 def scene_of(given: QueryScene, splats: Splats, camera: Camera) -> QueryScene:
     """A lift of nothing, over those splats and that camera."""
     ones = torch.ones(splats.count)
-    made = replace(given.lift, features=torch.ones(splats.count, 1), evidence=ones, seen=ones > 0)
+    metadata = given.metadata.model_copy(update={"landmarks": ()})
+    made = replace(given.lift, features=torch.ones(splats.count, 1), evidence=ones, seen=ones > 0, metadata=metadata)
     return QueryScene(made, splats, Cameras((camera,)))
 
 

@@ -53,6 +53,10 @@ def test_rows_may_come_in_another_order_and_keep_an_origin_of_map_coordinates() 
     some = far[::-1]
     assert some.origin == far.origin != (0, 0, 0)
     np.testing.assert_array_equal(some.positions(), far.positions()[::-1])
+    moved = far.transformed(MATRIX)
+    np.testing.assert_allclose(
+        moved.positions(), far.positions() @ MATRIX[:3, :3].T + MATRIX[:3, 3], rtol=0, atol=1e-4
+    )
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,109 @@
+"""Some rows of a lift, a lift in another frame, and lifts beside splats that are not theirs."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import liftcore as lc
+from tests.scenes import random_camera, random_splats, write_scene
+
+MOVE = {"scale": 2.0, "rotation": np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), "translation": [1.0, 2.0, 3.0]}
+
+
+@pytest.fixture(scope="module")
+def scene() -> tuple[lc.Splats, lc.Cameras, lc.LiftResult]:
+    """A lift with clusters and objects that masks make."""
+    splats = random_splats(4, 300)
+    cameras = lc.Cameras([random_camera(k, 48, 40, name=f"v{k}") for k in range(6)])
+    sides = splats.means[:, 0] > 0
+    views = {}
+    for name, camera in cameras.items():
+        image = lc.render(splats, camera, torch.stack([sides, ~sides], dim=1).float())
+        masks = torch.stack([(image[..., k] > image[..., 1 - k]) for k in range(2)])
+        views[name] = lc.Regions.from_masks(masks, np.eye(2, 6, dtype=np.float32))
+    return splats, cameras, lc.lift(splats, cameras, views, aggregation=True, aggregation_cluster_size=5)
+
+
+def test_rows_of_a_lift_are_its_columns_and_answer_as_those_of_the_whole(scene, tmp_path: Path) -> None:
+    splats, _, result = scene
+    keep = splats.means[:, 0] > -0.2
+    some, whole = result[keep], result
+    for name in ("features", "evidence", "agreement", "seen", "confidence"):
+        assert torch.equal(getattr(some, name), getattr(whole, name)[keep]), name
+    assert len(some) == len(splats[keep]) == int(keep.sum())
+    answer = some.query(np.eye(1, 6), splats=splats[keep], threshold=0.5)
+    np.testing.assert_array_equal(
+        answer.splats, np.asarray(whole.query(np.eye(1, 6), threshold=0.5).splats)[keep.numpy()]
+    )
+    some.save(tmp_path / "some.lift.safetensors")
+    again = lc.load_lift(tmp_path / "some.lift.safetensors")
+    assert torch.equal(again.features, some.features) and again.diagnostics["cropped_from"] == 300
+    assert again[::2].diagnostics["cropped_from"] == 300 and again.metadata.splats.path == ""
+
+
+def test_objects_and_clusters_without_splats_go_and_the_others_are_numbered_anew(scene) -> None:
+    splats, _, result = scene
+    assert result.object is not None and result.object_views is not None and len(result.object_views) >= 2
+    last = len(result.object_views) - 1
+    for labels, table in (("object", "object_views"), ("cluster", "cluster_features")):
+        own = getattr(result, labels)
+        some = result[own != 0]
+        numbers = torch.unique(getattr(some, labels))
+        assert numbers[numbers >= 0].tolist() == list(range(len(getattr(some, table))))
+        kept = own[own != 0]
+        mapped = getattr(result, table)[kept[kept >= 0].long()]
+        assert torch.equal(mapped, getattr(some, table)[getattr(some, labels)[kept >= 0].long()])
+    alone = result.object == last
+    assert len(result[alone].objects(splats[alone]).objects) == 1
+
+
+def test_a_lift_moves_with_its_splats(scene) -> None:
+    splats, _, result = scene
+    moved = result.transformed(**MOVE)
+    assert torch.equal(moved.features, result.features) and moved.metadata.poses == ""
+    found = moved.query(np.eye(1, 6), splats=splats.transformed(**MOVE))
+    assert np.array_equal(found.splats, result.query(np.eye(1, 6), splats=splats).splats)
+    with pytest.raises(lc.InvalidSplats, match=r"row for row, got others: .*result\.transformed"):
+        moved.query(np.eye(1, 6), splats=splats)
+
+
+OTHERS: dict[str, Callable[[lc.Splats], lc.Splats]] = {
+    "in another order": lambda splats: splats[::-1],
+    "moved": lambda splats: splats.transformed(translation=[0.5, 0, 0]),
+    "turned": lambda splats: splats.transformed(rotation=[0.9, 0.1, 0, 0]),
+    "of another scene": lambda splats: random_splats(9, splats.count),
+    "cropped elsewhere": lambda splats: splats[np.r_[1 : splats.count, 0]],
+}
+
+
+@pytest.mark.parametrize("kind", OTHERS)
+def test_splats_that_are_not_those_of_the_lift_are_refused(scene, kind: str) -> None:
+    splats, _, result = scene
+    for own, lift in ((OTHERS[kind](splats), result), (OTHERS[kind](splats)[:200], result[:200])):
+        with pytest.raises(lc.InvalidSplats, match=r"splats: expected the .* Splats that were lifted, row for row"):
+            lift.query(np.eye(1, 6), splats=own)
+        with pytest.raises(lc.InvalidSplats, match="row for row"):
+            lift.objects(own)
+
+
+def test_splats_of_a_quantised_copy_are_those_of_the_lift(scene) -> None:
+    splats, _, result = scene
+    rounded = replace(splats, means=(splats.means * 256).round() / 256)
+    assert result.query(np.eye(1, 6), splats=rounded).splats.shape == (300,)
+
+
+def test_lift_of_files_knows_its_splats_in_memory(tmp_path: Path) -> None:
+    splats, cameras, pack = write_scene(tmp_path, 3)
+    loaded = lc.read_splats(splats)
+    result = lc.lift(loaded, lc.read_cameras(cameras), lc.read_features(pack), preset="row-sum")
+    result.save(tmp_path / "lift.safetensors")
+    again = lc.load_lift(tmp_path / "lift.safetensors")
+    again.query(np.eye(1, 6), splats=loaded)
+    with pytest.raises(lc.InvalidSplats, match="row for row"):
+        again.query(np.eye(1, 6), splats=loaded[::-1])
+    with pytest.raises(lc.InvalidSplats, match=r"got 49 splats; crop a lift as its splats"):
+        again.query(np.eye(1, 6), splats=loaded[1:])
