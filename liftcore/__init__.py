@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from liftcore.errors import Unavailable as Unavailable
     from liftcore.io.cameras import read_cameras as read_cameras
     from liftcore.io.splats import read_splats as read_splats
+    from liftcore.io.splats import write_splats as write_splats
     from liftcore.lifting.engines.base import LocalEngine as LocalEngine
     from liftcore.lifting.engines.ray import RayEngine as RayEngine
     from liftcore.lifting.operators import region_weights as region_weights
@@ -67,6 +68,7 @@ if TYPE_CHECKING:
 
 _PUBLIC = {  # name -> the module that defines it
     "read_splats": "liftcore.io.splats",
+    "write_splats": "liftcore.io.splats",
     "read_cameras": "liftcore.io.cameras",
     "read_features": "liftcore.values.pack",
     "Splats": "liftcore.scene.splats",
@@ -151,6 +153,7 @@ __all__ = [
     "read_splats",
     "region_weights",
     "render",
+    "write_splats",
 ]
 
 

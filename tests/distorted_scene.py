@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from liftcore.io.ply import write_splats
+from liftcore.io.splats import write_splats
 from liftcore.scene.distortion import Brown, Distortion, Fisheye, Lens
 from liftcore.scene.splats import Splats
 from liftcore.values.pack import write_pack
@@ -68,7 +68,7 @@ def write_distorted_scene(folder: Path, lens: str, *, grids: bool = False) -> tu
     """The files of the scene: splats, cameras, features, which are one-hot vectors of the quarters."""
     folder.mkdir(exist_ok=True)
     paths = folder / "splats.ply", folder / "transforms.json", folder / "features.safetensors"
-    write_splats(wall(), paths[0])
+    write_splats(paths[0], wall())
     frames = []
     for name, x in VIEWS.items():
         pose = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL axes of a camera that looks along z

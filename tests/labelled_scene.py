@@ -15,7 +15,7 @@ from PIL import Image
 from safetensors.torch import save_file
 
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.ply import write_splats
+from liftcore.io.splats import write_splats
 from liftcore.query.result import LiftResult
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
@@ -48,7 +48,7 @@ def write_lift(folder: Path, name: str = "kitchen.lift.safetensors") -> Path:
         opacity_logits=torch.full((count,), 4.0),
         sh=torch.zeros(count, 1, 3),
     )
-    write_splats(splats, folder / "splats.ply")
+    write_splats(folder / "splats.ply", splats)
     cameras = []
     for frame, left in FRAMES.items():
         pose = np.eye(4)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.ply import write_splats
+from liftcore.io.splats import write_splats
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Kernel, Splats
 from liftcore.values.pack import write_pack
@@ -149,7 +149,7 @@ def write_scene(
     views = tuple(centred(random_camera(seed + k, 32 + 5 * k, 24 + 3 * k, name=f"v{k}")) for k in range(3))
     observations = {camera.name: observed(seed, k, grids) for k, camera in enumerate(views)}
     paths = folder / "splats.ply", folder / "cameras.json", folder / "features.safetensors"
-    write_splats(random_splats(seed, 50, kernel=kernel), paths[0])
+    write_splats(paths[0], random_splats(seed, 50, kernel=kernel))
     write_inria_cameras(Cameras(views), paths[1])
     write_pack(paths[2], observations, {"encoder": "random"})
     return paths

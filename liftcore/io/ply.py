@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from liftcore.errors import InvalidSplats
-from liftcore.io.files import open_regular, whole_file
+from liftcore.io.files import open_regular
 from liftcore.scene.harmonics import SH_C0, constant_terms
 from liftcore.scene.kernel import DARK_LOBE, LOBE_COLOURS, NORMALS, Kernel, kernel_named, scale_count
 from liftcore.scene.render_mode import RenderMode, RenderModel, kernel_of_mode, mode_beside, mode_of_comments
@@ -53,6 +53,9 @@ CHANNELS = (
 )  # of a colour
 SPLAT_PROPERTIES = ("opacity", "scale_0", "rot_0", "f_dc_0", "sh0_0", "packed_position")  # one at least
 SCAFFOLD = ("f_anchor_feat_0", "f_offset_0")  # of Scaffold-GS, whose networks turn anchors into splats
+MODEL = re.compile(
+    r"[xyz]|opacity|beta|filter_3D|(scale|rot|f_dc|f_rest|sh0|shN|sb_params)_\d+|packed_\w+"
+)  # columns that are splats, in any dialect
 SPELLING = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"}
 SPELLING |= {"f4": "float", "f8": "double"}
 WRITTEN_MODE = {RenderModel.ANTIALIASED: "mip", RenderModel.DISCS: "2dgs"}  # as editors read it
@@ -137,20 +140,12 @@ def read_places(path: Path) -> np.ndarray:
     return _read_columns(path, header, {axis: Slot("means", (k,)) for k, axis in enumerate("xyz")}, ())[0]["means"]
 
 
-def write_splats(splats: Splats, path: Path) -> None:
-    """Write splats whole or not at all: the layout they were read with, or else their kernel's usual one.
+def ply_blocks(splats: Splats) -> Iterator[bytes]:
+    """The bytes of a PLY of splats, in blocks: the layout they were read with, or else their kernel's usual one.
 
     Raises:
         InvalidSplats: the layout names a column that the splats do not have.
     """
-    blocks = ply_blocks(splats)
-    with whole_file(path) as handle:
-        for block in blocks:
-            handle.write(block)
-
-
-def ply_blocks(splats: Splats) -> Iterator[bytes]:
-    """The bytes of the file that `write_splats` writes, in blocks."""
     layout = splats.layout or _default_layout(splats)
     columns = _columns_of(splats, layout)
     source = None

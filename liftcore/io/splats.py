@@ -6,11 +6,12 @@ what it is and what to do.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,10 +19,11 @@ from liftcore.errors import InvalidSplats
 from liftcore.io import ply
 from liftcore.io.checkpoint import read_checkpoint
 from liftcore.io.compressed_ply import read_compressed_ply
+from liftcore.io.files import whole_file
 from liftcore.io.kinds import CONVERT, SplatFormat, identify, wrong_kind
 from liftcore.io.quantised import Fields
 from liftcore.io.ranks import rank_files
-from liftcore.io.remote import local_path
+from liftcore.io.remote import landing, local_path
 from liftcore.io.sog import is_bundled, read_sog, sog_files
 from liftcore.io.splat import ROW, read_splat, splat_blocks
 from liftcore.io.spz import read_spz, spz_blocks
@@ -31,9 +33,12 @@ from liftcore.scene.origin import lies_apart
 from liftcore.scene.render_mode import kernel_of_mode
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from liftcore.scene.splats import Splats
 
 
+COLUMN = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]{0,63}")  # a name that readers of PLY take
 EXPECTED = "splats as PLY, compressed PLY, .splat, .spz, .sog or a checkpoint"
 _READERS: dict[SplatFormat, Callable[..., Fields]] = {
     SplatFormat.COMPRESSED_PLY: read_compressed_ply,
@@ -76,6 +81,85 @@ def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool
         if chosen is Kernel.GAUSSIAN_2D:
             fields["log_scales"] = np.ascontiguousarray(fields["log_scales"][:, :2])
         return Splats(**fields, kernel=chosen)
+
+
+def write_splats(path: Path | str, splats: Splats, columns: Mapping[str, Any] | None = None) -> None:
+    """Write splats whole or not at all, as a PLY, or as a ``.splat`` or ``.spz`` where the path ends so.
+
+    A PLY keeps the layout and the further columns that the splats were read with.
+
+    Args:
+        path: a file; it may lie elsewhere (`io.remote`). A name without a suffix is a PLY.
+        columns: of a PLY, further properties a splat: name -> [P] booleans or numbers of numpy or torch, such as
+            ``{"object": result.object, "score": answer.scores}``; one that the splats have is replaced.
+
+    Raises:
+        InvalidSplats: ``splats`` are something else; columns have another number of rows, a name that PLY does not
+            take or that the model has, or come for another format; or the suffix is of none of these.
+    """
+    from liftcore.scene.splats import Splats
+
+    if not isinstance(splats, Splats):
+        got = f"{type(splats).__name__} {splats!r}"[:80]
+        raise InvalidSplats("splats", expected="Splats, behind the path", got=got, hint="write_splats(path, splats)")
+    suffix = Path(str(path)).suffix.lower()
+    write = _writer_of(suffix or ".ply", "path")
+    if columns and write is not ply.ply_blocks:
+        raise InvalidSplats("columns", expected="a path that ends in .ply, which holds columns", got=repr(suffix))
+    if columns:
+        own = {str(name): _column(name, values, splats.count) for name, values in columns.items()}
+        layout = (*splats.layout, *(name for name in own if name not in splats.layout)) if splats.layout else ()
+        splats = replace(splats, extras={**splats.extras, **own}, layout=layout)
+    with landing(path) as place, whole_file(place) as handle:
+        for block in write(splats):
+            handle.write(block)
+
+
+def _column(name: Any, values: Any, count: int) -> Tensor:
+    """A column [P] of a type that PLY has.
+
+    Raises:
+        InvalidSplats: the name or the values are none of a column.
+    """
+    import torch
+
+    from liftcore.scene.splats import shared_tensor
+
+    argument = f"columns[{name!r}]"[:80]
+    if not isinstance(name, str) or not COLUMN.fullmatch(name) or ply.MODEL.fullmatch(name):
+        expected = "a name of letters, digits and underscores that no property of splats has"
+        raise InvalidSplats(argument, expected=expected, got=repr(name)[:80])
+    try:
+        found = shared_tensor(values).cpu()
+    except (TypeError, ValueError, RuntimeError):
+        raise InvalidSplats(argument, expected=f"numbers [{count}]", got=repr(values)[:80]) from None
+    found = found[:, 0] if found.ndim == 2 and found.shape[1] == 1 else found
+    if found.shape != (count,) or found.is_complex():
+        hint = "give each of several columns a name" if found.ndim == 2 else ""
+        raise InvalidSplats(argument, expected=f"numbers [{count}]", got=f"shape {list(found.shape)}", hint=hint)
+    if found.dtype == torch.bool:
+        return found.to(torch.uint8)
+    if found.dtype in (torch.float16, torch.bfloat16):
+        return found.float()
+    if found.dtype in (torch.int64, torch.uint64):
+        low, high = int(found.min()), int(found.max())
+        if low < -(2**31) or high >= 2**31:
+            raise InvalidSplats(argument, expected="whole numbers of 32 bits, as PLY has them", got=f"{low}..{high}")
+        return found.to(torch.int32)
+    return found
+
+
+def _writer_of(suffix: str, argument: str) -> Callable[[Splats], Iterator[bytes]]:
+    """What writes files that end so.
+
+    Raises:
+        InvalidSplats: nothing does.
+    """
+    if suffix not in _WRITERS:
+        hint = "write a .ply, and convert it: npx @playcanvas/splat-transform IN.ply OUT"
+        expected = f"one of {', '.join(_WRITERS)}"
+        raise InvalidSplats(argument, expected=expected, got=repr(suffix)[:40], hint=hint)
+    return _WRITERS[suffix]
 
 
 def read_places(path: Path, kernel: Kernel | str = "auto") -> np.ndarray:
@@ -166,11 +250,7 @@ def some_rows(path: Path, kept: np.ndarray, suffix: str = ".ply") -> Iterator[by
     Raises:
         InvalidSplats: the file is malformed, or has another number of splats.
     """
-    if suffix not in _WRITERS:
-        hint = "write a .ply, and convert it: npx @playcanvas/splat-transform IN.ply OUT"
-        expected = f"one of {', '.join(_WRITERS)}"
-        raise InvalidSplats("suffix", expected=expected, got=repr(suffix)[:40], hint=hint)
-    write = _WRITERS[suffix]
+    write = _writer_of(suffix, "suffix")
     if write is ply.ply_blocks and format_of(path) is SplatFormat.PLY:
         return ply.some_rows(path, kept)
     splats = _of_count(path, len(kept))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 import torch
@@ -26,7 +26,7 @@ from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import LiftSettings, Preset
 
 
-@usual_modes()
+@overload
 def render(
     splats: Splats,
     camera: Camera,
@@ -36,19 +36,42 @@ def render(
     normalise: bool = False,
     device: str | torch.device = "auto",
     threads: int | None = None,
-) -> Tensor:
+) -> Tensor: ...
+@overload
+def render(
+    splats: Splats,
+    camera: Mapping[str, Camera],
+    values: Tensor | np.ndarray,
+    params: CompositingParams | None = None,
+    *,
+    normalise: bool = False,
+    device: str | torch.device = "auto",
+    threads: int | None = None,
+) -> dict[str, Tensor]: ...
+@usual_modes()
+def render(
+    splats: Splats,
+    camera: Camera | Mapping[str, Camera],
+    values: Tensor | np.ndarray,
+    params: CompositingParams | None = None,
+    *,
+    normalise: bool = False,
+    device: str | torch.device = "auto",
+    threads: int | None = None,
+) -> Tensor | dict[str, Tensor]:
     """Composite values on splats front to back, as a rasterizer does colours: ``A X``.
 
     Args:
+        camera: the camera, or several by their names, such as all of a scene.
         values: [P] or [P, F] of any numbers or booleans, a row a splat, in the splats' order; without gradients.
         params: how rays meet splats; None: as they were trained (`Splats.antialiased`), with the field's other
             constants. The scale of the opacity logits is 1; the background is zero.
         normalise: whether pixels are divided by the sum of their weights, where that is not zero.
         device: ``auto``, ``cpu`` or ``cuda``; also ``cuda:0``, if that card is current. threads: of the CPU; the
-        number changes no bit.
+            result is bitwise identical for any number.
 
     Returns:
-        [H, W] or [H, W, F] f32, on the CPU.
+        [H, W] or [H, W, F] f32, on the CPU; of several cameras such an image each, by their names.
 
     Raises:
         InvalidSplats, InvalidCameras: splats or camera are something else, such as a path or a name.
@@ -61,9 +84,30 @@ def render(
     if not isinstance(params, CompositingParams):
         raise InvalidSettings("params", expected="CompositingParams, or None", got=repr(params)[:80])
     check_antialiased(splats.kernel, params.antialiased)
-    if not isinstance(camera, Camera):
-        got, hint = repr(camera)[:80], "cameras[name] is the camera of a view"
-        raise InvalidCameras("camera", expected="a Camera", got=got, hint=hint)
+    cameras = camera if isinstance(camera, Mapping) else {"": camera}
+    for one in cameras.values():
+        if not isinstance(one, Camera):
+            got, hint = repr(one)[:80], "cameras[name] is the camera of a view"
+            raise InvalidCameras("camera", expected="a Camera", got=got, hint=hint)
+    rows = _rows(splats, values)
+    raster = open_raster(splats, choose_device(device), threads)
+
+    def image_of(camera: Camera) -> Tensor:
+        image = raster.render(camera, rows if rows.ndim == 2 else rows[:, None], params)
+        if normalise:
+            sums = raster.row_sums(camera, params)[:, :, None]
+            image = torch.where(sums > 0, image / sums.clamp_min(torch.finfo(torch.float32).tiny), 0.0)
+        return (image if rows.ndim == 2 else image[:, :, 0]).cpu()
+
+    return image_of(camera) if isinstance(camera, Camera) else {name: image_of(one) for name, one in cameras.items()}
+
+
+def _rows(splats: Splats, values: Tensor | np.ndarray) -> Tensor:
+    """Values as f32 on the CPU, a row a splat.
+
+    Raises:
+        InvalidSettings: they are no numbers, of another number of rows, or a gradient is recorded.
+    """
     _refuse_gradients(values)
     try:
         given = shared_tensor(values).cpu()
@@ -73,13 +117,7 @@ def render(
     if given.ndim not in (1, 2) or given.shape[0] != splats.count:
         expected = f"[{splats.count}] or [{splats.count}, F], a row a splat"
         raise InvalidSettings("values", expected=expected, got=str(list(given.shape)))
-    raster = open_raster(splats, choose_device(device), threads)
-    rows = given.float()[:, None] if given.ndim == 1 else given.float()
-    image = raster.render(camera, rows, params)
-    if normalise:
-        sums = raster.row_sums(camera, params)[:, :, None]
-        image = torch.where(sums > 0, image / sums.clamp_min(torch.finfo(torch.float32).tiny), 0.0)
-    return (image[:, :, 0] if given.ndim == 1 else image).cpu()
+    return given.float()
 
 
 def _refuse_gradients(values: Tensor | np.ndarray) -> None:

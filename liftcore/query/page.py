@@ -68,10 +68,10 @@ def show(
 def _splats_file(lift: Lift, splats: Splats | None, folder: Path) -> InputFile:
     if splats is None:
         return _remembered("splats", lift.metadata)
-    from liftcore.io.ply import write_splats
+    from liftcore.io.splats import write_splats
 
     lift.require_splats(splats)
-    write_splats(splats, folder / "splats.ply")
+    write_splats(folder / "splats.ply", splats)
     return input_file(folder / "splats.ply")
 
 

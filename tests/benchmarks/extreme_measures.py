@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 import liftcore as lc
 from liftcore.evaluate.inspect import describe_cameras, describe_packs, describe_splats
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.ply import write_splats
+from liftcore.io.splats import write_splats
 from liftcore.lifting.files import lift_files
 from liftcore.query.threshold import METHODS
 from liftcore.raster.cpu.raster import CpuRaster
@@ -285,7 +285,7 @@ def run(views: Mapping[str, ViewFeatures], splats: lc.Splats, **settings: Any) -
     """The lift, made through files, and the warnings of its pack; plain row-sum weights unless settings say else."""
     with tempfile.TemporaryDirectory() as name:
         paths = [Path(name) / part for part in ("splats.ply", "cameras.json", "pack.safetensors")]
-        write_splats(splats, paths[0])
+        write_splats(paths[0], splats)
         write_inria_cameras(lc.Cameras(tuple(camera(view) for view in views)), paths[1])
         write_pack(paths[2], views, {"encoder": "by hand", "normalised": "false"})
         chosen = lc.LiftSettings.of(**{"preset": "row-sum", "dtype": "float32", **settings})

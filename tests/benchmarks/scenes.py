@@ -19,7 +19,7 @@ import torch
 import liftcore as lc
 from liftcore.evaluate.synthetic import PART_LEVELS, room_cameras, room_parts, room_regions, room_splats
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.ply import write_splats
+from liftcore.io.splats import write_splats
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.values.pack import as_views, write_pack
 from liftcore.values.views import NO_LABEL, ViewFeatures
@@ -45,7 +45,7 @@ def write_room(folder: Path, room: Room) -> None:
     """Write ``point_cloud.ply``, ``cameras.json`` and ``features.safetensors``."""
     folder.mkdir(parents=True, exist_ok=True)
     splats, cameras = room_splats(room.splats, room.seed), room_cameras(room.views, *room.size)
-    write_splats(splats, folder / "point_cloud.ply")
+    write_splats(folder / "point_cloud.ply", splats)
     write_inria_cameras(lc.Cameras(tuple(cameras)), folder / "cameras.json")
     views = as_views(_observed(CpuRaster(splats), cameras, room))
     write_pack(folder / "features.safetensors", views, {"encoder": "random parts", "normalised": "true"})
@@ -105,7 +105,7 @@ def write_bench_room(folder: Path, size: Room, different: int = 12) -> tuple[Pat
     """
     paths = folder / "point_cloud.ply", folder / "cameras.json", folder / "features.safetensors"
     cameras = room_cameras(size.views, *size.size)
-    write_splats(room_splats(size.splats), paths[0])
+    write_splats(paths[0], room_splats(size.splats))
     write_inria_cameras(lc.Cameras(tuple(cameras)), paths[1])
     maps = [room_regions(camera, k, 4, 1).labels for k, camera in enumerate(cameras[:different])]
     views: dict[str, ViewFeatures] = {}

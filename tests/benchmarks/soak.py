@@ -21,7 +21,7 @@ import numpy as np
 
 import liftcore as lc
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.ply import write_splats
+from liftcore.io.splats import write_splats
 from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.values.pack import write_pack
 from service.models import AssetKind
@@ -46,7 +46,7 @@ def scene_files(folder: Path, *, views: int, splats: int, width: int) -> dict[st
     cameras = tuple(centred(random_camera(k, width, width * 3 // 4, name=f"v{k:03d}")) for k in range(views))
     observations = {camera.name: random_regions(k, F=32) for k, camera in enumerate(cameras)}
     paths = {kind: folder / f"{kind}{suffix}" for kind, suffix in SUFFIXES.items()}
-    write_splats(random_splats(0, splats), paths["splats"])
+    write_splats(paths["splats"], random_splats(0, splats))
     write_inria_cameras(lc.Cameras(cameras), paths["cameras"])
     write_pack(paths["features"], dict(observations), {"encoder": "random"})
     return {kind: path.read_bytes() for kind, path in paths.items()}

@@ -23,7 +23,7 @@ import pytest
 import torch
 
 import liftcore as lc
-from liftcore.io.ply import write_splats
+from liftcore.io.splats import write_splats
 from liftcore.io.transforms import transforms_of
 from liftcore.values.pack import write_pack
 from service import errand
@@ -452,7 +452,7 @@ def order_of(folder: Path, **settings: Any) -> dict[str, Any]:
     rng = np.random.default_rng(2)
     names = [f"v{number:02}" for number in range(VIEWS)]
     cameras = {name: look_at(name, rng.normal((0, 0, -4), 1), 32, 24, 30.0) for name in names}
-    write_splats(random_splats(3, 2000, spread=2.0), folder / "s.ply")
+    write_splats(folder / "s.ply", random_splats(3, 2000, spread=2.0))
     (folder / "c.json").write_text(json.dumps(transforms_of(cameras)))
     maps = {name: lc.Regions(rng.integers(-1, 6, (1, 12, 16)), np.eye(6, dtype=np.float32)) for name in names}
     write_pack(folder / "f.safetensors", maps, {})

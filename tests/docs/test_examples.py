@@ -31,8 +31,7 @@ from liftcore.features.encoders import Pixels
 from liftcore.features.encoders.crops import CropEncoder
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.ply import write_splats
-from liftcore.io.splats import read_splats
+from liftcore.io.splats import read_splats, write_splats
 from liftcore.text.table import TableEncoder
 from liftcore.values.pack import read_features, write_pack
 from service import models
@@ -419,7 +418,7 @@ def test_tensors_of_a_training_loop_lift_as_their_files_do(loop: dict[str, Any],
     loop["text_vectors"] = features[loop["means"][:, 0].detach() < 0].mean(dim=0)
     exec(five[4], loop)
 
-    write_splats(loop["splats"], tmp_path / "scene.ply")
+    write_splats(tmp_path / "scene.ply", loop["splats"])
     named = [lc.Camera(viewmat, K, WIDTH, HEIGHT, name=name) for name, viewmat, K in loop["poses"]]
     write_inria_cameras(lc.Cameras(tuple(named)), tmp_path / "cameras.json")
     grids = {name: lc.FeatureGrid(loop["encode"](photo)) for name, photo in loop["photos"]}

@@ -16,7 +16,7 @@ from safetensors.torch import save_file
 
 from liftcore import cli
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.ply import write_splats
+from liftcore.io.splats import write_splats
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.values.pack import write_pack
 from tests.scenes import random_grid, random_regions, random_splats
@@ -30,7 +30,7 @@ LIFT = ["lift", "splats.ply", "cameras.json", "pack.safetensors", "-o", "lift.sa
 @pytest.fixture
 def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A good scene in the working directory."""
-    write_splats(random_splats(1, 20), tmp_path / "splats.ply")
+    write_splats(tmp_path / "splats.ply", random_splats(1, 20))
     pose = np.eye(4)
     pose[2, 3] = 4.0
     write_inria_cameras(

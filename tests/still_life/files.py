@@ -9,7 +9,7 @@ import numpy as np
 from safetensors.numpy import save_file
 
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.ply import write_splats
+from liftcore.io.splats import write_splats
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.text.table import TableEncoder
 from liftcore.values.pack import write_pack
@@ -25,7 +25,7 @@ def write_still_life(folder: Path, scene: StillLife) -> Path:
     words = list(dict.fromkeys([*scene.things, *scene.parts]))
     vectors = np.random.default_rng(SEED).standard_normal((len(words), CHANNELS)).astype(np.float32)
     observed = observe(scene, CpuRaster(scene.splats), TableEncoder("words", words, vectors), Mistakes(), SEED)
-    write_splats(scene.splats, folder / "point_cloud.ply")
+    write_splats(folder / "point_cloud.ply", scene.splats)
     write_inria_cameras(scene.cameras, folder / "cameras.json")
     told = {"encoder": "generated masks", "text_space": "words", "normalised": "true"}
     write_pack(folder / "features.safetensors", observed, told)

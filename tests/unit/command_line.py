@@ -12,7 +12,7 @@ import torch
 
 from liftcore import cli
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.ply import write_splats
+from liftcore.io.splats import write_splats
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
 from liftcore.values.pack import write_pack
@@ -62,7 +62,7 @@ def write_toy_scene(folder: Path) -> Path:
         opacity_logits=torch.full((2,), 4.0),
         sh=torch.zeros(2, 1, 3),
     )
-    write_splats(splats, folder / "splats.ply")
+    write_splats(folder / "splats.ply", splats)
     camera = Camera.pinhole("front", 32, 16, 16.0, 16.0, 16.0, 8.0, np.eye(4))
     write_inria_cameras(Cameras((camera,)), folder / "cameras.json")
     labels = torch.zeros(1, 16, 32, dtype=torch.int32)

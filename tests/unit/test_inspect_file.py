@@ -17,7 +17,7 @@ from liftcore.errors import InvalidInput, SplatliftError
 from liftcore.evaluate.class_masks import read_masks
 from liftcore.evaluate.inspect import inspect_file
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.ply import write_splats
+from liftcore.io.splats import write_splats
 from liftcore.query.result import load_lift
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
@@ -43,7 +43,7 @@ def test_splats_are_described_and_their_faults_counted(tmp_path: Path) -> None:
         log_scales=torch.tensor([[0.0] * 3, [-40.0] * 3, [1e6, 0, 0], [0.0] * 3]),
         opacity_logits=torch.tensor([0.0, 1e4, -1e4, 2.0]),
     )
-    write_splats(splats, tmp_path / "s.ply")
+    write_splats(tmp_path / "s.ply", splats)
     found = inspected(tmp_path / "s.ply")
     assert (found["kind"], found["splats"], found["kernel"], found["sh_degree"]) == ("splats", 4, "3dgs", None)
     assert found["opacities"]["max"] == 1
@@ -60,7 +60,7 @@ def test_splats_are_described_and_their_faults_counted(tmp_path: Path) -> None:
 
 def test_splats_that_mean_something_else_are_noticed(tmp_path: Path) -> None:
     def told(splats: Splats) -> str:
-        write_splats(splats, tmp_path / "s.ply")
+        write_splats(tmp_path / "s.ply", splats)
         return " | ".join(inspected(tmp_path / "s.ply")["warnings"])
 
     opacities = torch.linspace(0.05, 1, 100)

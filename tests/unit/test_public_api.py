@@ -23,7 +23,7 @@ PUBLIC = """
     InvalidLift InvalidQuery InvalidSettings InvalidSplats LiftResult LiftSettings LocalEngine NamedSplats NotFound
     Objects PhotoPlan Plan RayEngine RegionWeights Regions SceneObject Segmentation Splats SplatliftError
     TextEncoder Unavailable VectorAnswer lift load_lift open_encoder plan plan_photos read_cameras read_features
-    read_splats region_weights render
+    read_splats region_weights render write_splats
 """
 
 
@@ -121,6 +121,18 @@ def test_render_composites_numbers_of_splats(scene):
     assert torch.allclose(share[ones > 0], torch.ones(()), atol=1e-6)
     with pytest.raises(lc.InvalidSettings, match="a row a splat"):
         lc.render(splats, camera, torch.ones(splats.count + 1))
+
+
+def test_render_of_cameras_is_an_image_of_each_by_its_name(scene):
+    _, splats, cameras, _ = scene
+    chosen = splats.means[:, 0] > 0
+    images = lc.render(splats, cameras, chosen, normalise=True)
+    assert list(images) == list(cameras)
+    for name, camera in cameras.items():
+        assert torch.equal(images[name], lc.render(splats, camera, chosen, normalise=True))
+        assert images[name].shape == (camera.height, camera.width) and bool((images[name] > 0.5).any())
+    with pytest.raises(lc.InvalidCameras, match="camera: expected a Camera, got 3"):
+        lc.render(splats, {"v0": cameras["v0"], "v1": 3}, chosen)  # pyright: ignore
 
 
 def test_region_weights_times_codebooks_are_the_lift(scene):
@@ -273,13 +285,13 @@ def test_render_refuses_the_name_of_a_camera_and_an_unknown_device(scene):
         lc.render(splats, cameras["v0"], torch.ones(splats.count), device="tpu")
     for values in (None, "colours", [["x"]]):
         with pytest.raises(lc.InvalidSettings, match="values: expected"):
-            lc.render(splats, cameras["v0"], values)  # pyright: ignore[reportArgumentType]
+            lc.render(splats, cameras["v0"], values)  # pyright: ignore[reportCallIssue, reportArgumentType]
     with pytest.raises(lc.InvalidSettings, match="params: expected CompositingParams"):
-        lc.render(splats, cameras["v0"], np.ones(splats.count), {})  # pyright: ignore[reportArgumentType]
+        lc.render(splats, cameras["v0"], np.ones(splats.count), {})  # pyright: ignore[reportCallIssue, reportArgumentType]
     swapped = np.arange(splats.count)[::-1].astype(">i4")
     assert lc.render(splats, cameras["v0"], swapped).shape == (cameras["v0"].height, cameras["v0"].width)
     with pytest.raises(lc.InvalidCameras, match=r"camera: expected a Camera, got 'v0'; cameras\[name\]"):
-        lc.render(splats, "v0", torch.ones(splats.count))  # pyright: ignore[reportArgumentType]
+        lc.render(splats, "v0", torch.ones(splats.count))  # pyright: ignore[reportCallIssue, reportArgumentType]
 
 
 def test_render_refuses_to_drop_a_gradient_that_is_recorded(scene):

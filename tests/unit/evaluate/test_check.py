@@ -14,7 +14,7 @@ from safetensors.torch import load_file, save_file
 from liftcore import cli
 from liftcore.evaluate.check import check_scene
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.ply import write_splats
+from liftcore.io.splats import write_splats
 from liftcore.lifting.planning import contradictions
 from liftcore.lifting.planning.contradictions import ViewAgreement
 from liftcore.query.splat_colours import seen_colours
@@ -255,7 +255,7 @@ def test_photos_without_cameras_are_named(scene: StillLife, photos) -> None:
 
 
 def test_command_says_what_is_wrong_and_exits_2(scene: StillLife, photos, grids, tmp_path: Path, capsys) -> None:
-    write_splats(scene.splats, tmp_path / "s.ply")
+    write_splats(tmp_path / "s.ply", scene.splats)
     write_inria_cameras(scene.cameras, tmp_path / "c.json")
     write_pack(tmp_path / "f.safetensors", grids, {})
     folder = next(iter(photos.values())).parent

@@ -10,7 +10,7 @@ import torch
 
 from liftcore.evaluate.accuracy import cosine_figures
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.ply import write_splats
+from liftcore.io.splats import write_splats
 from liftcore.lifting.files import lift_files, open_files
 from liftcore.lifting.planning.plan import FEW_VIEWS
 from liftcore.lifting.planning.views import PILOT_VIEWS, Pilot, fly_pilot, visibility
@@ -42,7 +42,7 @@ def disagreeing(folder, error: float, gap: bool = False, labelled: bool = True):
     cameras = [centred(camera) for camera in ring(VIEWS)]
     observed = {camera.name: Regions(labels, truth + one) for camera, one in zip(cameras, errors, strict=True)}
     paths = folder / "splats.ply", folder / "cameras.json", folder / "features.safetensors"
-    write_splats(random_splats(1, 80, 0.4), paths[0])
+    write_splats(paths[0], random_splats(1, 80, 0.4))
     write_inria_cameras(Cameras(tuple(cameras)), paths[1])
     write_pack(paths[2], observed, {})
     return paths
@@ -116,7 +116,7 @@ def test_a_pilot_that_learns_nothing_expects_nothing_but_errors(tmp_path):
 def test_where_no_ray_meets_a_splat_all_views_are_taken_and_nothing_is_expected_of_them(tmp_path):
     _, cameras, pack = disagreeing(tmp_path / "scene", 0.5)
     away = random_splats(1, 80, 0.01)
-    write_splats(replace(away, means=away.means + 1e4), tmp_path / "away.ply")
+    write_splats(tmp_path / "away.ply", replace(away, means=away.means + 1e4))
     pilot = flown(tmp_path / "away.ply", cameras, pack)
     assert not pilot.areas.any()
     assert pilot.views_for(0.9, range(VIEWS)) == (VIEWS, 0.0)

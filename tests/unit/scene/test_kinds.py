@@ -18,8 +18,7 @@ from liftcore.evaluate.inspect import inspect_file
 from liftcore.io.cameras import read_cameras
 from liftcore.io.files import MAX_DIRECTORY_BYTES, open_zip
 from liftcore.io.kinds import SplatFormat, identify, kind_of, page_table, wrong_kind
-from liftcore.io.ply import write_splats
-from liftcore.io.splats import read_splats, splat_files
+from liftcore.io.splats import read_splats, splat_files, write_splats
 from liftcore.query.result import load_lift
 from liftcore.text import open_encoder
 from liftcore.values.lift_file import input_file
@@ -113,7 +112,7 @@ def zipped(path: Path, files: dict[str, bytes]) -> Path:
 
 
 def splat_bytes(folder: Path) -> bytes:
-    write_splats(random_splats(0, 5), folder / "some.ply")
+    write_splats(folder / "some.ply", random_splats(0, 5))
     return (folder / "some.ply").read_bytes()
 
 
@@ -260,7 +259,7 @@ def test_the_page_has_the_table_of_this_version() -> None:
 
 def test_a_file_in_the_place_of_another_kind_is_named_for_what_it_is_everywhere(tmp_path: Path) -> None:
     rows = np.ones((2, 3), np.float32)
-    write_splats(random_splats(0, 5), tmp_path / "splats")
+    write_splats(tmp_path / "splats", random_splats(0, 5))
     contents = {
         "cameras": json.dumps({"frames": []}).encode(),
         "features": save({"v/grid": rows[None]}),

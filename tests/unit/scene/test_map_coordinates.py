@@ -13,9 +13,8 @@ import torch
 
 import liftcore as lc
 from liftcore.evaluate.inspect import describe_cameras, describe_splats
-from liftcore.io.ply import write_splats
 from liftcore.io.splat import splat_blocks
-from liftcore.io.splats import read_places, read_splats, some_rows, with_columns
+from liftcore.io.splats import read_places, read_splats, some_rows, with_columns, write_splats
 from liftcore.io.spz import spz_blocks
 from liftcore.lifting import pipeline
 from liftcore.lifting.engines.base import LocalEngine
@@ -154,11 +153,11 @@ def test_an_origin_stays_with_splats_that_are_changed_and_a_broken_one_is_refuse
 
 
 def doubles(path: Path, splats: Splats, offset: np.ndarray) -> None:
-    write_splats(moved(splats, offset), path)
+    write_splats(path, moved(splats, offset))
 
 
 def floats(path: Path, splats: Splats, offset: np.ndarray) -> None:
-    write_splats(replace(splats, means=(splats.means.double() + torch.from_numpy(offset)).float()), path)
+    write_splats(path, replace(splats, means=(splats.means.double() + torch.from_numpy(offset)).float()))
 
 
 def checkpoint(path: Path, splats: Splats, offset: np.ndarray) -> None:

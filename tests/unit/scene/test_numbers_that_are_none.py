@@ -15,8 +15,7 @@ import torch
 
 import liftcore as lc
 from liftcore.evaluate.inspect import inspect_file
-from liftcore.io.ply import write_splats
-from liftcore.io.splats import read_places, read_splats, some_rows
+from liftcore.io.splats import read_places, read_splats, some_rows, write_splats
 from liftcore.lifting.planning.photos import plan_photos
 from liftcore.query.splat_colours import seen_colours
 from liftcore.raster.reference import dense_view
@@ -90,7 +89,7 @@ def files(folder: Path) -> Iterator[tuple[Path, int, int]]:
     """A file of each format that can hold such numbers, with how many splats of it are unseen and how many grey."""
     splats = random_splats(3, COUNT)
     own = replace(splats, sh=torch.rand(COUNT, 4, 3))
-    write_splats(own, folder / "s.ply")
+    write_splats(folder / "s.ply", own)
     content = (folder / "s.ply").read_bytes()
     start, stride = content.index(b"end_header\n") + 11, 4 * len(own.layout or read_splats(folder / "s.ply").layout)
     names = read_splats(folder / "s.ply").layout
@@ -138,7 +137,7 @@ def test_questions_take_what_the_lift_took(tmp_path: Path, capsys: pytest.Captur
     places, sh = torch.cat([splats.means, torch.full((1, 3), np.nan)]), torch.zeros(3, 1, 3)
     sh[1, 0, 2] = np.nan
     own = {name: getattr(splats, name)[[0, 1, 1]] for name in ("quats", "log_scales", "opacity_logits")}
-    write_splats(Splats(places.nan_to_num(7.5), **own, sh=sh.nan_to_num(7.5)), scene / "splats.ply")
+    write_splats(scene / "splats.ply", Splats(places.nan_to_num(7.5), **own, sh=sh.nan_to_num(7.5)))
     content = (scene / "splats.ply").read_bytes()
     content = content.replace(struct.pack("<f", 7.5), struct.pack("<f", np.nan))
     (scene / "splats.ply").write_bytes(content)

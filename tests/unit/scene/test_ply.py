@@ -15,8 +15,8 @@ import torch
 from plyfile import PlyData
 
 from liftcore.errors import InvalidSplats
-from liftcore.io.ply import BLOCK_ROWS, write_splats
-from liftcore.io.splats import read_splats, recoloured, some_rows
+from liftcore.io.ply import BLOCK_ROWS
+from liftcore.io.splats import read_splats, recoloured, some_rows, write_splats
 from liftcore.query.splat_colours import seen_colours
 from liftcore.scene.splats import Kernel
 from tests.scenes import look_at, random_splats
@@ -70,7 +70,7 @@ def test_every_dialect_is_written_back_to_the_byte(dialect: str, tmp_path: Path)
     path = with_ply(tmp_path, ply_bytes(DIALECTS[dialect]))
     splats = read_splats(path)
     assert splats.kernel is KERNELS.get(dialect, Kernel.GAUSSIAN_3D)
-    write_splats(splats, tmp_path / "again.ply")
+    write_splats(tmp_path / "again.ply", splats)
     assert (tmp_path / "again.ply").read_bytes() == path.read_bytes()
 
 
@@ -85,7 +85,7 @@ def test_foreign_columns_and_comments_survive_in_their_own_type(line_end: bytes,
     splats = read_splats(path)
     kinds = [splats.extras[name].dtype for name in types]
     assert kinds == [torch.uint8, torch.int32, torch.float64, torch.uint16]
-    write_splats(splats, tmp_path / "again.ply")
+    write_splats(tmp_path / "again.ply", splats)
     assert (tmp_path / "again.ply").read_bytes() == path.read_bytes()
 
 
@@ -98,7 +98,7 @@ def test_comments_of_any_bytes_are_kept_and_not_understood(tmp_path: Path) -> No
         path = with_ply(tmp_path, content)
         splats = read_splats(path)
         assert (splats.count, splats.warnings) == (5, ())
-        write_splats(splats, tmp_path / "again.ply")
+        write_splats(tmp_path / "again.ply", splats)
         assert (tmp_path / "again.ply").read_bytes() == content
         copies = some_rows(path, np.ones(5, bool)), recoloured(path, np.zeros((5, 3), np.uint8))
         assert all(b"".join(copy).startswith((head + end).replace(b"\n", line_end)) for copy in copies)
@@ -145,7 +145,7 @@ def test_failed_write_leaves_nothing_behind(tmp_path: Path) -> None:
     splats = read_splats(with_ply(tmp_path, ply_bytes(INRIA)))
     broken = replace(splats, layout=(*splats.layout, "ghost"))
     with pytest.raises(InvalidSplats, match="'ghost'"):
-        write_splats(broken, tmp_path / "out.ply")
+        write_splats(tmp_path / "out.ply", broken)
     assert [path.name for path in tmp_path.iterdir()] == ["splats.ply"]
 
 
@@ -232,7 +232,7 @@ def test_real_scene_is_written_back_to_the_byte(scene: str, shared_data: Path, t
     assert splats.kernel is Kernel.GAUSSIAN_3D
     assert splats.count == {"plush": 179_788, "tabletop": 166_000}[scene]
     assert splats.sh_degree == {"plush": 1, "tabletop": 0}[scene]
-    write_splats(splats, tmp_path / "again.ply")
+    write_splats(tmp_path / "again.ply", splats)
     assert (tmp_path / "again.ply").read_bytes() == path.read_bytes()
 
 
@@ -240,7 +240,7 @@ def test_real_scene_is_written_back_to_the_byte(scene: str, shared_data: Path, t
 def test_a_lift_reads_no_colours_and_no_extras(tmp_path, kernel):
     splats = random_splats(4, 9, kernel=kernel)
     extras = {"mask": torch.ones(9)}
-    write_splats(replace(splats, sh=torch.ones(9, 16, 3), extras=extras), tmp_path / "s.ply")
+    write_splats(tmp_path / "s.ply", replace(splats, sh=torch.ones(9, 16, 3), extras=extras))
     whole, bare = read_splats(tmp_path / "s.ply"), read_splats(tmp_path / "s.ply", colour=False)
     assert whole.sh is not None
     assert "mask" in whole.extras
@@ -253,7 +253,7 @@ def test_elements_behind_the_vertices_are_passed_over(tmp_path: Path) -> None:
     plain = ply_bytes(INRIA, head="comment kept\n")
     others = b"element camera 2\nproperty float focal\nproperty uchar id\nelement version 3\nproperty uchar number\n"
     content = plain.replace(b"end_header", others + b"end_header") + bytes(2 * 5 + 3)
-    write_splats(read_splats(with_ply(tmp_path, content)), tmp_path / "again.ply")
+    write_splats(tmp_path / "again.ply", read_splats(with_ply(tmp_path, content)))
     assert (tmp_path / "again.ply").read_bytes() == plain
     with pytest.raises(InvalidSplats, match=r"and 13 bytes of other elements = 353 bytes.*got 352 bytes.*truncated"):
         read_splats(with_ply(tmp_path, content[:-1]))
@@ -269,7 +269,7 @@ def test_opacity_may_be_whole_and_a_splat_flat(tmp_path: Path) -> None:
     content = ply_bytes(INRIA, opacity=[np.inf, -np.inf, 0, 0, 0], scale_1=[0, 0, 0, -np.inf, 0])
     splats = read_splats(with_ply(tmp_path, content))
     assert torch.sigmoid(splats.opacity_logits[:2]).tolist() == [1, 0]
-    write_splats(splats, tmp_path / "again.ply")
+    write_splats(tmp_path / "again.ply", splats)
     assert (tmp_path / "again.ply").read_bytes() == content
 
 
@@ -284,7 +284,7 @@ def test_filter_of_mip_splatting_is_applied(colour: bool, tmp_path: Path) -> Non
     np.testing.assert_allclose(torch.exp(splats.log_scales.double()), np.sqrt(wider), rtol=1e-6)
     np.testing.assert_allclose(torch.sigmoid(splats.opacity_logits.double()), opacity, rtol=1e-6)
     if colour:  # what is written has the filter in it, and is not filtered again
-        write_splats(splats, tmp_path / "plain.ply")
+        write_splats(tmp_path / "plain.ply", splats)
         again = read_splats(tmp_path / "plain.ply")
         assert "filter_3D" not in again.layout
         assert torch.equal(again.opacity_logits, splats.opacity_logits)
@@ -348,7 +348,7 @@ def test_red_green_and_blue_are_the_colour_where_no_harmonics_are(kind, full, ch
     splats = read_splats(path)
     seen = seen_colours(splats, look_at("v", np.array([3.0, 1.0, -4.0]), 8, 8, 8.0))
     torch.testing.assert_close(seen, torch.from_numpy(levels).float(), atol=2e-5, rtol=0)
-    write_splats(splats, tmp_path / "again.ply")
+    write_splats(tmp_path / "again.ply", splats)
     assert (tmp_path / "again.ply").read_bytes() == content
     wanted = np.random.default_rng(2).integers(0, 256, (5, 3)).astype(np.uint8)
     wanted[:3] |= 2  # most of them above 1 of 255

@@ -15,9 +15,9 @@ import torch
 import liftcore as lc
 from liftcore.cli import main
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.ply import write_splats
 from liftcore.io.remote import local_path
 from liftcore.io.shards import INDEX
+from liftcore.io.splats import write_splats
 from liftcore.values.pack import write_pack
 from tests.scenes import centred, observed, random_camera, random_splats
 
@@ -29,7 +29,7 @@ def elsewhere(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytes
     """A folder elsewhere that holds the files of a scene."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     views = tuple(centred(random_camera(k, 32, 24, name=f"v{k}")) for k in range(3))
-    write_splats(random_splats(1, 50), tmp_path / FILES[0])
+    write_splats(tmp_path / FILES[0], random_splats(1, 50))
     write_inria_cameras(lc.Cameras(views), tmp_path / FILES[1])
     write_pack(tmp_path / FILES[2], {one.name: observed(1, k, False) for k, one in enumerate(views)}, {})
     base = f"memory://{uuid.uuid4()}" if request.param == "memory" else f"file://{tmp_path}/elsewhere"

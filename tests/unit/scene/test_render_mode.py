@@ -16,8 +16,7 @@ import torch
 import liftcore as lc
 from liftcore.errors import InvalidSettings, InvalidSplats
 from liftcore.evaluate.inspect import inspect_file
-from liftcore.io.ply import write_splats
-from liftcore.io.splats import read_splats, some_rows, with_columns
+from liftcore.io.splats import read_splats, some_rows, with_columns, write_splats
 from liftcore.lifting.files import lift_files
 from liftcore.query.render import _as_trained as params_of_renders
 from liftcore.query.scene import QueryScene
@@ -33,7 +32,7 @@ CLASSIC, MIP, DISCS = (Kernel.GAUSSIAN_3D, False), (Kernel.GAUSSIAN_3D, True), (
 
 def ply_saying(folder: Path, *lines: str, splats: Splats | None = None) -> Path:
     path = folder / "s.ply"
-    write_splats(splats or random_splats(3), path)
+    write_splats(path, splats or random_splats(3))
     said = "".join(f"{line}\n" for line in lines).encode()
     path.write_bytes(path.read_bytes().replace(b"element vertex", said + b"element vertex"))
     return path
@@ -272,7 +271,7 @@ def test_a_splat_below_a_pixel_is_lifted_as_it_was_trained(tmp_path: Path) -> No
         torch.cat([veil, ball]), torch.tensor([[1.0, 0, 0, 0]]).repeat(401, 1),
         torch.cat([torch.full((400, 3), -7.0), torch.zeros(1, 3)]), torch.full((401,), 4.0),
     )  # fmt: skip
-    write_splats(splats, tmp_path / "classic.ply")
+    write_splats(tmp_path / "classic.ply", splats)
     path = ply_saying(tmp_path, "comment SplatRenderMode: mip", splats=splats)
     camera = lc.Camera(np.eye(4), [[32.0, 0, 32], [0, 32, 24], [0, 0, 1]], 64, 48, name="v")
     whole = float(lc.render(splats_of(splats, 400), camera, torch.ones(1))[20:28, 28:36].mean())

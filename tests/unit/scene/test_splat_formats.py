@@ -21,7 +21,6 @@ import zstandard
 
 from liftcore.errors import InvalidSplats
 from liftcore.io.kinds import SplatFormat, kind_of
-from liftcore.io.ply import write_splats
 from liftcore.io.quantised import LEAST_ALPHA
 from liftcore.io.splats import (
     format_of,
@@ -30,6 +29,7 @@ from liftcore.io.splats import (
     recoloured,
     require_kernel,
     some_rows,
+    write_splats,
 )
 from liftcore.io.spz import FRAME_EXTENSION, FRAMES, RDF, spz_blocks
 from liftcore.query.splat_colours import _sh_basis
@@ -350,7 +350,7 @@ def test_checkpoints_of_trainers_are_read_as_tensors(kind: str, tmp_path: Path) 
     found = read_splats(path)
     for field in FIELDS:
         assert torch.equal(getattr(found, field), getattr(splats, field))
-    write_splats(found, tmp_path / "again.ply")
+    write_splats(tmp_path / "again.ply", found)
     assert torch.equal(read_splats(tmp_path / "again.ply").means, splats.means)
 
 
@@ -410,5 +410,5 @@ def test_random_bytes_are_no_splats(tmp_path: Path) -> None:
         (tmp_path / "noise").write_bytes(np.random.default_rng(seed).bytes(32 * 200))
         with pytest.raises(InvalidSplats, match=r"begins with|gzip|pickle"):
             read_splats(tmp_path / "noise")
-    write_splats(random_splats(1, 20), tmp_path / "noise")  # a PLY of any name stays one
+    write_splats(tmp_path / "noise", random_splats(1, 20))  # a PLY of any name stays one
     assert format_of(tmp_path / "noise") is SplatFormat.PLY

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from liftcore.errors import InvalidLift
 from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
-from liftcore.io.ply import write_splats
-from liftcore.io.splats import read_splats
+from liftcore.io.splats import read_splats, write_splats
 from liftcore.lifting.files import lift_files
 from liftcore.lifting.in_memory import LEAST_KEPT
 from liftcore.query.result import load_lift
@@ -112,7 +111,7 @@ def write_scene(folder, kind: str):
             maps[camera.name] = FeatureGrid(codebook[labels[0].long()])
     maps["nowhere"] = maps["v0"]
     paths = folder / "splats.ply", folder / "cameras.json", folder / "features.safetensors"
-    write_splats(splats, paths[0])
+    write_splats(paths[0], splats)
     write_inria_cameras(Cameras(tuple(views)), paths[1])
     write_pack(paths[2], maps, {"encoder": "random"})
     return paths, side
@@ -229,7 +228,7 @@ def test_a_lift_whose_clusters_do_not_fit_is_refused(tmp_path):
 
 
 def test_one_splat_is_aggregated_without_harm(tmp_path):
-    write_splats(random_splats(0, 1), tmp_path / "splats.ply")
+    write_splats(tmp_path / "splats.ply", random_splats(0, 1))
     camera = centred(random_camera(0, name="v0"))
     write_inria_cameras(Cameras((camera,)), tmp_path / "cameras.json")
     write_pack(tmp_path / "f.safetensors", {"v0": random_regions(0, F=3)}, {"encoder": "random"})

@@ -13,8 +13,7 @@ import torch
 
 from liftcore.errors import InvalidFeatures, InvalidSettings, InvalidSplats
 from liftcore.io.cameras import read_cameras
-from liftcore.io.ply import write_splats
-from liftcore.io.splats import read_splats
+from liftcore.io.splats import read_splats, write_splats
 from liftcore.lifting.files import lift_files
 from liftcore.lifting.geometry import strided
 from liftcore.query.directions import directions
@@ -169,7 +168,7 @@ def test_discs_written_with_three_scales_are_discs_where_the_settings_say_so(tmp
     discs, cameras, features = write_scene(tmp_path, 3, kernel=Kernel.GAUSSIAN_2D)
     flat, solid = read_splats(discs), tmp_path / "three.ply"
     scales = torch.cat([flat.log_scales, torch.full((flat.count, 1), -1.0)], dim=1)  # of no account
-    write_splats(Splats(flat.means, flat.quats, scales, flat.opacity_logits, sh=flat.sh), solid)
+    write_splats(solid, Splats(flat.means, flat.quats, scales, flat.opacity_logits, sh=flat.sh))
     wanted, got = lifted((discs, cameras, features)), lifted((solid, cameras, features), kernel="2dgs")
     assert got.metadata.certificate["plan"]["kernel"] == "2dgs"
     assert torch.equal(got.features, wanted.features)

@@ -1,0 +1,78 @@
+"""Splats written with columns of one's own."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData
+
+import liftcore as lc
+from tests.scenes import random_splats
+
+P = 40
+COLUMNS: dict[str, Any] = {
+    "object": torch.arange(P, dtype=torch.int32) - 1,
+    "class_id": np.arange(P),
+    "chosen": np.arange(P) % 2 == 0,
+    "score": np.linspace(-1, 1, P, dtype=np.float32),
+    "weight": torch.linspace(0, 1, P, dtype=torch.float64)[:, None],
+    "half": torch.linspace(0, 1, P).half(),
+}
+
+
+def test_columns_are_properties_that_other_programs_read(tmp_path: Path) -> None:
+    splats = random_splats(3)
+    lc.write_splats(tmp_path / "s.ply", splats, COLUMNS)
+    table = PlyData.read(str(tmp_path / "s.ply"))["vertex"].data
+    for name, values in COLUMNS.items():
+        np.testing.assert_array_equal(table[name], np.asarray(values).reshape(P))
+    assert [table.dtype[name].str for name in ("object", "class_id", "chosen", "score", "weight")] == [
+        "<i4", "<i4", "|u1", "<f4", "<f8",
+    ]  # fmt: skip
+    again = lc.read_splats(tmp_path / "s.ply")
+    assert torch.equal(again.means, splats.means) and set(again.extras) >= set(COLUMNS)
+
+
+def test_columns_of_a_file_that_was_read_stay_and_one_of_the_same_name_is_replaced(tmp_path: Path) -> None:
+    lc.write_splats(tmp_path / "s.ply", random_splats(3), {"mask": np.arange(P), "score": np.zeros(P, np.float32)})
+    again = lc.read_splats(str(tmp_path / "s.ply"))
+    lc.write_splats(str(tmp_path / "t.ply"), again[::2], {"score": np.arange(0, P, 2)})
+    found = lc.read_splats(tmp_path / "t.ply").extras
+    assert found["mask"].tolist() == found["score"].tolist() == list(range(0, P, 2))
+
+
+@pytest.mark.parametrize("suffix", [".splat", ".spz"])
+def test_the_suffix_names_the_format(suffix: str, tmp_path: Path) -> None:
+    lc.write_splats(tmp_path / f"s{suffix}", random_splats(3))
+    assert lc.read_splats(tmp_path / f"s{suffix}").count == P
+    with pytest.raises(lc.InvalidSplats, match=r"columns: expected a path that ends in \.ply"):
+        lc.write_splats(tmp_path / f"s{suffix}", random_splats(3), COLUMNS)
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"score": np.ones(3)}, r"columns\['score'\]: expected numbers \[40\], got shape \[3\]"),
+        ({"score": np.ones((P, 2))}, "give each of several columns a name"),
+        ({"score": "high"}, r"columns\['score'\]: expected numbers"),
+        ({"score": np.full(P, 2**40)}, "expected whole numbers of 32 bits"),
+        ({"opacity": np.ones(P)}, r"columns\['opacity'\]: expected a name .* that no property of splats has"),
+        ({"f_dc_0": np.ones(P)}, "that no property of splats has"),
+        ({"my score": np.ones(P)}, "a name of letters, digits and underscores"),
+        ({3: np.ones(P)}, "a name of letters"),
+    ],
+)
+def test_what_is_no_column_is_refused_by_its_name(columns: Any, message: str, tmp_path: Path) -> None:
+    with pytest.raises(lc.InvalidSplats, match=message):
+        lc.write_splats(tmp_path / "s.ply", random_splats(3), columns)
+    assert not list(tmp_path.iterdir())
+
+
+def test_other_formats_and_swapped_arguments_are_refused(tmp_path: Path) -> None:
+    swapped: Any = (random_splats(3), tmp_path / "s.ply")
+    with pytest.raises(lc.InvalidSplats, match=r"splats: expected Splats, behind the path, .*write_splats\(path"):
+        lc.write_splats(*swapped)
+    with pytest.raises(lc.InvalidSplats, match=r"path: expected one of \.ply, \.splat, \.spz, got '\.glb'"):
+        lc.write_splats(tmp_path / "s.glb", random_splats(3))
