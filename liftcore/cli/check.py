@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 
 from liftcore.cli.lift import pairs_of
 from liftcore.cli.options import BAD_INPUT, Parser, add_verbose
-from liftcore.cli.reply import PNG, free_output, progress_bars, reply, writing
+from liftcore.cli.reply import PNG, free_output, reply, writing
 from liftcore.io.remote import place
+from liftcore.runtime.progress import progress_bars
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

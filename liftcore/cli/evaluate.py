@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.cli.options import THRESHOLDS, Parser, add_encoder, add_negative, text_encoder
-from liftcore.cli.reply import progress_bars, reply
+from liftcore.cli.reply import reply
 from liftcore.errors import InvalidInput
 from liftcore.io.files import visible_files
+from liftcore.runtime.progress import progress_bars
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping, Sequence

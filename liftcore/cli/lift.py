@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.cli.options import Parser, add_settings, add_sources, add_verbose, count
-from liftcore.cli.reply import JSON, LIFT, free_output, progress_bars, reply, shown, writing
+from liftcore.cli.reply import JSON, LIFT, free_output, reply, shown, writing
 from liftcore.errors import InvalidInput, InvalidSettings
 from liftcore.io.remote import is_remote, place, require_storage
 from liftcore.lifting.engines import ENGINES, engine_named
 from liftcore.runtime.nearest import nearest
-from liftcore.runtime.progress import one_step
+from liftcore.runtime.progress import one_step, progress_bars
 
 FILLED = 0.9  # of a ray, in a scene that was trained with its background
 

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.cli.options import Parser
-from liftcore.cli.reply import PACK, folders_of, free_output, progress_bars, reply, shown, told_folders, writing
+from liftcore.cli.reply import PACK, folders_of, free_output, reply, shown, told_folders, writing
 from liftcore.errors import InvalidInput
+from liftcore.runtime.progress import progress_bars
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 from liftcore.cli.lift import in_short, plan_of, settings_of
 from liftcore.cli.options import Parser, add_settings, add_sources, add_verbose, count
-from liftcore.cli.reply import progress_bars, reply
+from liftcore.cli.reply import reply
+from liftcore.runtime.progress import progress_bars
 
 if TYPE_CHECKING:
     from liftcore.values.settings import LiftSettings

@@ -2,8 +2,6 @@
 
 import json
 import os
-import sys
-import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -11,11 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from liftcore.errors import InvalidInput
-from liftcore.runtime.progress import Progress
 
 SHOWN_ITEMS = 6  # of a list, for people
 SHOWN_FOLDERS = 8
-LINE_SECONDS = 10.0  # between two lines of progress where nothing draws bars
 
 
 def reply(document: Mapping[str, Any], *, as_json: bool, lines: Iterable[str] | None = None) -> None:
@@ -165,50 +161,3 @@ def told_folders(folders: Sequence[str]) -> list[str]:
     """A line about them, if there are any."""
     shown = ", ".join(folders[:SHOWN_FOLDERS]) + (" ..." if len(folders) > SHOWN_FOLDERS else "")
     return [f"  of sub-folders, whose names are part of their views': {shown}"] if folders else []
-
-
-@contextmanager
-def progress_bars() -> Iterator[Progress]:
-    """Progress that draws one bar a stage on a terminal; elsewhere it says a line every ten seconds."""
-    if not sys.stderr.isatty():
-        yield _Lines()
-        return
-    bars = _Bars()
-    try:
-        yield bars
-    finally:
-        bars.close()
-
-
-class _Lines:
-    def __init__(self) -> None:
-        self.next = time.monotonic() + LINE_SECONDS
-
-    def __call__(self, stage: str, done: int, total: int, unit: str) -> None:
-        if time.monotonic() >= self.next:
-            print(f"{stage}: {done} of {total} {unit}", file=sys.stderr, flush=True)
-            self.next = time.monotonic() + LINE_SECONDS
-
-
-class _Bars:
-    def __init__(self) -> None:
-        self.stage = ""
-        self.bar: Any = None
-
-    def __call__(self, stage: str, done: int, total: int, unit: str) -> None:
-        if self.bar is None or stage != self.stage:
-            from tqdm import tqdm
-
-            self.close()
-            self.stage = stage
-            look = {"leave": total > 1, "file": sys.stderr, "dynamic_ncols": True}
-            self.bar = tqdm(total=total, desc=stage, unit=f" {unit}", **look)
-        self.bar.total = total
-        self.bar.update(done - self.bar.n)
-        if done >= total == 1:  # one step is shown while it lasts: the plan is printed where its bar was
-            self.close()
-
-    def close(self) -> None:
-        if self.bar is not None:
-            self.bar.close()
-            self.bar = None

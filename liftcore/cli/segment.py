@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from liftcore.cli.options import Parser, add_encoder, add_lift, add_view, count, opened_lift, text_encoder, view_of
 from liftcore.cli.query import examples_of, made_from, place_of, write_files
-from liftcore.cli.reply import free_outputs, progress_bars, reply
+from liftcore.cli.reply import free_outputs, reply
 from liftcore.errors import InvalidQuery
+from liftcore.runtime.progress import progress_bars
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

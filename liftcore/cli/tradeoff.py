@@ -8,8 +8,9 @@ from pathlib import Path
 
 from liftcore.cli.lift import pairs_of
 from liftcore.cli.options import Parser, add_sources, count
-from liftcore.cli.reply import JSON, free_output, progress_bars, reply, writing
+from liftcore.cli.reply import JSON, free_output, reply, writing
 from liftcore.errors import InvalidSettings
+from liftcore.runtime.progress import progress_bars
 
 
 def add_arguments(parser: Parser) -> None:

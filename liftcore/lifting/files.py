@@ -52,7 +52,13 @@ def lift_files(
         sources = open_files(*paths, settings)
     with timings.step("digest"):
         inputs = input_files(*paths, views=sources[2].views)
-    given = {"threads": threads, "progress": progress, "on_plan": on_plan, "checkpoint": checkpoint, "engine": engine}
+    given = {
+        "threads": threads,
+        "progress": timings.progress,
+        "on_plan": on_plan,
+        "checkpoint": checkpoint,
+        "engine": engine,
+    }
     made = lift(*sources, settings, **given)
     own = {"splats": inputs[0], "cameras": inputs[1], "features": tuple(inputs[2:])}
     own["timings"] = timings.seconds | made.metadata.timings

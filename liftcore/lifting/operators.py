@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, overload
+from typing import Unpack, overload
 
 import numpy as np
 import torch
@@ -16,11 +16,12 @@ from liftcore.lifting.inputs import LiftInputs
 from liftcore.lifting.pipeline import reweigh
 from liftcore.raster import check_given, open_raster
 from liftcore.runtime.device import choose_device
-from liftcore.runtime.progress import Progress, Timings, silent
+from liftcore.runtime.progress import Progress, Timings, shown_progress
 from liftcore.runtime.torch_modes import callers_modes, usual_modes
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.compositing import CompositingParams, check_antialiased
 from liftcore.scene.splats import Splats, shared_tensor
+from liftcore.values.lift_options import LiftOptions
 from liftcore.values.lift_views import Given
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import LiftSettings, Preset
@@ -139,9 +140,9 @@ def region_weights(
     preset: Preset | str | LiftSettings = Preset.DEFAULT,
     *,
     reweight: bool = False,
-    progress: Progress = silent,
+    progress: Progress | bool | None = None,
     threads: int | None = None,
-    **settings: Any,
+    **settings: Unpack[LiftOptions],
 ) -> RegionWeights:
     """The weight of each region, or cell of a grid, of each view at each splat: ``W = A^T S``.
 
@@ -149,8 +150,8 @@ def region_weights(
     holds the weight of each splat on the ray of one pixel.
 
     Args:
-        splats, cameras, views, preset, threads, settings: as `lift` has them. All views are weighed, whatever the
-            settings' coverage. A label on several levels is a region each time.
+        splats, cameras, views, preset, progress, threads, settings: as `lift` has them. All views are weighed,
+            whatever the settings' coverage. A label on several levels is a region each time.
         reweight: False: W by geometry alone, which reads no feature. True: W as `lift` solves with it, reweighted by
             what features of other views say (``robust_steps``, ``consensus``, ``reliability``, ``loss``); sums of
             rows stay the same but for ``loss=huber``.
@@ -167,9 +168,10 @@ def region_weights(
     device = choose_device(inputs.settings.device)
     raster = open_raster(inputs.splats, device, threads)
     count = inputs.splats.count
-    geometry = weigh_views(raster, count, inputs.views, inputs.settings, progress, by_rows=True, threads=threads)
-    W = SceneWeights(raster, device, None, inputs.views, geometry)
-    if reweight:
-        steps = InMemory(inputs.splats, inputs.settings, Timings(progress), threads)
-        W, _ = reweigh(steps, W, bool((geometry.levels >= 0).any()), inputs.settings, steps.timings)
+    with shown_progress(progress) as shown:
+        geometry = weigh_views(raster, count, inputs.views, inputs.settings, shown, by_rows=True, threads=threads)
+        W = SceneWeights(raster, device, None, inputs.views, geometry)
+        if reweight:
+            steps = InMemory(inputs.splats, inputs.settings, Timings(shown), threads)
+            W, _ = reweigh(steps, W, bool((geometry.levels >= 0).any()), inputs.settings, steps.timings)
     return W.weights.cpu()

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import torch
 
@@ -21,13 +21,14 @@ from liftcore.lifting.planning.plan import Plan, plan_lift
 from liftcore.lifting.warm_up import warm_up_lift
 from liftcore.query.result import LiftResult
 from liftcore.runtime.device import choose_device, within_memory
-from liftcore.runtime.progress import Progress, Timings
+from liftcore.runtime.progress import Progress, Timings, shown_progress
 from liftcore.runtime.torch_modes import usual_modes
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
 from liftcore.solve.diagnostics import ViewMeasures, certify, lift_warnings
 from liftcore.solve.objects import object_facts
 from liftcore.solve.reweight import agreement_facts
+from liftcore.values.lift_options import LiftOptions
 from liftcore.values.lift_views import Given
 from liftcore.values.settings import LiftSettings, Preset
 
@@ -41,12 +42,12 @@ def lift(
     views: Given,
     preset: Preset | str | LiftSettings = Preset.DEFAULT,
     *,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     on_plan: Callable[[Plan], None] | None = None,
     threads: int | None = None,
     checkpoint: Checkpoint | Path | str | None = None,
     engine: Engine | None = None,
-    **settings: Any,
+    **settings: Unpack[LiftOptions],
 ) -> LiftResult:
     """Lift the features of views onto splats: ``X = D^-1 A^T B`` A the weights of splats on rays.
 
@@ -56,7 +57,8 @@ def lift(
             feature pack (`read_features`), or an iterator of (name, view) pairs, which is gone through once and kept
             on the disk, so that no more than a few maps are in memory.
         preset: a published choice of weights (`Preset`), or `LiftSettings` in place of preset and settings.
-        progress: called ``progress(stage, done, total, unit)``; an exception from it stops the work.
+        progress: called ``progress(stage, done, total, unit)``; an exception from it stops the work. None: bars where
+            stderr is a terminal. True: bars there and lines elsewhere. False: nothing.
         on_plan: called with the plan before the first view, and shows its warnings. None: they are logged, and at
             the end those of the diagnostics.
         threads: None takes the cores that this process may use. The number changes no bit of the result.
@@ -80,13 +82,15 @@ def lift(
     Source: Splat Feature Solver, Eq. 3 and 6.
     """
     inputs = LiftInputs.of(splats, cameras, views, preset, settings, threads)
-    checkpoint, warn, timings = _checkpoint(checkpoint), _WarnOnce(), Timings(progress)
-    if engine is None:
-        steps = InMemory(inputs.splats, inputs.settings, timings, threads, checkpoint)
-        result = run(steps, inputs, timings, on_plan or warn.of_plan)
-    else:
-        with steps_in_blocks(engine, inputs, timings, checkpoint.folder if checkpoint else None) as steps:
+    checkpoint, warn = _checkpoint(checkpoint), _WarnOnce()
+    with shown_progress(progress) as shown:
+        timings = Timings(shown)
+        if engine is None:
+            steps = InMemory(inputs.splats, inputs.settings, timings, threads, checkpoint)
             result = run(steps, inputs, timings, on_plan or warn.of_plan)
+        else:
+            with steps_in_blocks(engine, inputs, timings, checkpoint.folder if checkpoint else None) as steps:
+                result = run(steps, inputs, timings, on_plan or warn.of_plan)
     warn.of(result.diagnostics["warnings"] if on_plan is None else ())
     return result
 
@@ -216,7 +220,7 @@ def plan(
     preset: Preset | str | LiftSettings = Preset.DEFAULT,
     *,
     threads: int | None = None,
-    **settings: Any,
+    **settings: Unpack[LiftOptions],
 ) -> Plan:
     """What `lift` with the same arguments would do, and what it would take: views, memory, warnings.
 

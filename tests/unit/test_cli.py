@@ -21,6 +21,7 @@ from liftcore.errors import InvalidFeatures, InvalidSettings, SplatliftError
 from liftcore.lifting.files import lift_files
 from liftcore.query.result import load_lift
 from liftcore.query.threshold import METHODS
+from liftcore.runtime.progress import progress_bars
 from liftcore.values.pack import write_pack
 from liftcore.values.settings import LiftSettings, Preset
 from liftcore.values.views import FeatureGrid
@@ -226,7 +227,7 @@ def test_progress_is_drawn_only_on_a_terminal(
 ) -> None:
     for watched in (False, True):
         monkeypatch.setattr(sys.stderr, "isatty", lambda watched=watched: watched)
-        with reply.progress_bars() as progress:
+        with progress_bars() as progress:
             progress("compile", 0, 1, "steps")
             assert ("compile:   0%" in capsys.readouterr().err) is watched
             progress("compile", 1, 1, "steps")

@@ -31,7 +31,7 @@ from liftcore.raster import check_given
 from liftcore.raster.base import ViewRequest
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.runtime.one_thread import one_thread
-from liftcore.runtime.progress import Progress, silent
+from liftcore.runtime.progress import Progress, shown_progress, silent
 from liftcore.runtime.torch_modes import usual_modes
 from liftcore.scene.cameras import Camera, Cameras, distortion_warning
 from liftcore.scene.compositing import CompositingParams
@@ -105,14 +105,14 @@ def plan_photos(
     settings: LiftSettings | None = None,
     *,
     threads: int | None = None,
-    progress: Progress = silent,
+    progress: Progress | bool | None = None,
 ) -> PhotoPlan:
     """Order the photos of a scene by what each adds to those before it; no feature is needed.
 
     Args:
         cameras: of the photos that there are; every ``view_stride``-th is looked at.
         settings: of the lift that is to come; its compositing parameters count. None: the default ones.
-        threads: None takes the cores that this process may use.
+        threads: None takes the cores that this process may use. progress: as `lift` has it.
 
     Raises:
         InvalidCameras: there is no camera.
@@ -127,8 +127,8 @@ def plan_photos(
     views = list(known.values())[:: settings.view_stride]
     rows = spread(splats.count, min(SAMPLE, splats.count))
     raster = CpuRaster(splats, threads)
-    with one_thread():
-        evidence, row_sum = evidence_of_views(raster, views, rows, settings, progress)
+    with one_thread(), shown_progress(progress) as shown:
+        evidence, row_sum = evidence_of_views(raster, views, rows, settings, shown)
         seconds = _seconds(raster, views[len(views) // 2], settings)
     weight, seen = evidence.sum(axis=0, dtype=np.float64), sees(evidence)
     order = list(photo_order(seen, weight))

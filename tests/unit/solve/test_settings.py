@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from enum import StrEnum
+from typing import Any, Literal, get_type_hints
 
 import pytest
+import torch
 
 from liftcore.errors import InvalidSettings
+from liftcore.values.lift_options import LiftOptions
 from liftcore.values.settings import LiftSettings, Preset
 
 LEVELS = "'rows' or 'composite' or a valid integer"
@@ -84,3 +87,17 @@ def test_a_preset_only_fills_what_is_not_said(preset: Preset) -> None:
     assert (said.power, said.weight_floor, said.selection, said.mass) == (1, 0.25, "front-mass", 0.5)
     assert said.render_gain == plain.render_gain
     assert LiftSettings.of(**plain.model_dump(mode="json")) == plain
+
+
+def test_keyword_arguments_of_a_lift_are_typed_as_its_settings() -> None:
+    hints = get_type_hints(LiftOptions, localns={"torch": torch})
+    fields = {name: field.annotation for name, field in LiftSettings.model_fields.items() if name != "preset"}
+    assert list(hints) == list(fields)
+    assert hints.pop("device") == str | torch.device and fields.pop("device")
+    for name, annotation in fields.items():
+        allowed: Any = annotation
+        if isinstance(annotation, type) and issubclass(annotation, StrEnum):
+            allowed = annotation | Literal[tuple(str(one) for one in annotation)]
+        elif annotation == LiftSettings.model_fields["levels"].annotation:
+            allowed = Literal["rows", "composite"] | int
+        assert hints[name] == allowed, name

@@ -1,0 +1,56 @@
+"""The settings of a lift as keyword arguments, for type checkers and editors: ``lc.lift(..., robust_steps=1)``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal, TypedDict
+
+from liftcore.scene.compositing import Selection
+from liftcore.values.settings import Speed
+
+if TYPE_CHECKING:
+    import torch
+
+
+class LiftOptions(TypedDict, total=False):
+    """The fields of `LiftSettings` but the preset, which is an argument of its own; a test holds them equal."""
+
+    speed: Speed | Literal["exact", "balanced", "fast", "draft"]
+    selection: Selection | Literal["all", "top-k", "front-mass", "centre"]
+    k: int
+    mass: float
+    weight_floor: float
+    power: int
+    lift_gain: float
+    render_gain: float
+    alpha_cap: float
+    transmittance_stop: float
+    antialiased: bool | Literal["auto"]
+    stride: int
+    view_stride: int
+    coverage: int
+    view_cosine: float
+    levels: Literal["rows", "composite"] | int
+    grid_reading: Literal["bilinear", "nearest"]
+    robust_steps: int
+    reliability: bool | Literal["auto"]
+    consensus: bool | Literal["auto"]
+    objects: bool | Literal["auto"]
+    loss: Literal["l2", "huber"]
+    dtype: Literal["float16", "float32"]
+    aggregation: bool
+    aggregation_clusters: Literal["hdbscan", "touching", "graph", "auto"]
+    aggregation_guard: bool
+    aggregation_iou: float
+    aggregation_cluster_size: int
+    aggregation_neighbours: int
+    aggregation_sample: int
+    aggregation_resolve: bool
+    aggregation_channels: int
+    certificate_rays: int
+    seed: int
+    cg_steps: int
+    damping: float
+    cg_basis: int
+    reference_channels: int
+    kernel: Literal["auto", "3dgs", "2dgs", "dbs"]
+    device: str | torch.device
