@@ -167,6 +167,6 @@ def _real(folder: Path, channels: int, levels: int, count: int) -> Workload:
             raise InvalidInput("scene", expected="a pack of region maps", got=f"grids in {pack.name}")
         labels = observed.labels.repeat(-(-levels // observed.labels.shape[0]), 1, 1)[:levels]
         generator = torch.Generator().manual_seed(number)
-        codebook = torch.randn(observed.codebook.shape[0], channels, generator=generator)
+        codebook = torch.randn(observed.codebook.shape[0], channels, generator=generator, dtype=torch.float32)
         views.append((cameras[name], Regions(labels, torch.nn.functional.normalize(codebook, dim=1).half())))
     return Workload(folder.name, read_splats(folder / "point_cloud.ply"), views)

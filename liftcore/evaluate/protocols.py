@@ -119,7 +119,7 @@ class RenderedFeatures(Segmenter):
     def _cosines(self, camera: Camera) -> Tensor:
         scene = self.scene
         products = scene.raster.render(camera, self._products, scene.compositing)
-        squares = torch.zeros(products.shape[:2])
+        squares = torch.zeros(products.shape[:2], dtype=torch.float32)
         for part in scene.lift.features.split(CHANNELS, dim=1):
             squares += scene.raster.render(camera, part.float().contiguous(), scene.compositing).square().sum(dim=-1)
         lengths = squares.sqrt()[..., None]

@@ -78,7 +78,9 @@ def room_regions(camera: Camera, seed: int, levels: int, channels: int) -> Regio
         maps.append(first + KDTree(sites).query(pixels)[1].reshape(height, width))
         first += regions
     generator = torch.Generator().manual_seed(seed)
-    codebook = torch.nn.functional.normalize(torch.randn(first, channels, generator=generator), dim=1).half()
+    codebook = torch.nn.functional.normalize(
+        torch.randn(first, channels, generator=generator, dtype=torch.float32), dim=1
+    ).half()
     return Regions(torch.from_numpy(np.stack(maps).astype(np.int32)), codebook)
 
 

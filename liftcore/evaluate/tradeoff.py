@@ -131,7 +131,7 @@ class Scene:
     def truth(self, cameras: Cameras) -> tuple[dict[str, Tensor], Tensor]:
         """Camera -> its class numbers [h, w] i64, and the unit vectors [K, F] of the classes' words."""
         if self.labels is None or self.table is None:
-            return {}, torch.empty(0, 0)
+            return {}, torch.empty(0, 0, dtype=torch.float32)
         masks = read_masks(self.labels, len(self.classes))
         by_camera = {camera: masks[view] for view, camera in cameras_of_views(masks, cameras).items()}
         return by_camera, torch.as_tensor(TableEncoder.open(self.table).encode(self.classes))

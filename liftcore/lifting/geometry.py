@@ -43,7 +43,7 @@ class Geometry:
 
     def evidence(self) -> Tensor:
         """[P] f32 on the CPU: sums of plain weights over all views, each ray once."""
-        found = torch.zeros(self.weights.splats.shape[0])
+        found = torch.zeros(self.weights.splats.shape[0], dtype=torch.float32)
         found[self.weights.evidence_splats.cpu().long()] = self.weights.evidence.cpu()
         return found
 

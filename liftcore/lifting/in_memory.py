@@ -207,7 +207,7 @@ class InMemory(Steps[SceneWeights]):
             return X, 0.0
         weights = W.weights.cpu()
         counted = [
-            torch.ones(book.shape[0]) if rows is None else torch.from_numpy(rows).float()
+            torch.ones(book.shape[0], dtype=torch.float32) if rows is None else torch.from_numpy(rows).float()
             for book, rows in zip(W.geometry.books, aggregation.kept, strict=True)
         ]
         fewer = reweighted(weights, torch.cat(counted).index_select(0, weights.region))

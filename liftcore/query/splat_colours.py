@@ -39,7 +39,7 @@ def seen_colours(splats: Splats, camera: Camera) -> Tensor:
         [P, 3] f32, at least zero; grey for splats without colours.
     """
     if splats.sh is None:
-        return torch.full((splats.count, 3), NO_COLOUR)
+        return torch.full((splats.count, 3), NO_COLOUR, dtype=torch.float32)
     centre = torch.from_numpy(np.asarray(camera.about(splats.origin).centre, dtype=np.float32))
     directions = torch.nn.functional.normalize(splats.means - centre, dim=1)
     basis = _sh_basis(directions, min(splats.sh_degree or 0, 3))
@@ -110,7 +110,7 @@ def principal_colours(features: np.ndarray, weights: np.ndarray) -> Tensor:
     rows_of, odds_of = torch.from_numpy(features), torch.from_numpy(weights)
     known = (rows_of != 0).any(dim=1)
     odds = torch.where(known, odds_of.to(torch.float32), 0.0)
-    colours = torch.zeros(features.shape[0], COMPONENTS)
+    colours = torch.zeros(features.shape[0], COMPONENTS, dtype=torch.float32)
     if not bool((odds > 0).any()):
         return colours
     rows = _draw(odds, max(COMPONENTS, min(SAMPLE, SAMPLE_FLOATS // features.shape[1])))
@@ -118,7 +118,7 @@ def principal_colours(features: np.ndarray, weights: np.ndarray) -> Tensor:
     centre = sample.mean(dim=0)
     axes = torch.from_numpy(principal_axes((sample - centre).numpy(), COMPONENTS))
     shown = (sample - centre) @ axes
-    low, high = torch.quantile(shown, torch.tensor(_RANGE), dim=0)
+    low, high = torch.quantile(shown, torch.tensor(_RANGE, dtype=torch.float32), dim=0)
     at_a_time = rows_at_a_time(features.shape[1])
     for first in range(0, features.shape[0], at_a_time):
         block = slice(first, first + at_a_time)

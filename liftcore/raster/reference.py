@@ -328,7 +328,7 @@ class ReferenceRaster:
 
     def row_sums(self, camera: Camera, params: CompositingParams) -> Tensor:
         """``A 1``."""
-        return self.render(camera, torch.ones(self.splats.count, 1), params)[:, :, 0]
+        return self.render(camera, torch.ones(self.splats.count, 1, dtype=torch.float32), params)[:, :, 0]
 
     def strongest_labels(self, camera: Camera, labels: Tensor, params: CompositingParams) -> Tensor:
         """``argmax(A Gamma) - 1`` with the one-hot matrix Gamma [P, K + 1] written out, its first column for -1."""

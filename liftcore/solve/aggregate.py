@@ -190,7 +190,7 @@ def explained_by(
     blocks, step = W.blocks(), max(TABLE_BYTES // (4 * max(regions, 1)), 1)
     for begin in range(0, own.shape[0], step):
         chosen = own[begin : begin + step]
-        cosines = torch.zeros(chosen.shape[0], regions)
+        cosines = torch.zeros(chosen.shape[0], regions, dtype=torch.float32)
         for columns in directions.slices():
             cosines += chosen[:, columns] @ directions.table(columns).T
         given = indptr, region, weight, labels.numpy(), begin, cosines.numpy(), told

@@ -50,7 +50,7 @@ class ViewCodebook:
             return rows
         tuples = self.tuples.to(rows.device)
         named = tuples != NO_LABEL
-        shares = named / named.sum(dim=1, keepdim=True)  # zero where a tuple names none
+        shares = named.float() / named.sum(dim=1, keepdim=True)  # zero where a tuple names none
         means = embedding_bag(tuples.clamp_min(0), rows, mode="sum", per_sample_weights=shares)
         largest = torch.finfo(torch.float32).max
         return means.clamp_(-largest, largest)  # the rounded shares of six rows add up to more than one
@@ -124,7 +124,7 @@ class Codebook:
         return self._table(channels, place, divided)
 
     def _table(self, channels: slice, place: torch.device, of_rows: Callable[[int, Tensor], Tensor]) -> Tensor:
-        table, base = torch.empty(self.regions, channels.stop - channels.start, device=place), 0
+        table, base = torch.empty(self.regions, channels.stop - channels.start, device=place, dtype=torch.float32), 0
         for number, view in enumerate(self.views):
             table[base : base + view.regions] = view.means(of_rows(number, view.rows[:, channels].to(place)))
             base += view.regions

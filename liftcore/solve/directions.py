@@ -68,7 +68,7 @@ class RegionDirections:
         """Some columns of e of all regions, [M, C] f32; zeros for none."""
         if self._axes is None:
             return self._centred(self._codebook.unit_values(columns, CPU), columns)
-        table = torch.zeros(self._codebook.regions, columns.stop - columns.start)
+        table = torch.zeros(self._codebook.regions, columns.stop - columns.start, dtype=torch.float32)
         for own in self._codebook.slices():
             table += self._centred(self._codebook.unit_values(own, CPU), own) @ self._axes[own, columns]
         return table

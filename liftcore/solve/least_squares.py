@@ -74,7 +74,7 @@ class Channels:
 
     def project(self, rows: Tensor) -> np.ndarray:
         """[n, F] f16 or f32 -> [n, C] f32."""
-        result = torch.empty(rows.shape[0], self.end - self.begin)
+        result = torch.empty(rows.shape[0], self.end - self.begin, dtype=torch.float32)
         axes = None if self.axes is None else self.axes[:, self.begin : self.end].contiguous()
         with one_thread():
             for first in range(0, rows.shape[0], ROWS):
@@ -134,7 +134,7 @@ def longest_row(books: Sequence[Tensor]) -> float:
 def random_axes(channels: int, count: int, seed: int) -> Tensor:
     """Gaussian projections [F, count] f32 that keep squared lengths in the mean (Johnson-Lindenstrauss)."""
     generator = torch.Generator().manual_seed(seed)
-    return torch.randn(channels, count, generator=generator) / count**0.5
+    return torch.randn(channels, count, generator=generator, dtype=torch.float32) / count**0.5
 
 
 def _gram_times(codebooks: Sequence[Tensor], axes: Tensor, scale: float) -> Tensor:
@@ -254,8 +254,8 @@ def _readout(observation: ViewFeatures, camera: Camera) -> Readout:
 def _labelled(observation: ViewFeatures) -> Regions:
     """The observation with one region for all that is labelled: its region weights are sums over the rows of B."""
     if isinstance(observation, Regions):
-        return Regions(observation.labels.clamp(NO_LABEL, 0), torch.ones(1, 1))
-    return Regions(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1))
+        return Regions(observation.labels.clamp(NO_LABEL, 0), torch.ones(1, 1, dtype=torch.float32))
+    return Regions(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1, dtype=torch.float32))
 
 
 @dataclass(frozen=True)

@@ -129,7 +129,7 @@ def agreement_factors(
     """
     directions = RegionDirections.of_weights(W, codebook, threads)
     block = ViewConsistency(W, means, threads)
-    factors, scores, scene = None, torch.zeros(2, 0), None
+    factors, scores, scene = None, torch.zeros(2, 0, dtype=torch.float32), None
     for step in range(steps):
         table = np.zeros((2, codebook.regions + 1))
 
@@ -163,7 +163,10 @@ class SceneAgreement:
             sums: [2, M + 1] f64. whole: [M] bool, the regions that have factors as a whole; None: none has.
         """
         told, everything = torch.from_numpy(sums)
-        usual, regions = float(told[-1]) / (float(everything[-1]) or 1.0), torch.ones(sums.shape[1] - 1)
+        usual, regions = (
+            float(told[-1]) / (float(everything[-1]) or 1.0),
+            torch.ones(sums.shape[1] - 1, dtype=torch.float32),
+        )
         if whole is None:
             return cls(usual, regions, 1.0, None)
         known = (everything[:-1] > 0) & whole
@@ -236,8 +239,13 @@ class ViewConsistency:
         Returns:
             [2, n] f32: the confidence of each splat, and how well its own feature explains what views say of it.
         """
-        scores = torch.zeros(2, self.W.indptr.shape[0] - 1)
-        parts = cosines, scene.regions, torch.zeros(0) if consensus is None else consensus, scores
+        scores = torch.zeros(2, self.W.indptr.shape[0] - 1, dtype=torch.float32)
+        parts = (
+            cosines,
+            scene.regions,
+            torch.zeros(0, dtype=torch.float32) if consensus is None else consensus,
+            scores,
+        )
         arrays = [*self._arrays(_or_ones(factors)), *(part.numpy() for part in parts), scene.usual, scene.power]
         blocks = [(self.rows[first:last].numpy(), *arrays) for first, last in self.blocks]
         run_each(weigh_rows, blocks, self.threads)
@@ -256,7 +264,7 @@ class ViewConsistency:
 
 def _or_ones(factors: Tensor | None) -> Tensor:
     """Factors [nnz] f32 for a kernel, which takes none [0] for ones."""
-    return torch.zeros(0) if factors is None else factors
+    return torch.zeros(0, dtype=torch.float32) if factors is None else factors
 
 
 @vectorised

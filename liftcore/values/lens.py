@@ -86,7 +86,7 @@ def _grid(grid: Tensor, camera: Camera) -> Tensor:
     band = max(1, BAND_VALUES // (x.shape[1] * channels))
     for first in range(0, x.shape[0], band):
         here = slice(first, first + band)
-        total = torch.zeros((*x[here].shape, channels))
+        total = torch.zeros((*x[here].shape, channels), dtype=torch.float32)
         for row in (0, 1):
             for column in (0, 1):
                 share = (1 - np.abs(u - left - column)) * (1 - np.abs(v - top - row))

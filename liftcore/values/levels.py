@@ -104,7 +104,7 @@ def _unit_sums(tuples: np.ndarray, codebook: torch.Tensor) -> torch.Tensor:
     largest = codebook.abs().amax().double().clamp_min(torch.finfo(torch.float64).tiny)  # squares cannot overflow
     found = torch.empty(tuples.shape[1], codebook.shape[1], dtype=codebook.dtype)
     for block in torch.arange(len(found)).split(max(1, BLOCK_FLOATS // codebook.shape[1])):
-        sums = torch.zeros(len(block), codebook.shape[1])
+        sums = torch.zeros(len(block), codebook.shape[1], dtype=torch.float32)
         for level in torch.from_numpy(tuples.astype(np.int64))[:, block]:
             labelled = level != NO_LABEL
             sums[labelled] += (codebook[level[labelled]].double() / largest).float()

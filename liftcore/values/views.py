@@ -245,7 +245,7 @@ def check_finite(values: Tensor, where: str) -> None:
         InvalidFeatures: some value is not finite or too large; the error says where and how many.
     """
     # The extremes carry NaN and infinity along, and cost a tenth of testing every value.
-    low, high = torch.aminmax(values) if values.numel() else (torch.zeros(()), torch.zeros(()))
+    low, high = torch.aminmax(values) if values.numel() else values.new_zeros(2)
     if not (float(low) >= -LARGEST and float(high) <= LARGEST):  # in float64: float16 would take the bound for inf
         bad = int((~(values.float().abs() <= LARGEST)).sum())
         got = f"{bad} of {values.numel()} that are NaN, infinite or larger"

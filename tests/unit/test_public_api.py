@@ -392,7 +392,8 @@ def test_torch_modes_change_no_bit_and_hold_in_the_callers_iterator(scene, mode)
         assert lc.plan(splats, cameras, views).views == made.views
         answer = made.query(vectors, splats=splats)
         W, image = lc.region_weights(splats, cameras, views), lc.render(splats, cameras["v0"], values)
-        return made.features, made.evidence, answer.scores, W.weight, image
+        tuples = lc.lift(splats, cameras, views, preset="row-sum").features
+        return made.features, made.evidence, answer.scores, W.weight, image, tuples
 
     def iterator(seen):
         for name, view in views.items():

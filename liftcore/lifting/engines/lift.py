@@ -317,7 +317,11 @@ class InBlocks(Steps[Job]):
         """See the protocol: the features of clusters that masks make."""
         assert clusters is not None, "check_blocks refuses those of features"
         job = _with_clusters(W, clusters)
-        merged, taken, guarded = torch.zeros(0, job.channels, dtype=job.dtype), torch.zeros(job.splats) > 0, None
+        merged, taken, guarded = (
+            torch.zeros(0, job.channels, dtype=job.dtype),
+            torch.zeros(job.splats, dtype=torch.bool),
+            None,
+        )
         if job.clusters:
             merged = cluster_means(_sums(job, "columns", (job.channels + 1, job.clusters)), job.dtype)
             place = map_tensors(job.folder / steps.CLUSTERS)[0]["place"]

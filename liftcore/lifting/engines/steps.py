@@ -144,7 +144,13 @@ def _weights(parts: Callable[[], Iterable[SomeRows]], count: int, offsets: np.nd
     fill_rows(parts(), starts, [region.numpy(), weight.numpy()])
     every, none = torch.arange(count, dtype=torch.int32), torch.zeros(0, dtype=torch.int32)
     return RegionWeights(
-        every, torch.from_numpy(starts), region, weight, none, torch.zeros(0), torch.from_numpy(offsets)
+        every,
+        torch.from_numpy(starts),
+        region,
+        weight,
+        none,
+        torch.zeros(0, dtype=torch.float32),
+        torch.from_numpy(offsets),
     )
 
 
@@ -309,7 +315,7 @@ def _splat_block(job: Job, piece: int) -> SplatBlock:
     indptr, region, weight = (torch.from_numpy(arrays[name]) for name in ("indptr", "region", "weight"))
     every, none = torch.arange(last - first, dtype=torch.int32), torch.zeros(0, dtype=torch.int32)
     offsets = torch.from_numpy(offsets_of(job))
-    W = RegionWeights(every, indptr, region, weight, none, torch.zeros(0), offsets)
+    W = RegionWeights(every, indptr, region, weight, none, torch.zeros(0, dtype=torch.float32), offsets)
     return SplatBlock(first, last, W, scene_of(job).means[first:last], arrays)
 
 

@@ -157,7 +157,9 @@ def agreement_of(geometry: Geometry) -> ViewAgreement:
 
 def _agreement_of(geometry: Geometry) -> float | None:
     W, books = geometry.weights.cpu(), geometry.codebook.views
-    mass = torch.zeros(sum(book.regions for book in books)).index_add_(0, W.region.long(), W.weight)
+    mass = torch.zeros(sum(book.regions for book in books), dtype=torch.float32).index_add_(
+        0, W.region.long(), W.weight
+    )
     if not bool(mass.any()):
         return None
     owner = torch.cat([torch.full((book.regions,), number) for number, book in enumerate(books)])

@@ -45,7 +45,7 @@ SEEN = 0.1  # of the evidence of the view that sees a splat best
 LEAST_NEW = 0.001  # of the weight: a photo that adds less adds nothing
 FIRST_COUNT = 4  # photos of the first row; each further row has twice as many
 SHOWN_PHOTOS = 12  # names in a line for people
-ONE_REGION = Regions(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1))
+ONE_REGION = Regions(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1, dtype=torch.float32))
 NO_PIXELS = torch.empty(0, 2, dtype=torch.int32)
 
 

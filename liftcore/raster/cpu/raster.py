@@ -178,7 +178,7 @@ class CpuRaster:
 
     def row_sums(self, camera: Camera, params: CompositingParams) -> Tensor:
         """``A 1``: [H, W] f32."""
-        return self.render(camera, torch.ones(self.splats.count, 1), params)[:, :, 0]
+        return self.render(camera, torch.ones(self.splats.count, 1, dtype=torch.float32), params)[:, :, 0]
 
     def strongest_labels(self, camera: Camera, labels: Tensor, params: CompositingParams) -> Tensor:
         """``argmax(A onehot(labels))``: labels [P] i32 in -1..K - 1 -> [H, W] i32. See the protocol."""
@@ -345,5 +345,8 @@ def _weights_of(raster: Raster, request: ViewRequest) -> ViewWeights:
     if len(request.pixels):
         return ViewWeights(weights, raster.ray_rows(camera, request.pixels, params))
     return ViewWeights(
-        weights, RayRows(torch.zeros(1, dtype=torch.int64), torch.empty(0, dtype=torch.int32), torch.empty(0))
+        weights,
+        RayRows(
+            torch.zeros(1, dtype=torch.int64), torch.empty(0, dtype=torch.int32), torch.empty(0, dtype=torch.float32)
+        ),
     )

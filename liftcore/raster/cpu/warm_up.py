@@ -31,17 +31,17 @@ def warm_up(
         params: of the lift. weighting: likewise.
     """
     splats = Splats(
-        torch.tensor([[0.0, 0.0, 2.0]]),
-        torch.zeros(1, 4),
-        torch.zeros(1, scale_count(kernel)),
-        torch.zeros(1),
+        torch.tensor([[0.0, 0.0, 2.0]], dtype=torch.float32),
+        torch.zeros(1, 4, dtype=torch.float32),
+        torch.zeros(1, scale_count(kernel), dtype=torch.float32),
+        torch.zeros(1, dtype=torch.float32),
         kernel=kernel,
-        beta=torch.zeros(1) if kernel is Kernel.BETA else None,
+        beta=torch.zeros(1, dtype=torch.float32) if kernel is Kernel.BETA else None,
     )
     camera = Camera.pinhole("warm-up", 16, 16, 16.0, 16.0, 8.0, 8.0, np.eye(4))
     raster = open_raster(splats, device, threads=1)
-    regions = Regions(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1))
-    for observation in (regions, FeatureGrid(torch.ones(1, 1, 1))):
+    regions = Regions(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1, dtype=torch.float32))
+    for observation in (regions, FeatureGrid(torch.ones(1, 1, 1, dtype=torch.float32))):
         raster.region_weights(camera, observation, params, weighting)
     raster.row_sums(camera, CompositingParams())
     raster.ray_rows(camera, torch.zeros(1, 2, dtype=torch.int32), CompositingParams())

@@ -154,7 +154,7 @@ class GpuRaster:
         """``A X``: values [P, C] f32 -> [H, W, C] f32. See the protocol."""
         check_rows(values, self.splats.count)
         frame = self._frame(camera, every_pixel(params))
-        image = torch.empty(camera.height, camera.width, values.shape[1])
+        image = torch.empty(camera.height, camera.width, values.shape[1], dtype=torch.float32)
         for begin in range(0, values.shape[1], render.WIDEST):
             block = values[:, begin : begin + render.WIDEST].to(torch.float32).contiguous()
             image[:, :, begin : begin + render.WIDEST] = render.render(frame, block)
@@ -165,7 +165,7 @@ class GpuRaster:
         """``A^T Y``: values [H, W, C] f32 -> [P, C] f32. See the protocol."""
         check_image(values, camera)
         frame = self._frame(camera, every_pixel(params))
-        result = torch.empty(self.splats.count, values.shape[2])
+        result = torch.empty(self.splats.count, values.shape[2], dtype=torch.float32)
         for begin in range(0, values.shape[2], weights.WIDEST):
             block = values[:, :, begin : begin + weights.WIDEST]
             result[:, begin : begin + weights.WIDEST] = weights.adjoint(frame, block, self.splats.count)
@@ -173,7 +173,7 @@ class GpuRaster:
 
     def row_sums(self, camera: Camera, params: CompositingParams) -> Tensor:
         """``A 1``: [H, W] f32."""
-        return self.render(camera, torch.ones(self.splats.count, 1), params)[:, :, 0]
+        return self.render(camera, torch.ones(self.splats.count, 1, dtype=torch.float32), params)[:, :, 0]
 
     @_within_memory
     def strongest_labels(self, camera: Camera, labels: Tensor, params: CompositingParams) -> Tensor:

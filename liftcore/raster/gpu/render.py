@@ -100,7 +100,7 @@ def _strongest(
 
 def render(frame: Frame, values: Tensor) -> Tensor:
     """``A X``: values [P, C] f32 on the host, C at most ``WIDEST`` -> [H, W, C] f32 on the host."""
-    image = torch.empty(frame.height, frame.width, values.shape[1])
+    image = torch.empty(frame.height, frame.width, values.shape[1], dtype=torch.float32)
     for band in frame.bands:
         _render_band(frame, frame.lists_of(band), values, image)
     return image
@@ -111,7 +111,7 @@ def _render_band(frame: Frame, lists: Lists, values: Tensor, image: Tensor) -> N
     rows = frame.of_splats(values, lists)
     top = lists.first_row * TILE
     tall = min(lists.tiles // frame.columns * TILE, frame.height - top)
-    own = torch.zeros(tall, frame.width, channels, device=frame.device)
+    own = torch.zeros(tall, frame.width, channels, device=frame.device, dtype=torch.float32)
     wide = max(NARROWEST, 1 << (channels - 1).bit_length())
     for first, last in frame.tile_runs(lists):
         launch(
@@ -215,7 +215,7 @@ def _walked(
     frame: Frame, lists: Lists, rays: tuple[Tensor, Tensor], starts: Tensor, floats: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Lengths i64, splats i32 and weights f32 of the rows of rays, given by tile and pixel [n] i32."""
-    table, count = torch.zeros(floats, device=frame.device), rays[0].shape[0]
+    table, count = torch.zeros(floats, device=frame.device, dtype=torch.float32), rays[0].shape[0]
     launch(
         _trace, count, *lists.splats, lists.starts, lists.items, frame.scratch(count), *rays, table, starts,
         lists.first_tile, *frame.size, *frame.cuts, KIND=frame.kind,

@@ -105,7 +105,7 @@ class DeviceReading:
         keys = torch.where(inside & (labels >= 0).any(dim=0), keys, NONE)
         taps, starts, tile, place = _numbered(keys)
         rows = labels[:, tile, place].T.contiguous()
-        return Slots(taps, torch.empty(0, device=x.device), starts, rows)
+        return Slots(taps, torch.empty(0, device=x.device, dtype=torch.float32), starts, rows)
 
     def _cells(self, x: Tensor, y: Tensor, inside: Tensor) -> Slots:
         keys, shares = [], []
@@ -350,7 +350,7 @@ def _weigh_band(
 ) -> None:  # fmt: skip
     """Add a band's sums to those of the weights and of the evidence."""
     rows = reading.codebook_rows
-    given = torch.zeros(lists.items.shape[0], 1, device=frame.device)
+    given = torch.zeros(lists.items.shape[0], 1, device=frame.device, dtype=torch.float32)
     for first, last in frame.tile_runs(lists):
         slots = reading.slots(lists.first_tile + first, lists.first_tile + last, frame.columns)
         marks = marks_of(frame, lists, (first, last), choice.k) if choice.kind == LARGEST else None
@@ -383,7 +383,7 @@ def _weigh_run(
     lists, slots, programs = job.lists, job.slots, job.tiles[1] - job.tiles[0]
     starts = torch.zeros(programs + 1, dtype=torch.int64, device=frame.device)
     torch.cumsum(job.sizes, 0, out=starts[1:])
-    table = torch.zeros(job.floats, device=frame.device)
+    table = torch.zeros(job.floats, device=frame.device, dtype=torch.float32)
     parts = 2 * PARTS if with_plain or choice.kind in (LARGEST, FRONT) else PARTS
     least, room = job.marks or (slots.shares, slots.taps)  # unread where there are no marks
     launch(
@@ -443,7 +443,7 @@ def adjoint(frame: Frame, image: Tensor, splats: int) -> Tensor:
     for band in frame.bands:
         _gather_band(frame, frame.lists_of(band), image, pieces)
     found = sums_over_units(pieces)
-    result = torch.zeros(splats, channels)
+    result = torch.zeros(splats, channels, dtype=torch.float32)
     result[found.keys.long().cpu()] = found.values.to(torch.float32).cpu()
     return result
 
@@ -453,7 +453,7 @@ def _gather_band(frame: Frame, lists: Lists, image: Tensor, pieces: list[Sums]) 
     for first, last in frame.tile_runs(lists):
         sizes = lists.starts[first : last + 1].diff() * channels
         for begin, end, floats in frame.table_runs((first, last), sizes):
-            table = torch.zeros(floats // channels, channels, device=frame.device)
+            table = torch.zeros(floats // channels, channels, device=frame.device, dtype=torch.float32)
             launch(
                 _gather, end - begin, *lists.splats, lists.starts, lists.items, frame.scratch(end - begin), own,
                 table, lists.first_tile, begin, *frame.size, channels, *frame.cuts, KIND=frame.kind,
@@ -479,7 +479,7 @@ def marks_of(frame: Frame, lists: Lists, run: tuple[int, int], count: int) -> tu
 def _largest_weights(frame: Frame, lists: Lists, run: tuple[int, int], count: int) -> Tensor:
     """[tiles, 256, count] f32: the largest weights of each ray of a run, in no order; 0 where there are fewer."""
     tiles = run[1] - run[0]
-    weights = torch.zeros(tiles, TILE * TILE, count, device=frame.device)
+    weights = torch.zeros(tiles, TILE * TILE, count, device=frame.device, dtype=torch.float32)
     wide = 1 << (count - 1).bit_length()
     launch(
         rank_tile, tiles, *lists.splats, lists.starts, lists.items, frame.scratch(tiles), weights,
