@@ -15,6 +15,7 @@ ASKED_CHARACTERS = 4000  # of the texts of a question together: an encoder takes
 PACKS = 64  # of a lift
 SETTINGS = 100  # of a lift
 ASKED = 32  # texts, or examples, of a question
+VECTOR = 65_536  # numbers of a vector
 WORDS = 4096  # that are asked at once
 PAGE = 1000  # records of a list, names or views in one answer
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
     AfterValidator,
@@ -15,39 +15,27 @@ from pydantic import (
     ConfigDict,
     Field,
     GetJsonSchemaHandler,
-    ValidationError,
-    ValidatorFunctionWrapHandler,
-    WrapValidator,
-    model_validator,
 )
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError
 
-from liftcore.scene.distortion import MAX_SIDE
+from liftcore.query.question import (
+    Answer,
+    BestWord,
+    CoveringRegion,
+    Found,
+    NamedSplats,
+    Notation,
+    Objects,
+    Picture,
+    Query,
+    SceneObject,
+    Seen,
+)
+from liftcore.runtime.fields import Body, NoBoolean, takes
 from liftcore.scene.origin import FILE_ORIGIN
 from liftcore.values.settings import LiftSettings
 from service import limits
-
-# How fields tell of what does not fit: one error, in words, whatever pydantic would make of it
-
-NAME_CHARACTERS = 80  # of a name that a client sent, told back
-
-
-def one_of(names: Iterable[str]) -> str:
-    """What is expected where one of these names is."""
-    return f"one of {', '.join(names)}"
-
-
-def takes(expected: str) -> WrapValidator:
-    """Says what a union takes, in one error in place of one for each of its branches."""
-
-    def check(value: Any, branches: ValidatorFunctionWrapHandler) -> Any:
-        try:
-            return branches(value)
-        except ValidationError:
-            raise PydanticCustomError("takes", "{expected}", {"expected": expected}) from None
-
-    return WrapValidator(check)
 
 
 def at_most(characters: int) -> AfterValidator:
@@ -66,15 +54,6 @@ def _once(texts: list[str]) -> list[str]:
     return list(dict.fromkeys(texts))
 
 
-def _no_boolean(value: Any) -> Any:
-    if isinstance(value, bool):
-        raise PydanticCustomError("no_number", "{expected}", {"expected": "a number"})
-    return value
-
-
-NoBoolean = BeforeValidator(_no_boolean)  # of a number: pydantic reads true as 1
-
-
 @dataclass(frozen=True)
 class Published:
     """Shows a field in the OpenAPI document as a model's own fields, which another module checks in its own words."""
@@ -88,23 +67,6 @@ class Published:
             shown["properties"].pop(name)
         del shown["title"]
         return shown
-
-
-class Body(BaseModel):
-    """What a body, or a part of one, may hold. A field that is not known is refused with those that are."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    @model_validator(mode="before")
-    @classmethod
-    def _knows(cls, given: Any) -> Any:
-        for name in given if isinstance(given, dict) else ():
-            if name not in cls.model_fields:
-                # Half a surrogate pair, which JSON can name, would break pydantic's own report.
-                shown = name[:NAME_CHARACTERS].encode("utf-8", "backslashreplace").decode()
-                told = {"field": shown, "expected": one_of(cls.model_fields)}
-                raise PydanticCustomError("unknown_field", "{expected}", told)
-        return given
 
 
 def _bounded(given: Any) -> Any:
@@ -127,6 +89,7 @@ Bounded = BeforeValidator(_bounded)
 ASSET_ID = r"^sha256:[0-9a-f]{64}$"
 JOB_ID = r"^[0-9a-f]{32}$"
 COMPARED = "speed"  # what only the runs of a trade-off set
+THE_LIFT = "the lift; may be left out when there is exactly one"
 PRINTABLE = r"^[^\x00-\x1f\x7f]*$"
 
 AssetId = Annotated[str, Field(pattern=ASSET_ID, description="sha256: and the digest of the bytes, in hex")]
@@ -134,6 +97,15 @@ JobId = Annotated[str, Field(pattern=JOB_ID)]
 Text = Annotated[str, Field(min_length=1, max_length=limits.WORD_CHARACTERS)]
 # The first thing that is wrong is all that is told: whoever sends a hundred thousand is not answered about each.
 Texts = Annotated[list[Text], Field(max_length=limits.ASKED, fail_fast=True), at_most(limits.ASKED_CHARACTERS)]
+Numbers = Annotated[
+    tuple[Annotated[float, Field(allow_inf_nan=False, strict=True)], ...],
+    Field(min_length=1, max_length=limits.VECTOR, fail_fast=True),
+]
+AnExample = Annotated[
+    Notation | Numbers,
+    takes(f"VIEW:x,y, region:VIEW:LEVEL:ID, splat:J, or a vector of 1 to {limits.VECTOR} finite numbers"),
+]
+Examples = Annotated[list[AnExample], Field(max_length=limits.ASKED, fail_fast=True)]
 Scalar = Annotated[bool | int | float | str, takes("a boolean, a number or a text")]
 
 
@@ -416,149 +388,30 @@ class Tradeoff(BaseModel):
     links: dict[str, str]
 
 
-class Threshold(BaseModel):
-    """Which scores count as found, and why."""
-
-    value: float | None = Field(description="null when no score stands out, or nothing asked for is there")
-    method: str
-    explanation: str = Field(description="one sentence on how it was found")
-
-
-class TopSplat(BaseModel):
-    """One of the best splats."""
-
-    splat: int = Field(description="row in the splat file")
-    score: float
-    position: list[float] = Field(description="x y z, world frame")
-
-
-class Box(BaseModel):
-    """An axis-aligned box, world frame."""
-
-    low: list[float] = Field(description="x y z")
-    high: list[float]
-
-
-class FoundObject(BaseModel):
-    """Splats at or above the threshold that hang together."""
-
-    splats: int = Field(description="how many")
-    share: float = Field(
-        description="of the evidence of all splats at or above the threshold, or of what `weigh` says"
-    )
-    score: float = Field(description="the mean of its splats' scores, by the same")
-    centre: list[float] = Field(description="the middle of its box: x y z, world frame")
-    box: Box = Field(description="of its splats' centres, but for a thousandth of the evidence at each end")
-
-
-Notation = Annotated[
-    str, Field(min_length=1, max_length=600, description="VIEW:x,y, region:VIEW:LEVEL:ID or splat:J")
-]
-Vector = Annotated[
-    list[Annotated[float, Field(allow_inf_nan=False, strict=True)]],
-    Field(min_length=1, max_length=65_536, fail_fast=True),
-]
-Example = Annotated[
-    Notation | Vector,
-    takes("VIEW:x,y, region:VIEW:LEVEL:ID, splat:J, or a vector of 1 to 65536 finite numbers"),
-]
-Examples = Annotated[list[Example], Field(max_length=limits.ASKED, fail_fast=True)]
-ViewName = Annotated[str, Field(min_length=1, max_length=limits.VIEW_CHARACTERS, description="the name of a camera")]
-Coordinate = Annotated[float, Field(allow_inf_nan=False), NoBoolean]
-Pixels = Annotated[int, Field(ge=1, le=MAX_SIDE), NoBoolean]
-Score = Annotated[float, Field(ge=-1, le=1), NoBoolean]  # a cosine, which NaN is not
-Method = Literal["auto", "valley", "paper", "otsu", "stability"]
-Cut = Annotated[Method | Score, takes(f"{', '.join(get_args(Method))}, or a number from -1 to 1")]
-Count = Annotated[int, Field(ge=1, le=100), NoBoolean]
-Top = Annotated[int, Field(ge=0, le=1000), NoBoolean]
-
-
-Rendered = Literal["rgb", "depth", "pca", "cluster", "confidence"]
-RENDERED = (
-    "the splats' colours, expected depth, three principal components of features, clusters, or how far views agree"
-)
-SplatsOf = Literal["object", "scores"]
-SPLATS_OF = "the splats that were found and no others, or all splats in the colours of their scores"
-
-
-class OwnCamera(Body):
-    """A camera that no file has, in the frame of the splats; an entry of GET /lifts/{lift}/views is one, too."""
-
-    width: Pixels = Field(description="pixels")
-    height: Pixels
-    fx: Coordinate = Field(description="pixels, like fy, cx and cy")
-    fy: Coordinate | None = Field(None, description="fx if left out")
-    cx: Coordinate | None = Field(None, description="from the left edge; the middle if left out, as cy")
-    cy: Coordinate | None = None
-    viewmat: Annotated[
-        list[Annotated[list[Coordinate], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)
-    ] = Field(description="[4, 4], world to camera, rigid; OpenCV axes: x right, y down, z forward")
-    name: ViewName = "camera"
-    lifted: bool | None = Field(None, description="of no meaning here, like photo")
-    photo: bool | None = None
-
-
 class LiftQuestion(BaseModel):
     """Which lift is asked, and in whose words."""
 
-    lift: JobId | None = Field(None, description="the lift; may be left out when there is exactly one")
+    lift: JobId | None = Field(None, description=THE_LIFT)
     encoder: str | None = Field(
         None, max_length=200, description="a text space that the operator set up, the lift's own, or default"
     )
     table: AssetId | None = Field(None, description="an uploaded text table that has the words, in place of encoder")
 
 
-class Question(LiftQuestion):
-    """What all queries share: the words, and how to find what they mean."""
-
-    text: Texts = Field([], description="what to look for; may be given several times, 4000 characters in all")
-    negatives: Texts = Field([], description="what it is not; likewise")
-    threshold: Cut = Field("auto", description="how to find it, or the score from which a splat counts as found")
-    instances: Count | None = Field(None, description="how many there are: so many objects are kept, the best")
-    keep: Literal["all", "largest"] = Field("all", description="of what was found, in masks, splats and objects")
-    absent: Literal["drop", "keep"] = Field(
-        "drop", description="words for what is not there: select nothing for them, or what is most like them"
-    )
-    weigh: Literal["evidence", "confidence"] = Field(
-        "evidence",
-        description="what splats count by in the threshold's histogram and in objects; confidence: times it",
-    )
+def _same(name: str) -> Any:
+    """A field of a question with its default and description, which HTTP bounds."""
+    field = Query.model_fields[name]
+    return Field(field.default, description=field.description)
 
 
-class Asked(Question):
-    """A query in a URL."""
+class Question(Query, LiftQuestion):
+    """A question to a lift."""
 
-    like: list[Notation] = Field([], max_length=limits.ASKED, description="an example; may be given several times")
-    unlike: list[Notation] = Field([], max_length=limits.ASKED, description="one of what it is not, likewise")
-
-
-class AskedWhere(Asked):
-    """Where something is."""
-
-    view: ViewName | None = Field(None, description="for the links")
-    top: Top = Field(10, description="how many of the best splats to list")
-
-
-class AskedInView(Asked):
-    """Where something is in a view."""
-
-    view: ViewName
-
-
-class AskedForSplats(Asked):
-    """Splats of an answer."""
-
-    what: SplatsOf = Field("object", description=SPLATS_OF)
-
-
-class AskedInBody(Question, Body):
-    """A query in a body, where an example may also be a vector [F]."""
-
-    like: Examples = Field([], description="examples of it, or vectors")
-    unlike: Examples = Field([], description="examples of what it is not, likewise")
-    view: ViewName | None = Field(None, description="for pictures, and for the links")
-    camera: OwnCamera | None = Field(None, description="for pictures, in place of a view")
-    top: Top = Field(10, description="how many of the best splats to list")
+    error_type: ClassVar = None
+    text: Texts = _same("text")
+    like: Examples = _same("like")
+    negatives: Texts = _same("negatives")
+    unlike: Examples = _same("unlike")
 
 
 class Words(LiftQuestion, Body):
@@ -569,47 +422,39 @@ class Words(LiftQuestion, Body):
     )
 
 
-class AskedToSegment(Words):
+class AskedToSegment(Words, Seen):
     """Every splat's best word."""
-
-    view: ViewName | None = Field(None, description="for pictures")
-    camera: OwnCamera | None = Field(None, description="for pictures, in place of a view")
 
 
 class AskedWhat(Words):
     """What is this?"""
 
-    example: Example = Field(description="what is meant")
+    example: AnExample = Field(description="what is meant")
     top: Annotated[int, Field(ge=1, le=1000), NoBoolean] = Field(5, description="how many words")
 
 
-class AskedToRender(Body):
-    """A picture of the scene."""
+class AskedToRender(Picture):
+    """A picture of a lift's scene."""
 
-    lift: JobId | None = Field(None, description="the lift; may be left out when there is exactly one")
-    view: ViewName | None = Field(None, description="the name of a camera")
-    camera: OwnCamera | None = Field(None, description="in place of a view")
-    what: Rendered = Field("rgb", description=RENDERED)
+    lift: JobId | None = Field(None, description=THE_LIFT)
 
 
-class FoundWord(BaseModel):
-    """A word that is there."""
-
-    value: int = Field(description="of its splats and pixels in labels and maps; 0 is none")
-    word: str
-    splats: int = Field(description="how many it names")
-    share: float = Field(description="of the evidence of all seen splats")
-    score: float = Field(description="the mean cosine of its splats, by evidence")
-    margin: float = Field(description="the mean of how much nearer they are to it than to the nearest other word")
-    threshold: float = Field(description="of its cosines")
-    colour: list[int] = Field(description="sRGB, 0 to 255, in pictures")
-    box: Box = Field(description="of its splats' centres, but for a thousandth of the evidence at each end")
-
-
-class SegmentAnswer(BaseModel):
-    """What is there, of many words."""
+class OfLift(BaseModel):
+    """An answer of a lift."""
 
     lift: JobId
+
+
+class FoundWord(NamedSplats):
+    """A word that is there, and how pictures show it."""
+
+    value: int = Field(description="of its splats and pixels in labels and maps; 0 is none")
+    colour: list[int] = Field(description="sRGB, 0 to 255, in pictures")
+
+
+class SegmentAnswer(OfLift):
+    """What is there, of many words."""
+
     encoder: str = Field(description="the text encoder that was asked, without its file")
     words: int = Field(description="how many were asked")
     splats: int = Field(description="P")
@@ -617,85 +462,36 @@ class SegmentAnswer(BaseModel):
     found: list[FoundWord] = Field(description="those that are there, with the most evidence first")
 
 
-class BestWord(BaseModel):
-    """How like a word something is."""
-
-    word: str
-    score: float = Field(description="their cosine")
-
-
-class WhatAnswer(BaseModel):
+class WhatAnswer(OfLift):
     """The words that something is most like."""
 
-    lift: JobId
     encoder: str
     example: str
     words: list[BestWord] = Field(description="the nearest first")
 
 
-class QueryAnswer(BaseModel):
-    """Where in a scene is what was asked for."""
+class QueryAnswer(Answer, OfLift):
+    """An answer, with what it is of and where its pictures are."""
 
-    text: list[str]
-    like: list[str] = Field(description="the examples, in their notation; vectors by their length")
-    lift: JobId
     view: str | None
     text_space: str = Field(description="of the lift's features")
     encoder: str | None = Field(description="the text encoder that was asked, without its file; null without a text")
-    statistics: dict[str, Any] = Field(description="of the scores over the seen splats")
-    threshold: Threshold
-    count: int = Field(description="splats that were selected")
-    clear: bool = Field(description="whether what was found stands apart")
-    present: bool | None = Field(description="whether it is there; null when not known or not sure")
-    presence: float | None = Field(description="how sure that is, in 0..1: there from 0.5 on; null when not known")
-    why: str = Field(description="one sentence on how it is known whether it is there, or why it is not")
-    top: list[TopSplat]
-    box: Box | None = Field(description="around all selected splats, strays too: see objects")
     links: dict[str, str]
 
 
-class ObjectsAnswer(BaseModel):
+class ObjectsAnswer(Found, Objects, OfLift):
     """The things that were found."""
 
-    lift: JobId
-    threshold: Threshold
-    count: int = Field(description="splats that were selected")
-    clear: bool = Field(description="whether they stand apart")
-    present: bool | None = Field(description="whether they are what was asked for; null when not known or not sure")
-    presence: float | None = Field(description="how sure that is, in 0..1: there from 0.5 on; null when not known")
-    why: str = Field(description="one sentence on how it is known whether it is there, or why it is not")
-    objects: list[FoundObject] = Field(description="those with the most evidence first")
-    strays: int = Field(description="selected splats in none of them")
 
+class ListedObject(SceneObject):
+    """A thing in the scene, in a list."""
 
-class SceneObject(BaseModel):
-    """A thing that masks of many views keep together."""
-
-    id: int = Field(description="the same for the same lift; 0 has the most evidence")
-    name: str | None = Field(description="the nearest word of the vocabulary; null without one")
-    score: float | None = Field(description="its cosine with the object's mean feature")
-    splats: int = Field(description="how many")
-    share: float = Field(description="of the evidence of all splats")
-    centre: list[float] = Field(description="the middle of its box: x y z, frame of the splat file")
-    box: Box = Field(description="of its largest group of splats that touch, without outliers elsewhere")
-    views: list[str] = Field(description="that show most of it, the best first")
     feature: list[float] | None = Field(description="with features=true: the mean of its unit features [F], unit")
 
 
-class CoveringRegion(BaseModel):
-    """A region that covers a pixel."""
-
-    example: str = Field(description="its notation, for like and unlike")
-    view: str
-    level: int = Field(description="of the view's label map")
-    region: int = Field(description="its label there")
-    share: float = Field(description="of the view's pixels that it covers")
-
-
-class CoveringRegions(BaseModel):
+class CoveringRegions(OfLift):
     """The regions that cover a pixel."""
 
-    lift: JobId
     view: str
     regions: list[CoveringRegion] = Field(description="one a level at most, the smallest first")
 
@@ -714,14 +510,13 @@ class AskedForSceneObjects(BaseModel):
     cursor: int = Field(0, ge=0, le=10**9, description="the `next` of the page before")
 
 
-class SceneObjects(BaseModel):
+class SceneObjects(OfLift):
     """Some of the objects of a lift, those with the most evidence first."""
 
-    lift: JobId
     encoder: str | None = Field(description="what named them, without its file; null for nothing")
     explanation: str = Field(description="why there are so many; or why there are none")
     count: int = Field(description="of all pages")
-    objects: list[SceneObject]
+    objects: list[ListedObject]
     next: int | None = Field(description="the cursor of the page after this one; null at the end")
 
 

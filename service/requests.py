@@ -5,11 +5,13 @@ from __future__ import annotations
 import email.message
 import json
 import re
-from collections.abc import Iterator
-from typing import Annotated, Any, TypeVar
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated, Any, Generic, TypeVar
 
 import anyio
-from fastapi import Depends, Request
+from fastapi import APIRouter, Depends, Request
 from fastapi.dependencies.models import Dependant
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import APIRoute
@@ -17,12 +19,14 @@ from pydantic import BaseModel, ValidationError
 from pydantic.json_schema import JsonSchemaMode, models_json_schema
 from starlette.exceptions import HTTPException
 
+from liftcore.runtime.fields import NAME_CHARACTERS, one_of
 from service import limits, models
+from service.content import TAGGED
 from service.errors import InvalidRequest, UnreadableBody
-from service.models import NAME_CHARACTERS, one_of
 from service.problems import CLOSE
 
 M = TypeVar("M", bound=BaseModel)
+F = TypeVar("F", bound=Callable[..., Any])
 SCHEMAS = "#/components/schemas/"
 BODY = "in the body of the request"
 LET_GO = 16  # times the limit of a body: an upload sent to the wrong route ends there
@@ -35,7 +39,8 @@ async def _known_only(request: Request) -> None:
     if not given:
         return
     route: APIRoute = request.scope["route"]
-    known = list(_names(route.dependant))
+    described = [parameter["name"] for parameter in (route.openapi_extra or {}).get("parameters", ())]
+    known = [*_names(route.dependant), *described]
     for name in given:
         if name not in known:
             raise InvalidRequest(
@@ -102,18 +107,84 @@ def _parsed(model: type[M], content: bytes, media: str | None) -> M:
         expected = f"JSON of at most {limits.BODY_COMMAS} values and {limits.BODY_BRACKETS} lists and objects"
         raise InvalidRequest("body", expected=expected, got="more", hint=BODY)
     try:
-        return model.model_validate(json.loads(content))
+        return _checked(model, json.loads(content), "body")
     except json.JSONDecodeError as error:
         told = {"type": "json_invalid", "loc": ("body", error.pos), "msg": "", "ctx": {"error": error.msg}}
         raise RequestValidationError([told], body=error.doc) from None
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise RequestValidationError([{**first, "loc": ("body", *first["loc"])}]) from None
     except UnicodeDecodeError:
         raise UnreadableBody("body", expected="JSON in UTF-8", got="bytes that are none", hint=BODY) from None
     except (ValueError, RecursionError):
         got = "a number of thousands of digits, or brackets within brackets without end"
         raise UnreadableBody("body", expected="JSON that can be read", got=got, hint=BODY) from None
+
+
+def _checked(model: type[M], values: Any, where: str) -> M:
+    """A model of values; what is wrong with them is said with where they came: in the query or the body."""
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise RequestValidationError([{**first, "loc": (where, *first["loc"])}]) from None
+
+
+@dataclass(frozen=True)
+class Asked(Generic[M]):
+    """A dependency that gives a model: of the parameters of a GET, or of the body of a POST (`both`).
+
+    Args:
+        model: what is asked. names: its fields that are parameters. needs: those that a GET must have.
+    """
+
+    model: type[M]
+    names: tuple[str, ...]
+    needs: tuple[str, ...] = ()
+
+    async def __call__(self, request: Request, content: BodyBytes) -> M:
+        limiter = request.app.state.deps.parsing
+        if request.method == "POST":
+            media = request.headers.get("content-type")
+            return await anyio.to_thread.run_sync(_parsed, self.model, content, media, limiter=limiter)
+        given = request.query_params
+        fields = self.schema["properties"]
+        values = {
+            name: given.getlist(name) if fields[name].get("type") == "array" else given[name]
+            for name in self.names
+            if name in given
+        }
+        model = await anyio.to_thread.run_sync(_checked, self.model, values, "query", limiter=limiter)
+        for name in self.needs:
+            if name not in given:
+                raise RequestValidationError([{"type": "missing", "loc": ("query", name), "msg": "", "input": None}])
+        return model
+
+    @cached_property
+    def schema(self) -> dict[str, Any]:
+        """The fields as JSON schema has them."""
+        return self.model.model_json_schema()
+
+    def described(self) -> dict[str, Any]:
+        """What OpenAPI tells of the parameters."""
+        parameters = []
+        for name in self.names:
+            schema = {key: value for key, value in self.schema["properties"][name].items() if key != "description"}
+            if "anyOf" in schema.get("items", {}):  # of an example, what a URL can hold
+                schema["items"] = next(part for part in schema["items"]["anyOf"] if part["type"] == "string")
+            about = self.schema["properties"][name].get("description", "")
+            parameter = {"name": name, "in": "query", "required": name in self.needs, "schema": schema}
+            parameters.append(parameter | {"description": about})
+        return {"parameters": parameters}
+
+
+def both(router: APIRouter, path: str, asked: Asked[Any], **route: Any) -> Callable[[F], F]:
+    """Register an endpoint for a GET by parameters, and for a POST of the same as JSON."""
+
+    def register(endpoint: F) -> F:
+        answers = {"responses": route["responses"] | TAGGED} if "responses" in route else {}
+        router.get(path, openapi_extra=asked.described(), **route | answers)(endpoint)
+        router.post(path, openapi_extra=described_body(asked.model), **route)(endpoint)
+        return endpoint
+
+    return register
 
 
 def _refused(kind: str, message: str, given: object) -> RequestValidationError:

@@ -8,6 +8,7 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from functools import partial
 from importlib import import_module
 
 from liftcore.cli.options import BAD_INPUT, Parser, misplaced, shared_options
@@ -81,12 +82,16 @@ def bring(options: argparse.Namespace) -> None:
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """All commands and their options. What a command needs is loaded when it runs, so that ``--help`` is quick."""
+    """All commands; one's options are added when it is parsed, and what it needs is loaded when it runs."""
     parser = Parser(prog="splatlift", description="Lift 2D features onto trained splats and query them in words.")
     parser.add_argument("--version", action="version", version=f"splatlift {__version__}")
     shared = shared_options()
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
     for name, said in COMMANDS.items():
         own = commands.add_parser(name, parents=[] if name in WITH_ACTIONS else [shared], help=said)
-        import_module(f"liftcore.cli.{name}").add_arguments(own, *([shared] if name in WITH_ACTIONS else []))
+        own.fill = partial(_add_options, name, own, [shared] if name in WITH_ACTIONS else [])
     return parser
+
+
+def _add_options(name: str, parser: Parser, shared: list[Parser]) -> None:
+    import_module(f"liftcore.cli.{name}").add_arguments(parser, *shared)

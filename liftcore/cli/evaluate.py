@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import THRESHOLDS, Parser, add_encoder, add_negative, text_encoder
+from liftcore.cli.options import Parser, add_encoder, text_encoder
 from liftcore.cli.reply import reply
 from liftcore.errors import InvalidInput
 from liftcore.io.files import visible_files
@@ -33,6 +33,8 @@ _SHOWN = {  # the means of a protocol that a table shows, and their names there
 
 def add_arguments(parser: Parser) -> None:
     """The options of the command."""
+    from liftcore.query.question import METHODS
+
     parser.add_argument("dataset", choices=("lerf-ovs", "3d-ovs"), help="whose labels")
     parser.add_argument(
         "lifts", nargs="+", metavar="LIFT", help="SCENE=LIFT, SCENE.lift.safetensors, or a folder of those"
@@ -40,8 +42,11 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="the dataset, or its labels")
     add_encoder(parser)
     parser.add_argument("--protocol", nargs="+", choices=("P1", "P2", "P3", "own"), help="else all")
-    parser.add_argument("--threshold", default="auto", metavar="T", help=f"of P2, P3 and own: {THRESHOLDS}")
-    add_negative(parser)
+    parser.add_argument(
+        "--threshold", default="auto", metavar="T", help=f"of P2, P3 and own: {', '.join(METHODS)} or a number"
+    )
+    competitors = "texts to compete with: all up to the next option; may be given several times"
+    parser.add_argument("--negative", nargs="+", action="extend", default=[], metavar="WORD", help=competitors)
     parser.add_argument("--held-out", type=Path, metavar="FILE", help="the only frames to judge, a name a line")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,7 +42,7 @@ def run(options: argparse.Namespace) -> int:
         free_outputs(files, made_from(scene))
     encoder, words, vectors = _vocabulary(options, scene)
     found = catalogue(scene, words, vectors)
-    things = [asdict(one) for one in found.objects]
+    things = [dict(one) for one in found.objects]
     if options.features:
         things = [one | {"feature": row.tolist()} for one, row in zip(things, found.features, strict=True)]
     document: dict[str, Any] = {"encoder": encoder, "explanation": found.explanation, "objects": things}

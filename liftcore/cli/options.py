@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from types import UnionType
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, Self, Union, get_args, get_origin
 
 from liftcore.errors import InvalidInput, InvalidQuery
 from liftcore.io.remote import place
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+
+    from pydantic import BaseModel
+
     from liftcore.query.scene import QueryScene
     from liftcore.text import TextEncoder
 
@@ -20,18 +25,30 @@ ROLES = {  # of arguments that name files: what belongs there
 ORDER = ("splats", "cameras", "features")
 ORDERED = ("lift", "plan", "check", "tradeoff")  # commands that take splats, cameras and features
 PRESETS = "default, row-sum, tikhonov, argmax, top-k, front-mass, centre or mean"
-THRESHOLDS = "auto, valley, paper, otsu, stability or a number"
 
 
 class Parser(argparse.ArgumentParser):
     """Argument errors are bad input like any other: one line, exit 2."""
 
     last = ""  # the argument that may be left out, and then come after options
+    fill: Callable[[], None] | None = None  # adds the options, when they are needed first
+
+    def filled(self) -> Self:
+        """The parser with all of its options."""
+        fill, self.fill = self.fill, None
+        if fill is not None:
+            fill()
+        return self
+
+    def format_help(self) -> str:
+        self.filled()
+        return super().format_help()
 
     def parse_known_args(  # pyright: ignore[reportIncompatibleMethodOverride]: it has overloads
         self, args: Any = None, namespace: Any = None
     ) -> tuple[Any, list[str]]:
         """Parse, with the last argument wherever it stands: argparse gives it up where an option comes before it."""
+        self.filled()
         options, rest = super().parse_known_args(args, namespace)
         if not self.last or not rest or (rest[0].startswith("-") and rest[0] != "--"):
             return options, rest
@@ -103,10 +120,32 @@ def add_device(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--device", metavar="NAME", help="what walks and solves: auto, cpu or cuda")
 
 
-def add_negative(parser: argparse.ArgumentParser, order: str = "") -> None:
-    """Texts against which a question competes."""
-    competitors = f"texts to compete with: all up to the next option{order}; may be given several times"
-    parser.add_argument("--negative", nargs="+", action="extend", default=[], metavar="WORD", help=competitors)
+def add_fields(
+    parser: argparse.ArgumentParser, model: type[BaseModel], names: Iterable[str], own: Mapping[str, dict[str, Any]]
+) -> None:
+    """An option a field of a model, with its description and what it takes.
+
+    Args:
+        names: of the fields. own: of some, what `add_argument` takes in place of what the field says; ``flag`` is
+            the option's own name.
+    """
+    for name in names:
+        field = model.model_fields[name]
+        known: dict[str, Any] = {"help": field.description, "default": field.default}
+        union = get_args(field.annotation) if get_origin(field.annotation) in (Union, UnionType) else ()
+        parts = [get_args(part)[0] if get_origin(part) is Annotated else part for part in union or [field.annotation]]
+        if get_origin(parts[0]) is list:
+            known |= {"action": "append", "default": [], "metavar": "TEXT"}
+        elif get_origin(parts[0]) is Literal and not union:
+            known["choices"] = get_args(parts[0])
+        elif int in parts:
+            known |= {"type": whole, "metavar": "N"}
+        else:
+            known["metavar"] = name[0].upper()
+        known |= own.get(name, {})
+        flag = known.pop("flag", f"--{name.replace('_', '-')}")
+        known |= {"dest": name} if flag.startswith("-") else {}
+        parser.add_argument(flag, **known)
 
 
 def add_encoder(parser: argparse.ArgumentParser) -> None:

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import argparse
 import math
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.cli.options import (
-    THRESHOLDS,
     Parser,
     add_encoder,
+    add_fields,
     add_lift,
-    add_negative,
     add_view,
-    count,
     opened_lift,
     text_encoder,
     view_of,
@@ -29,37 +26,40 @@ if TYPE_CHECKING:
 
     from PIL.Image import Image
 
-    from liftcore.query.ask import Answer
+    from liftcore.query.question import Answer, Objects, Query
     from liftcore.query.render import ViewMask
     from liftcore.query.scene import QueryScene
-    from liftcore.query.terms import Example, Query
+    from liftcore.query.terms import Example
     from liftcore.scene.cameras import Camera
     from liftcore.text import TextEncoder
 
 
 LOCAL_SUFFIXES = (".splat", ".spz")  # of files whose positions are about the splats' origin
+EXAMPLES = "VIEW:x,y (a pixel), region:VIEW:LEVEL:ID, splat:J or a vector FILE.npy; may be given several times"
+OWN: dict[str, dict[str, Any]] = {  # what the command line says of fields beside what they say themselves
+    "text": {
+        "flag": "text", "nargs": "?", "action": "store", "default": None, "metavar": "text",
+        "help": "what to look for, in quotes; may be left out beside --like",
+    },
+    "like": {"metavar": "EXAMPLE", "help": f"more of this: {EXAMPLES}"},
+    "unlike": {"metavar": "EXAMPLE", "help": "less of that, likewise"},
+    "negatives": {
+        "flag": "--negative", "nargs": "+", "action": "extend", "metavar": "WORD",
+        "help": "texts to compete with: all up to the next option, so TEXT goes before it; may be given again",
+    },
+    "top": {"default": 0},
+}  # fmt: skip
 OUTPUTS = ("object", "coloured", "scores", "mask", "attention", "overlay")  # options that name a file to write
 
 
 def add_arguments(parser: Parser) -> None:
     """The options of the command."""
+    from liftcore.query.question import Query
+
     parser.last = "text"
     add_lift(parser)
-    parser.add_argument("text", nargs="?", help="what to look for, in quotes; may be left out beside --like")
-    like = "VIEW:x,y (a pixel), region:VIEW:LEVEL:ID, splat:J or a vector FILE.npy; may be given several times"
-    parser.add_argument("--like", action="append", default=[], metavar="EXAMPLE", help=f"more of this: {like}")
-    parser.add_argument("--unlike", action="append", default=[], metavar="EXAMPLE", help="less of that, likewise")
     add_encoder(parser)
-    add_negative(parser, ", so TEXT goes before it")
-    parser.add_argument("--threshold", default="auto", metavar="T", help=THRESHOLDS)
-    parser.add_argument("--instances", type=count, metavar="N", help="how many there are: the N best are kept")
-    keep = "of what was found, all or the largest alone: in the mask, in --object and in --objects"
-    parser.add_argument("--keep", choices=("all", "largest"), default="all", help=keep)
-    absent = "of a word for what is not there, drop it and select nothing, or keep what is most like it"
-    parser.add_argument("--absent", choices=("drop", "keep"), default="drop", help=absent)
-    weigh = "what splats count by in the threshold's histogram and in objects: evidence, or that times confidence"
-    parser.add_argument("--weigh", choices=("evidence", "confidence"), default="evidence", help=weigh)
-    parser.add_argument("--top", type=count, default=0, metavar="N", help="name the best N splats")
+    add_fields(parser, Query, (*Query.deciding(), "top"), OWN)
     parser.add_argument("--objects", action="store_true", help="name the things found, with their places and boxes")
     add_view(parser)
     parser.add_argument("--mask", type=Path, metavar="PNG", help="write the mask of the view")
@@ -78,7 +78,7 @@ def run(options: argparse.Namespace) -> int:
     view = view_of(options, "mask", "attention", "overlay")
     files = {kind: path for kind in OUTPUTS if (path := getattr(options, kind)) is not None}
     free_outputs(files, [path for path in (options.lift, options.table, options.camera) if path])
-    from liftcore.query.ask import ask, top
+    from liftcore.query.ask import ask, located
     from liftcore.query.objects import objects
 
     query = _query(options)
@@ -93,13 +93,9 @@ def run(options: argparse.Namespace) -> int:
         from liftcore.query.render import view_mask  # with torch, which numbers do without
 
         seen = view_mask(scene, answer, view)
-    document = _document(answer, seen, encoder)
-    if options.top:
-        best = top(answer, scene, options.top)
-        document |= {"top": [asdict(splat) for splat in best.best], "box": best.box}
-    if options.objects:
-        found = objects(scene, answer)
-        document |= {"objects": [asdict(thing) for thing in found.found], "strays": found.strays}
+    answer = located(scene, answer) if options.top else answer
+    found = objects(scene, answer) if options.objects else None
+    document = _document(answer, found, seen, encoder)
     document["files"] = write_files(files, _contents(options, scene, answer, seen, view))
     if options.object is not None and options.object.suffix.lower() in LOCAL_SUFFIXES and any(scene.splats.origin):
         document["origin"] = scene.splats.origin
@@ -108,29 +104,25 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _query(options: argparse.Namespace) -> Query:
-    from liftcore.query.terms import Query
+    from liftcore.query.question import Query
 
-    if options.text is None and not options.like and options.negative:
+    if options.text is None and not options.like and options.negatives:
         raise InvalidQuery(
             "text",
             expected="what to look for, before --negative",
-            got=f"--negative {' '.join(options.negative)} alone",
+            got=f"--negative {' '.join(options.negatives)} alone",
             hint="--negative takes all words up to the next option",
         )
-    return Query(
-        positives=(*([options.text] if options.text is not None else []), *examples_of(options.like, "--like")),
-        negatives=(*options.negative, *examples_of(options.unlike, "--unlike")),
-        threshold=_threshold(options.threshold),
-        instances=options.instances,
-        keep=options.keep,
-        absent=options.absent,
-        weigh=options.weigh,
-    )
+    fields: dict[str, Any] = {name: getattr(options, name) for name in (*Query.deciding(), "top")}
+    fields["text"] = [] if options.text is None else options.text
+    fields |= {name: examples_of(fields[name], f"--{name}") for name in ("like", "unlike")}
+    return Query(**fields)
 
 
 def examples_of(notations: list[str], argument: str) -> list[Example]:
     """Examples of their notations; what ends in .npy is a file of a vector."""
-    from liftcore.query.terms import parse_example, read_vector
+    from liftcore.query.directions import read_vector
+    from liftcore.query.terms import parse_example
 
     return [
         read_vector(Path(notation)) if notation.endswith(".npy") else parse_example(notation, argument)
@@ -138,35 +130,36 @@ def examples_of(notations: list[str], argument: str) -> list[Example]:
     ]
 
 
-def _threshold(text: str) -> str | float:
-    try:
-        return float(text)
-    except ValueError:
-        return text
+def _document(
+    answer: Answer, found: Objects | None, seen: ViewMask | None, encoder: TextEncoder | None
+) -> dict[str, Any]:
+    """The answer as HTTP has it, and what the command did; the keys of before go with the next release."""
+    lists = {"top", "box"} if not answer.top else set()
+    told = answer.model_dump(mode="json", exclude=lists)
+    told |= {} if found is None else found.model_dump(mode="json")
+    document = {"answer": told, "encoder": encoder.name if encoder else None, "splats": len(answer.scores)}
+    document |= _keys_of_before(answer, found)
+    if seen is not None:
+        share = float(seen.mask.mean())
+        document["view"] = {"name": seen.view, "explanation": seen.explanation, "mask_share": share}
+    return document
 
 
-def _document(answer: Answer, seen: ViewMask | None, encoder: TextEncoder | None) -> dict[str, Any]:
+def _keys_of_before(answer: Answer, found: Objects | None) -> dict[str, Any]:
+    positives = len(answer.query.positives)
     document: dict[str, Any] = {
         "query": [str(term) for term in answer.query.positives],
-        "negatives": [str(term) for term in answer.query.negatives],
-        "encoder": encoder.name if encoder else None,
-        "splats": len(answer.scores),
+        "negatives": [str(term) for term in answer.query.terms[positives:]],
         "selected": answer.count,
-        "threshold": answer.threshold,
-        "threshold_method": answer.threshold_method,
-        "explanation": answer.explanation,
-        "clear": answer.clear and answer.count > 0,
-        "present": answer.presence.present,
-        "presence": answer.presence.presence,
-        "why": answer.presence.why,
-        "statistics": dict(answer.statistics),
+        "threshold": answer.threshold.value,
+        "threshold_method": answer.threshold.method,
+        "explanation": answer.threshold.explanation,
+        **{name: getattr(answer, name) for name in ("clear", "present", "presence", "why", "statistics")},
     }
-    if seen is not None:
-        document["view"] = {
-            "name": seen.view,
-            "explanation": seen.explanation,
-            "mask_share": float(seen.mask.mean()),
-        }
+    if answer.top:
+        document |= {"top": [vars(splat) for splat in answer.top], "box": answer.box}
+    if found is not None:
+        document |= {"objects": [vars(thing) for thing in found.objects], "strays": found.strays}
     return document
 
 

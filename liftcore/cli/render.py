@@ -5,22 +5,19 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from liftcore.cli.options import Parser, add_lift, add_view, opened_lift, view_of
+from liftcore.cli.options import Parser, add_fields, add_lift, add_view, opened_lift, view_of
 from liftcore.cli.query import made_from, write_files
 from liftcore.cli.reply import free_outputs, reply
 from liftcore.errors import InvalidQuery
 
-WHAT = ("rgb", "depth", "pca", "confidence", "cluster")
-
 
 def add_arguments(parser: Parser) -> None:
     """The options of the command."""
+    from liftcore.query.question import Picture
+
     add_lift(parser)
     add_view(parser)
-    parser.add_argument("--what", choices=WHAT, default="rgb", help="; ".join((
-        "rgb: the splats' colours", "depth: near is bright", "pca: principal components of features",
-        "confidence: how far views agree, of lifts with a robust step", "cluster: of lifts with aggregation",
-    )))  # fmt: skip
+    add_fields(parser, Picture, ["what"], {})
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="PNG", help="the picture to write")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -63,7 +62,7 @@ def run(options: argparse.Namespace) -> int:
     if options.what:
         named = zip(options.what, examples_of(options.what, "--what"), strict=True)
         document["what"] = {
-            said: [asdict(word) for word in best_words(scene, example, words, vectors, options.top)]
+            said: [vars(word) for word in best_words(scene, example, words, vectors, options.top)]
             for said, example in named
         }
     if files or not options.what:
@@ -73,7 +72,7 @@ def run(options: argparse.Namespace) -> int:
             "splats": len(found.labels),
             "none": int((found.labels < 0).sum()),
             "found": [
-                {"value": value, **asdict(named), "colour": found.colours[value].tolist()}
+                {"value": value, **vars(named), "colour": found.colours[value].tolist()}
                 for value, named in enumerate(found.found, 1)
             ],
         }

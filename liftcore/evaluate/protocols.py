@@ -21,13 +21,13 @@ import torch
 from scipy.ndimage import uniform_filter
 from torch import Tensor
 
-from liftcore.query.ask import Answer, ask
+from liftcore.query.ask import ask
 from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.objects import Objects, objects
+from liftcore.query.question import Answer, Query
 from liftcore.query.render import view_mask
 from liftcore.query.scene import QueryScene
 from liftcore.query.scores import DEFAULT_NEGATIVES, relevancy
-from liftcore.query.terms import Query
 from liftcore.query.threshold import find_threshold
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Camera
@@ -83,7 +83,8 @@ class Segmenter(ABC):
     def answers(self) -> dict[str, Answer]:
         """Each text asked of the splats."""
         return {
-            text: ask(self.scene, Query((text,), self.negatives, self.threshold), self.encoder) for text in self.texts
+            text: ask(self.scene, Query.of(text, self.negatives, threshold=self.threshold), self.encoder)
+            for text in self.texts
         }
 
 

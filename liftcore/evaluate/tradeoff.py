@@ -34,10 +34,10 @@ from liftcore.lifting.planning.views import spread
 from liftcore.lifting.warm_up import warm_up_lift
 from liftcore.query.ask import ask
 from liftcore.query.objects import objects
+from liftcore.query.question import Query
 from liftcore.query.render import in_photo, view_mask
 from liftcore.query.result import LiftResult
 from liftcore.query.scene import QueryScene
-from liftcore.query.terms import Query
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.runtime.device import choose_device
 from liftcore.runtime.progress import Progress
@@ -316,7 +316,7 @@ def _phrase_ious(spec: RunSpec, scene: QueryScene, masks: Mapping[str, Tensor]) 
         [view for view in spec.labelled if (masks[view] == number).any()] for number in range(len(spec.scene.classes))
     ]
     for number in _some([number for number, views in enumerate(showing) if views], MOST_PHRASES):
-        answer = ask(scene, Query((spec.scene.classes[number],)), encoder)
+        answer = ask(scene, Query.of(spec.scene.classes[number]), encoder)
         found = cache(partial(objects, scene, answer))  # once for all views, if they ask for it
         for view in _some(showing[number], PHRASE_VIEWS):
             seen = view_mask(scene, answer, view, group=lambda *_, found=found: found())

@@ -29,7 +29,7 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from liftcore.errors import InvalidFeatures
-from liftcore.scene.cameras import MAX_SIDE
+from liftcore.scene.compositing import MAX_SIDE
 
 LABELS = "a PNG of one channel, 8 or 16 bits of grey or a palette"
 BINARY = "a PNG without transparent pixels, of one value beside black"

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from liftcore.errors import InvalidQuery
+from liftcore.io.json_file import finite
 from liftcore.query.directions import directions
-from liftcore.query.objects import Objects, objects
+from liftcore.query.objects import objects
 from liftcore.query.presence import (
     NOT_IN_WORDS,
-    Presence,
     References,
     judge,
     pack_of,
@@ -25,11 +25,12 @@ from liftcore.query.presence import (
     references_of,
     together,
 )
+from liftcore.query.question import Answer, Box, Objects, Point, Presence, Query, Threshold, TopSplat
 from liftcore.query.scene import QueryScene, as_numpy
 from liftcore.query.scores import LEAST_LIKENESS, LOWEST_COSINE, combine, cosines, cosines_about
 from liftcore.query.selection import LEAST_FIRST, Rivals, contest, nearer_than_rivals, whole_things
-from liftcore.query.terms import Query, Vector
-from liftcore.query.threshold import Threshold, find_threshold, nothing_alike
+from liftcore.query.terms import Vector
+from liftcore.query.threshold import find_threshold, nothing_alike
 from liftcore.text import TextEncoder, encoder_of_space, open_encoder
 
 if TYPE_CHECKING:
@@ -50,52 +51,6 @@ class Question:
     plain: np.ndarray  # [n] bool, the terms that are compared by plain cosines: words
     references: References | str  # of the words' space, or why there are none
     pack: np.ndarray | None = None  # [n, F] f32, unit, all words of a table that has too few to be references
-
-
-@dataclass(frozen=True)
-class Answer:
-    """How a scene answers a query."""
-
-    query: Query
-    scores: np.ndarray  # [P] f32, in -1..1 (`scores.combine`); the minimum where not seen
-    seen: np.ndarray  # [P] bool, whether the splat has a feature
-    threshold: float  # on the scores
-    threshold_method: str  # what was asked for: auto, valley, paper, otsu, stability or fixed
-    explanation: str  # one sentence on how the threshold was found
-    selected: np.ndarray  # [P] bool, what answers (`ask`)
-    statistics: Mapping[str, float]  # min, max, mean and quantiles q01..q99 of the seen scores
-    clear: bool = True  # whether the scores have what the threshold's method looks for
-    presence: Presence = NOT_IN_WORDS  # whether it is there at all
-
-    @property
-    def dropped(self) -> bool:
-        """Whether it is not there, so that nothing is selected and pictures show nothing."""
-        return self.presence.present is False and self.query.absent == "drop"
-
-    @property
-    def count(self) -> int:
-        """How many splats were selected."""
-        return int(self.selected.sum())
-
-
-Point = tuple[float, float, float]  # x y z, world frame, scene units
-
-
-@dataclass(frozen=True)
-class TopSplat:
-    """One of the best splats of an answer."""
-
-    splat: int  # its row in the splat file
-    score: float
-    position: Point
-
-
-@dataclass(frozen=True)
-class Found:
-    """Where an answer lies in the world."""
-
-    best: tuple[TopSplat, ...]  # descending by score, equal ones by their rows
-    box: tuple[Point, Point] | None  # least and greatest corner of the centres of all selected; None = none
 
 
 @dataclass(frozen=True)
@@ -139,7 +94,7 @@ def ask(scene: QueryScene, query: Query | str, encoder: TextEncoder | None = Non
         NotFound: an example names a view or a region that is not there.
         InvalidLift: an example needs the scene's files, and they moved or changed.
     """
-    query = Query((query,)) if isinstance(query, str) else query
+    query = Query.of(query) if isinstance(query, str) else query
     return answers(scene, [question(scene, query, encoder)])[0]
 
 
@@ -199,7 +154,7 @@ def query_vectors(
 
     scene = QueryScene(result.cpu(), splats)
     groups = [_terms(values) for values in (positives, negatives)]
-    query = Query(*groups, threshold=threshold, instances=instances, keep=keep, absent=absent, weigh=weigh)
+    query = Query.of(*groups, threshold=threshold, instances=instances, keep=keep, absent=absent, weigh=weigh)
     encoder = encoder_for(scene, encoder) if query.texts or encoder is not None else None
     rows = directions(scene, query, encoder)
     if references is not None:
@@ -212,11 +167,8 @@ def query_vectors(
     answer = answers(scene, [Question(query, rows, np.ones(len(rows), np.bool_), others, pack)])[0]
     scores, selected = map(torch.from_numpy, (answer.scores, answer.selected))
     found = None if splats is None else objects(scene, answer)
-    clear = answer.clear and answer.count > 0
-    told = answer.presence
-    return VectorAnswer(
-        scores, selected, answer.threshold, answer.explanation, clear, told.present, told.presence, told.why, found
-    )
+    cut, known = answer.threshold, (answer.present, answer.presence, answer.why)
+    return VectorAnswer(scores, selected, cut.value, cut.explanation, answer.clear, *known, found)
 
 
 def _terms(values: Any) -> tuple[str | Vector, ...]:
@@ -231,10 +183,14 @@ def _terms(values: Any) -> tuple[str | Vector, ...]:
     return tuple(Vector(tuple(row.tolist())) for row in np.atleast_2d(rows)) if rows.size else ()
 
 
-def question(scene: QueryScene, query: Query, encoder: TextEncoder | None) -> Question:
-    """A query with the directions of its terms; what can be wrong with a query is found here (see `ask`)."""
+def question(scene: QueryScene, query: Query, encoder: TextEncoder | None, names: Sequence[str] = ()) -> Question:
+    """A query with the directions of its terms; what can be wrong with a query is found here (see `ask`).
+
+    Args:
+        names: what errors call each of the terms; () = what they are themselves.
+    """
     words = np.array([isinstance(term, str) for term in query.terms])
-    rows = directions(scene, query, encoder)
+    rows = directions(scene, query, encoder, names)
     scene.counted(query.weigh)
     encoder = encoder or scene.table
     if encoder is None or not words[: len(query.positives)].any():
@@ -251,28 +207,30 @@ def answers(scene: QueryScene, questions: Sequence[Question]) -> list[Answer]:
         return list(pool.map(lambda asked, similar: _answer(scene, asked, similar), questions, similarities))
 
 
-def top(answer: Answer, scene: QueryScene, count: int) -> Found:
-    """The best splats of an answer with their places, and the box around all selected ones.
+def located(scene: QueryScene, answer: Answer, count: int | None = None) -> Answer:
+    """An answer with its best splats, and the box around all selected ones.
 
-    A single stray splat stretches the box; ``objects`` tells strays from things.
+    A single outlier stretches the box; ``objects`` tells outliers from things.
+
+    Args:
+        count: of the best splats; None = as many as the query asks for. Equal scores go by their rows.
 
     Raises:
         InvalidLift: the splats moved or changed since the lift.
     """
-    places = scene.axes
+    places, count = scene.axes, answer.query.top if count is None else count
     seen = np.flatnonzero(answer.seen)
     scores = answer.scores[seen]
     if 0 < count < len(scores):
         last = np.partition(scores, len(scores) - count)[len(scores) - count]
         seen = np.concatenate([seen[scores > last], seen[scores == last]])[:count]
     best = seen[np.argsort(-answer.scores[seen], kind="stable")][:count]
-    told = tuple(TopSplat(int(row), float(answer.scores[row]), _point(places[:, row])) for row in best)
-    chosen = np.flatnonzero(answer.selected)
-    if not len(chosen):
-        return Found(told, None)
-    taken = [axis[chosen] for axis in places]
-    low, high = np.array([axis.min() for axis in taken]), np.array([axis.max() for axis in taken])
-    return Found(told, (_point(low), _point(high)))
+    top = tuple(
+        TopSplat(splat=int(row), score=float(answer.scores[row]), position=_point(places[:, row])) for row in best
+    )
+    chosen = [axis[np.flatnonzero(answer.selected)] for axis in places] if answer.count else []
+    ends = [np.array([end(axis) for axis in chosen]) for end in (np.min, np.max)] if chosen else []
+    return answer.model_copy(update={"top": top, "box": Box(*map(_point, ends)) if ends else None})
 
 
 def _similarities(scene: QueryScene, questions: Sequence[Question]) -> list[np.ndarray]:
@@ -301,22 +259,15 @@ def _answer(scene: QueryScene, asked: Question, similarities: np.ndarray) -> Ans
     known = scores if scene.all_seen else scores[seen]
     if presence.present is False and query.absent == "drop":
         method = query.threshold if isinstance(query.threshold, str) else "fixed"
-        found, selected = Threshold(math.inf, method, presence.why, clear=False), np.zeros_like(seen)
+        found = Threshold(value=math.inf, method=method, explanation=presence.why, clear=False)
+        selected = np.zeros_like(seen)
     else:
         found, selected = _selected(scene, asked, kept, scores, scene.counted(query.weigh))
-        found = replace(found, clear=found.clear and presence.present is not False)
-    return Answer(
-        query=query,
-        scores=scores,
-        seen=seen,
-        threshold=found.value,
-        threshold_method=found.method,
-        explanation=found.explanation,
-        selected=selected,
-        statistics=_statistics(known),
-        clear=found.clear,
-        presence=presence,
-    )
+    clear = found.clear and presence.present is not False and bool(selected.any())
+    return Answer.of(
+        query, scores, seen, selected,
+        threshold=found, clear=clear, statistics=finite(_statistics(known)), **dict(presence),
+    )  # fmt: skip
 
 
 def _selected(
@@ -331,7 +282,8 @@ def _selected(
     known = scores if scene.all_seen else scores[scene.seen]
     nothing = nothing_alike(known)
     if nothing:
-        found = Threshold(math.inf, query.threshold if isinstance(query.threshold, str) else "fixed", nothing, False)
+        method = query.threshold if isinstance(query.threshold, str) else "fixed"
+        found = Threshold(value=math.inf, method=method, explanation=nothing, clear=False)
         return found, np.zeros_like(scene.seen)
     in_words = (asked.plain & kept)[:positives]
     least = -math.inf if in_words.any() else LEAST_LIKENESS
@@ -347,9 +299,11 @@ def _selected(
         again = find_threshold(known, "auto", alone, standing.lowest, counted)
         value = max(again.value, standing.lowest)
         told = f"Below {standing.lowest:.4g} other words are nearer. {again.explanation}"
-        found = replace(again, value=value, explanation=told, clear=again.clear and again.value == value)
+        found = again.model_copy(
+            update={"value": value, "explanation": told, "clear": again.clear and again.value == value}
+        )
         selected = scene.seen & (scores >= np.float32(value))
-    found = replace(found, clear=found.clear and standing.first >= LEAST_FIRST)
+    found = found.model_copy(update={"clear": found.clear and standing.first >= LEAST_FIRST})
     if rivals[-1].allowed == 0:
         selected = nearer_than_rivals(scene, selected, rivals[-1])
     whole = whole_things(scene, selected, weights, rivals[0])
@@ -357,7 +311,7 @@ def _selected(
         selected = selected | (scene.seen & np.isin(np.asarray(scene.object), whole))
         things = "a thing" if len(whole) == 1 else f"{len(whole)} things"
         told = f"{found.explanation.removesuffix('.')}; of {things} mostly above it all is taken."
-        found = replace(found, explanation=told)
+        found = found.model_copy(update={"explanation": told})
     return found, selected
 
 
@@ -378,12 +332,12 @@ def _presence(scene: QueryScene, asked: Question, similarities: np.ndarray) -> t
     if not words:
         return NOT_IN_WORDS, kept
     if isinstance(asked.references, str):
-        return Presence(None, None, asked.references), kept
+        return Presence(present=None, presence=None, why=asked.references), kept
     names = [repr(term) if isinstance(term, str) else str(term) for term in asked.query.positives]
     told = [judge(scene, names[k], asked.rows[k], similarities[:, k], asked.references) for k in words]
     here = together(told)
     if here.present is False and len(words) < positives:  # examples are not questioned
-        here = replace(here, present=None)
+        here = here.model_copy(update={"present": None})
     if here.present is not False and asked.query.absent == "drop":
         kept[[k for k, one in zip(words, told, strict=True) if one.present is False]] = False
     return here, kept

@@ -11,18 +11,16 @@ import csv
 import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from liftcore.errors import InvalidQuery, NotFound
 from liftcore.query.objects import largest_box
+from liftcore.query.question import SceneObject
 from liftcore.query.scene import QueryScene, as_numpy
 from liftcore.query.scores import cosines, norms_of
 from liftcore.scene.origin import MAP_REACH
-
-if TYPE_CHECKING:
-    from liftcore.query.ask import Point
 
 MOST_WORDS = 65_536  # of a vocabulary: their vectors take 130 MB at 512 channels
 NOT_LOOKED_FOR = (
@@ -31,20 +29,6 @@ NOT_LOOKED_FOR = (
 )
 NONE_FOUND = "no object: masks of three views never keep the same splats together"
 _BLOCK = 1 << 14  # rows of features widened at once
-
-
-@dataclass(frozen=True)
-class SceneObject:
-    """A thing that masks of many views keep together."""
-
-    id: int  # the same for the same lift
-    name: str | None  # the nearest word of the vocabulary; None without one
-    score: float | None  # its cosine with the object's feature
-    splats: int  # how many
-    share: float  # of the evidence of all splats
-    centre: Point  # the middle of its box, frame of the splat file, scene units
-    box: tuple[Point, Point]  # of its largest group of splats that touch (`largest_box`)
-    views: tuple[str, ...]  # that show most of it, the best first
 
 
 @dataclass(frozen=True)

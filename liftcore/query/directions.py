@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from itertools import groupby
 from operator import itemgetter
+from pathlib import Path
 
 import numpy as np
 
 from liftcore.errors import InvalidQuery, NotFound
+from liftcore.query.question import Query
 from liftcore.query.regions import codebook_row, regions_of
 from liftcore.query.scene import QueryScene, as_numpy
-from liftcore.query.terms import OneSplat, Pixel, Query, Region, Vector
+from liftcore.query.terms import OneSplat, Pixel, Region, Term, Vector
 from liftcore.text import TextEncoder
 
 MINIMUM_ROW_SUM = 0.5  # below it a ray mostly misses the scene: no histogram, no mask and no example takes it
 
 
-def directions(scene: QueryScene, query: Query, encoder: TextEncoder | None) -> np.ndarray:
-    """The unit vector of every term, [n, F] f32; errors name a term as the query does.
+def directions(scene: QueryScene, query: Query, encoder: TextEncoder | None, names: Sequence[str] = ()) -> np.ndarray:
+    """The unit vector of every term, [n, F] f32.
+
+    Args:
+        names: what errors call each of the terms; () = what they are themselves.
 
     Raises:
         InvalidQuery: a text without an encoder or with one of another space, a text that it cannot read, or an
@@ -27,28 +33,35 @@ def directions(scene: QueryScene, query: Query, encoder: TextEncoder | None) -> 
         NotFound: an example names a view or a region that is not there.
         InvalidLift: the splats, the cameras or the packs that an example needs moved or changed.
     """
-    rows = _encode(scene, query, encoder) | _regions(scene, query)
+    named = _Names(query.terms, names)
+    rows = _encode(scene, query, encoder, named) | _regions(scene, query, named)
     for place, term in enumerate(query.terms):
         if isinstance(term, Pixel | OneSplat | Vector):
-            with _named(query, place):
+            with named(place):
                 rows[place] = _unit(_feature(scene, term), "vector" if isinstance(term, Vector) else str(term))
     return np.stack([rows[place] for place in range(len(query.terms))])
 
 
-@contextmanager
-def _named(query: Query, place: int) -> Iterator[None]:
-    """What is wrong with a term is told under its name, if it has one."""
-    try:
-        yield
-    except (InvalidQuery, NotFound) as error:
-        if not query.names:
-            raise
-        term = query.terms[place]
-        got = error.got if isinstance(term, str | Vector) else f"{error.got} in {term}"
-        raise type(error)(query.names[place], expected=error.expected, got=got, hint=error.hint) from None
+@dataclass(frozen=True)
+class _Names:
+    """What is wrong with a term is said under its name, if it has one."""
+
+    terms: Sequence[Term]
+    names: Sequence[str]
+
+    @contextmanager
+    def __call__(self, place: int) -> Iterator[None]:
+        try:
+            yield
+        except (InvalidQuery, NotFound) as error:
+            if not self.names:
+                raise
+            term = self.terms[place]
+            got = error.got if isinstance(term, str | Vector) else f"{error.got} in {term}"
+            raise type(error)(self.names[place], expected=error.expected, got=got, hint=error.hint) from None
 
 
-def _encode(scene: QueryScene, query: Query, encoder: TextEncoder | None) -> dict[int, np.ndarray]:
+def _encode(scene: QueryScene, query: Query, encoder: TextEncoder | None, named: _Names) -> dict[int, np.ndarray]:
     """The unit vector of each text, by its place among the terms."""
     texts = {place: term for place, term in enumerate(query.terms) if isinstance(term, str)}
     if not texts:
@@ -68,20 +81,20 @@ def _encode(scene: QueryScene, query: Query, encoder: TextEncoder | None) -> dic
         rows = encoder.encode(list(texts.values()))
     except InvalidQuery:
         for place, text in texts.items():  # together they do not tell which of them it is
-            with _named(query, place):
+            with named(place):
                 encoder.encode([text])
         raise
     return {place: _unit(row, text) for row, (place, text) in zip(as_numpy(rows), texts.items(), strict=True)}
 
 
-def _regions(scene: QueryScene, query: Query) -> dict[int, np.ndarray]:
+def _regions(scene: QueryScene, query: Query, named: _Names) -> dict[int, np.ndarray]:
     """The unit row of each region, by its place among the terms; a view is read once for all that are of it."""
     asked = [(term.view, place, term) for place, term in enumerate(query.terms) if isinstance(term, Region)]
     rows: dict[int, np.ndarray] = {}
     for _, of_view in groupby(sorted(asked, key=itemgetter(0, 1)), key=itemgetter(0)):
         regions = None  # one view at a time: maps are large
         for _, place, term in of_view:
-            with _named(query, place):
+            with named(place):
                 regions = regions or regions_of(scene, term.view, str(term))
                 rows[place] = _unit(codebook_row(regions, term), str(term))
     return rows
@@ -135,3 +148,18 @@ def _unit(vector: np.ndarray, name: str) -> np.ndarray:
         raise InvalidQuery(name, expected="a finite feature with a direction", got=got)
     scaled = wide / largest
     return (scaled / np.linalg.norm(scaled)).astype(np.float32)
+
+
+def read_vector(path: Path) -> Vector:
+    """The vector of a ``.npy`` file, [F] or [1, F] of any number type.
+
+    Raises:
+        InvalidFeatures: no such file, or no array of numbers in it; a pickle is never opened.
+        InvalidQuery: the array is no vector.
+    """
+    from liftcore.io.npy import open_npy
+
+    values = open_npy(path)
+    if values.shape not in ((values.size,), (1, values.size)):
+        raise InvalidQuery(str(path), expected="one vector, [F] or [1, F]", got=f"the shape {list(values.shape)}")
+    return Vector(tuple(values.reshape(-1).astype(np.float64).tolist()))

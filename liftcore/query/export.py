@@ -10,9 +10,9 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.ask import Answer
 from liftcore.query.colours import NOT_SEEN_COLOUR, cluster_colours, heat_colours
 from liftcore.query.objects import MOST_SPLATS, objects
+from liftcore.query.question import Answer
 from liftcore.query.scene import QueryScene, as_numpy
 
 
@@ -30,9 +30,7 @@ def object_splats(scene: QueryScene, answer: Answer, suffix: str = ".ply") -> It
 
     if answer.dropped:
         hint = "absent=keep takes what is most like it; or ask in other words or by example"
-        raise InvalidQuery(
-            "object", expected="something that is there", got=answer.presence.why.rstrip("."), hint=hint
-        )
+        raise InvalidQuery("object", expected="something that is there", got=answer.why.rstrip("."), hint=hint)
     if answer.count == 0:
         raise InvalidQuery(
             "object",

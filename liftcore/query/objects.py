@@ -1,16 +1,15 @@
 """How many things an answer found, and where each lies: components of the graph in which splats touch."""
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from liftcore.errors import InvalidQuery
+from liftcore.query.question import Answer, Box, FoundObject, Objects, Point
 from liftcore.query.scene import QueryScene
 from liftcore.scene.touching import touching
 
 if TYPE_CHECKING:
-    from liftcore.query.ask import Answer, Point
     from liftcore.scene.splats import Splats
 
 LEAST_EVIDENCE = 0.05  # of an object, as a share of the largest's
@@ -18,27 +17,7 @@ MOST_SPLATS = 1 << 20  # that are grouped: a million take seven seconds of two c
 _TAIL = 1e-3  # of an object's evidence that its box leaves out at each end of each axis
 
 
-@dataclass(frozen=True)
-class FoundObject:
-    """Selected splats that hang together."""
-
-    splats: int  # how many
-    share: float  # of the evidence of all selected splats; with weigh=confidence of that times confidence
-    score: float  # the mean of its splats' scores, by the same
-    centre: "Point"  # the middle of its box, world frame, scene units
-    box: "tuple[Point, Point]"  # least and greatest corner of the splats' centres, but for a thousandth at each end
-
-
-@dataclass(frozen=True)
-class Objects:
-    """What an answer found, thing by thing."""
-
-    found: tuple[FoundObject, ...]  # those with the most evidence first
-    numbers: np.ndarray  # [P] i32, the place in ``found`` of each splat's object; -1 for none
-    strays: int  # selected splats that belong to none
-
-
-def objects(scene: QueryScene, answer: "Answer") -> Objects:
+def objects(scene: QueryScene, answer: Answer) -> Objects:
     """Group the selected splats of an answer into the things that they make up.
 
     Things are splats that touch (`touching`). What has less than a twentieth of the evidence of the largest is no
@@ -56,7 +35,7 @@ def objects(scene: QueryScene, answer: "Answer") -> Objects:
         raise InvalidQuery("threshold", expected=expected, got=f"{len(rows):,}", hint="name a higher threshold")
     numbers = np.full(len(answer.scores), -1, np.int32)
     if not len(rows):
-        return Objects((), numbers, 0)
+        return Objects.of((), numbers, 0)
     weights = scene.counted(answer.query.weigh)[rows].astype(np.float64)
     weights = weights if weights.any() else np.ones(len(rows))
     groups = touching(scene.splats, rows)
@@ -82,10 +61,10 @@ def objects(scene: QueryScene, answer: "Answer") -> Objects:
                 box=box,
             )
         )
-    return Objects(tuple(found), numbers, int((numbers[rows] < 0).sum()))
+    return Objects.of(found, numbers, int((numbers[rows] < 0).sum()))
 
 
-def largest_box(splats: "Splats", rows: np.ndarray, weights: np.ndarray) -> "tuple[Point, Point]":
+def largest_box(splats: "Splats", rows: np.ndarray, weights: np.ndarray) -> Box:
     """The box of one thing without its strays: `trimmed_box` of the group of touching splats with the most weight.
 
     Args:
@@ -99,7 +78,7 @@ def largest_box(splats: "Splats", rows: np.ndarray, weights: np.ndarray) -> "tup
     return trimmed_box(means[inside], weights[inside])
 
 
-def trimmed_box(means: np.ndarray, weights: np.ndarray) -> "tuple[Point, Point]":
+def trimmed_box(means: np.ndarray, weights: np.ndarray) -> Box:
     """The corners between which all but a thousandth of the weight at each end lies, axis by axis.
 
     Args:
@@ -111,9 +90,9 @@ def trimmed_box(means: np.ndarray, weights: np.ndarray) -> "tuple[Point, Point]"
         sums = np.cumsum(weights[order])
         ends = np.searchsorted(sums, [_TAIL * sums[-1], (1 - _TAIL) * sums[-1]])
         corners[:, axis] = means[order[np.minimum(ends, len(order) - 1)], axis]
-    return _point(corners[0]), _point(corners[1])
+    return Box(_point(corners[0]), _point(corners[1]))
 
 
-def _point(row: np.ndarray) -> "Point":
+def _point(row: np.ndarray) -> Point:
     x, y, z = row.tolist()
     return x, y, z

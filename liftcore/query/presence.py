@@ -36,6 +36,7 @@ from typing import Any, Self
 import numpy as np
 
 from liftcore.errors import InvalidQuery, InvalidTable, Unavailable
+from liftcore.query.question import Presence
 from liftcore.query.scene import QueryScene, as_numpy
 from liftcore.query.scores import cosines
 from liftcore.query.threshold import LEAST_SHARE
@@ -51,15 +52,6 @@ MOST_SPLATS = 256  # of the best ones that are looked at, those with the most ev
 _FIRST = 1_024  # splats in which the best ones are looked for at first
 _SAME = 0.99  # cosine of two vectors of one text that come from one encoder
 _IN_CONE = 0.5  # cosine to the shipped words' mean direction: they have .75 to .93, other spaces' vectors about 0
-
-
-@dataclass(frozen=True)
-class Presence:
-    """Whether what was asked for is there."""
-
-    present: bool | None  # None: not known, or not sure
-    presence: float | None  # in 0..1, present from 0.5 on; None: not known
-    why: str  # one sentence for the user
 
 
 @dataclass(frozen=True)
@@ -121,7 +113,7 @@ def judge(
     """
     best, weights = best_splats(scene, scores)
     if not len(best):
-        return Presence(False, 0.0, f"{name} is not there: no splat has a feature.")
+        return Presence(present=False, presence=0.0, why=f"{name} is not there: no splat has a feature.")
     others, allowed = references.against(direction)
     rows, norms, count = scene.features[best], scene.norms[best], len(references.words)
     plain, contrast = nearer_counts(rows, norms, scene.rough_mean, direction[None], references.vectors[others])
@@ -129,7 +121,7 @@ def judge(
     presence = min(shares)
     if presence >= 0.5:
         told = f"at {presence:.0%} of its best splats at most {allowed} of {count} reference words are nearer"
-        return Presence(True, presence, f"{name} is there: {told}.")
+        return Presence(present=True, presence=presence, why=f"{name} is there: {told}.")
     order = np.argsort(plain, kind="stable")
     middle = int(plain[order[np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2)]])
     near = weights @ cosines(rows, norms, references.vectors[others])
@@ -137,12 +129,12 @@ def judge(
     told = f"its best splats are nearer to {middle} of {count} reference words, first of all to {nearest!r}"
     first = float(weights[contrast == 0].sum() / weights.sum())
     if shares[0] < 0.5 and first < 0.5:
-        return Presence(False, presence, f"{name} is not there: {told}.")
+        return Presence(present=False, presence=presence, why=f"{name} is not there: {told}.")
     if shares[0] < 0.5:
         yet = "but to what sets them apart from the rest of the scene it is the nearest"
-        return Presence(None, presence, f"Whether {name} is there is not sure: {told}, {yet}.")
+        return Presence(present=None, presence=presence, why=f"Whether {name} is there is not sure: {told}, {yet}.")
     told = "hardly a reference word is nearer to its best splats, but many are to what sets them apart from the rest"
-    return Presence(None, presence, f"Whether {name} is there is not sure: {told}.")
+    return Presence(present=None, presence=presence, why=f"Whether {name} is there is not sure: {told}.")
 
 
 def nearer_counts(
@@ -179,13 +171,15 @@ def products(
     return along[:, : len(directions)], along[:, len(directions) :]
 
 
-NOT_IN_WORDS = Presence(None, None, "Nothing was asked in words: what an example shows is not questioned.")
+NOT_IN_WORDS = Presence(
+    present=None, presence=None, why="Nothing was asked in words: what an example shows is not questioned."
+)
 
 
 def together(words: Sequence[Presence]) -> Presence:
     """Whether any of one or more words is there."""
     first = max(words, key=lambda one: (one.present is not False, one.present is True, one.presence or 0.0))
-    return Presence(first.present, first.presence, " ".join(one.why for one in words))
+    return Presence(present=first.present, presence=first.presence, why=" ".join(one.why for one in words))
 
 
 def best_splats(scene: QueryScene, scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -3,25 +3,17 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from liftcore.errors import InvalidFeatures, InvalidQuery, NotFound
+from liftcore.query.question import CoveringRegion
 from liftcore.query.scene import QueryScene, as_numpy
 from liftcore.query.terms import Region
 
 if TYPE_CHECKING:
     from liftcore.values.views import Regions
-
-
-@dataclass(frozen=True)
-class CoveringRegion:
-    """A region that covers a pixel: an example of a question by its notation."""
-
-    example: Region
-    share: float  # of the pixels of its view's label map
 
 
 def regions_of(scene: QueryScene, view: str, argument: str) -> Regions:
@@ -70,9 +62,10 @@ def regions_at(scene: QueryScene, view: str, x: int, y: int) -> tuple[CoveringRe
         expected = f"a pixel with x in 0..{len(columns) - 1} and y in 0..{len(rows) - 1}"
         raise InvalidQuery("x, y", expected=expected, got=f"{x},{y}")
     found = [
-        CoveringRegion(Region(view, level, int(label)), float((labels[level] == label).mean()))
+        CoveringRegion(example=str(region), **vars(region), share=float((labels[level] == region.region).mean()))
         for level, label in enumerate(labels[:, rows[y], columns[x]])
         if label >= 0
+        for region in [Region(view, level, int(label))]
     ]
     return tuple(sorted(found, key=lambda one: one.share))
 

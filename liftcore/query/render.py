@@ -11,10 +11,10 @@ from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.ask import Answer
 from liftcore.query.colours import cluster_colours, heat_colours, map_colours
 from liftcore.query.directions import MINIMUM_ROW_SUM
-from liftcore.query.objects import Objects, objects
+from liftcore.query.objects import objects
+from liftcore.query.question import Answer, Objects
 from liftcore.query.scene import QueryScene
 from liftcore.query.splat_colours import seen_colours
 from liftcore.scene.cameras import Camera, drawn_by

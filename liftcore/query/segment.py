@@ -23,14 +23,14 @@ from liftcore.query.colours import cluster_colours
 from liftcore.query.directions import MINIMUM_ROW_SUM, directions
 from liftcore.query.objects import trimmed_box
 from liftcore.query.presence import LEAST_WORDS, References, judge, references_beside
+from liftcore.query.question import BestWord, NamedSplats, Query
 from liftcore.query.scene import QueryScene, as_numpy
 from liftcore.query.scores import cosines, norms_of
-from liftcore.query.terms import Example, Query
+from liftcore.query.terms import Example
 from liftcore.query.threshold import find_threshold
 from liftcore.runtime.progress import Progress, silent
 
 if TYPE_CHECKING:
-    from liftcore.query.ask import Point
     from liftcore.scene.cameras import Camera
     from liftcore.text import TextEncoder
 
@@ -40,20 +40,6 @@ MOST_WORDS = 4_096
 AT_ONCE = 16  # words whose cosines are held at a time: [P, AT_ONCE] f32
 SHOWN = 20  # words of a drawn legend
 SHOWN_WORDS = 6  # of what Python shows
-
-
-@dataclass(frozen=True)
-class NamedSplats:
-    """A word that is there."""
-
-    word: str
-    row: int  # among the words that were asked
-    splats: int  # how many it names
-    share: float  # of the evidence of all seen splats
-    score: float  # the mean cosine of its splats, by evidence
-    margin: float  # the mean of theirs
-    threshold: float  # of its cosines
-    box: tuple[Point, Point]  # least and greatest corner of its splats' centres, but for a thousandth at each end
 
 
 @dataclass(frozen=True)
@@ -192,14 +178,6 @@ def _scores(scene: QueryScene, vectors: np.ndarray, rows: Sequence[int]) -> Iter
         yield from zip(some, np.ascontiguousarray(cosines(scene.features, scene.norms, vectors[some]).T), strict=True)
 
 
-@dataclass(frozen=True)
-class BestWord:
-    """How like a word an example is."""
-
-    word: str
-    score: float  # their cosine
-
-
 def best_words(
     scene: QueryScene, example: Example, words: Sequence[str], vectors: Any, count: int = 5
 ) -> tuple[BestWord, ...]:
@@ -212,10 +190,10 @@ def best_words(
         InvalidQuery, NotFound, InvalidLift: as `liftcore.query.directions.directions`.
     """
     rows = np.atleast_2d(np.asarray(as_numpy(vectors), np.float32))
-    feature = directions(scene, Query((example,)), None)
+    feature = directions(scene, Query.of([example]), None)
     scores = cosines(rows, norms_of(rows), feature)[:, 0]
     nearest = map(int, np.argsort(-scores, kind="stable")[:count])
-    return tuple(BestWord(words[row], float(scores[row])) for row in nearest)
+    return tuple(BestWord(word=words[row], score=float(scores[row])) for row in nearest)
 
 
 def named_ply(scene: QueryScene, segmentation: Segmentation) -> Iterable[bytes]:

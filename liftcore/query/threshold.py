@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from liftcore.errors import InvalidQuery
+from liftcore.query.question import Threshold
 
 BINS = 300  # a multiple of the sweep's 100 steps
 SMOOTHING = BINS / 64  # bins, standard deviation of the Gaussian that removes a histogram's ripples
@@ -31,16 +32,6 @@ DEPTH = 0.6  # a valley must fall to this share of its peak, else it is a ripple
 # The sweep of Occam's LGS: thresholds in steps, the slope of the share found after a median filter, and how long a
 # stretch, of which slopes and shares, is stable.
 STEPS, FILTER, LEAST_STEPS, MOST_SLOPE, SHARES = 100, 5, 5, 0.4, (0.005, 0.9)
-
-
-@dataclass(frozen=True)
-class Threshold:
-    """A threshold and how it came about."""
-
-    value: float  # scores at or above it answer the query
-    method: str  # auto, valley, paper, otsu, stability or fixed
-    explanation: str  # one sentence for the user
-    clear: bool = True  # whether the scores have what the method looks for
 
 
 @dataclass(frozen=True)
@@ -109,22 +100,25 @@ def find_threshold(
     """
     check_method(method)
     if isinstance(method, int | float):
-        return Threshold(float(method), "fixed", f"The threshold {method:.4g} was given.")
+        return Threshold(value=float(method), method="fixed", explanation=f"The threshold {method:.4g} was given.")
     values = np.asarray(scores, np.float32).ravel()
     if values.size == 0:
-        return Threshold(math.inf, method, "There are no scores: nothing can be found.", clear=False)
+        told = "There are no scores: nothing can be found."
+        return Threshold(value=math.inf, method=method, explanation=told, clear=False)
     low, high = float(values.min()), float(values.max())
     if not (math.isfinite(low) and math.isfinite(high)):
         raise InvalidQuery("scores", expected="finite values", got="NaN or infinity")
     histogram = _count(values, low, high, weights)
     if histogram is None:
-        return Threshold(low, method, f"All scores are {low:.4g}: the histogram has no valley.", clear=False)
+        told = f"All scores are {low:.4g}: the histogram has no valley."
+        return Threshold(value=low, method=method, explanation=told, clear=False)
     value, explanation, clear = steady(histogram, least) if method == "auto" else METHODS[method](histogram)
     value = min(max(value, low), high)
     above = np.append(histogram.above(), 0.0)
     share = float(np.interp((value - low) / histogram.width, np.arange(len(above)), above))
     told = f"{share:.1%} of the {'pixels' if weights is None else counted} at or above {value:.4g}"
-    return Threshold(value, method, f"{explanation.removesuffix('.')}; {told}.", clear)
+    explanation = f"{explanation.removesuffix('.')}; {told}."
+    return Threshold(value=value, method=method, explanation=explanation, clear=clear)
 
 
 def all_alike(low: float, high: float) -> str:

@@ -12,7 +12,8 @@ import numpy as np
 
 from liftcore.errors import InvalidCameras, NotFound
 from liftcore.runtime.nearest import nearest
-from liftcore.scene.distortion import MAX_SIDE, Distortion, Lens, Rectangle, shared_lens
+from liftcore.scene.compositing import MAX_SIDE
+from liftcore.scene.distortion import Distortion, Lens, Rectangle, shared_lens
 from liftcore.scene.origin import FILE_ORIGIN, MAP_REACH, Origin
 from liftcore.scene.panorama import TURNS, Face
 from liftcore.scene.similarity import Similarity

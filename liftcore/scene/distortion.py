@@ -17,11 +17,12 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
+from liftcore.scene.compositing import MAX_SIDE
+
 ITERATIONS = 30  # of Newton's method, which needs four to six where a lens is one
 TOLERANCE = 1e-9  # on the plane: a millionth of a pixel
 RADII, DIRECTIONS = 513, 16  # at which it is looked whether a lens turns back
 FARTHEST = 1e3  # on the plane: what a fisheye sees beside or behind the camera is put so far out
-MAX_SIDE = 32_768  # pixels; larger images are a broken header, not a photo
 WIDEST = float(np.tan(np.radians(60)))  # of a pinhole's image from its axis, in x and in y, on the plane
 GROWTH = 0.5  # of the photo's sides, by which a pinhole's image is larger on each side at most
 LEAST_SHARE = 0.1  # of the photo that its pinhole has to see: with less the calibration is broken

@@ -17,25 +17,24 @@ import threading
 import traceback
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import torch
 
 from liftcore.errors import SplatliftError
-from liftcore.io.json_file import finite
-from liftcore.query.ask import Answer, Point, Question, answers, question, top
+from liftcore.query.ask import Question, answers, located, question
 from liftcore.query.catalogue import Catalogue, catalogue, one_object_ply
 from liftcore.query.export import coloured_ply, layer_colours, npy, object_splats, viewer_splats
-from liftcore.query.objects import Objects, objects
+from liftcore.query.objects import objects
 from liftcore.query.presence import references_of
+from liftcore.query.question import Answer, Found, Objects, OwnCamera, Query, Seen
 from liftcore.query.regions import region_mask, regions_at
 from liftcore.query.render import ViewMask, attention_png, mask_png, render, render_png, view_mask
 from liftcore.query.scene import QueryScene
 from liftcore.query.scores import warm_up as warm_up_scores
 from liftcore.query.segment import Segmentation, best_words, map_png, picture_png, segment, word_map, words_of
-from liftcore.query.terms import Example, Query, Region, Vector, parse_example
+from liftcore.query.terms import Example, Region, Vector, parse_example
 from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Kernel
@@ -46,7 +45,6 @@ from service.encoders import encoder_version
 from service.errors import NoSpace
 from service.queries.client import PIPE_BYTES, Frame, write_frame
 
-TERMS = ("text", "like", "negatives", "unlike")  # in the order in which a query has them
 WARM_UP_TEXT = "something"
 PRODUCT_BYTES = 128 << 20  # of the cosines that one pass over a lift's features may give
 COSINE_BYTES = 4  # of a splat and a direction
@@ -217,7 +215,8 @@ class Answers:
     def _question(self, request: dict[str, Any]) -> Question:
         spec = request["encoder"]
         encoder = None if spec in (None, OWN_WORDS) else self._encoder(spec, request["encoder_version"])
-        return question(self._scene(request), query_of(request["query"]), encoder)
+        query = Query(**request["query"])
+        return question(self._scene(request), query, encoder, query.places)
 
     def _answer(self, request: dict[str, Any]) -> Answer:
         made = self._cache.get(_key(request), lambda: answers(self._scene(request), [self._question(request)])[0])
@@ -245,10 +244,11 @@ class Answers:
         scene, answer = self._scene(request), self._answer(request)
         if request["view"] is not None:
             scene.cameras[request["view"]]  # links to pictures of a view that is not there help nobody
-        return Frame(describe(scene, answer, request["top"]))
+        return Frame(located(scene, answer, request["top"]).model_dump(mode="json"))
 
     def _objects(self, request: dict[str, Any]) -> Frame:
-        return Frame(_found(self._answer(request)) | describe_objects(self._grouped(request)))
+        found = self._answer(request).model_dump(mode="json", include=set(Found.model_fields))
+        return Frame(found | self._grouped(request).model_dump(mode="json"))
 
     def _scores(self, request: dict[str, Any]) -> Frame:
         return _file(npy(self._answer(request).scores), request)
@@ -285,11 +285,11 @@ class Answers:
         cameras = self._scene(request).cameras
         if "view" in request:
             found = cameras_of_views([request["view"]], cameras).values()
-            return Frame({"views": [describe_view(cameras[name], name) for name in found], "more": False})
+            return Frame({"views": [_camera(cameras[name], name) for name in found], "more": False})
         first, count = request["first"], request["count"]
         names = list(itertools.islice(cameras, first, first + count))
         more = first + count < len(cameras)
-        return Frame({"views": [describe_view(cameras[name], name) for name in names], "more": more})
+        return Frame({"views": [_camera(cameras[name], name) for name in names], "more": more})
 
     def _words(self, request: dict[str, Any]) -> tuple[list[str], TextEncoder]:
         """The words of a request, all of its table where it names none."""
@@ -326,7 +326,7 @@ class Answers:
     def _what(self, request: dict[str, Any]) -> Frame:
         (words, encoder), example = self._words(request), _example(request["example"], "example")
         best = best_words(self._scene(request), example, words, encoder.encode(words), request["top"])
-        return Frame({"words": [asdict(word) for word in best]})
+        return Frame({"words": [word.model_dump(mode="json") for word in best]})
 
     def _catalogue(self, request: dict[str, Any]) -> Frame:
         key = ("catalogue", request["lift"], request["encoder"], json.dumps(request["encoder_version"]))
@@ -335,7 +335,7 @@ class Answers:
         first, last = request["first"], request["first"] + request["count"]
         rows = found.features[first:last] if request["means"] else [None] * len(found.objects[first:last])
         things = (
-            asdict(one) | {"box": _box(one.box), "feature": None if row is None else row.tolist()}
+            one.model_dump(mode="json") | {"feature": None if row is None else row.tolist()}
             for one, row in zip(found.objects[first:last], rows, strict=True)
         )
         after = last if last < len(found.objects) else None
@@ -344,8 +344,7 @@ class Answers:
 
     def _regions(self, request: dict[str, Any]) -> Frame:
         found = regions_at(self._scene(request), request["view"], request["x"], request["y"])
-        told = [vars(one.example) | {"example": str(one.example), "share": one.share} for one in found]
-        return Frame({"regions": told})
+        return Frame({"regions": [one.model_dump(mode="json") for one in found]})
 
     def _region_mask(self, request: dict[str, Any]) -> Frame:
         example = Region(request["view"], request["level"], request["region"])
@@ -409,7 +408,7 @@ def bytes_of(made: Answer | Objects | ViewMask | Segmentation | Catalogue) -> in
     """The memory that an answer, with its question, the objects of one, a view of one or named splats take."""
     if isinstance(made, Answer):
         tensors = made.scores.nbytes + made.seen.nbytes + made.selected.nbytes
-        return ENTRY_BYTES + tensors + sum(map(_term_bytes, (*made.query.positives, *made.query.negatives)))
+        return ENTRY_BYTES + tensors + sum(map(_term_bytes, made.query.terms))
     if isinstance(made, Objects):
         return ENTRY_BYTES + made.numbers.nbytes
     if isinstance(made, Segmentation):
@@ -423,26 +422,6 @@ def _term_bytes(term: str | Example) -> int:
     return NUMBER_BYTES * len(term.values) if isinstance(term, Vector) else len(str(term).encode())
 
 
-def query_of(asked: dict[str, Any]) -> Query:
-    """The query of a request.
-
-    Raises:
-        InvalidQuery: it asks for nothing, or an example has no known notation.
-    """
-    names = {name: [f"{name}.{place}" for place in range(len(asked[name]))] for name in TERMS}
-    like, unlike = (list(map(_example, asked[name], names[name])) for name in ("like", "unlike"))
-    return Query(
-        positives=(*asked["text"], *like),
-        negatives=(*asked["negatives"], *unlike),
-        threshold=asked["threshold"],
-        instances=asked["instances"],
-        keep=asked["keep"],
-        absent=asked["absent"],
-        weigh=asked["weigh"],
-        names=tuple(itertools.chain.from_iterable(names.values())),
-    )
-
-
 def _example(example: str | list[float], argument: str) -> Example:
     return parse_example(example, argument) if isinstance(example, str) else Vector(tuple(example))
 
@@ -453,12 +432,7 @@ def view_of(request: dict[str, Any]) -> str | Camera:
     Raises:
         InvalidCameras: what came is none.
     """
-    own = request.get("camera")
-    if own is None:
-        return request["view"]
-    fy = own["fx"] if own["fy"] is None else own["fy"]
-    cx, cy = (side / 2 if own[at] is None else own[at] for at, side in (("cx", own["width"]), ("cy", own["height"])))
-    return Camera.pinhole(own["name"], own["width"], own["height"], own["fx"], fy, cx, cy, own["viewmat"])
+    return Seen(view=request.get("view"), camera=request.get("camera")).seen_from()
 
 
 def open_scene(request: dict[str, Any]) -> QueryScene:
@@ -467,44 +441,18 @@ def open_scene(request: dict[str, Any]) -> QueryScene:
     return QueryScene.open(Path(request["lift"]), splats=splats, cameras=cameras)
 
 
-def describe(scene: QueryScene, answer: Answer, count: int) -> dict[str, Any]:
-    """The answer in numbers, as JSON takes them; ``count`` of the best splats."""
-    found = top(answer, scene, count)
-    best, box = [asdict(splat) for splat in found.best], None if found.box is None else _box(found.box)
-    return {"statistics": finite(answer.statistics), **_found(answer), "top": best, "box": box}
-
-
-def describe_objects(found: Objects) -> dict[str, Any]:
-    """The things that were found, as JSON takes them."""
-    things = [asdict(thing) | {"box": _box(thing.box)} for thing in found.found]
-    return {"objects": things, "strays": found.strays}
-
-
 def describe_words(found: Segmentation) -> dict[str, Any]:
     """What is there, of many words, as JSON takes it."""
     named = [
-        {**asdict(word), "value": value, "colour": found.colours[value].tolist(), "box": _box(word.box)}
+        word.model_dump(mode="json") | {"value": value, "colour": found.colours[value].tolist()}
         for value, word in enumerate(found.found, 1)
     ]
     counts = {"words": len(found.words), "splats": len(found.labels), "none": int((found.labels < 0).sum())}
     return {**counts, "found": named}
 
 
-def describe_view(camera: Camera, name: str) -> dict[str, Any]:
-    """A camera, as JSON takes it; of a distorted photo the pinhole that stands for it."""
-    K = {"fx": camera.fx, "fy": camera.fy, "cx": camera.K[0, 2].item(), "cy": camera.K[1, 2].item()}
-    size = {"width": camera.width, "height": camera.height}
-    return {"name": name, **size, **K, "viewmat": camera.viewmat.tolist()}
-
-
-def _box(corners: tuple[Point, Point]) -> dict[str, Point]:
-    return {"low": corners[0], "high": corners[1]}
-
-
-def _found(answer: Answer) -> dict[str, Any]:
-    cut = {"method": answer.threshold_method, "explanation": answer.explanation}
-    told = {"count": answer.count, "clear": answer.clear and answer.count > 0, **asdict(answer.presence)}
-    return {"threshold": {"value": finite(answer.threshold), **cut}, **told}
+def _camera(camera: Camera, name: str) -> dict[str, Any]:
+    return OwnCamera.of(camera, name).model_dump(exclude_unset=True)
 
 
 def reply_to(requests: list[dict[str, Any]], answers: Answers) -> Frame:

@@ -13,19 +13,8 @@ from service import limits, models
 from service.content import TAGGED, Limit, kept, unchanged
 from service.encoders import encoder_label
 from service.photos import in_camera_orientation
-from service.routes.queries import (
-    NO_ENCODER,
-    NPY,
-    PLY,
-    PNG,
-    Ask,
-    View,
-    made,
-    scene_request,
-    tagged_answer,
-    with_encoder,
-    with_packs,
-)
+from service.queries.requests import NO_ENCODER, Ask, made, scene_request, tagged_answer, with_encoder, with_packs
+from service.routes.queries import NPY, PLY, PNG
 from service.state import AppState, Deps
 from service.store.lifts import LiftRecord
 
@@ -33,6 +22,7 @@ _BYTES = {"schema": {"type": "string", "format": "binary"}}
 PHOTO: dict[int | str, dict[str, Any]] = {200: {"content": {"image/jpeg": _BYTES, "image/png": _BYTES}}}
 
 router = APIRouter(prefix="/lifts/{lift}", tags=["lifts"])
+View = Annotated[str, Query(min_length=1, max_length=limits.VIEW_CHARACTERS, description="the name of a camera")]
 ViewsCursor = Annotated[int, Query(ge=0, le=10**9, description="the `next` of the page before")]
 Pixel = Annotated[int, Query(ge=0, le=10**9, description="of the photo: x from the left, y from the top")]
 Level = Annotated[int, Query(ge=0, le=10**9, description="as GET /lifts/{lift}/regions tells it")]

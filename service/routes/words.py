@@ -8,8 +8,9 @@ from fastapi import APIRouter, Response
 
 from service import models
 from service.encoders import encoder_label
+from service.queries.requests import Ask, find_lift, made, scene_request, seen_from, with_encoder
 from service.requests import described_body, json_body
-from service.routes.queries import NPY, PNG, Ask, find_lift, made, scene_request, seen_from, shown, with_encoder
+from service.routes.queries import NPY, PNG, shown
 from service.state import AppState, Deps
 from service.store.lifts import LiftRecord
 

@@ -19,9 +19,10 @@ from fastapi.testclient import TestClient
 
 from liftcore.errors import SplatliftError
 from liftcore.query import ask
-from liftcore.query.ask import Answer
 from liftcore.query.objects import objects
-from liftcore.query.terms import Query, Vector
+from liftcore.query.presence import NOT_IN_WORDS
+from liftcore.query.question import Answer, Query, Threshold
+from liftcore.query.terms import Vector
 from service import models
 from service.auth import EVERYBODY
 from service.errors import Busy, ClientLeft, TimedOut, TooMany
@@ -257,7 +258,7 @@ def request_of(client: TestClient, lift: dict[str, Any]) -> Callable[..., dict[s
     record = here.store.lifts.get(here.owner, lift["id"])
 
     def make(operation: str = "scores", **asked: Any) -> dict[str, Any]:
-        body = models.AskedInBody.model_validate({"lift": lift["id"], **asked})
+        body = models.Question.model_validate({"lift": lift["id"], **asked})
         return query_request(operation, body, record, here) | {"view": "left", "top": 3}
 
     return make
@@ -365,8 +366,10 @@ def test_cache_keeps_what_was_used_last_and_knows_its_size() -> None:
 
 def test_question_counts_with_its_answer() -> None:
     none, no_scores = np.empty(0, bool), np.empty(0, np.float32)
+    cut = Threshold(value=0.5, method="fixed", explanation="as asked")
+    fields = {"threshold": cut, "clear": False, "statistics": {}, **dict(NOT_IN_WORDS)}
     short, long, vector = (
-        bytes_of(Answer(Query(terms), no_scores, none, 0.5, "fixed", "as asked", none, {}))
+        bytes_of(Answer.of(Query.of(terms), no_scores, none, none, **fields))
         for terms in (("apple",), ("apple", "x" * 1000), (Vector((0.5,) * 65_536),))
     )
     assert short >= 1024 and long >= short + 1000 and vector >= 65_536 * 24  # an entry is never free

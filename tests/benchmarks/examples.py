@@ -24,8 +24,9 @@ from torch import Tensor
 
 import liftcore as lc
 from liftcore.query.ask import ask
+from liftcore.query.question import Query
 from liftcore.query.scene import QueryScene
-from liftcore.query.terms import Pixel, Query
+from liftcore.query.terms import Pixel
 from liftcore.query.threshold import METHODS, find_threshold
 from tests.benchmarks.base import PACKS, PRESETS, command_line, read_pack, read_scene, tell
 from tests.benchmarks.tabletop import Truth, tabletop
@@ -48,7 +49,7 @@ def measure(scene: QueryScene, cases: Iterable[Case]) -> dict[str, float]:
     for example, truths in cases:
         asked += 1
         try:
-            answers = {name: ask(scene, Query((example,), threshold=name)) for name in METHODS}
+            answers = {name: ask(scene, Query.of((example,), threshold=name)) for name in METHODS}
         except lc.InvalidQuery:
             refused += 1
             continue

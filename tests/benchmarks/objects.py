@@ -23,8 +23,9 @@ from typing import Any
 
 import numpy as np
 
-from liftcore.query.ask import Answer, ask
+from liftcore.query.ask import ask
 from liftcore.query.objects import objects
+from liftcore.query.question import Answer
 from liftcore.query.scene import QueryScene
 from liftcore.solve.clusters import cluster_splats
 from liftcore.text import open_encoder

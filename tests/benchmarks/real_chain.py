@@ -44,9 +44,10 @@ import liftcore as lc
 from liftcore.features.encoders.encode import find_images
 from liftcore.query.ask import ask
 from liftcore.query.directions import MINIMUM_ROW_SUM
+from liftcore.query.question import Query
 from liftcore.query.render import overlay, view_mask
 from liftcore.query.scene import QueryScene
-from liftcore.query.terms import Pixel, Query
+from liftcore.query.terms import Pixel
 from liftcore.text.table import TableEncoder
 from liftcore.values.pack import read_features
 from tests.benchmarks.base import box_iou, command_line, scene_files, tell
@@ -307,7 +308,7 @@ def of_lift(
     scene = QueryScene.open(out / f"{name}.lift.safetensors")
     sheet: list[np.ndarray] = []
     for number, (asked, word, terms) in enumerate(questions):
-        answer = ask(scene, Query(terms), words)
+        answer = ask(scene, Query.of(terms), words)
         found, shown = [], []
         for view, boxes in BOXES.items():
             seen = view_mask(scene, answer, view)

@@ -27,12 +27,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from liftcore.query.ask import Answer, ask
+from liftcore.query.ask import ask
 from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.objects import objects
+from liftcore.query.question import Answer, Query
 from liftcore.query.render import LEAST_SHARE, MOST_GROUPED, view_mask
 from liftcore.query.scene import QueryScene
-from liftcore.query.terms import Query
 from liftcore.query.threshold import METHODS, find_threshold
 from liftcore.text import TextEncoder, open_encoder
 from liftcore.text.table import TableEncoder
@@ -100,7 +100,7 @@ def measure_phrases(scene: QueryScene, truth: Truth, encoder: TextEncoder) -> di
     """Means over the words and the held-out views, each word asked for alone; ``worst`` is the mean of one word."""
     of_words = []
     for number, word in enumerate(truth.words):
-        answers = {way: ask(scene, Query((word,), threshold=way), encoder) for way in METHODS}
+        answers = {way: ask(scene, Query.of((word,), threshold=way), encoder) for way in METHODS}
         of_words.append(judged(scene, answers, [(view, mask == number) for view, mask in truth.held_out.items()]))
     columns = {name: [value for rows in of_words for value in rows[name]] for name in COLUMNS}
     worst = min(float(np.mean(rows["auto"])) for rows in of_words if rows["auto"])
@@ -128,7 +128,7 @@ def still_life_rows(lifts: Iterable[str]) -> Iterator[dict[str, Any]]:
 
 def measure_alone(scene: QueryScene, truth: Truth, encoder: TextEncoder, absent: Sequence[str]) -> dict[str, Any]:
     """What ``auto`` selects of each word, ``absent=keep``, and of words for what is not there."""
-    told = [ask(scene, Query((word,), absent="keep"), encoder) for word in truth.words]
+    told = [ask(scene, Query.of((word,), absent="keep"), encoder) for word in truth.words]
     found = [objects(scene, one).numbers >= 0 if one.count <= MOST_GROUPED else one.selected for one in told]
     values = torch.from_numpy(np.stack([*found, np.ones(len(found[0]))], axis=1).astype(np.float32))
     rows: dict[str, list[float]] = {word: [] for word in truth.words}
@@ -141,7 +141,7 @@ def measure_alone(scene: QueryScene, truth: Truth, encoder: TextEncoder, absent:
                 rows[word].append(mask_iou(seen[..., number], mask == number))
     means = {word: float(np.mean(values)) for word, values in rows.items() if values}
     worst = min(means, key=lambda word: means[word])
-    states = {word: one.presence.present for word, one in zip(truth.words, told, strict=True)}
+    states = {word: one.present for word, one in zip(truth.words, told, strict=True)}
     nothing = [ask(scene, word, encoder).count == 0 for word in absent]
     return {
         "mean": float(np.mean(list(means.values()))),

@@ -170,7 +170,8 @@ def test_settings_of_the_service_that_are_told_exist_and_have_that_default() -> 
 
 def _commands() -> dict[str, argparse.ArgumentParser]:
     actions = build_parser()._actions
-    return next(dict(action.choices) for action in actions if isinstance(action, argparse._SubParsersAction))
+    choices = next(action.choices for action in actions if isinstance(action, argparse._SubParsersAction))
+    return {name: parser.filled() for name, parser in choices.items()}
 
 
 def _actions(parser: argparse.ArgumentParser) -> list[argparse.Action]:

@@ -15,6 +15,7 @@ from safetensors.numpy import save_file
 from liftcore import cli
 from liftcore.errors import InvalidInput
 from liftcore.io.splats import read_splats
+from liftcore.query.question import Query
 from liftcore.query.result import load_lift
 from liftcore.query.scene import QueryScene
 from liftcore.text import BUILT_IN, open_encoder
@@ -24,8 +25,6 @@ from .command_line import assert_one_line, lift_arguments, run, write_toy_scene
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-    from liftcore.query.terms import Query
 
 
 @pytest.fixture
@@ -48,7 +47,7 @@ def scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
 def test_the_text_of_a_query_stands_before_between_or_after_options(arguments: list[str]) -> None:
     options = cli.build_parser().parse_args(["query", *arguments])
     assert (str(options.lift), options.text) == ("L", "a mug")
-    assert options.negative == (["cat", "dog", "cow"] if "--negative" in arguments else [])
+    assert options.negatives == (["cat", "dog", "cow"] if "--negative" in arguments else [])
 
 
 @pytest.mark.parametrize(
@@ -154,7 +153,7 @@ def test_every_term_and_option_is_part_of_the_query(
     assert told == [
         ("auto", "all", None, plain), (0.25, "largest", None, plain), ("auto", "all", 3, "confidence"),
     ]  # fmt: skip
-    assert {(*map(str, query.positives), *map(str, query.negatives)) for query in asked} == {("splat:1", "splat:0")}
+    assert {tuple(map(str, query.terms)) for query in asked} == {("splat:1", "splat:0")}
 
 
 def test_what_was_found_is_written_as_splats_and_over_no_input(

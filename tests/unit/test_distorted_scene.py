@@ -16,10 +16,11 @@ from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.lifting.files import lift_files
 from liftcore.query.ask import ask
+from liftcore.query.question import Query
 from liftcore.query.render import render_png, view_mask
 from liftcore.query.result import LiftResult
 from liftcore.query.scene import QueryScene
-from liftcore.query.terms import Pixel, Query, Region
+from liftcore.query.terms import Pixel, Region
 from liftcore.scene.cameras import Camera
 from liftcore.values.lift_file import save_lift
 from liftcore.values.settings import LiftSettings
@@ -88,16 +89,16 @@ def test_masks_lie_over_the_photo(lens: str, tmp_path: Path) -> None:
         photo = np.where(is_lifted(scene.cameras[view]), photo_of(view, lens, CLEAR), -1)
         for part in np.unique(photo[photo >= 0]):
             y, x = np.argwhere(photo == part)[len(np.argwhere(photo == part)) // 2]
-            answer = ask(scene, Query((Pixel(view, int(x), int(y)),), threshold=0.5))
+            answer = ask(scene, Query.of((Pixel(view, int(x), int(y)),), threshold=0.5))
             seen = view_mask(scene, answer, view)
             assert seen.mask.shape == photo.shape
             found, truth = seen.mask & (photo >= 0), photo == part
             assert (found & truth).sum() / (found | truth).sum() > 0.99
-    answer = ask(scene, Query((Region("left", 0, 1),), threshold=0.5))
+    answer = ask(scene, Query.of((Region("left", 0, 1),), threshold=0.5))
     shown = is_lifted(scene.cameras["left"]) & (photo_of("left", lens, CLEAR) == 1)
     assert view_mask(scene, answer, "left").mask[shown].all()
     with pytest.raises(InvalidQuery, match=rf"x in 0\.\.{WIDTH - 1} and y in 0\.\.{HEIGHT - 1}, got {WIDTH},0"):
-        ask(scene, Query((Pixel("left", WIDTH, 0),)))
+        ask(scene, Query.of((Pixel("left", WIDTH, 0),)))
     for what in ("rgb", "pca", "depth"):
         picture = Image.open(io.BytesIO(render_png(scene, "left", what)))
         assert picture.size == (WIDTH, HEIGHT)
@@ -111,9 +112,9 @@ def test_a_pixel_at_the_rim_of_a_wide_photo_has_no_pinhole(tmp_path: Path) -> No
     frame = {"file_path": "wide.jpg", "transform_matrix": np.diag([1.0, -1.0, -1.0, 1.0]).tolist()}
     (tmp_path / "wide.json").write_text(json.dumps({**document, "frames": [frame]}))
     scene.__dict__["cameras"] = read_cameras(tmp_path / "wide.json")
-    assert len(ask(scene, Query((Pixel("wide", 200, 20),), threshold=0.5)).scores) == 3600
+    assert len(ask(scene, Query.of((Pixel("wide", 200, 20),), threshold=0.5)).scores) == 3600
     with pytest.raises(InvalidQuery, match="a pixel that a pinhole sees, got one at the rim of a wide lens; pick"):
-        ask(scene, Query((Pixel("wide", 2, 20),)))
+        ask(scene, Query.of((Pixel("wide", 2, 20),)))
 
 
 def test_a_model_that_comes_later_changes_no_lift(tmp_path: Path) -> None:

@@ -24,9 +24,9 @@ from liftcore.evaluate.protocols import (
 )
 from liftcore.evaluate.published import published
 from liftcore.query.ask import ask
+from liftcore.query.question import Query
 from liftcore.query.render import view_mask
 from liftcore.query.scene import QueryScene
-from liftcore.query.terms import Query
 from liftcore.query.threshold import find_threshold
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.text import open_encoder
@@ -145,7 +145,7 @@ def test_p1_compares_rendered_features(scene: QueryScene) -> None:
 def test_p2_sees_the_selected_splats_alone(scene: QueryScene) -> None:
     texts, encoder = ["red apple", "unicorn"], words(scene)
     protocol = SelectedSplats(scene, texts, encoder, threshold=0.5)
-    chosen = ask(scene, Query(("red apple",), threshold=0.5), encoder).selected
+    chosen = ask(scene, Query.of(("red apple",), threshold=0.5), encoder).selected
     splats = scene.splats
     few = replace(
         splats,
@@ -163,7 +163,7 @@ def test_p3_cuts_the_rendered_scores_of_a_query(scene: QueryScene, threshold: st
     texts, encoder = ["book", "red apple"], words(scene)
     found = RenderedScores(scene, texts, encoder, threshold).look("frame_00002")
     for text in texts:
-        seen = view_mask(scene, ask(scene, Query((text,), threshold=threshold), encoder), "frame_00002")
+        seen = view_mask(scene, ask(scene, Query.of((text,), threshold=threshold), encoder), "frame_00002")
         met = seen.row_sums >= 0.5
         cut = find_threshold(seen.attention[met], threshold).value
         assert (found[text].mask == (met & (seen.attention >= cut))).all() and found[text].mask.any()

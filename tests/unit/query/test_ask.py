@@ -16,11 +16,12 @@ from hypothesis import strategies as st
 
 from liftcore.errors import InvalidLift, InvalidQuery, NotFound, SplatliftError
 from liftcore.io.splats import some_rows
-from liftcore.query.ask import answers, ask, question, top
-from liftcore.query.directions import directions
+from liftcore.query.ask import answers, ask, located, question
+from liftcore.query.directions import directions, read_vector
+from liftcore.query.question import Query
 from liftcore.query.result import LiftResult, load_lift
 from liftcore.query.scene import QueryScene
-from liftcore.query.terms import Example, OneSplat, Pixel, Query, Region, Vector, parse_example, read_vector
+from liftcore.query.terms import Example, OneSplat, Pixel, Region, Vector, parse_example
 from liftcore.query.threshold import find_threshold
 from liftcore.values.lift_file import save_lift
 from service.queries.answers import open_scene
@@ -64,21 +65,21 @@ def test_splats_that_mean_the_text_are_selected_the_best_with_places_and_a_box(e
     assert np.flatnonzero(answer.selected).tolist() == list(range(0, COUNT - 1, 3))
     assert answer.count == len(range(0, COUNT - 1, 3))
     assert answer.statistics["min"] <= answer.statistics["q50"] <= answer.statistics["max"]
-    found, means = top(answer, exact, 4), exact.splats.means.numpy()
-    assert [best.splat for best in found.best] == [0, 3, 6, 9]  # of equal scores the first in the file
-    assert found.best[0].position == pytest.approx(means[0].tolist())
+    found, means = located(exact, answer, 4), exact.splats.means.numpy()
+    assert [best.splat for best in found.top] == [0, 3, 6, 9]  # of equal scores the first in the file
+    assert found.top[0].position == pytest.approx(means[0].tolist())
     selected = means[answer.selected]
     assert found.box == tuple(tuple(end.tolist()) for end in (selected.min(axis=0), selected.max(axis=0)))
-    assert len(top(answer, exact, 1000).best) == COUNT - 1  # none that was not seen
-    assert top(ask(exact, Query(("x",), ("y",), threshold=1.0), Axes()), exact, 1).box is None
+    assert len(located(exact, answer, 1000).top) == COUNT - 1  # none that was not seen
+    assert located(exact, ask(exact, Query.of(("x",), ("y",), threshold=1.0), Axes()), 1).box is None
 
 
 def test_negatives_take_away_and_unseen_splats_are_never_selected(exact: QueryScene) -> None:
-    plain, answer = ask(exact, "x", Axes()), ask(exact, Query(("x",), ("y", "z"), threshold=0.5), Axes())
-    assert (answer.scores <= plain.scores).all() and answer.threshold_method == "fixed"
+    plain, answer = ask(exact, "x", Axes()), ask(exact, Query.of(("x",), ("y", "z"), threshold=0.5), Axes())
+    assert (answer.scores <= plain.scores).all() and answer.threshold.method == "fixed"
     assert np.flatnonzero(answer.selected).tolist() == list(range(0, COUNT - 1, 3))
     for negatives in ((), ("x",)):
-        all_seen = ask(exact, Query(("z",), negatives, threshold=-1.0), Axes())
+        all_seen = ask(exact, Query.of(("z",), negatives, threshold=-1.0), Axes())
         assert not all_seen.selected[-1] and all_seen.scores[-1] == all_seen.scores.min()
         assert all_seen.count == COUNT - 1
 
@@ -90,16 +91,18 @@ def test_splats_without_evidence_or_confidence_do_not_decide_the_threshold(exact
     stray[:, 0], stray[:, 1] = 1.0, np.linspace(0.0, 3.0, COUNT)  # scores all over the range
     weights = torch.cat([torch.ones(COUNT), torch.full((COUNT,), 1e-4)])
     crowd = of(exact, np.concatenate([exact.features, stray]), **{weigh: weights})
-    answer = ask(crowd, Query(("x",), weigh=weigh), Axes())
-    plainly = ask(crowd, Query(("x",)), Axes())
+    answer = ask(crowd, Query.of(("x",), weigh=weigh), Axes())
+    plainly = ask(crowd, Query.of(("x",)), Axes())
     assert np.array_equal(answer.scores, plainly.scores)
-    assert (answer.explanation == plainly.explanation) == (weigh == "evidence")  # which tells the share above it
+    assert (answer.threshold.explanation == plainly.threshold.explanation) == (
+        weigh == "evidence"
+    )  # which tells the share above it
     assert np.array_equal(answer.selected[:COUNT], plain.selected)
     assert answer.selected[COUNT] and answer.count > plain.count  # they are selected all the same
 
 
 def test_questions_together_have_the_bits_of_each_alone(scene: QueryScene) -> None:
-    queries = [Query(("x",)), Query(("y", OneSplat(3)), ("z",)), Query((OneSplat(1),)), Query(("z", "x"))]
+    queries = [Query.of(("x",)), Query.of(("y", OneSplat(3)), ("z",)), Query.of((OneSplat(1),)), Query.of(("z", "x"))]
     asked = [question(scene, query, Axes()) for query in queries]
     for together, one in zip(answers(scene, asked), asked, strict=True):
         (alone,) = answers(scene, [one])
@@ -115,14 +118,14 @@ def test_what_cannot_be_asked_is_refused(scene: QueryScene) -> None:
         (lambda: ask(of_space(""), "x"), r"text space: not named\), got no encoder"),
         (lambda: ask(of_space("axes"), "x"), r"text space: axes\), got no encoder"),
         (
-            lambda: question(scene, Query(("x",), weigh="confidence"), Axes()),
+            lambda: question(scene, Query.of(("x",), weigh="confidence"), Axes()),
             "a lift with confidence.*preset default",
         ),
-        (lambda: Query(("x",), weigh="light"), "weigh: expected one of evidence, confidence"),
-        (lambda: Query(()), "query: expected a text or an example"),
-        (lambda: Query(("a",) * 65), "at most 64"),
-        (lambda: Query(("a",), keep="some"), "keep: expected"),
-        (lambda: Query(("a",), threshold="best"), "threshold: expected"),
+        (lambda: Query.of(("x",), weigh="light"), "weigh: expected one of evidence, confidence"),
+        (lambda: Query.of(()), "query: expected a text or an example"),
+        (lambda: Query.of(("a",) * 65), "at most 64"),
+        (lambda: Query.of(("a",), keep="some"), "keep: expected"),
+        (lambda: Query.of(("a",), threshold="best"), "threshold: expected"),
     ):
         with pytest.raises(InvalidQuery, match=message):
             refused()
@@ -132,10 +135,10 @@ def test_what_cannot_be_asked_is_refused(scene: QueryScene) -> None:
 
 
 def test_vectors_are_asked_as_their_words_are(scene: QueryScene) -> None:
-    words = ask(scene, Query(("x",), ("y",)), Axes())
+    words = ask(scene, Query.of(("x",), ("y",)), Axes())
     for positive in (torch.eye(CHANNELS)[0], 7 * np.eye(CHANNELS)[:1]):
         found = LiftResult.of(scene.lift).query(positive, torch.eye(CHANNELS)[1], splats=scene.splats)
-        assert found.scores.numpy().tolist() == words.scores.tolist() and found.threshold == words.threshold
+        assert found.scores.numpy().tolist() == words.scores.tolist() and found.threshold == words.threshold.value
         assert np.array_equal(found.splats.numpy(), words.selected) and found.clear
         assert found.objects is not None and len(found.objects.found) == 1
     alike = LiftResult.of(replace(scene.lift, features=torch.ones(COUNT, CHANNELS)))
@@ -150,7 +153,7 @@ def test_scene_made_of_values_needs_no_files(scene: QueryScene) -> None:
     nowhere = scene.metadata.splats.model_copy(update={"path": ""})
     lift = replace(scene.lift, metadata=scene.metadata.model_copy(update={"splats": nowhere}))
     bare = QueryScene(lift, scene.splats, scene.cameras, scene.packs)
-    query = Query((Pixel("middle", 6, HEIGHT // 2), Region("left", 0, 1)))
+    query = Query.of((Pixel("middle", 6, HEIGHT // 2), Region("left", 0, 1)))
     assert np.array_equal(ask(bare, query).selected, ask(scene, query).selected)
     with pytest.raises(InvalidLift, match="give the splats"):
         _ = QueryScene(lift).splats
@@ -158,11 +161,11 @@ def test_scene_made_of_values_needs_no_files(scene: QueryScene) -> None:
 
 def test_words_of_a_table_are_asked_without_torch(tiny_lift: Path) -> None:
     code = (
-        "import sys; from pathlib import Path; from liftcore.query.ask import ask, top; "
-        "from liftcore.query.scene import QueryScene; from liftcore.query.terms import OneSplat, Query; "
+        "import sys; from pathlib import Path; from liftcore.query.ask import ask, located; "
+        "from liftcore.query.scene import QueryScene; from liftcore.query.question import Query; "
         "import liftcore.text.table; "
-        "scene = QueryScene.open(Path(sys.argv[1])); answer = ask(scene, Query((OneSplat(0),))); "
-        "assert top(answer, scene, 3).best and 'torch' not in sys.modules"
+        "scene = QueryScene.open(Path(sys.argv[1])); answer = ask(scene, Query(like=['splat:0'])); "
+        "assert located(scene, answer, 3).top and 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code, str(tiny_lift)], check=True)
 
@@ -177,10 +180,10 @@ def test_lift_finds_its_files_beside_it_or_where_told(lift_tiny: Callable[..., P
     (after / "s.ply").rename(after / "another.ply")
     scene = QueryScene.open(after / lift)
     assert scene.splats.count == COUNT and len(scene.cameras) == 3
-    assert ask(scene, Query((Region("left", 0, 0),))).count > 0
+    assert ask(scene, Query.of((Region("left", 0, 0),))).count > 0
     (after / "another.ply").rename(away / "s.ply")
     lost = QueryScene.open(after / lift)
-    assert ask(lost, Query((OneSplat(0),))).count > 0  # scores need no splats
+    assert ask(lost, Query.of((OneSplat(0),))).count > 0  # scores need no splats
     with pytest.raises(InvalidLift, match=r"splats at .*s\.ply, or beside the lift.*--splats"):
         _ = lost.splats
     assert QueryScene.open(after / lift, splats=away / "s.ply").splats.count == COUNT
@@ -199,7 +202,7 @@ def test_cameras_may_be_added_but_not_moved(lift_tiny: Callable[..., Path], tmp_
     with (tmp_path / "f.st").open("a") as pack:
         pack.write(" ")
     with pytest.raises(InvalidLift, match="features changed since the lift"):
-        ask(QueryScene.open(lift), Query((Region("left", 0, 0),)))
+        ask(QueryScene.open(lift), Query.of((Region("left", 0, 0),)))
 
 
 @pytest.mark.parametrize("cluster", range(3))
@@ -212,7 +215,7 @@ def test_every_kind_of_example_finds_its_cluster(scene: QueryScene, cluster: int
         Vector(tuple(1e30 * np.eye(CHANNELS)[cluster])),
     ]
     for example in kinds:
-        answer = ask(scene, Query((example,)))
+        answer = ask(scene, Query.of((example,)))
         assert answer.selected[splats].mean() > 0.7, example
         assert answer.count <= 1.3 * SPLATS_A_CLUSTER, example
 
@@ -221,7 +224,7 @@ def test_pixel_is_the_feature_rendered_there(scene: QueryScene) -> None:
     features = torch.from_numpy(scene.features).float()
     image = scene.raster.render(scene.cameras["middle"], features, scene.compositing)
     for x, y in ((5, 12), (16, 12), (26, 10)):
-        (found,) = directions(scene, Query((Pixel("middle", x, y),)), None)
+        (found,) = directions(scene, Query.of((Pixel("middle", x, y),)), None)
         expected = torch.nn.functional.normalize(image[y, x], dim=0)
         np.testing.assert_allclose(found, expected.numpy(), atol=1e-5)
 
@@ -231,14 +234,14 @@ def test_threshold_of_examples_is_above_a_least_likeness(scene: QueryScene) -> N
     rows = np.zeros((COUNT, CHANNELS))
     rows[:10, 0], rows[10:25, :3], rows[25:, 1] = 1.0, [0.3, 0.3, 0.9], -1.0
     lifted = of(scene, rows + np.random.default_rng(0).normal(0, 0.01, rows.shape))
-    by_example = ask(lifted, Query((OneSplat(0),)))
+    by_example = ask(lifted, Query.of((OneSplat(0),)))
     assert np.flatnonzero(by_example.selected).tolist() == list(range(10))
-    assert by_example.threshold > 0.4 and find_threshold(by_example.scores).value < 0.0
-    in_words = ask(lifted, Query(("x", "y")), Axes())
-    assert in_words.threshold == find_threshold(in_words.scores).value
-    both = ask(lifted, Query((OneSplat(0), "x")), Axes())
-    assert both.threshold == find_threshold(both.scores).value
-    assert ask(lifted, Query((OneSplat(0),), threshold=0.1)).count == 25
+    assert by_example.threshold.value > 0.4 and find_threshold(by_example.scores).value < 0.0
+    in_words = ask(lifted, Query.of(("x", "y")), Axes())
+    assert in_words.threshold.value == find_threshold(in_words.scores).value
+    both = ask(lifted, Query.of((OneSplat(0), "x")), Axes())
+    assert both.threshold.value == find_threshold(both.scores).value
+    assert ask(lifted, Query.of((OneSplat(0),), threshold=0.1)).count == 25
 
 
 @pytest.mark.parametrize(
@@ -262,10 +265,11 @@ def test_term_without_a_feature_says_why_under_its_name(
     scene: QueryScene, example: Example, error: type[SplatliftError], said: str
 ) -> None:
     with pytest.raises(error, match=said):
-        ask(scene, Query((example,)))
+        ask(scene, Query.of((example,)))
     if example != "apple":
+        query = Query.of((OneSplat(0),), (example,))
         with pytest.raises(error, match=r"unlike\.0"):
-            ask(scene, Query((OneSplat(0),), (example,), names=("like.0", "unlike.0")))
+            question(scene, query, None, query.places)
 
 
 @given(view=NAMES, x=st.integers(0, 9999), y=st.integers(0, 9999))
@@ -314,12 +318,12 @@ def test_a_lift_with_other_rows_than_its_splats_answers_nothing(
     rows = ("features", "evidence", "agreement", "seen", "confidence", "cluster", "object")
     cropped = {name: getattr(lift, name)[:-1] for name in rows if getattr(lift, name) is not None}
     save_lift(replace(lift, **cropped), tmp_path / "cropped.lift")
-    ask(QueryScene.open(path), Query((OneSplat(0),)))
+    ask(QueryScene.open(path), Query.of((OneSplat(0),)))
     with pytest.raises(InvalidLift, match="a row for each of its"):
-        ask(QueryScene.open(tmp_path / "cropped.lift"), Query((OneSplat(0),)))  # scores alone, without places
+        ask(QueryScene.open(tmp_path / "cropped.lift"), Query.of((OneSplat(0),)))  # scores alone, without places
     splats.write_bytes(b"".join(some_rows(tmp_path / "s.ply", np.arange(len(lift.features)) > 0, suffix)))
     request = {"lift": str(path), "splats": str(splats), "cameras": str(tmp_path / "c.json")}
     with pytest.raises(InvalidLift, match="a row for each of its"):
         open_scene(request)
     (tmp_path / "s.ply").write_bytes(splats.read_bytes())  # another file lies there now: places alone are lost
-    ask(QueryScene.open(path), Query((OneSplat(0),)))
+    ask(QueryScene.open(path), Query.of((OneSplat(0),)))

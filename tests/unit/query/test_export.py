@@ -9,11 +9,12 @@ import pytest
 from liftcore.errors import InvalidLift
 from liftcore.io.splats import read_splats
 from liftcore.lifting.files import lift_files
-from liftcore.query.ask import Answer, ask
+from liftcore.query.ask import ask
 from liftcore.query.colours import NOT_SEEN_COLOUR, colour_map
 from liftcore.query.export import coloured_ply, object_splats
+from liftcore.query.question import Answer, Query
 from liftcore.query.scene import QueryScene
-from liftcore.query.terms import Query, Region
+from liftcore.query.terms import Region
 from liftcore.scene.harmonics import SH_C0
 from liftcore.values.settings import LiftSettings
 from tests.api.tiny_scene import SPLATS_A_CLUSTER, ply, splat_rows
@@ -28,7 +29,7 @@ def scene(lift_tiny: Callable[..., Path], tmp_path: Path) -> QueryScene:
 
 
 def of_lamp(scene: QueryScene, threshold: float = 0.5) -> Answer:
-    return ask(scene, Query((Region("left", 0, 2),), threshold=threshold))
+    return ask(scene, Query.of((Region("left", 0, 2),), threshold=threshold))
 
 
 def test_the_object_is_what_was_selected_and_can_be_lifted_again(scene: QueryScene, tmp_path: Path) -> None:

@@ -8,24 +8,27 @@ import torch
 
 from liftcore.errors import InvalidQuery
 from liftcore.query import objects as module
-from liftcore.query.ask import Answer, ask
+from liftcore.query.ask import ask
 from liftcore.query.export import object_splats
 from liftcore.query.objects import objects
+from liftcore.query.question import Answer, Query
 from liftcore.query.scene import QueryScene
-from liftcore.query.terms import Query, Region
+from liftcore.query.terms import Region
 from tests.api.tiny_scene import SPLATS_A_CLUSTER, ply, splat_rows
+
+from .made_up import answer_with
 
 
 def of(
     scene: QueryScene, *clusters: int, keep: str = "all", instances: int | None = None, rows: tuple[int, ...] = ()
 ) -> Answer:
     """An answer that selected these clusters and rows, with scores of .5 and more the later they stand."""
-    answer = ask(scene, Query((Region("left", 0, 2),), threshold=0.5, keep=keep, instances=instances))
+    answer = ask(scene, Query.of((Region("left", 0, 2),), threshold=0.5, keep=keep, instances=instances))
     selected = np.zeros(3 * SPLATS_A_CLUSTER, np.bool_)
     for cluster in clusters:
         selected[cluster * SPLATS_A_CLUSTER : (cluster + 1) * SPLATS_A_CLUSTER] = True
     selected[list(rows)] = True
-    return replace(answer, selected=selected, scores=np.linspace(0.5, 1.0, len(selected), dtype=np.float32))
+    return answer_with(answer, selected=selected, scores=np.linspace(0.5, 1.0, len(selected), dtype=np.float32))
 
 
 def means(scene: QueryScene, cluster: int) -> np.ndarray:
@@ -36,7 +39,7 @@ def means(scene: QueryScene, cluster: int) -> np.ndarray:
 def test_clusters_that_are_apart_are_objects_with_their_boxes(weigh: str, scene: QueryScene) -> None:
     confidence = torch.rand(len(scene.features), generator=torch.Generator().manual_seed(0))
     answer = of(scene, 0, 2)
-    answer = replace(answer, query=replace(answer.query, weigh=weigh))
+    answer = answer_with(answer, weigh=weigh)
     found = objects(QueryScene(replace(scene.lift, confidence=confidence), scene.splats), answer)
     assert len(found.found) == 2 and found.strays == 0
     evidence = scene.evidence * (confidence.numpy() if weigh == "confidence" else 1)

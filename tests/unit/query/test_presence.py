@@ -10,15 +10,16 @@ import pytest
 import torch
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.ask import Answer, ask
+from liftcore.query.ask import ask
 from liftcore.query.export import object_splats
 from liftcore.query.objects import objects
 from liftcore.query.presence import References, references_of
+from liftcore.query.question import Answer, Query
 from liftcore.query.render import view_mask
 from liftcore.query.result import LiftResult
 from liftcore.query.scene import QueryScene
 from liftcore.query.segment import segment
-from liftcore.query.terms import OneSplat, Query
+from liftcore.query.terms import OneSplat
 from liftcore.text import LVIS_TABLE, RememberingEncoder
 from liftcore.text.table import TableEncoder
 from tests.api.tiny_scene import SPLATS_A_CLUSTER
@@ -57,25 +58,25 @@ def test_absent_words_select_nothing_and_present_ones_do(clip: QueryScene, table
     absent = np.random.default_rng(1).choice(others, 60, replace=False).tolist()
     for word in THINGS:
         found = ask(clip, word, table)
-        assert found.presence.present and found.count > 0 and "is there" in found.presence.why
+        assert found.present and found.count > 0 and "is there" in found.why
     answers = [ask(clip, word, table) for word in absent]
     assert sum(one.count == 0 for one in answers) >= 57
-    assert all((one.presence.present is False) == (one.count == 0) for one in answers)
+    assert all((one.present is False) == (one.count == 0) for one in answers)
 
 
 def test_absent_thing_shows_nothing_unless_kept(clip: QueryScene, table: TableEncoder) -> None:
     nothing = ask(clip, "sofa", table)
-    assert nothing.threshold == np.inf and nothing.explanation == nothing.presence.why
+    assert nothing.threshold.value == np.inf and nothing.threshold.explanation == nothing.why
     assert objects(clip, nothing).found == ()
     seen = view_mask(clip, nothing, "middle")
     assert not seen.mask.any() and not seen.attention.any()
     with pytest.raises(InvalidQuery, match="absent=keep"):
         object_splats(clip, nothing)
-    assert ask(clip, Query(("sofa",), threshold=0.0), table).count == 0
-    kept = ask(clip, Query(("sofa",), absent="keep"), table)
+    assert ask(clip, Query.of(("sofa",), threshold=0.0), table).count == 0
+    kept = ask(clip, Query.of(("sofa",), absent="keep"), table)
     assert kept.count > 0 and kept.presence == nothing.presence
     with pytest.raises(InvalidQuery, match="drop, keep"):
-        Query(("sofa",), absent="hide")
+        Query.of(("sofa",), absent="hide")
 
 
 def test_of_several_words_the_absent_ones_are_left_out(clip: QueryScene, table: TableEncoder) -> None:
@@ -83,13 +84,15 @@ def test_of_several_words_the_absent_ones_are_left_out(clip: QueryScene, table: 
         return np.array_equal(one.scores, other.scores) and np.array_equal(one.selected, other.selected)
 
     cat = ask(clip, "cat", table)
-    both = ask(clip, Query(("sofa", "cat")), table)
-    assert same(both, cat) and both.presence.present and "'sofa' is not there" in both.presence.why
-    assert not same(ask(clip, Query(("sofa", "cat"), absent="keep"), table), cat)
-    assert ask(clip, Query(("cat",), ("sofa",)), table).presence == cat.presence  # negatives are not questioned
-    example = Query((OneSplat(0), "sofa"))
-    assert same(ask(clip, example, table), ask(clip, Query((OneSplat(0),)))) and ask(clip, example, table).count > 0
-    assert ask(clip, Query((OneSplat(0),))).presence.present is None
+    both = ask(clip, Query.of(("sofa", "cat")), table)
+    assert same(both, cat) and both.present and "'sofa' is not there" in both.why
+    assert not same(ask(clip, Query.of(("sofa", "cat"), absent="keep"), table), cat)
+    assert ask(clip, Query.of(("cat",), ("sofa",)), table).presence == cat.presence  # negatives are not questioned
+    example = Query.of((OneSplat(0), "sofa"))
+    assert (
+        same(ask(clip, example, table), ask(clip, Query.of((OneSplat(0),)))) and ask(clip, example, table).count > 0
+    )
+    assert ask(clip, Query.of((OneSplat(0),))).present is None
 
 
 def test_references_that_mean_the_same_hide_nothing(clip: QueryScene, table: TableEncoder) -> None:
@@ -97,8 +100,8 @@ def test_references_that_mean_the_same_hide_nothing(clip: QueryScene, table: Tab
     near = table.encode(["cat"] * 30) + 0.01 * rng.normal(size=(30, 512))
     crowded = TableEncoder("crowded", (*table.words, *(f"cat {k}" for k in range(30))),
                            np.concatenate([table.embeddings, near]).astype(np.float32))  # fmt: skip
-    assert ask(clip, "cat", crowded).presence.present
-    assert ask(clip, "sofa", crowded).presence.present is False
+    assert ask(clip, "cat", crowded).present
+    assert ask(clip, "sofa", crowded).present is False
 
 
 def test_small_evidence_does_not_make_a_thing(clip: QueryScene, table: TableEncoder) -> None:
@@ -109,7 +112,7 @@ def test_small_evidence_does_not_make_a_thing(clip: QueryScene, table: TableEnco
     for weight, present in ((1e-4, False), (1.0, True)):
         evidence[-1] = weight
         lifted = QueryScene(replace(clip.lift, evidence=evidence.clone(), **given))
-        assert ask(lifted, "sofa", table).presence.present is present
+        assert ask(lifted, "sofa", table).present is present
 
 
 class Asked:
@@ -143,8 +146,8 @@ def test_an_encoder_makes_its_references_once(tmp_path: Path, monkeypatch: pytes
 def test_without_references_presence_is_not_known(clip: QueryScene, table: TableEncoder) -> None:
     axes = TableEncoder("axes", ("cat",), np.eye(512, dtype=np.float32)[:1])
     unknown = ask(clip, "cat", axes)
-    assert (unknown.presence.present, unknown.presence.presence) == (None, None) and unknown.count > 0
-    assert "200 words" in unknown.presence.why
+    assert (unknown.present, unknown.presence) == (None, None) and unknown.count > 0
+    assert "200 words" in unknown.why
     few = TableEncoder("few", ("cat", "sofa"), table.encode(["cat", "sofa"]))  # of CLIP's, as its vectors tell
     assert ask(clip, "sofa", few).presence == ask(clip, "sofa", table).presence
 

@@ -14,9 +14,10 @@ from liftcore.errors import InvalidQuery, NotFound
 from liftcore.query import objects as grouping
 from liftcore.query import render as module
 from liftcore.query import scene as scenes
-from liftcore.query.ask import Answer, ask
+from liftcore.query.ask import ask
 from liftcore.query.colours import NO_CLUSTER_COLOUR, cluster_colours
 from liftcore.query.objects import objects
+from liftcore.query.question import Answer, Query
 from liftcore.query.render import (
     attention_png,
     expected_depth,
@@ -30,7 +31,7 @@ from liftcore.query.render import (
 )  # fmt: skip
 from liftcore.query.scene import QueryScene
 from liftcore.query.splat_colours import principal_colours, seen_colours
-from liftcore.query.terms import Query, Region
+from liftcore.query.terms import Region
 from liftcore.raster.reference import ReferenceRaster
 from liftcore.scene.cameras import Camera, Cameras, behind_lens, drawn_by
 from liftcore.scene.compositing import CompositingParams
@@ -39,6 +40,8 @@ from liftcore.scene.harmonics import SH_C0
 from liftcore.scene.splats import Kernel, Splats
 from tests.api.tiny_scene import HEIGHT, SPLATS_A_CLUSTER, WIDTH
 from tests.scenes import look_at, random_camera, random_splats
+
+from .made_up import answer_with
 
 STRAY = 2 * SPLATS_A_CLUSTER + 5  # a splat of the third cluster
 
@@ -56,12 +59,12 @@ def scene(lifted: Path) -> QueryScene:
 
 def of(scene: QueryScene, *clusters: int, keep: str = "all", rows: tuple[int, ...] = ()) -> Answer:
     """An answer that selected these clusters and rows."""
-    answer = ask(scene, Query((Region("left", 0, 0),), threshold=0.5, keep=keep))
+    answer = ask(scene, Query.of((Region("left", 0, 0),), threshold=0.5, keep=keep))
     selected = np.zeros_like(answer.selected)
     for cluster in clusters:
         selected[cluster * SPLATS_A_CLUSTER : (cluster + 1) * SPLATS_A_CLUSTER] = True
     selected[list(rows)] = True
-    return replace(answer, selected=selected)
+    return answer_with(answer, selected=selected)
 
 
 def mostly(scene: QueryScene, members: np.ndarray) -> np.ndarray:
@@ -87,7 +90,7 @@ def test_a_mask_is_where_most_of_a_ray_is_of_what_was_found(scene: QueryScene) -
     seen = view_mask(scene, answer, "middle")
     assert seen.mask.shape == (HEIGHT, WIDTH)
     assert np.array_equal(seen.mask, mostly(scene, answer.selected)) and "2 objects that were f" in seen.explanation
-    kept = view_mask(scene, replace(answer, query=replace(answer.query, keep="largest")), "middle")
+    kept = view_mask(scene, answer_with(answer, keep="largest"), "middle")
     assert np.array_equal(kept.mask, mostly(scene, objects(scene, answer).numbers == 0))
     assert 0 < int(kept.mask.sum()) < int(seen.mask.sum())
     nothing = view_mask(scene, of(scene), "middle")
@@ -116,7 +119,7 @@ def test_of_very_many_splats_strays_stay(scene: QueryScene, monkeypatch: pytest.
     seen = view_mask(scene, answer, "middle")
     assert np.array_equal(seen.mask, mostly(scene, answer.selected))
     assert f"all {answer.count} selected splats" in seen.explanation
-    largest = replace(answer, query=replace(answer.query, keep="largest"))
+    largest = answer_with(answer, keep="largest")
     assert "1 object" in view_mask(scene, largest, "middle").explanation
     monkeypatch.setattr(grouping, "MOST_SPLATS", answer.count - 1)
     assert view_mask(scene, answer, "middle").mask.any()
@@ -169,7 +172,7 @@ def test_pictures_have_the_size_and_the_mode_they_promise(scene: QueryScene) -> 
 
 
 def test_pictures_have_a_limit(scene: QueryScene, monkeypatch: pytest.MonkeyPatch) -> None:
-    answer = ask(scene, Query((Region("left", 0, 0),)))
+    answer = ask(scene, Query.of((Region("left", 0, 0),)))
 
     def draw(what: str) -> object:
         return view_mask(scene, answer, "middle") if what == "mask" else render_png(scene, "middle", what)

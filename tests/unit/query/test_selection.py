@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from liftcore.query.ask import answers, ask, question
+from liftcore.query.question import Query
 from liftcore.query.scene import QueryScene
-from liftcore.query.terms import Query
 from liftcore.query.threshold import METHODS, find_threshold
 from liftcore.text import LVIS_TABLE
 from liftcore.text.table import TableEncoder
@@ -54,28 +54,28 @@ def thin(scene: QueryScene, table: TableEncoder) -> QueryScene:
 
 
 def test_thin_thing_does_not_take_the_scene(thin: QueryScene, table: TableEncoder) -> None:
-    scores = ask(thin, Query(("cat",), threshold=0.0), table).scores
+    scores = ask(thin, Query.of(("cat",), threshold=0.0), table).scores
     plain = scores >= find_threshold(scores).value
     assert plain.mean() > 0.5  # which the histogram alone selects
     answer = ask(thin, "cat", table)
-    assert answer.presence.present is not False
+    assert answer.present is not False
     assert answer.selected[THINGS == 0].mean() > 0.4
     assert answer.selected.sum() < 3 * CAT
-    assert "other words are nearer" in answer.explanation
+    assert "other words are nearer" in answer.threshold.explanation
     for method in ("otsu", 0.0):  # what was asked for by name is done as asked
-        found = ask(thin, Query(("cat",), threshold=method), table)
-        assert np.array_equal(found.selected, found.scores >= np.float32(found.threshold))
+        found = ask(thin, Query.of(("cat",), threshold=method), table)
+        assert np.array_equal(found.selected, found.scores >= np.float32(found.threshold.value))
 
 
 def test_competition_keeps_what_the_histogram_finds_well(thin: QueryScene, table: TableEncoder) -> None:
     answer = ask(thin, "curtain", table)
-    assert answer.threshold == find_threshold(answer.scores).value
-    assert np.array_equal(answer.selected, answer.scores >= np.float32(answer.threshold))
+    assert answer.threshold.value == find_threshold(answer.scores).value
+    assert np.array_equal(answer.selected, answer.scores >= np.float32(answer.threshold.value))
     assert answer.selected[THINGS == 2].mean() > 0.9 and answer.clear
 
 
 def test_selection_has_the_same_bits_together_and_alone(thin: QueryScene, table: TableEncoder) -> None:
-    asked = [question(thin, Query((word,), absent="keep"), table) for word in ("cat", "cow", "sofa")]
+    asked = [question(thin, Query.of((word,), absent="keep"), table) for word in ("cat", "cow", "sofa")]
     for together, one in zip(answers(thin, asked), asked, strict=True):
         (alone,) = answers(thin, [one])
         assert np.array_equal(together.selected, alone.selected) and together.threshold == alone.threshold
@@ -89,9 +89,9 @@ def test_equal_or_zero_scores_select_nothing_and_say_why(
     rows = np.zeros((60, 4))
     rows[:, :2] = level, (1 - level**2) ** 0.5
     axis = TableEncoder("axis", ("x",), np.eye(4, dtype=np.float32)[:1])
-    answer = ask(lifted(scene, rows), Query(("x",), threshold=method), axis)
+    answer = ask(lifted(scene, rows), Query.of(("x",), threshold=method), axis)
     assert answer.count == 0 and not answer.clear
-    assert answer.threshold == np.inf and "nothing is selected" in answer.explanation
+    assert answer.threshold.value == np.inf and "nothing is selected" in answer.threshold.explanation
 
 
 def test_words_of_a_pack_compete_with_each_other(scene: QueryScene) -> None:
@@ -101,11 +101,11 @@ def test_words_of_a_pack_compete_with_each_other(scene: QueryScene) -> None:
     rows[20:40, 0] = 0.9  # nearer to the second word, and like the first
     rows = noisy(rows, 0.02)
     pack = TableEncoder("pack", ("one", "two", "three", "first"), axes[[0, 1, 2, 0]])
-    plain = find_threshold(ask(lifted(scene, rows), Query(("one",), threshold=0.0), pack).scores).value
-    assert (ask(lifted(scene, rows), Query(("one",), threshold=plain), pack).selected).sum() == 40
+    plain = find_threshold(ask(lifted(scene, rows), Query.of(("one",), threshold=0.0), pack).scores).value
+    assert (ask(lifted(scene, rows), Query.of(("one",), threshold=plain), pack).selected).sum() == 40
     answer = ask(lifted(scene, rows), "one", pack)  # "first" is the same word, and takes nothing
     assert np.flatnonzero(answer.selected).tolist() == list(range(20))
-    both = ask(lifted(scene, rows), Query(("one", "two")), pack)
+    both = ask(lifted(scene, rows), Query.of(("one", "two")), pack)
     assert np.flatnonzero(both.selected).tolist() == list(range(40))
 
 
@@ -114,10 +114,10 @@ def test_what_hubs_hide_is_not_sure_and_shown(scene: QueryScene, table: TableEnc
     words = [word for word in ("cat", "boat", "pizza") for _ in range(200)]
     drawn = lifted(scene, pictures(table, words, 0.2, hub=0.3))
     found = ask(drawn, "pizza", table)
-    assert found.presence.present is None and "not sure" in found.presence.why
-    assert found.presence.presence is not None and found.presence.presence < 0.5
+    assert found.present is None and "not sure" in found.why
+    assert found.presence is not None and found.presence < 0.5
     assert found.selected[400:].mean() > 0.9 and found.count < 300
-    assert ask(drawn, "sofa", table).presence.present is False
+    assert ask(drawn, "sofa", table).present is False
 
 
 def test_thing_that_is_mostly_selected_is_taken_whole_unless_it_holds_two(

@@ -22,14 +22,15 @@ from liftcore.lifting.engines.lift import steps_in_blocks
 from liftcore.lifting.files import lift_files
 from liftcore.lifting.inputs import LiftInputs
 from liftcore.lifting.planning.views import visibility
-from liftcore.query.ask import ask, top
+from liftcore.query.ask import ask, located
 from liftcore.query.catalogue import catalogue, table_csv
 from liftcore.query.labels import labels
 from liftcore.query.objects import objects
+from liftcore.query.question import Query
 from liftcore.query.render import expected_depth, render
 from liftcore.query.scene import QueryScene
 from liftcore.query.segment import segment
-from liftcore.query.terms import Query, Vector
+from liftcore.query.terms import Vector
 from liftcore.raster.reference import dense_view
 from liftcore.runtime.progress import Timings
 from liftcore.scene.cameras import Camera, Cameras, viewmat_of
@@ -219,15 +220,15 @@ def asked_of(splats: Splats, cameras: Cameras, views: dict[str, Any]) -> dict[st
     lift = lc.lift(splats, cameras, views, LiftSettings.of(dtype="float32"))
     scene = QueryScene(lift, splats, cameras)
     vectors = np.eye(6, dtype=np.float32)[:2]
-    answer = ask(scene, Query((Vector(tuple(vectors[0].tolist())),), threshold=0.2, absent="keep"))
-    best, parts = top(answer, scene, 5), objects(scene, answer)
+    answer = ask(scene, Query.of((Vector(tuple(vectors[0].tolist())),), threshold=0.2, absent="keep"))
+    best, parts = located(scene, answer, 5), objects(scene, answer)
     words = segment(scene, ["one", "two"], vectors)
     told = labels(scene, words).document
     whole = replace(lift, object=torch.arange(len(lift.features)).int() % 2, object_views=torch.zeros(2, 5).int())
     things = catalogue(QueryScene(whole, splats, cameras))
     rows = [line.split(",")[5:14] for line in table_csv(things).decode().splitlines()[1:]]
     return {
-        "top": [one.position for one in best.best],
+        "top": [one.position for one in best.top],
         "box": best.box,
         "objects": [point for one in parts.found for point in (one.centre, *one.box)],
         "words": [point for one in words.found for point in one.box],

@@ -163,8 +163,8 @@ def test_things_all_around_are_found_and_asked_by_their_masks() -> None:
     scene = QueryScene(result, splats, cameras, as_views({"pano": regions}))
     camera = cameras["pano@back"]
     [found] = regions_at(scene, "pano@back", camera.width // 2, camera.height // 2)
-    assert found.example == Region("pano@back", 0, 0)  # the heap behind
-    assert region_mask(scene, found.example).shape == (camera.height, camera.width)
+    assert found.example == "region:pano@back:0:0"  # the heap behind
+    assert region_mask(scene, Region("pano@back", 0, 0)).shape == (camera.height, camera.width)
     with pytest.raises(NotFound):
         regions_at(scene, "other@back", 1, 1)
 

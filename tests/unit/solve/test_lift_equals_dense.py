@@ -17,9 +17,10 @@ from liftcore.io.splats import read_splats, write_splats
 from liftcore.lifting.files import lift_files
 from liftcore.lifting.geometry import strided
 from liftcore.query.directions import directions
+from liftcore.query.question import Query
 from liftcore.query.result import LiftResult, load_lift
 from liftcore.query.scene import QueryScene
-from liftcore.query.terms import Query, Region
+from liftcore.query.terms import Region
 from liftcore.raster.reference import counted_weights, dense_view, reading_matrix, strided_rays
 from liftcore.scene.cameras import Cameras
 from liftcore.scene.compositing import CompositingParams, Selection, Weighting
@@ -254,7 +255,7 @@ def test_folders_before_the_names_of_views_change_no_bit(tmp_path):
     regions = observed(3, 1)
     assert isinstance(regions, Regions)
     label = int(regions.labels[0].max())  # the region is asked for by the lift's name of the view
-    (direction,) = directions(QueryScene.open(tmp_path / "rig.lift"), Query((Region("v1", 0, label),)), None)
+    (direction,) = directions(QueryScene.open(tmp_path / "rig.lift"), Query.of((Region("v1", 0, label),)), None)
     expected = torch.nn.functional.normalize(regions.codebook[label], dim=0)
     assert torch.allclose(torch.as_tensor(direction), expected, atol=1e-3)
 

@@ -10,9 +10,9 @@ import torch
 
 import liftcore as lc
 from liftcore.query.ask import ask
+from liftcore.query.question import Query
 from liftcore.query.render import view_mask
 from liftcore.query.scene import QueryScene
-from liftcore.query.terms import Query
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.text.table import TableEncoder
 from tests.benchmarks.base import mask_iou
@@ -55,7 +55,7 @@ class Scene:
         }
 
     def _iou(self, scene: QueryScene, thing: str, view: str) -> float:
-        mask = view_mask(scene, ask(scene, Query((thing,), absent="keep"), self.encoder), view).mask
+        mask = view_mask(scene, ask(scene, Query.of((thing,), absent="keep"), self.encoder), view).mask
         return mask_iou(mask, self.truth[view] == self.made.things.index(thing))
 
 

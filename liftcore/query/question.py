@@ -1,0 +1,451 @@
+"""A question to a lift and its answer, as every face has them.
+
+The fields of `Query` are the parameters and bodies of HTTP, the frames of its worker and the options of the command
+line; those of `Answer` are what HTTP answers, and ``answer`` of ``--json``. A field is declared here alone.
+Nothing here loads numpy or torch: help and the HTTP process do without.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    PlainSerializer,
+    PrivateAttr,
+    model_validator,
+)
+from pydantic_core import CoreSchema, core_schema
+
+from liftcore.errors import InvalidQuery
+from liftcore.query.terms import NOTATIONS, Example, OneSplat, Pixel, Region, Term, Vector, parse_example
+from liftcore.runtime.fields import Body, NoBoolean, takes
+from liftcore.scene.compositing import MAX_SIDE
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from liftcore.scene.cameras import Camera
+
+MOST_TERMS = 64  # for and against together
+MOST_INSTANCES = 100
+VIEW_CHARACTERS = 500  # of a view's name
+Point = tuple[float, float, float]  # x y z, world frame, scene units
+
+
+def _several(given: Any) -> Any:
+    return [given] if isinstance(given, str) else given
+
+
+def _examples(given: Any) -> Any:
+    """Examples as JSON has them: notations, and vectors as numbers."""
+    if isinstance(given, str | Example):
+        return [_plain(given)]
+    if hasattr(given, "ndim"):
+        given = given.tolist() if given.ndim == 2 else [given.tolist()]
+    return list(map(_plain, given)) if isinstance(given, list | tuple) else given
+
+
+def _plain(example: Any) -> Any:
+    if isinstance(example, Vector):
+        return example.values
+    return str(example) if isinstance(example, Pixel | Region | OneSplat) else example
+
+
+def _camera(given: Any) -> Any:
+    return OwnCamera.of(given) if hasattr(given, "K") else given
+
+
+Notation = Annotated[str, Field(min_length=1, max_length=600, description=NOTATIONS)]
+Numbers = Annotated[tuple[float, ...], Field(min_length=1)]
+Texts = Annotated[list[str], BeforeValidator(_several)]
+Examples = Annotated[
+    list[Annotated[Notation | Numbers, takes(f"{NOTATIONS}, or a vector")]], BeforeValidator(_examples)
+]
+Method = Literal["auto", "valley", "paper", "otsu", "stability"]
+METHODS: tuple[str, ...] = get_args(Method)
+Score = Annotated[float, Field(ge=-1, le=1), NoBoolean]  # a cosine, which NaN is not
+Cut = Annotated[Method | Score, takes(f"{', '.join(METHODS)}, or a number from -1 to 1")]
+Count = Annotated[int, Field(ge=1, le=MOST_INSTANCES), NoBoolean]
+ViewName = Annotated[str, Field(min_length=1, max_length=VIEW_CHARACTERS)]
+Coordinate = Annotated[float, Field(allow_inf_nan=False), NoBoolean]
+Pixels = Annotated[int, Field(ge=1, le=MAX_SIDE), NoBoolean]
+Row4 = Annotated[list[Coordinate], Field(min_length=4, max_length=4)]
+Rendered = Literal["rgb", "depth", "pca", "cluster", "confidence"]
+
+
+class OwnCamera(Body):
+    """A camera that no file has, in the frame of the splats; an entry of GET /lifts/{lift}/views is one, too."""
+
+    width: Pixels = Field(description="pixels")
+    height: Pixels
+    fx: Coordinate = Field(description="pixels, like fy, cx and cy")
+    fy: Coordinate | None = Field(default=None, description="fx if left out")
+    cx: Coordinate | None = Field(default=None, description="from the left edge; the middle if left out, as cy")
+    cy: Coordinate | None = None
+    viewmat: Annotated[list[Row4], Field(min_length=4, max_length=4)] = Field(
+        description="[4, 4], world to camera, rigid; OpenCV axes: x right, y down, z forward"
+    )
+    name: ViewName = "camera"
+    lifted: bool | None = Field(default=None, description="of no meaning here, like photo")
+    photo: bool | None = None
+
+    @classmethod
+    def of(cls, camera: Camera, name: str = "") -> Self:
+        """A camera as JSON takes it; of a distorted photo the pinhole that stands for it."""
+        numbers = {"fx": camera.fx, "fy": camera.fy, "cx": camera.K[0, 2].item(), "cy": camera.K[1, 2].item()}
+        size = {"width": camera.width, "height": camera.height}
+        return cls(name=name or camera.name or "camera", viewmat=camera.viewmat.tolist(), **size, **numbers)
+
+    def camera(self) -> Camera:
+        """The same as pictures are drawn by.
+
+        Raises:
+            InvalidCameras: its numbers are none of a pinhole.
+        """
+        from liftcore.scene.cameras import Camera
+
+        fy = self.fx if self.fy is None else self.fy
+        cx, cy = (side / 2 if at is None else at for at, side in ((self.cx, self.width), (self.cy, self.height)))
+        return Camera.pinhole(self.name, self.width, self.height, self.fx, fy, cx, cy, self.viewmat)
+
+
+class Seen(Body):
+    """Where a picture is seen from."""
+
+    view: ViewName | None = Field(
+        default=None, description="the name of a camera, for pictures and for links to them"
+    )
+    camera: Annotated[OwnCamera | None, BeforeValidator(_camera)] = Field(
+        default=None, description="for pictures, in place of a view"
+    )
+
+    def seen_from(self) -> str | Camera:
+        """The camera of a picture.
+
+        Raises:
+            InvalidQuery: neither is there, or both are.
+        """
+        if (self.view is None) == (self.camera is None):
+            got = "nothing" if self.view is None else "both"
+            raise InvalidQuery("view", expected="a view's name or a camera", got=got)
+        return self.camera.camera() if self.camera is not None else str(self.view)
+
+
+class Picture(Seen):
+    """A picture of the scene."""
+
+    what: Rendered = Field(
+        default="rgb",
+        description="the splats' colours, expected depth, three principal components of features, clusters, or how "
+        "far views agree",
+    )
+
+
+class Query(Seen):
+    """What is looked for, and how to find it: words and examples, for and against, make one query.
+
+    Texts need an encoder of the lift's text space, examples need none. The scores are defined in
+    ``liftcore.query.scores.combine``.
+
+    Raises:
+        InvalidQuery: no positive, too many terms, an unknown choice, or a number out of its range.
+    """
+
+    model_config = ConfigDict(frozen=True)
+    error_type: ClassVar = InvalidQuery
+
+    text: Texts = Field(default=[], description="what to look for; may be given several times")
+    like: Examples = Field(default=[], description="an example of it, or a vector; may be given several times")
+    negatives: Texts = Field(default=[], description="what it is not; may be given several times")
+    unlike: Examples = Field(default=[], description="an example of what it is not, likewise")
+    threshold: Cut = Field(
+        default="auto",
+        description=f"{', '.join(METHODS)} or a number from -1 to 1: how to find it, or the score from which a splat "
+        "counts as found",
+    )
+    instances: Count | None = Field(
+        default=None, description="how many there are: so many objects are kept, the best"
+    )
+    keep: Literal["all", "largest"] = Field(
+        default="all", description="of what was found, in masks, splats and objects"
+    )
+    absent: Literal["drop", "keep"] = Field(
+        default="drop", description="words for what is not there: select nothing for them, or what is most like them"
+    )
+    weigh: Literal["evidence", "confidence"] = Field(
+        default="evidence",
+        description="what splats count by in the threshold's histogram and in objects; confidence: times it",
+    )
+    top: Annotated[int, Field(ge=0, le=1000), NoBoolean] = Field(
+        default=10, description="how many of the best splats to list"
+    )
+
+    @classmethod
+    def of(cls, positives: Iterable[Term] | str, negatives: Iterable[Term] | str = (), **others: Any) -> Self:
+        """A query of terms, each a text or an example; texts come before examples."""
+        sides = [list(_several(terms)) for terms in (positives, negatives)]
+        (text, like), (against, unlike) = (
+            ([term for term in side if isinstance(term, str)], [term for term in side if not isinstance(term, str)])
+            for side in sides
+        )
+        return cls(text=text, like=like, negatives=against, unlike=unlike, **others)
+
+    @model_validator(mode="after")
+    def _asks(self) -> Self:
+        against = bool(self.negatives or self.unlike)
+        if not (self.text or self.like):
+            raise InvalidQuery(
+                "query", expected="a text or an example of what to look for",
+                got="only what it is not" if against else "neither",
+                hint="say what to look for, too" if against else "",
+            )  # fmt: skip
+        count = sum(map(len, (self.text, self.like, self.negatives, self.unlike)))
+        if count > MOST_TERMS:
+            raise InvalidQuery("query", expected=f"at most {MOST_TERMS} texts and examples", got=str(count))
+        return self
+
+    @classmethod
+    def deciding(cls) -> list[str]:
+        """The fields that decide what is found; the others say what is listed of it, and where from."""
+        return [name for name in cls.model_fields if name not in {*Seen.model_fields, "top"}]
+
+    @cached_property
+    def positives(self) -> tuple[Term, ...]:
+        """Texts and examples of what to look for."""
+        return (*self.text, *_parsed(self.like, "like"))
+
+    @cached_property
+    def terms(self) -> tuple[Term, ...]:
+        """Positives, then negatives."""
+        return (*self.positives, *self.negatives, *_parsed(self.unlike, "unlike"))
+
+    @property
+    def places(self) -> list[str]:
+        """The field and the place in it of each of the terms, as errors over HTTP name them."""
+        names = ("text", "like", "negatives", "unlike")
+        return [f"{name}.{place}" for name in names for place in range(len(getattr(self, name)))]
+
+    @property
+    def keeps_some(self) -> bool:
+        """Whether some of the objects are kept and others not, as all else than outliers is."""
+        return self.keep == "largest" or self.instances is not None
+
+    @property
+    def texts(self) -> list[str]:
+        """The texts among the terms, in their order."""
+        return [*self.text, *self.negatives]
+
+
+def _parsed(examples: list[Any], field: str) -> list[Example]:
+    return [
+        parse_example(one, f"{field}.{place}") if isinstance(one, str) else Vector(tuple(one))
+        for place, one in enumerate(examples)
+    ]
+
+
+class Box(NamedTuple):
+    """An axis-aligned box, world frame."""
+
+    low: Point
+    high: Point
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """In JSON an object with ``low`` and ``high``."""
+        return core_schema.no_info_before_validator_function(
+            lambda given: given if isinstance(given, dict) else {"low": given[0], "high": given[1]},
+            core_schema.no_info_after_validator_function(lambda box: cls(**vars(box)), handler(Corners)),
+            serialization=core_schema.plain_serializer_function_ser_schema(
+                lambda box: Corners(low=box.low, high=box.high), return_schema=handler(Corners)
+            ),
+        )
+
+
+class Corners(BaseModel):
+    """An axis-aligned box, world frame, as JSON has it."""
+
+    low: Point = Field(description="x y z")
+    high: Point
+
+
+class Value(BaseModel):
+    """A part of an answer."""
+
+    model_config = ConfigDict(frozen=True, defer_build=True)
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+class Threshold(Value):
+    """Which scores count as found, and why."""
+
+    value: Annotated[
+        float,
+        BeforeValidator(lambda value: math.inf if value is None else value),
+        PlainSerializer(_finite, return_type=float | None, when_used="json"),
+        Field(description="null when no score stands out, or nothing asked for is there"),
+    ]
+    method: str
+    explanation: str = Field(description="one sentence on how it was found")
+    clear: bool = Field(default=True, exclude=True)  # whether the scores have what the method looks for
+
+
+class Presence(Value):
+    """Whether what was asked for is there."""
+
+    present: bool | None = Field(description="whether it is there; null when not known or not sure")
+    presence: float | None = Field(description="how sure that is, in 0..1: there from 0.5 on; null when not known")
+    why: str = Field(description="one sentence on how it is known whether it is there, or why it is not")
+
+
+class Found(Presence):
+    """How much was found."""
+
+    threshold: Threshold
+    count: int = Field(description="splats that were selected")
+    clear: bool = Field(description="whether what was found stands apart")
+
+
+class TopSplat(Value):
+    """One of the best splats."""
+
+    splat: int = Field(description="row in the splat file")
+    score: float
+    position: Point = Field(description="x y z, world frame")
+
+
+class Answer(Found):
+    """Where in a scene is what was asked for."""
+
+    text: list[str]
+    like: list[str] = Field(description="the examples, in their notation; vectors by their length")
+    statistics: Mapping[str, Any] = Field(description="of the scores over the seen splats")
+    top: tuple[TopSplat, ...] = ()
+    box: Box | None = Field(default=None, description="around all selected splats, outliers too: see objects")
+    _query: Query = PrivateAttr()
+    _arrays: tuple[np.ndarray, np.ndarray, np.ndarray] = PrivateAttr()
+
+    @classmethod
+    def of(cls, query: Query, scores: np.ndarray, seen: np.ndarray, selected: np.ndarray, **fields: Any) -> Self:
+        """An answer with what was asked and a value a splat, which JSON leaves out."""
+        answer = cls(
+            text=query.text,
+            like=[example if isinstance(example, str) else str(Vector(example)) for example in query.like],
+            count=int(selected.sum()),
+            **fields,
+        )
+        answer._query, answer._arrays = query, (scores, seen, selected)
+        return answer
+
+    @property
+    def query(self) -> Query:
+        """What was asked."""
+        return self._query
+
+    @property
+    def scores(self) -> np.ndarray:
+        """[P] f32 in -1..1 (`liftcore.query.scores.combine`); the minimum where a splat was not seen."""
+        return self._arrays[0]
+
+    @property
+    def seen(self) -> np.ndarray:
+        """[P] bool, whether a splat has a feature."""
+        return self._arrays[1]
+
+    @property
+    def selected(self) -> np.ndarray:
+        """[P] bool, the splats that answer (`liftcore.query.ask`)."""
+        return self._arrays[2]
+
+    @property
+    def dropped(self) -> bool:
+        """Whether it is not there, so that nothing is selected and pictures show nothing."""
+        return self.present is False and self.query.absent == "drop"
+
+
+class FoundObject(Value):
+    """Selected splats that hang together."""
+
+    splats: int = Field(description="how many")
+    share: float = Field(description="of the evidence of all selected splats, or of what `weigh` says")
+    score: float = Field(description="the mean of its splats' scores, by the same")
+    centre: Point = Field(description="the middle of its box: x y z, world frame")
+    box: Box = Field(description="of its splats' centres, but for a thousandth of the evidence at each end")
+
+
+class Objects(Value):
+    """What an answer found, thing by thing."""
+
+    objects: tuple[FoundObject, ...] = Field(description="those with the most evidence first")
+    strays: int = Field(description="selected splats in none of them")
+    _numbers: np.ndarray = PrivateAttr()
+
+    @classmethod
+    def of(cls, objects: Iterable[FoundObject], numbers: np.ndarray, strays: int) -> Self:
+        """Objects with the number of each splat's, which JSON leaves out."""
+        made = cls(objects=tuple(objects), strays=strays)
+        made._numbers = numbers
+        return made
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """[P] i32, the place in ``objects`` of each splat's object; -1 for none."""
+        return self._numbers
+
+    @property
+    def found(self) -> tuple[FoundObject, ...]:
+        """The objects."""
+        return self.objects
+
+
+class NamedSplats(Value):
+    """A word that is there."""
+
+    word: str
+    row: int = Field(description="among the words that were asked")
+    splats: int = Field(description="how many it names")
+    share: float = Field(description="of the evidence of all seen splats")
+    score: float = Field(description="the mean cosine of its splats, by evidence")
+    margin: float = Field(description="the mean of how much nearer they are to it than to the nearest other word")
+    threshold: float = Field(description="of its cosines")
+    box: Box = Field(description="of its splats' centres, but for a thousandth of the evidence at each end")
+
+
+class BestWord(Value):
+    """How like a word something is."""
+
+    word: str
+    score: float = Field(description="their cosine")
+
+
+class SceneObject(Value):
+    """A thing that masks of many views keep together."""
+
+    id: int = Field(description="the same for the same lift; 0 has the most evidence")
+    name: str | None = Field(description="the nearest word of the vocabulary; null without one")
+    score: float | None = Field(description="its cosine with the object's mean feature")
+    splats: int = Field(description="how many")
+    share: float = Field(description="of the evidence of all splats")
+    centre: Point = Field(description="the middle of its box: x y z, frame of the splat file")
+    box: Box = Field(description="of its largest group of splats that touch, without outliers elsewhere")
+    views: tuple[str, ...] = Field(description="that show most of it, the best first")
+
+
+class CoveringRegion(Value):
+    """A region that covers a pixel."""
+
+    example: str = Field(description="its notation, for like and unlike")
+    view: str
+    level: int = Field(description="of the view's label map")
+    region: int = Field(description="its label there")
+    share: float = Field(description="of the view's pixels that it covers")
