@@ -18,6 +18,7 @@ mask. A pixel has no label where nobody decided what it shows: what ``unlabelled
 mask, and all that no mask covers in a view that was not searched for every phrase.
 """
 
+import csv
 import json
 import re
 from collections import Counter
@@ -52,8 +53,12 @@ LEGEND = "legend"  # the text of a label picture that names its values
 LAYOUTS = "PHRASE/VIEW.png, VIEW.json with run lengths or polygons, or label pictures VIEW.png with --names"
 PICTURE = ".png"
 LABELMAP = re.compile(r":[0-9]+,[0-9]+,[0-9]+:.*$")  # what CVAT writes behind a name: its colour, parts and actions
-NUMBERED = re.compile(r"([0-9]{1,6})\s*[,:;=\t]\s*(.*\S)")
-HEADER = re.compile(r"\w+\s*[,:;=\t]\s*\w+")
+NUMBERED = re.compile(r"([0-9]{1,6})(?:\s*[,:;=]\s*|\s+)(.*\S)")
+NAMED = re.compile(r"(.*\S)\s*[,:;=\t]\s*([0-9]{1,6})")
+TABLES = {".csv": ",", ".tsv": "\t"}  # files of names with columns, and what parts these
+VALUE_COLUMNS = ("id", "value", "pixel value", "idx", "index", "number", "label id")
+NAME_COLUMNS = ("name", "class", "class name", "label", "label name", "category", "phrase")
+NAME_LISTS = ("id2label", "categories", "classes", "labels", "names")  # of Hugging Face, COCO and others
 OTHER_FILES = {
     **dict.fromkeys((".jpg", ".jpeg"), "JPEG blurs the edges of masks: write them as PNG"),
     **dict.fromkeys((".bmp", ".tif", ".tiff", ".webp", ".gif"), "convert them to PNG"),
@@ -335,25 +340,59 @@ def _add_ids(
 
 def _names(path: Path) -> dict[int, str]:
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise InvalidFeatures("--names", expected="a file of names", got=str(error)[:120]) from None
-    if path.suffix.lower() == ".json":
+    suffix = path.suffix.lower()
+    if suffix in (".yml", ".yaml"):
+        hint = 'write its values and names as JSON, {"1": "red mug"}; 0 is what no mask covers'
+        raise InvalidFeatures("--names", expected="JSON, a table (.csv, .tsv) or a text", got=path.name, hint=hint)
+    if suffix == ".json":
         return _numbered(_parsed(text), str(path))
-    return _listed(text.splitlines())
+    found = _tabled(text, TABLES[suffix], path) if suffix in TABLES else _listed(text.splitlines())
+    if not found:
+        raise InvalidFeatures("--names", expected="a file of names", got=f"none in {path.name}")
+    return found
+
+
+def _tabled(text: str, separator: str, path: Path) -> dict[int, str]:
+    """Names by their values, of a table: columns that its first row calls so, or its only two, in any order.
+
+    Of a single column the k-th name is of the value k, as of lines.
+    """
+    rows = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines(), delimiter=separator)]
+    rows = [row for row in rows if any(row)]
+    if all(len(row) == 1 for row in rows):
+        return _listed([row[0] for row in rows])
+    has_header = bool(rows) and not any(map(str.isdecimal, rows[0]))
+    header = [cell.lower().replace("_", " ") for cell in rows[0]] if has_header else []
+    columns = [*zip(*rows[has_header:], strict=False)]
+    values = [place for place, column in enumerate(columns) if all(map(str.isdecimal, column))]
+    value = next((place for place in values if header and header[place] in VALUE_COLUMNS), None)
+    name = next((header.index(known) for known in NAME_COLUMNS if known in header[: len(columns)]), None)
+    if len(columns) == 2 and len(values) == 1:
+        value, name = values[0], 1 - values[0]
+    if value is None or name is None or name == value:
+        got = f"columns {', '.join(header or rows[0])}"[:80]
+        raise InvalidFeatures(str(path), expected="a column 'id' of values and one 'name'", got=got)
+    return {int(row[value]): row[name] for row in zip(*columns, strict=True) if row[name]}
 
 
 def _listed(lines: Sequence[str]) -> dict[int, str]:
     """Names by their values, of lines: the k-th names the value k, unless the lines have numbers of their own.
 
     A first line ``background`` (``_background_`` of LabelMe) names 0. Lines that begin with ``#`` are none, nor is
-    LabelMe's ``__ignore__``; of CVAT's ``labelmap.txt``, ``red mug:128,0,0::``, the name counts.
+    LabelMe's ``__ignore__``; of CVAT's ``labelmap.txt``, ``red mug:128,0,0::``, the name counts. Numbers stand before
+    the names or, behind a separator, after different ones; a first line without one is a header.
     """
     named = [line.strip() for line in lines if not line.lstrip().startswith("#") and line.strip() != "__ignore__"]
     named = [LABELMAP.sub("", line) for line in named]
-    values = [NUMBERED.match(line) for line in named if line]
-    if values[1:] and all(values[1:]) and (values[0] or HEADER.fullmatch(named[0])):  # which may be "id,name"
-        return {int(found[1]): found[2] for found in values if found}
+    for pattern, value, name in ((NUMBERED, 1, 2), (NAMED, 2, 1)):
+        found = [pattern.fullmatch(line) for line in named if line]
+        pairs = {int(match[value]): match[name] for match in found if match}
+        is_whole = bool(found[1:]) and all(found[1:]) and len(pairs) >= len(found) - (found[0] is None)
+        if is_whole and (name > value or len({*pairs.values()}) == len(pairs)):
+            return pairs
     first = 0 if named and named[0].strip("_").lower() == "background" else 1
     return {value: line for value, line in enumerate(named, start=first) if line}
 
@@ -368,24 +407,30 @@ def _parsed(text: str) -> Any:
 def _numbered(told: Any, where: str) -> dict[int, str]:
     """Names by their values, of JSON from values to names or from names to values, or of a list.
 
-    The first of a list names the value 1, unless it is of COCO's categories, ``id`` and ``name``. Hugging Face's
-    ``id2label`` counts where there is one.
+    A list names values as lines do (`_listed`), unless it is of COCO's categories, ``id`` and ``name``. Of an object
+    with one of NAME_LISTS that counts.
     """
-    told = told.get("id2label", told) if isinstance(told, dict) else told
+    if isinstance(told, dict):
+        told = next((told[key] for key in NAME_LISTS if isinstance(told.get(key), dict | list)), told)
     is_inverse = isinstance(told, dict) and not any(str(name).strip().isdecimal() for name in told)
     if is_inverse and told and all(type(value) is int for value in told.values()):
         told = {value: name for name, value in told.items()}
     elif isinstance(told, list) and told and all(isinstance(one, dict) for one in told):
         told = {one.get("id"): one.get("name") for one in told}
-    if isinstance(told, list):
-        told = dict(enumerate(told, start=1))
+    if isinstance(told, list) and all(isinstance(name, str) for name in told):
+        told = _listed(told)
     try:
-        named = {int(value): name for value, name in told.items()}
+        named = {int(value): _name_in(name) for value, name in told.items()}
     except (AttributeError, TypeError, ValueError):
         named = {}
     if not named or not all(isinstance(name, str) and name.strip() for name in named.values()):
         raise InvalidFeatures(where, expected='JSON of values and names, {"1": "red mug"}', got="none")
     return named
+
+
+def _name_in(entry: Any) -> Any:
+    """The name of a value, which may be an object with it."""
+    return entry.get("name") if isinstance(entry, dict) else entry
 
 
 def _documents(

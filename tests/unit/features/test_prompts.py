@@ -144,7 +144,17 @@ NAMES = {  # the same names for values 1 and 2
     "labelmap.txt": "# label:color_rgb:parts:actions\nbackground:0,0,0::\nred_apple:128,0,0::\nLamp:0,128,0::\n",
     "lines.txt": "red_apple\nLamp\n",
     "labels.txt": "__ignore__\n_background_\nred_apple\nLamp\n",
+    "windows.txt": "\ufeffred_apple\r\nLamp\r\n",
+    "spaces.txt": "0 background\n1 red_apple\n2 Lamp\n",
+    "behind.txt": "red_apple: 1\nLamp: 2\n",
     "numbers.csv": "id,name\n1,red_apple\n2,Lamp\n",
+    "behind.csv": '\ufeffname,id\n"red_apple",1\nLamp,2\n',
+    "_classes.csv": "Pixel Value, Class\n0, background\n1, red_apple\n2, Lamp\n",
+    "columns.csv": "Idx,Ratio,Train,Name\n1,0.2,20,red_apple\n2,0.1,10,Lamp\n",
+    "table.tsv": "1\tred_apple\n2\tLamp\n",
+    "list.json": ["background", "red_apple", "Lamp"],
+    "classes.json": {"classes": ["red_apple", "Lamp"]},
+    "objects.json": {"1": {"name": "red_apple"}, "2": {"name": "Lamp"}},
     "inverse.json": {"red_apple": 1, "Lamp": 2},
     "config.json": {"id2label": {"0": "background", "1": "red_apple", "2": "Lamp"}},
     "categories.json": [{"id": 2, "name": "Lamp"}, {"id": 1, "name": "red_apple"}],
@@ -242,6 +252,20 @@ def test_packs_of_other_words_make_no_lift(tmp_path: Path) -> None:
 def test_names_that_do_not_fit_their_pictures_are_told(names: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(InvalidFeatures, match=message):
         prompt_views(save(tmp_path, {**LABELS, "names.json": names}), tmp_path / "names.json")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("data.yaml", "names:\n  0: mug\n", "JSON, a table"),
+        ("class_dict.csv", "name,r,g,b\nmug,9,9,9\nlamp,8,8,8\n", "columns name, r, g, b"),
+        ("pairs.csv", "mug,cup\nlamp,light\n", "columns mug, cup"),
+        ("empty.csv", "", "none in empty.csv"),
+    ],
+)
+def test_tables_without_values_are_no_names(name: str, content: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(InvalidFeatures, match=message):
+        prompt_views(save(tmp_path, {"a.png": numbered("left"), name: content}), tmp_path / name)
 
 
 @pytest.mark.parametrize(
