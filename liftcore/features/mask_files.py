@@ -52,6 +52,7 @@ MAX_PIXELS = 178_956_970  # as many as Pillow opens
 MOST_CROSSINGS = 1 << 24  # of columns of pixels by the edges of a polygon
 MAX_COORDINATE = 1e6  # pixels; what lies beyond is no place on an image
 CIRCLE_CORNERS = 64
+OVERHANG = 0.02  # of the image's sides: so far polygons reach beyond it that somebody drew over its edge
 TOO_LARGE = Image.DecompressionBombError
 MAX_PICTURE_BYTES = 64 << 20  # of a PNG of a mask
 RECORD_LISTS = ("annotations", "shapes", "objects", "predictions")  # COCO's, LabelMe's, ISAT's, Roboflow's
@@ -169,6 +170,12 @@ class PolygonMask:
     def is_empty(self) -> bool:
         """Return whether no pixel is inside."""
         return not self.pixels().any()
+
+    def reaches_beyond(self, size: tuple[int, int]) -> bool:
+        """Return whether a corner lies further outside an image (h, w) than tools and rounding leave it."""
+        height, width = size
+        most = np.array([width, height]) * (1 + OVERHANG) + 1
+        return any((part > most).any() for part in self.parts)
 
 
 StoredMask = RunMask | PolygonMask

@@ -83,6 +83,27 @@ class MaskDocument:
     path: Path
     images: list[ImageMasks]
     boxes: int = 0  # records that have a box and no mask
+    polygons: list[PolygonMask] = field(default_factory=list)  # of all records
+
+    def beyond(self) -> int:
+        """Count the polygons that reach beyond their images.
+
+        Raises:
+            InvalidFeatures: they would not, of images of one size, were width and height exchanged.
+        """
+        by_size: dict[tuple[int, int], list[PolygonMask]] = {}
+        for polygon in self.polygons:
+            by_size.setdefault(polygon.size, []).append(polygon)
+        count = 0
+        for (height, width), polygons in by_size.items():
+            beyond = sum(polygon.reaches_beyond((height, width)) for polygon in polygons)
+            if beyond and not any(polygon.reaches_beyond((width, height)) for polygon in polygons):
+                got = f"{beyond} of {len(polygons)} that fit {height} x {width} alone"
+                hint = "width and height are exchanged: write those of the photos as they were annotated"
+                expected = f"polygons within images of {width} x {height} pixels"
+                raise InvalidFeatures(str(self.path), expected=expected, got=got, hint=hint)
+            count += beyond
+        return count
 
     def has_ids(self) -> bool:
         """Return whether it speaks of objects by ids, which lie in other files."""
@@ -203,6 +224,7 @@ def _add_record(
         return
     found.phrases.append(phrase)
     if mask is not None:
+        document.polygons += [mask] if isinstance(mask, PolygonMask) else []
         if not mask.is_empty():
             found.masks.append((phrase, mask))
         return

@@ -534,6 +534,10 @@ def _document_views(documents: Sequence[MaskDocument], folder: Path) -> dict[tup
     return views
 
 
+def _names_of(files: Sequence[Path]) -> str:
+    return files[0].name if len(files) == 1 else f"{len(files)} files ({files[0].name}, ...)"
+
+
 def _is_absolute(path: str) -> bool:
     return path.startswith("/") or path[1:3] == ":/"
 
@@ -549,10 +553,16 @@ def _document_warnings(documents: Sequence[MaskDocument], views: Mapping[tuple[P
                 "with --unannotated negative they show none of its phrases"
             )
     if boxes := [document for document in documents if document.boxes]:
-        some = boxes[0].path.name if len(boxes) == 1 else f"{len(boxes)} files ({boxes[0].path.name}, ...)"
+        count, some = sum(document.boxes for document in boxes), _names_of([document.path for document in boxes])
         warnings.append(
-            f"{sum(document.boxes for document in boxes)} annotations of {some} have a box or less and no mask: what "
-            "lies in the boxes has no label; make masks of them, with SAM say"
+            f"{count} annotations of {some} have a box or less and no mask: what lies in the boxes has no label; "
+            "make masks of them, with SAM say"
+        )
+    beyond = {document.path: count for document in documents if (count := document.beyond())}
+    if beyond:
+        warnings.append(
+            f"{sum(beyond.values())} polygons of {_names_of([*beyond])} reach beyond their images, and are cut off "
+            "there: width and height must be those of the photos that were annotated"
         )
     several = Counter(view for (_, image), view in views.items() if image is not None)
     alone = {
