@@ -5,8 +5,8 @@ too, the edges of masks against the same masks mirrored, and features as `liftin
 
 Photos of another shape than their cameras are told by their headers alone, and compared no further. Where renders are
 not like their photos, the causes that photos can show are tried: photos that are turned or mirrored, photos that are
-shifted (a principal point that is off), positions in another scale. One is named where it makes renders like their
-photos; where none does, nothing is blamed.
+shifted (a principal point that is off), photos of another exposure, positions in another scale. One is named where it
+makes renders like their photos; where none does, nothing is blamed.
 """
 
 from __future__ import annotations
@@ -258,8 +258,7 @@ def _photo(path: Path, like: tuple[int, int], size: tuple[int, int], panorama: C
 def _against(name: str, row_sum: float, render: np.ndarray | None, pictures: Mapping[str, np.ndarray]) -> ViewCheck:
     if render is None or name not in pictures:
         return ViewCheck(name, row_sum, None, None)
-    others = [view for view in pictures if view != name and pictures[view].shape == render.shape]
-    controls = [_psnr(render, pictures[view]) for view in _some(others, CONTROLS)]
+    controls = [_psnr(render, photo) for photo in _controls(name, pictures)]
     return ViewCheck(name, row_sum, _psnr(render, pictures[name]), float(np.mean(controls)) if controls else None)
 
 
@@ -318,6 +317,7 @@ def _unlike_photos(
     cause = (
         _turned_photos(floor, pictures, renders, headers)
         or _shifted_photos(floor, pictures, renders)
+        or _exposed_photos(floor, pictures, renders)
         or _scaled_positions(floor, pictures, scaled)
     )
     unknown = "splats, cameras and photos are not of one scene in one frame, or photos and cameras not of each other"
@@ -427,13 +427,52 @@ def _overlap(photo: np.ndarray, render: np.ndarray, down: int, across: int) -> t
     return photo[there], render[here]
 
 
+def _exposed_photos(
+    floor: Mapping[str, float], pictures: Mapping[str, np.ndarray], renders: Mapping[str, np.ndarray]
+) -> str:
+    """The change of the renders' colours by which they are like their photos; empty where none is.
+
+    Any colours become like any photo's to some degree, so other views' photos are the control here too.
+    """
+    gains, factors = [], []
+    for name, least in floor.items():
+        changed, factor = _in_colours_of(renders[name], pictures[name])
+        others = _controls(name, pictures)
+        control = [_psnr(_in_colours_of(renders[name], photo)[0], photo) for photo in others]
+        gains.append(_psnr(changed, pictures[name]) - max(least, *control))
+        factors.append(factor)
+    if _median(gains) < LEAST_GAIN:
+        return ""
+    return (
+        f"with their colours times about {_median(factors):.2g} they are {_median(gains):.1f} dB more so: the photos "
+        "are of another exposure or development than those that the splats were trained on"
+    )
+
+
+def _in_colours_of(render: np.ndarray, photo: np.ndarray) -> tuple[np.ndarray, float]:
+    """A render [H, W, 3] f32 with the factor and the offset of each channel that fit a photo, and the mean factor."""
+    centred = render - render.mean(axis=(0, 1))
+    factors = (centred * photo).mean(axis=(0, 1)) / np.maximum(np.square(centred).mean(axis=(0, 1)), 1e-12)
+    return photo.mean(axis=(0, 1)) + factors * centred, float(factors.mean())
+
+
+def _controls(name: str, pictures: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+    """Photos of other views that a render is held against, of the shape of its own."""
+    alike = [view for view in pictures if view != name and pictures[view].shape == pictures[name].shape]
+    return [pictures[view] for view in _some(alike, CONTROLS)]
+
+
 def _scaled_positions(floor: Mapping[str, float], pictures: Mapping[str, np.ndarray], scaled: _Scaled) -> str:
     """The scale of the cameras' positions by which renders are like the photos; empty where none is."""
     names, best, scale = _some(list(floor), SCALED_VIEWS), 0.0, 1.0
     for factor in (*NEAR_SCALES, *FAR_SCALES):
-        gain = _median([_psnr(scaled.render(name, factor), pictures[name]) - floor[name] for name in names])
-        if gain > best:
-            best, scale = gain, factor
+        gains = []
+        for name in names:
+            render = scaled.render(name, factor)
+            control = [_psnr(render, photo) for photo in _controls(name, pictures)]
+            gains.append(_psnr(render, pictures[name]) - max(floor[name], *control))
+        if _median(gains) > best:
+            best, scale = _median(gains), factor
     if best < LEAST_GAIN:
         return ""
     return (

@@ -137,6 +137,7 @@ CAUSES = {  # what is done to photos, and their orientation -> the cause that is
     "mirrored": (lambda image: image[:, ::-1], 1, "mirrored left to right"),
     "upside down": (lambda image: image[::-1], 1, "mirrored upside down"),
     "shifted": (lambda image: np.roll(image, (-30, 40), axis=(0, 1)), 1, "principal points"),
+    "darker": (lambda image: image // 4, 1, "another exposure"),
 }
 
 
