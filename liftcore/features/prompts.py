@@ -44,7 +44,7 @@ from liftcore.features.mask_json import (
 )
 from liftcore.io.files import visible_files
 from liftcore.io.npy import ARRAYS, NUMBERS, open_array, without_unit_axes
-from liftcore.scene.views import composed, without_image_suffix
+from liftcore.scene.views import composed, require_name, without_image_suffix
 from liftcore.text.table import TableEncoder, plain
 from liftcore.values.views import NO_LABEL, Regions, label_levels
 
@@ -138,12 +138,14 @@ class _MaskIndex:
 
     def view(self, name: str, path: Path) -> _View:
         """A view that a file names."""
+        require_name(name, f"the view of {str(path)!a}", InvalidFeatures)
         return self.views.setdefault(name, _View(path))
 
     def name(self, view: str, phrase: str) -> str:
         """The plain form of a phrase of a view, which is known from then on."""
         if not (key := plain(phrase)):
             raise InvalidFeatures(f"view {view!r}", expected="a phrase for each mask", got="an empty one")
+        require_name(phrase, f"a phrase of the view {view!r}", InvalidFeatures)
         self.phrases.setdefault(key, " ".join(composed(phrase).replace("_", " ").split()))
         return key
 
@@ -207,6 +209,7 @@ def prompt_views(
     elif pictures or any(len(path.relative_to(folder).parts) > 1 for path in arrays):
         for path in pictures or arrays:
             _add_binary(index, path, path.relative_to(folder), folders, unlabelled)
+        warnings += _exchanged_folders(index, folders)
     else:
         suffix, count = Counter(path.suffix.lower() for path in files).most_common(1)[0] if files else ("", 0)
         hint = OTHER_FILES.get(suffix, "")
@@ -232,6 +235,21 @@ def prompt_views(
     table = TableEncoder("phrases", [index.phrases[phrase] for phrase in order], vectors[:-1])
     counts = {said: seen_in[phrase] for phrase, said in sorted(index.phrases.items())}
     return Prompts(views, table, counts, tuple(warnings))
+
+
+def _exchanged_folders(index: _MaskIndex, folders: Folders) -> list[str]:
+    """A warning where phrases are numbered as photos are, and views are not."""
+    phrases, views = [*index.phrases.values()], [*index.views]
+    if not _is_numbered(phrases) or _is_numbered(views):
+        return []
+    way, other = ("VIEW/PHRASE", "views") if folders == "phrases" else ("PHRASE/VIEW", "phrases")
+    some = f"phrases are {', '.join(phrases[:2])}, ... and views {', '.join(views[:2])}"
+    return [f"{some}: of {way}.png give --folders {other}"]
+
+
+def _is_numbered(names: Sequence[str]) -> bool:
+    """Return whether names differ by their numbers alone."""
+    return len(names) > 1 and len({re.sub(r"[0-9]+", "0", name) for name in names}) == 1
 
 
 def label_texts(path: Path) -> dict[str, str]:

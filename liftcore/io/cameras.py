@@ -275,7 +275,8 @@ def has_nerfstudio_beside(path: Path) -> bool:
     if source.file is None or not zipfile.is_zipfile(source.file):
         return False
     with open_zip(source.file) as archive:
-        return bool(_named(_files(archive), lambda name: name == TRANSFORMS))
+        files = _files(archive)
+        return bool(_whole_models(files) and _named(files, lambda name: name == TRANSFORMS))
 
 
 def _is_of_nerfstudio(document: Path) -> bool:

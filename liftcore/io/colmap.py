@@ -23,7 +23,7 @@ from liftcore.scene.cameras import (
 )
 from liftcore.scene.distortion import Brown, Distortion, Fisheye
 from liftcore.scene.quaternions import rotation_matrices
-from liftcore.scene.views import view_names
+from liftcore.scene.views import REPLACED, view_names
 
 MAX_TEXT_LINE = 64 * 1024 * 1024  # bytes; a line of an image's points runs to a few MB
 MAX_NAME_BYTES = 4096
@@ -135,6 +135,10 @@ def read_colmap(folder: Path) -> Cameras:
         files = camera_file, image_file
         pairs = zip(names, images, strict=True)
         cameras, warnings = read_views(pairs, lambda name, image: _cameras(name, image, sensors, files))
+        broken = [name for name in names if REPLACED in name]
+        if broken:
+            what = "views pair with none of them: rename the photos, and their names in the model"
+            warnings.append(f"the names of {len(broken)} images are not UTF-8, such as {broken[0]!r}; {what}")
         return Cameras(cameras, warnings=warnings)
 
 

@@ -486,6 +486,9 @@ def _object_rules(document: dict[str, Any], path: Path) -> Iterator[FileKind | N
     yield _splats_as(SplatFormat.SOG) if is_sog_document(document) else None
     is_streamed = keys >= {"tree", "filenames"} or path.name == LOD_META
     yield _streamed(f"a streamed SOG ({LOD_META})", path) if is_streamed else None
+    frames = document.get("frames")
+    first = frames[0] if isinstance(frames, list) and frames and isinstance(frames[0], dict) else {}
+    yield _cameras_of("sdfstudio") if {"rgb_path", "camtoworld"} <= first.keys() else None
     yield FileKind("cameras", "cameras") if "frames" in keys else None
     program = next((name for name, own in _CAMERA_KEYS.items() if own <= keys), None)
     yield _cameras_of(program) if program else None

@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import PurePosixPath
 from urllib.parse import unquote
 
-from liftcore.errors import InvalidCameras, InvalidFeatures
+from liftcore.errors import InvalidCameras, InvalidFeatures, InvalidInput
 
 # Only these are cut off, so that "frame.0001", which some files name without its extension, stays whole.
 IMAGE_SUFFIXES = frozenset(
@@ -23,6 +23,7 @@ NAMED_AFTER = (
     "a view is named after its image, without the extension, and with its folders where file names of the scene "
     "repeat (camA/000)"
 )
+REPLACED = "\ufffd"  # in the place of bytes that are no UTF-8
 UNSAYABLE = re.compile("[\\x00-\\x1f\\x7f\\ud800-\\udfff]")
 
 
@@ -41,11 +42,21 @@ def view_names(images: Sequence[str]) -> list[str]:
         InvalidCameras: a name with control characters, or with half of a surrogate pair, which no UTF-8 can say.
     """
     for image in images:
-        if UNSAYABLE.search(image):
-            raise InvalidCameras("image name", expected="one of printable characters", got=ascii(image)[:60])
+        require_name(image, "image name", InvalidCameras)
     paths = [without_image_suffix(image) for image in images]
     stems = [PurePosixPath(path).name for path in paths]
     return stems if len(set(stems)) == len(stems) else paths
+
+
+def require_name(name: str, argument: str, fault: type[InvalidInput]) -> str:
+    """The name of a view, a photo or a phrase, refused by an error of that type where UTF-8 or a line cannot say it.
+
+    Names of files whose bytes are no UTF-8 come with halves of surrogate pairs in them.
+    """
+    if UNSAYABLE.search(name):
+        expected, hint = "one of printable characters in UTF-8", "rename the file"
+        raise fault(argument, expected=expected, got=ascii(name)[:80], hint=hint)
+    return name
 
 
 def without_image_suffix(image: str) -> str:
@@ -96,6 +107,8 @@ def require_pairs(views: Collection[str], cameras: Collection[str]) -> dict[str,
 
 def _difference(views: Collection[str], cameras: Collection[str]) -> str:
     """How names would pair, of the ways in which programs change them; empty where none pairs most of them."""
+    if sum(REPLACED in camera for camera in cameras) > len(cameras) / 2:
+        return "names of cameras are not UTF-8: rename the photos, and their names in the camera file"
     names = [composed(view) for view in views]
     before, behind = _shared_start(names), _shared_start([name[::-1] for name in names])[::-1]
     ways: dict[str, Callable[[str], str]] = {

@@ -27,7 +27,7 @@ from liftcore.io.safetensors_file import MAX_HEADER_BYTES, TYPES, check_header, 
 from liftcore.runtime.progress import Progress, silent
 from liftcore.runtime.torch_modes import callers_modes
 from liftcore.scene.cameras import FEWER_VIEWS, MAX_VIEWS, Camera
-from liftcore.scene.views import composed, require_pairs
+from liftcore.scene.views import composed, require_name, require_pairs
 from liftcore.text.table import TableEncoder
 from liftcore.values.lens import as_pinhole_sees, grid_sides
 from liftcore.values.views import MAX_CHANNELS, NO_LABEL, FeatureGrid, Regions, ViewFeatures
@@ -248,6 +248,8 @@ def write_pack(
     """
     if not views:
         raise InvalidFeatures(str(path), expected="at least one view", got="none")
+    for view in views:
+        require_name(view, "the name of a view", InvalidFeatures)
     with whole_file(path) as handle:
         if table is None:
             return _write(handle, views, metadata, progress)

@@ -19,7 +19,7 @@ from liftcore.features.encoders import ImageEncoder, Pixels
 from liftcore.features.folders import files_below, grids_of
 from liftcore.io.photos import ORIENTATION, UNREAD, UPRIGHT, PhotoHeader, Reading, header_of
 from liftcore.runtime.progress import Progress, silent
-from liftcore.scene.views import IMAGE_SUFFIXES, without_image_suffix
+from liftcore.scene.views import IMAGE_SUFFIXES, require_name, without_image_suffix
 from liftcore.values.pack import write_pack
 from liftcore.values.views import check_finite
 
@@ -148,6 +148,7 @@ def find_images(paths: Sequence[Path]) -> dict[str, Path]:
     for path in paths:
         for file in _images_of(path):
             name = without_image_suffix(file.relative_to(path).as_posix() if path.is_dir() else file.name)
+            require_name(name, "images", InvalidInput)
             if found.get(name, file) != file:
                 got = f"{found[name]} and {file}"
                 raise InvalidInput(

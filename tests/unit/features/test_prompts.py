@@ -5,8 +5,10 @@ from __future__ import annotations
 import base64
 import io
 import json
+import os
 import zlib
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,9 +23,6 @@ from liftcore.values.views import Regions
 from tests.api.tiny_scene import labels, make_scene
 from tests.run_lengths import sam_records
 from tests.unit.command_line import assert_one_line, run
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 PHRASES = {0: "red_apple", 2: "Lamp"}  # the cluster between them has no phrase
 MASKS = {
@@ -223,6 +222,29 @@ def test_a_lift_of_prompts_is_asked_in_its_words_alone(tmp_path: Path, capsys: p
 def test_phrases_of_a_mac_are_asked_as_they_are_typed(tmp_path: Path) -> None:
     found = prompt_views(save(tmp_path, {"ku\u0308che/a.png": MASKS["middle"]["Lamp"]}))
     assert found.table.encode(["K\u00fcche"]).tolist() == [[1, 0]]
+
+
+@pytest.mark.parametrize(("folders", "warned"), [("phrases", True), ("views", False)])
+def test_phrases_that_are_numbered_as_photos_are_told(folders: Any, warned: bool, tmp_path: Path) -> None:
+    mask = MASKS["middle"]["Lamp"]
+    save(tmp_path, {f"IMG_{view}/{phrase}.png": mask for view in (7, 12) for phrase in ("lamp", "mug")})
+    assert ("--folders views" in " ".join(prompt_views(tmp_path, folders=folders).warnings)) is warned
+
+
+@pytest.mark.parametrize("name", [b"mug/caf\xe9.png", b"caf\xe9/a.png"])
+def test_names_that_are_no_utf8_are_told_before_a_pack_is_written(
+    name: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save(tmp_path, {"mug/a.png": MASKS["middle"]["Lamp"]})
+    path = Path(os.fsdecode(os.fsencode(tmp_path / "masks" / "_").removesuffix(b"_") + name))
+    try:
+        path.parent.mkdir(parents=True)
+        (tmp_path / "mug" / "a.png").rename(path)
+    except OSError:
+        pytest.skip("the file system takes names in UTF-8 alone")
+    status, _, err = run(capsys, "pack", "prompts", tmp_path / "masks", "-o", tmp_path / "p.safetensors")
+    assert status == 2 and "UTF-8" in err and not (tmp_path / "p.safetensors").exists()
+    assert_one_line(err)
 
 
 def test_masks_that_overlap_count_for_both_phrases(tmp_path: Path) -> None:

@@ -15,13 +15,15 @@ import numpy as np
 import pytest
 from camera_files import CAMERAS, IMAGES, assert_same, binary_files, text_files, with_json, write_files
 
-from liftcore.errors import InvalidCameras
+from liftcore.errors import InvalidCameras, InvalidFeatures
 from liftcore.evaluate.inspect import describe_camera_file, inspect_file
 from liftcore.io import cameras, json_file
 from liftcore.io.cameras import MODEL_FOLDERS, other_models, read_cameras
 from liftcore.io.inria import write_inria_cameras
+from liftcore.io.transforms import transforms_of
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.distortion import Brown, Fisheye, Lens
+from liftcore.scene.views import require_pairs
 from liftcore.values.lift import LiftMetadata
 from liftcore.values.lift_file import camera_input, has_poses, poses_of
 from liftcore.values.settings import LiftSettings
@@ -428,6 +430,23 @@ def test_scenes_in_numbered_folders_are_no_models_of_one(tmp_path: Path) -> None
         write_files(tmp_path / "scans" / str(number), named_model(*ALL, shift=float(number)))
     with pytest.raises(InvalidCameras, match=r"name what is meant, such as .*/24 or .*/37"):
         read_cameras(tmp_path / "scans")
+
+
+def test_image_names_that_are_no_utf8_are_told(tmp_path: Path) -> None:
+    files = {name: content.replace(b"K?c", b"K\xfcc") for name, content in named_model("K?che_0", "K?che_1").items()}
+    found = read_cameras(write_files(tmp_path, files))
+    assert len(found) == 2 and "2 images are not UTF-8" in " ".join(found.warnings)
+    with pytest.raises(InvalidFeatures, match="names of cameras are not UTF-8"):
+        require_pairs(["K\u00fcche_0", "K\u00fcche_1"], found)
+
+
+def test_a_zip_of_json_alone_is_warned_of_no_model(tmp_path: Path) -> None:
+    document = transforms_of(
+        {"a": next(iter(read_cameras(write_files(tmp_path / "m", named_model("a.png"))).values()))}
+    )
+    with zipfile.ZipFile(tmp_path / "scene.zip", "w") as archive:
+        archive.writestr("transforms.json", json.dumps(document))
+    assert describe_camera_file(tmp_path / "scene.zip")["warnings"] == []
 
 
 def test_a_lift_of_one_of_several_models_is_asked_with_the_same(tmp_path: Path) -> None:

@@ -74,6 +74,7 @@ OTHERS = {  # content, a word of its name and of what to do
     "sfm_data.json": (b'{"sfm_data_version": "0.3", "views": []}', "cameras of OpenMVG", "COLMAP"),
     "cameras.sfm": (b'{"views": [], "poses": [], "featuresFolders": []}', "cameras of Meshroom", "COLMAP"),
     "reconstruction.json": (b'[{"cameras": {}, "shots": {}}]', "cameras of OpenSfM", "COLMAP"),
+    "meta_data.json": (b'{"frames": [{"rgb_path": "a", "camtoworld": []}]}', "cameras of sdfstudio", "COLMAP"),
     "poses_bounds.npy": (b"\x93NUMPY\1\0", "cameras of LLFF", "COLMAP"),
     "weights.safetensors": (b"", "safetensors", "pack"),
     "dataparser_transforms.json": (b'{"transform": [], "scale": 1.0}', "frame", "cameras"),
