@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from liftcore.errors import InvalidSplats
-from liftcore.io.kinds import EXPORT_PLY
+from liftcore.io.kinds import EXPORT_PLY, TRAINED
 from liftcore.io.quantised import Fields
 from liftcore.io.ranks import missing_ranks, rank_files
 from liftcore.scene.render_mode import mode_beside
@@ -98,7 +98,8 @@ def _splats(stored: Any, path: Path) -> tuple[dict[str, Any], tuple[str, str]]:
             return own, NERFSTUDIO_COLOUR
     some = ", ".join(map(repr, list(inner)[:4])) if inner else type(stored).__name__
     expected = "the splats of gsplat ('splats') or of nerfstudio ('pipeline')"
-    raise InvalidSplats(str(path), expected=expected, got=f"a checkpoint of {some}"[:160], hint=EXPORT_PLY)
+    hint = TRAINED if isinstance(stored, tuple) else EXPORT_PLY  # as 3DGS's trainer writes its chkpnt*.pth
+    raise InvalidSplats(str(path), expected=expected, got=f"a checkpoint of {some}"[:160], hint=hint)
 
 
 def _array(tensors: dict[str, Any], name: str, path: Path) -> np.ndarray:

@@ -93,7 +93,7 @@ class FileKind:
     name: str  # as it stands behind "got"
     hint: str = ""  # what to do with it
     format: SplatFormat | None = None  # of splats
-    splats: tuple[str, ...] = ()  # splat files in a folder or zip, the one to give first
+    splats: tuple[str, ...] = ()  # splat files in a folder or zip, the one (or the folder of all ranks) to give first
     recognised: bool = True  # False: nothing is known of it but its first bytes
 
 
@@ -612,6 +612,8 @@ def _folder_rules(path: Path) -> Iterator[FileKind | None]:
     names = _names_below(path)
     splats = _splat_files(names, lambda name: _has_splats(path / name))
     named = _folder_name(names, splats)
+    if splats and len(rank_files(path / splats[0])) > 1:  # their folder is the whole scene
+        splats = (str(PurePosixPath(splats[0]).parent), *splats)
     yield FileKind("cameras", named or "a folder of cameras", splats=splats) if _has_cameras(path) else None
     yield FileKind(None, named or "a folder", f"give {path / splats[0]}", splats=splats) if splats else None
     suffixes = {PurePosixPath(name).suffix.lower() for name in names}
@@ -681,7 +683,7 @@ def page_table() -> dict[str, Any]:
 
 
 __all__ = [
-    "CONVERT", "EXPORT_PLY", "PICKLED", "SPLATS_SENT", "SUFFIX", "FileKind", "SplatFormat", "identify",
+    "CONVERT", "EXPORT_PLY", "PICKLED", "SPLATS_SENT", "SUFFIX", "TRAINED", "FileKind", "SplatFormat", "identify",
     "keys_of", "kind_of", "page_table", "splat_format", "wrong_kind",
 ]  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -76,6 +77,12 @@ def test_every_command_says_that_one_rank_is_a_part_and_takes_the_folder(
         assert status == 0 and "beside" not in text, (command, text, err)
     scene = QueryScene.open(out)
     assert scene.splats.count == 50 and scene.axes.shape == (3, 50)
+
+
+def test_a_trainers_folder_names_the_folder_of_its_ranks(tmp_path: Path) -> None:
+    folder = write_ranks(tmp_path / "ckpts", random_splats(3, 50))
+    with pytest.raises(InvalidSplats, match=rf"give {re.escape(str(folder))}$"):
+        read_splats(tmp_path)
 
 
 def test_the_only_rank_of_a_run_is_no_part_of_anything(tmp_path: Path) -> None:
