@@ -57,6 +57,11 @@ def lies_apart(means: np.ndarray) -> bool:
     return float(np.abs(middle).max()) > APART * extent
 
 
+def extent_of_most(means: np.ndarray | Tensor) -> float:
+    """The largest side of the box about the middle four fifths of the finite means [P, 3], scene units; 0 of none."""
+    return _middle_and_extent(means)[1]
+
+
 def usual_size(log_scales: np.ndarray | Tensor) -> float:
     """The median of the splats' larger scales, scene units; 0 where none is finite."""
     sizes = _sample(log_scales).max(axis=1)

@@ -18,7 +18,7 @@ import torch
 from liftcore.errors import InvalidSplats
 from liftcore.scene.harmonics import SH_C0, band_rotation
 from liftcore.scene.kernel import DARK_LOBE, LOBE_COLOURS, NORMALS, Kernel, kernel_named, scale_count
-from liftcore.scene.origin import FILE_ORIGIN, Origin, float32_step, local_origin, usual_size
+from liftcore.scene.origin import FILE_ORIGIN, Origin, extent_of_most, float32_step, local_origin, usual_size
 from liftcore.scene.render_mode import RenderMode, RenderModel, render_mode_of
 from liftcore.scene.rows import Rows, chosen_rows
 from liftcore.scene.similarity import Similarity
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 SH_ROWS = (1, 4, 9, 16, 25)  # (degree + 1)^2
 _BEYOND = {"opacity_logits": (True, True), "log_scales": (True, False)}  # whether -inf and +inf have a meaning
 ROUNDED = 0.25  # of a splat's size: a coarser float32 has moved splats visibly
+WIDEST = 4.0  # spacings of splats that lie spread over a square as wide as their scene
 MANY = 100  # splats: what all of so many have in common is no accident
 _GEOMETRY = ("means", "quats", "log_scales", "opacity_logits", "beta")  # what rays meet; all else is colour
 
@@ -312,7 +313,11 @@ def _moved_to_origin(
 
 
 def _activation_warnings(columns: Mapping[str, Tensor]) -> list[str]:
-    """Warnings of numbers that look activated already: a file keeps logits of opacities, and logarithms of scales."""
+    """Warnings of numbers that look activated already: a file keeps logits of opacities, and logarithms of scales.
+
+    In a small unit all scales may be above 1. They are no logarithms where their exponentials are much larger than so
+    many splats need to cover a scene of that extent.
+    """
     if len(columns["means"]) < MANY:
         return []
     logits, warnings = columns["opacity_logits"], []
@@ -322,7 +327,8 @@ def _activation_warnings(columns: Mapping[str, Tensor]) -> list[str]:
             "all opacities lie between 0 and 1, as if they were no logits: sigmoid makes them 0.5 to 0.73; if they "
             "are opacities o, give log(o / (1 - o))"
         )
-    if bool((columns["log_scales"] > 0).all()):
+    spacing = extent_of_most(columns["means"]) / len(columns["means"]) ** 0.5
+    if bool((columns["log_scales"] > 0).all()) and usual_size(columns["log_scales"]) > WIDEST * spacing:
         warnings.append(
             "all scales are above 0, as if they were no logarithms: exp makes them larger than 1; if they are "
             "lengths, give their logarithms"

@@ -68,6 +68,8 @@ def test_splats_that_mean_something_else_are_noticed(tmp_path: Path) -> None:
     assert "as if they were no logits" in told(activated) and "as if they were no logarithms" in told(activated)
     opacities[7], activated.log_scales[7, 1] = 1.5, -0.5
     assert "as if" not in told(activated)
+    millimetres = Splats(1e3 * torch.rand(100, 3), torch.ones(100, 4), torch.full((100, 3), 4.0), opacities)
+    assert "as if" not in told(millimetres)
     flat = torch.tensor([[0.0, -1.0, -13.8], [1.0, 0.5, -13.8]])
     discs = Splats(torch.zeros(2, 3), torch.ones(2, 4), flat, torch.zeros(2))
     assert "kernel=2dgs" in told(discs)
