@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from plyfile import PlyData
 
 import liftcore as lc
 from liftcore.evaluate.inspect import describe_cameras, describe_splats
@@ -202,6 +204,82 @@ def test_every_file_gives_the_positions_that_it_holds(name: str, tmp_path: Path)
         (tmp_path / f"again{suffix}").write_bytes(b"".join(blocks(read)))
         again = read_splats(tmp_path / f"again{suffix}")
         assert again.origin == FILE_ORIGIN and torch.allclose(again.means, read.means, atol=1e-5)
+
+
+QUANTISED = Path(__file__).parents[2] / "data" / "splats"  # as splat-transform wrote them
+PLACE = np.array([65_536.0, 40_960.0, 512.0])  # scene units; an .spz reaches no further with a hundredth of one
+
+
+def compressed_ply(path: Path) -> np.ndarray:
+    """Write a compressed PLY whose chunks are moved; the positions that it then says."""
+    source = QUANTISED / "degree1.compressed.ply"
+    there, said = PlyData.read(source), read_splats(source).positions().astype(np.float64)
+    chunks = there["chunk"].data
+    for axis, name in enumerate("xyz"):
+        low, high = (chunks[f"{end}_{name}"] for end in ("min", "max"))
+        of_row = np.arange(len(said)) // 256
+        unit = (said[:, axis] - low[of_row]) / (high - low).astype(np.float64)[of_row]
+        low += np.float32(PLACE[axis])
+        high += np.float32(PLACE[axis])
+        said[:, axis] = low[of_row] * (1 - unit) + high[of_row].astype(np.float64) * unit
+    there.write(path)
+    return said
+
+
+def sog(path: Path) -> np.ndarray:
+    """Write a SOG between bounds that are moved; the positions that it then says."""
+    source = QUANTISED / "degree1.sog"
+    said = read_splats(source).positions().astype(np.float64)
+    with zipfile.ZipFile(source) as given, zipfile.ZipFile(path, "w") as made:
+        for name in given.namelist():
+            content = given.read(name)
+            if name == "meta.json":
+                meta = json.loads(content)
+                low, high = (np.array(meta["means"][key]) for key in ("mins", "maxs"))
+                unit = (np.sign(said) * np.log1p(np.abs(said)) - low) / (high - low)
+                low, high = np.log1p(PLACE - 2), np.log1p(PLACE + 2)
+                meta["means"] |= {"mins": low.tolist(), "maxs": high.tolist()}
+                said = np.expm1(low + unit * (high - low))
+                content = json.dumps(meta).encode()
+            made.writestr(name, content)
+    return said
+
+
+def spz(path: Path) -> np.ndarray:
+    """Write an ``.spz`` about the origin of its file; the positions that it was made of, to its last bit."""
+    splats = random_splats(4, 200)
+    there = replace(splats, means=(splats.means.double() + torch.from_numpy(PLACE)).float(), origin=FILE_ORIGIN)
+    path.write_bytes(b"".join(spz_blocks(there)))
+    return there.positions().astype(np.float64)
+
+
+@pytest.mark.parametrize(("write", "step"), [(compressed_ply, 2e-5), (sog, 2e-5), (spz, 1 / 128)])
+def test_quantised_files_far_from_their_origin_keep_their_digits(write: Any, step: float, tmp_path: Path) -> None:
+    wanted = write(tmp_path / "far")
+    read = read_splats(tmp_path / "far")
+    assert read.origin != FILE_ORIGIN and np.abs(np.array(read.origin) - PLACE).max() < 16
+    assert np.abs(read.positions() - wanted).max() <= step
+    assert np.array_equal(read_places(tmp_path / "far"), read.positions())
+
+
+def test_check_says_of_a_moved_scene_what_it_says_where_it_stood(
+    tiny: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    answers = []
+    for name, lift in tiny.items():
+        folder, photos = lift.parent, tmp_path / name
+        photos.mkdir()
+        for view in ("left", "middle", "right"):
+            assert run(capsys, "render", tiny["here"], "--view", view, "-o", photos / f"{view}.png")[0] == 0
+        (folder / "f.safetensors").write_bytes((folder / "f.st").read_bytes())
+        files = folder / "s.ply", folder / "c.json", photos, folder / "f.safetensors"
+        status, out, err = run(capsys, "check", *files, "--json")
+        answers.append({"status": status, "err": err, **json.loads(out)})
+    here, far = answers
+    assert (here["status"], here["wrong"]) == (far["status"], far["wrong"]) and here["err"] == far["err"] == ""
+    assert np.isclose(here["in_view"], far["in_view"]) and far["in_view"] > 0.9
+    for one, other in zip(here["views"], far["views"], strict=True):
+        assert np.allclose([one["row_sum"], one["psnr"]], [other["row_sum"], other["psnr"]], atol=0.1), one["view"]
 
 
 def test_cameras_whose_rotation_has_few_digits_stand_where_their_file_says() -> None:
