@@ -1,6 +1,7 @@
 """How commands answer: one JSON object, or lines for people; and bars on stderr for somebody who watches."""
 
 import json
+import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -12,6 +13,8 @@ from liftcore.errors import InvalidInput
 
 SHOWN_ITEMS = 6  # of a list, for people
 SHOWN_FOLDERS = 8
+LARGE = 1e5  # from here on numbers show about three decimals: places in map coordinates begin alike
+MOST_DIGITS = 15
 
 
 def reply(document: Mapping[str, Any], *, as_json: bool, lines: Iterable[str] | None = None) -> None:
@@ -139,7 +142,8 @@ def _entries(document: Mapping[str, Any]) -> Iterable[str]:
 def shown(value: Any) -> str:
     """A value in short, for people."""
     if isinstance(value, float):
-        return f"{value:.6g}"
+        is_large = LARGE <= abs(value) < math.inf
+        return f"{value:.{min(MOST_DIGITS, 4 + int(math.log10(abs(value)))) if is_large else 6}g}"
     if isinstance(value, Mapping):
         return ", ".join(f"{key} {_nested(item)}" for key, item in value.items()) or "-"
     if isinstance(value, list | tuple):

@@ -387,3 +387,6 @@ def test_the_command_line_tells_places_in_the_frame_of_the_file(
     assert np.abs(read_splats(tmp_path / "far.splat").means.numpy()).max() < 16
     status, out, _ = run(capsys, "inspect", tiny["far"].parent / "s.ply", "--json")
     assert status == 0 and np.abs(np.array(json.loads(out)["box"]) - UTM).max() < 8
+    [shown] = [line for line in run(capsys, "inspect", tiny["far"].parent / "s.ply")[1].splitlines() if "box" in line]
+    corners = [float(number.strip("(),")) for number in shown.split()[1:]]
+    assert np.abs(np.array(corners) - np.array(json.loads(out)["box"]).ravel()).max() < 2e-3
