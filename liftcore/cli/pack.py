@@ -141,10 +141,12 @@ def _retag(options: argparse.Namespace) -> int:
 
 def _renamed(views: ViewFolder, options: argparse.Namespace) -> dict[str, str]:
     """The views that lost the suffix of an image, by their files of vectors."""
+    from liftcore.scene.views import IMAGE_SUFFIXES
+
     if options.format in ("langsplat", "prompts") or getattr(options, "encoder", None):
         return {}
     files = {path.relative_to(options.folder).as_posix(): view for view, path in views.files.items()}
-    return {name: view for name, view in files.items() if name != f"{view}.npy"}
+    return {name: view for name, view in files.items() if Path(name).with_suffix("").suffix.lower() in IMAGE_SUFFIXES}
 
 
 def _lines(document: dict[str, Any]) -> Iterator[str]:

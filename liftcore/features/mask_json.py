@@ -163,7 +163,8 @@ def stated_size(content: Any) -> tuple[int, int] | None:
     if not isinstance(content, dict):
         return None
     slots = content["item"].get("slots") if isinstance(content.get("item"), dict) else None  # of Darwin
-    for place in (content, *(content.get(key) for key in ("image", "info", "size")), *(slots or [])[:1]):
+    first = slots[:1] if isinstance(slots, list) else []
+    for place in (content, *(content.get(key) for key in ("image", "info", "size")), *first):
         for keys in SIZE_KEYS:
             height, width = (_side(place.get(key) if isinstance(place, dict) else None) for key in keys)
             if height is not None and width is not None:

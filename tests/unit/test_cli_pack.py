@@ -31,15 +31,16 @@ def test_maps_are_packed_under_their_cameras_names_in_either_layout(
     maps, pack = tmp_path / "maps", tmp_path / "p.safetensors"
     for name in ("a.jpg", "b.PNG", "frame.0001", "camA/000", "camB/000.jpg", ".trash/000"):
         save(maps / f"{name}.npy", np.full((3, 4, 5), 2.0, np.float16))
+    np.savez(maps / "c.npz", np.full((3, 4, 5), 2.0, np.float16))
     status, out, _ = run(capsys, "pack", "npy", maps, "-o", pack, "--layout", "chw", "--encoder-name", "toy")
-    assert status == 0 and "5 views, 3 channels" in out
+    assert status == 0 and "6 views, 3 channels" in out
     assert "a.jpg.npy is 'a'" in out and "warning: unnormalised vectors" in out
     arguments = ["pack", "npy", maps, "-o", pack, "--encoder-name", "toy"]
     document = json.loads(run(capsys, *arguments, "--json")[1])
     assert document["renamed"] == {"a.jpg.npy": "a", "b.PNG.npy": "b", "camB/000.jpg.npy": "camB/000"}
     assert document["warnings"][0].startswith("unnormalised vectors:")
     packs = read_features(pack)
-    assert (packs.views, packs.channels) == (("a", "b", "camA/000", "camB/000", "frame.0001"), 5)
+    assert (packs.views, packs.channels) == (("a", "b", "c", "camA/000", "camB/000", "frame.0001"), 5)
     save(maps / "a.npy", np.ones((3, 4, 5), np.float16))
     for folder, message in ((maps, "a.jpg.npy and a.npy, both of the view 'a'"), (maps / "a.npy", "folder")):
         status, out, err = run(capsys, "pack", "npy", folder, "-o", pack)

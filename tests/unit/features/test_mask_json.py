@@ -419,10 +419,11 @@ def test_masks_with_vectors_may_be_polygons_or_have_a_unit_axis(tmp_path: Path) 
         assert np.array_equal(labels, np.where(MUG, 0, np.where(BOWL, 1, -1)))
 
 
-@pytest.mark.parametrize("strange", [10**400, float("inf"), None, "x", [], {}, -1])
+@pytest.mark.parametrize("strange", [10**400, float("inf"), None, "x", [], {}, -1, 3])
 def test_strange_values_are_refused_or_passed_over(strange: Any, tmp_path: Path) -> None:
     shape = {"label": "bowl", "points": [[strange, 2], [8, 5]], "shape_type": "rectangle"}
     document = {"imageHeight": HEIGHT, "imageWidth": WIDTH, "shapes": [{"label": "red mug", "rle": rle(MUG)}, shape]}
+    document["item"] = {"slots": strange}
     data_set = coco((0, 1, rle(MUG)), image_0={"neg_category_ids": [2, strange], "width": strange})
     data_set["categories"] = [CATEGORIES[0], {"id": 2, "name": strange}]
     found = prompt_views(write(tmp_path / "shapes", a=document))
