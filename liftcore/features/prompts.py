@@ -123,6 +123,7 @@ class _View:
     decided: set[str] = field(default_factory=set)  # plain, that it was searched for
     undecided: set[str] = field(default_factory=set)  # plain, that some document did not search it for
     has_void: bool = False
+    filled: int = 0  # pictures of phrases that cover more than half of it
 
     def was_searched(self, phrases: Iterable[str]) -> bool:
         """Return whether each of these phrases is masked wherever it is."""
@@ -209,7 +210,7 @@ def prompt_views(
     elif pictures or any(len(path.relative_to(folder).parts) > 1 for path in arrays):
         for path in pictures or arrays:
             _add_binary(index, path, path.relative_to(folder), folders, unlabelled)
-        warnings += _exchanged_folders(index, folders)
+        warnings += [*_exchanged_folders(index, folders), *_inverted_masks(index)]
     else:
         suffix, count = Counter(path.suffix.lower() for path in files).most_common(1)[0] if files else ("", 0)
         hint = OTHER_FILES.get(suffix, "")
@@ -245,6 +246,17 @@ def _exchanged_folders(index: _MaskIndex, folders: Folders) -> list[str]:
     way, other = ("VIEW/PHRASE", "views") if folders == "phrases" else ("PHRASE/VIEW", "phrases")
     some = f"phrases are {', '.join(phrases[:2])}, ... and views {', '.join(views[:2])}"
     return [f"{some}: of {way}.png give --folders {other}"]
+
+
+def _inverted_masks(index: _MaskIndex) -> list[str]:
+    """A warning where several phrases fill most of most views at once, as masks in black on white do."""
+    inverted = sum(view.filled > 1 for view in index.views.values())
+    if 2 * inverted <= len(index.views):
+        return []
+    return [
+        f"in {inverted} of {len(index.views)} views two or more phrases cover over half of the picture each: a mask "
+        "is what is not black; invert masks that are black on white"
+    ]
 
 
 def _is_numbered(names: Sequence[str]) -> bool:
@@ -329,6 +341,7 @@ def _add_binary(index: _MaskIndex, path: Path, inner: Path, folders: Folders, un
         view.has_void = view.has_void or bool(void.any())
     if mask.any():
         view.phrases.add(key)
+    view.filled += bool(mask.mean() > 1 / 2)
 
 
 def _add_labels(index: _MaskIndex, path: Path, name: str, names: Mapping[int, str], unlabelled: int | None) -> None:

@@ -207,6 +207,7 @@ def test_a_lift_of_prompts_is_asked_in_its_words_alone(tmp_path: Path, capsys: p
     pack.unlink()  # the lift alone is asked
     status, out, err = run(capsys, "query", lifted, "a red apple", "--json")
     assert (status, err, json.loads(out)["selected"]) == (0, "", 20)
+    assert json.loads(out)["present"] is None and "not known" in json.loads(out)["why"]  # as no other words compete
     status, out, _ = run(capsys, "segment", lifted, "--json")
     assert (status, {named["word"] for named in json.loads(out)["found"]}) == (0, {"Lamp", "red apple"})
     status, _, err = run(capsys, "query", lifted, "red ample")
@@ -229,6 +230,13 @@ def test_phrases_that_are_numbered_as_photos_are_told(folders: Any, warned: bool
     mask = MASKS["middle"]["Lamp"]
     save(tmp_path, {f"IMG_{view}/{phrase}.png": mask for view in (7, 12) for phrase in ("lamp", "mug")})
     assert ("--folders views" in " ".join(prompt_views(tmp_path, folders=folders).warnings)) is warned
+
+
+def test_masks_in_black_on_white_are_told(tmp_path: Path) -> None:
+    save(tmp_path / "black", {name: 255 - mask for name, mask in binary("{phrase}/{view}").items()})
+    assert "black on white" in " ".join(prompt_views(tmp_path / "black").warnings)
+    found = prompt_views(save(tmp_path / "white", binary("{phrase}/{view}")))
+    assert found.warnings == ()
 
 
 @pytest.mark.parametrize("name", [b"mug/caf\xe9.png", b"caf\xe9/a.png"])
