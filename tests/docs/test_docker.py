@@ -102,7 +102,8 @@ def test_the_port_is_the_services_own_everywhere() -> None:
 def test_versions_come_from_the_lock_and_torch_is_first() -> None:
     installs = [run for run in given("RUN") if "pip install" in run]
     assert "^(torch(vision)?==" in installs[0] and "requirements.lock" in installs[0]
-    assert any("--require-hashes --requirement runtime.lock" in run for run in installs)
+    hashed = next(k for k, run in enumerate(installs) if "--require-hashes --requirement runtime.lock" in run)
+    assert hashed > 0 and all("--no-deps" in run for run in installs[:hashed])  # else torch's needs come without
     assert all("lock" in run or "--constraint pins.txt" in run or "--no-deps ." in run for run in installs)
     assert not any("--constraint requirements.lock" in run for run in installs)  # its digests would be asked of all
     locked = {line.split("==")[0].lower().replace("_", "-") for line in text("requirements.lock").splitlines()}
