@@ -448,11 +448,11 @@ def _numbered(told: Any, where: str) -> dict[int, str]:
         told = {value: name for name, value in told.items()}
     elif isinstance(told, list) and told and all(isinstance(one, dict) for one in told):
         told = {one.get("id"): one.get("name") for one in told}
-    if isinstance(told, list) and all(isinstance(name, str) for name in told):
-        told = _listed(told)
+    if isinstance(told, list):
+        told = _listed(told) if all(isinstance(name, str) for name in told) else {}
     try:
-        named = {int(value): _name_in(name) for value, name in told.items()}
-    except (AttributeError, TypeError, ValueError):
+        named = {int(value): _name_in(name) for value, name in told.items()} if isinstance(told, dict) else {}
+    except (TypeError, ValueError):
         named = {}
     if not named or not all(isinstance(name, str) and name.strip() for name in named.values()):
         raise InvalidFeatures(where, expected='JSON of values and names, {"1": "red mug"}', got="none")
