@@ -8,8 +8,12 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from liftcore.runtime.jit import kernel
+from liftcore.runtime.memory import zeros
+from liftcore.values.region_weights import MEMORY_LIMIT
 
 
 @dataclass(frozen=True)
@@ -39,17 +43,22 @@ def fill_rows(parts: Iterable[SomeRows], starts: np.ndarray, targets: Sequence[n
         cursors[part.rows] += np.diff(part.starts)
 
 
+def values_of(count: int, dtype: torch.dtype) -> Tensor:
+    """Zeros [n], in a mapped file where they are many."""
+    return zeros((count,), dtype, name="weights", in_file=count * dtype.itemsize > MEMORY_LIMIT >> 1)
+
+
 def gather_rows(
-    parts: Callable[[], Iterable[SomeRows]], count: int, dtypes: Sequence[type]
-) -> tuple[np.ndarray, list[np.ndarray]]:
+    parts: Callable[[], Iterable[SomeRows]], count: int, dtypes: Sequence[torch.dtype]
+) -> tuple[np.ndarray, list[Tensor]]:
     """The rows of a block of so many: where they begin [count + 1] i64, and their values, of those types.
 
     Args:
         parts: gives the parts, one in memory at a time; it is called twice.
     """
     starts = row_starts(parts(), count)
-    targets = [np.empty(starts[-1], dtype) for dtype in dtypes]
-    fill_rows(parts(), starts, targets)
+    targets = [values_of(int(starts[-1]), dtype) for dtype in dtypes]
+    fill_rows(parts(), starts, [target.numpy() for target in targets])
     return starts, targets
 
 

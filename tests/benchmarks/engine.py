@@ -1,15 +1,16 @@
 """What lifts in blocks cost, and what they hold: against a lift in memory, by Ray's workers, of a scene too large.
 
-    python -m tests.benchmarks.engine overhead SCENE
-    python -m tests.benchmarks.engine weak SCENE
-    python -m tests.benchmarks.engine large [--splats N] [--channels F] [--views V]
+    python -m tests.benchmarks.engine overhead SCENE [--preset P]
+    python -m tests.benchmarks.engine weak SCENE [--preset P]
+    python -m tests.benchmarks.engine large [--splats N] [--channels F] [--views V] [--preset P]
 
-The first prints seconds in memory, by LocalEngine, and by one and two workers of Ray. SCENE is a folder with
-``point_cloud.ply``, cameras and ``regions.safetensors`` or ``features.safetensors``. The second gives one worker of
-a core half of the views, and then two of them all views. The third flies over a made
-city, where each view looks down on a part of it: seconds, bytes, and the memory that the process holds for itself
-(RssAnon, the most of all looks; pages of mapped files may be dropped). From its costs follows the model that it
-prints, of fifty million splats, ten thousand views and 512 channels on more workers.
+The preset is `default` where none is named. The first prints seconds in memory, by LocalEngine, and by one and two
+workers of Ray. SCENE is a folder with ``point_cloud.ply``, cameras and ``regions.safetensors`` or
+``features.safetensors``. The second gives one worker of a core half of the views, and then two of them all views. The
+third flies over a made city, where each view looks down on a part of it and has masks of plots on four levels:
+seconds, bytes, and the memory that the process holds for itself (RssAnon, the most of all looks; pages of mapped
+files may be dropped). From its costs follows the model that it prints, of fifty million splats, ten thousand views
+and 512 channels on more workers.
 """
 
 from __future__ import annotations
@@ -39,6 +40,8 @@ GIB = 1 << 30
 SIZE, FOCAL = (960, 720), 900.0
 CITY = 4_000.0  # units of a side
 HEIGHT = 300.0  # of the cameras
+OPENED = 7  # times that a block of splats opens the files of a piece of views: W three times, tuples and shares twice
+PLOTS = (8, 16, 40, 80)  # units of a side, of each level
 
 
 @contextmanager
@@ -86,10 +89,22 @@ def flight(views: int) -> lc.Cameras:
     return lc.Cameras(made)
 
 
-def maps(views: lc.Cameras, channels: int) -> Iterator[tuple[str, lc.FeatureGrid]]:
-    """A feature map a view, one in memory at a time."""
-    for number, name in enumerate(views):
-        yield name, lc.FeatureGrid(np.random.default_rng(number).normal(0, 1, (45, 60, channels)).astype(np.float16))
+def plots(views: lc.Cameras, channels: int) -> Iterator[tuple[str, lc.Regions]]:
+    """Masks of square plots of the ground on four levels, with a vector a plot; one view in memory at a time."""
+    for name, camera in views.items():
+        corner, width, height = np.linalg.inv(camera.viewmat)[:2, 3], SIZE[0] // 2, SIZE[1] // 2
+        across = (np.arange(width) * 2 + 1 - SIZE[0] / 2) * HEIGHT / FOCAL
+        down = (np.arange(height) * 2 + 1 - SIZE[1] / 2) * HEIGHT / FOCAL
+        x, y = corner[0] + across, corner[1] - down  # the camera's y axis is the city's turned round
+        labels, vectors, count = [], [], 0
+        for side in PLOTS:
+            cells = np.stack(np.broadcast_arrays(*np.meshgrid(x // side, y // side)), axis=-1).astype(np.int64)
+            own, label = np.unique(cells.reshape(-1, 2), axis=0, return_inverse=True)
+            labels.append(count + label.reshape(height, width))
+            seeds = [np.random.default_rng([side, *(cell + 1000).tolist()]) for cell in own]
+            vectors.append(np.stack([seed.normal(size=channels) for seed in seeds]))
+            count += len(own)
+        yield name, lc.Regions(np.stack(labels).astype(np.int32), np.concatenate(vectors).astype(np.float16))
 
 
 class Cost(NamedTuple):
@@ -105,30 +120,30 @@ class Cost(NamedTuple):
     seen: float  # share of the splats
 
 
-def large(splats: int, channels: int, views: int) -> Cost:
+def large(splats: int, channels: int, views: int, preset: str) -> Cost:
     """Lift the city in blocks."""
     cameras = flight(views)
     with tempfile.TemporaryDirectory() as folder, most_held() as held:
         scene = city(splats)
         begun, before = time.perf_counter(), held[0]
         work = Path(folder, "blocks")
-        given = {"preset": "row-sum", "engine": lc.LocalEngine(), "checkpoint": work}
-        result = lc.lift(scene, cameras, maps(cameras, channels), **given)
+        given = {"preset": preset, "engine": lc.LocalEngine(), "checkpoint": work}
+        result = lc.lift(scene, cameras, plots(cameras, channels), **given)
         seconds = time.perf_counter() - begun
         result.save(Path(folder, "lift"))
         entries, shown = result.diagnostics["weights_entries"], result.diagnostics["plan"]["splats_a_view"]
-        blocks = sum(path.stat().st_size for path in work.glob("view-*"))
+        blocks = sum(path.stat().st_size for path in work.glob("weights-*"))
     seen = float(result.seen.float().mean())
     return Cost(seconds, result.metadata.timings, held[0], before, entries, blocks, shown, seen)
 
 
-def tell_large(splats: int, channels: int, views: int) -> None:
+def tell_large(splats: int, channels: int, views: int, preset: str) -> None:
     """Print what the city took, in a process of its own, and what follows from it."""
     with ProcessPoolExecutor(1, get_context("spawn")) as own:
-        cost = own.submit(large, splats, channels, views).result()
+        cost = own.submit(large, splats, channels, views, preset).result()
     view, entry = cost.timings["geometry"] / views, cost.timings["solve"] / (cost.entries * channels)
     size = "x".join(map(str, SIZE))
-    print(f"{splats} splats, {views} views of {size}, {channels} channels: {cost.seconds:.0f} s, "
+    print(f"{preset}: {splats} splats, {views} views of {size}, {channels} channels: {cost.seconds:.0f} s, "
           f"{cost.seen:.1%} seen")  # fmt: skip
     print("  " + ", ".join(f"{name} {took:.1f}" for name, took in cost.timings.items()))
     print(f"  at most {cost.held / GIB:.2f} GiB held, {cost.scene / GIB:.2f} of it the scene; "
@@ -145,7 +160,8 @@ def tell_large(splats: int, channels: int, views: int) -> None:
         rounds = -(-parts // workers) * WEIGHED * view + -(-blocks // workers) * solve / blocks
         sent = traffic / workers / GIB
         print(f"  {workers:>3} workers: {rounds / 3600:.2f} h, {sent:.1f} GiB read and written by each")
-    print(f"  first to break: {goal_views * blocks} openings of files ({goal_views} views x {blocks} blocks)")
+    opened = OPENED * parts * blocks
+    print(f"  first to break: {opened} openings of files ({OPENED} x {parts} pieces of views x {blocks} of splats)")
     print(f"  sums without waiting: {walk / 3600:.2f} h geometry, {solve / 3600:.2f} h solution")
 
 
@@ -158,11 +174,11 @@ def read(folder: Path) -> tuple[lc.Splats, lc.Cameras, Mapping[str, ViewFeatures
 def timed(scene: tuple[Any, ...], **given: Any) -> tuple[float, lc.LiftResult]:
     """Seconds of a lift, and what it gave."""
     begun = time.perf_counter()
-    result = lc.lift(*scene, preset="row-sum", **given)
+    result = lc.lift(*scene, **given)
     return time.perf_counter() - begun, result
 
 
-def overhead(folder: Path, turns: int) -> None:
+def overhead(folder: Path, turns: int, preset: str) -> None:
     """Print the seconds of the same lift in memory and in blocks, by turns."""
     scene = read(folder)
     engines: dict[str, Any] = {"in memory": None, "LocalEngine": lc.LocalEngine()}
@@ -177,7 +193,7 @@ def overhead(folder: Path, turns: int) -> None:
     first = None
     for _ in range(turns + 1):  # the first warms up
         for name, engine in engines.items():
-            seconds, found = timed(scene, engine=engine)
+            seconds, found = timed(scene, engine=engine, preset=preset)
             took[name].append(seconds)
             first = first or found
             assert torch.equal(found.features, first.features)
@@ -186,12 +202,12 @@ def overhead(folder: Path, turns: int) -> None:
         print(f"{name}: {middle:.2f} s, {middle / middles['in memory']:.2f} of a lift in memory, the same bits")
 
 
-def weak(folder: Path, turns: int) -> None:
+def weak(folder: Path, turns: int, preset: str) -> None:
     """Print the seconds of half of the views by one worker of a core, and of all views by two."""
     ray, scene, middles = import_module("ray"), read(folder), []
     for workers in (1, 2):
         ray.init(num_cpus=workers, include_dashboard=False, log_to_driver=False, _node_ip_address="127.0.0.1")
-        given = {"engine": lc.RayEngine("auto", cpus=1), "view_stride": 3 - workers}
+        given = {"engine": lc.RayEngine("auto", cpus=1), "view_stride": 3 - workers, "preset": preset}
         took = [timed(scene, **given) for _ in range(turns + 1)][1:]  # the first warms up
         ray.shutdown()
         middles.append(float(np.median([seconds for seconds, _ in took])))
@@ -209,10 +225,12 @@ def main() -> None:
         one = commands.add_parser(run.__name__)
         one.add_argument("folder", type=Path, metavar="SCENE")
         one.add_argument("--turns", type=int, default=3)
+        one.add_argument("--preset", default="default")
         one.set_defaults(run=run)
     two = commands.add_parser("large")
     for name, usual in (("splats", 20_000_000), ("channels", 64), ("views", 64)):
         two.add_argument(f"--{name}", type=int, default=usual)
+    two.add_argument("--preset", default="default")
     two.set_defaults(run=tell_large)
     options = vars(parser.parse_args())
     options.pop("run")(**options)

@@ -1,14 +1,16 @@
 """A lift in blocks: the job that all workers know, and its first step, W of a few views. Files in, files out.
 
-**Weighing** (`weigh`) reads WEIGHED views and writes a file each: its ``W = A'^T S`` (`RegionWeights`), the codebook
-E of its regions, and its sampled rays. It holds the splats that its views can see, and no others.
+**Weighing** (`weigh`) reads WEIGHED views and writes a file each, of the codebook E of its regions and its sampled
+rays, and one of all of them, of their ``W = A'^T S``, whose rows are splats: a block of splats lies in one place of
+it, so that later steps open one file for WEIGHED views. It holds the splats that its views can see, and no others.
 
-What follows on the views' files are the steps of `lifting.engines.steps`, whose pieces are views or blocks of splats.
+What follows on these files are the steps of `lifting.engines.steps`, whose pieces are views or blocks of splats.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -32,6 +34,7 @@ from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
 from liftcore.solve.codebook import ViewCodebook
 from liftcore.solve.rays import Readout, SampledRays
+from liftcore.solve.rows import SomeRows, gather_rows
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.pack import pair, read_features
 from liftcore.values.region_weights import RegionWeights
@@ -77,8 +80,12 @@ class Job:
         return -(-self.splats // self.rows)
 
     def view_file(self, number: int) -> Path:
-        """What was found of the view of that number."""
+        """What was found of the view of that number, beside its W."""
         return self.folder / f"view-{number:05}.safetensors"
+
+    def weights_file(self, piece: int) -> Path:
+        """W of a piece of views."""
+        return self.piece_file("weights", piece)
 
     def views_of(self, piece: int) -> range:
         """The numbers of the views of a piece."""
@@ -102,12 +109,25 @@ class Job:
 
 
 class FoundView(NamedTuple):
-    """What a weighing wrote of a view."""
+    """What a weighing wrote of a view, beside its W."""
 
-    weights: RegionWeights
     codebook: ViewCodebook
     sample: SampledRays
     levels: np.ndarray  # [M] i8, as `Geometry` has them
+    entries: int  # of its W
+    blind: bool  # whether it meets no splat
+
+
+class FoundWeights(NamedTuple):
+    """W of a piece of views: rows of splats, in each the entries of one view after the other's."""
+
+    splats: np.ndarray  # [n] i32 ascending
+    starts: np.ndarray  # [n + 1] i64
+    region: np.ndarray  # [nnz] i32, counted from the piece's first
+    weight: np.ndarray  # [nnz] f32
+    evidence_splats: np.ndarray  # [m] i32 ascending
+    evidence_starts: np.ndarray  # [m + 1] i64
+    evidence: np.ndarray  # [e] f32, of each view that meets the splat
 
 
 # ---- weighing
@@ -120,9 +140,16 @@ def weigh(job: Job, piece: int, threads: int | None) -> None:
     Raises:
         InvalidFeatures: a view is malformed.
     """
-    numbers = [number for number in job.views_of(piece) if not job.view_file(number).exists()]
-    if not numbers:
-        return
+    if not job.weights_file(piece).exists():
+        numbers = [number for number in job.views_of(piece) if not job.view_file(number).exists()]
+        if numbers:
+            _weigh_views(job, numbers, threads)
+        _write_weights(job, piece)
+    for number in job.views_of(piece):
+        _entries_file(job, number).unlink(missing_ok=True)
+
+
+def _weigh_views(job: Job, numbers: list[int], threads: int | None) -> None:
     device = choose_device(job.settings.device)
     views = LiftViews(job.cameras, pair(_packs(*job.packs), job.cameras)[0], job.names, [])
     cameras = [views.camera(number) for number in numbers]
@@ -140,9 +167,15 @@ def weigh(job: Job, piece: int, threads: int | None) -> None:
         for number, view in zip(numbers, found, strict=True):
             asked = waiting.popleft()
             weights = asked.weights(_renumbered(view, ids)).cpu()
+            weights.save(_entries_file(job, number))
             _write_view(
                 job.view_file(number), weights, asked, replace(view.rows, splats=ids[view.rows.splats.long()])
             )
+
+
+def _entries_file(job: Job, number: int) -> Path:
+    """W of a view, until that of its piece is written."""
+    return job.piece_file("entries", number)
 
 
 def seen_splats(job: Job, cameras: list[Camera], threads: int | None) -> tuple[Splats, Tensor]:
@@ -210,21 +243,63 @@ def _renumbered(view: ViewWeights, ids: Tensor) -> ViewWeights:
     return replace(view, weights=replace(weights, **own))
 
 
-# A view's file: W by the names of its own, and beside it the codebook and the sampled rays.
+# A view's file: the codebook and the sampled rays, and how much there is of its W.
 
 
 def _write_view(path: Path, weights: RegionWeights, asked: Question, rows: RayRows) -> None:
     readout, tuples = asked.readout, asked.codebook.tuples
-    others = {f"rays/{name}": getattr(rows, name) for name in ("indptr", "splats", "weights")}
-    others |= {f"read/{name}": torch.from_numpy(getattr(readout, name)) for name in ("rays", "columns", "shares")}
-    others |= {"codebook": asked.codebook.rows, "levels": torch.from_numpy(asked.levels)}
-    weights.save(path, others | ({} if tuples is None else {"tuples": tuples}))
+    tensors = {f"rays/{name}": getattr(rows, name) for name in ("indptr", "splats", "weights")}
+    tensors |= {f"read/{name}": torch.from_numpy(getattr(readout, name)) for name in ("rays", "columns", "shares")}
+    tensors |= {"codebook": asked.codebook.rows, "levels": torch.from_numpy(asked.levels)}
+    tensors["counts"] = torch.tensor([weights.region.shape[0], weights.evidence.shape[0]])
+    write_tensors(path, tensors | ({} if tuples is None else {"tuples": tuples}), {})
 
 
 def read_view(path: Path) -> FoundView:
-    """What a weighing wrote, mapped."""
-    weights, others = RegionWeights.load_with_others(path)
-    rows = RayRows(**{name: others[f"rays/{name}"] for name in ("indptr", "splats", "weights")})
-    readout = Readout(**{name: others[f"read/{name}"].numpy() for name in ("rays", "columns", "shares")})
-    codebook, sample = ViewCodebook(others["codebook"], others.get("tuples")), SampledRays(rows, readout)
-    return FoundView(weights, codebook, sample, others["levels"].numpy())
+    """What a weighing wrote of a view, mapped."""
+    arrays = map_tensors(path)[0]
+    found = {name: torch.from_numpy(array) for name, array in arrays.items()}
+    rows = RayRows(**{name: found[f"rays/{name}"] for name in ("indptr", "splats", "weights")})
+    readout = Readout(**{name: arrays[f"read/{name}"] for name in ("rays", "columns", "shares")})
+    codebook, sample = ViewCodebook(found["codebook"], found.get("tuples")), SampledRays(rows, readout)
+    entries, met = arrays["counts"].tolist()
+    return FoundView(codebook, sample, arrays["levels"], entries, blind=not met)
+
+
+# The file of a piece of views: their W, put together by splats.
+
+
+def _write_weights(job: Job, piece: int) -> None:
+    parts = [RegionWeights.load(_entries_file(job, number)) for number in job.views_of(piece)]
+    bases = np.cumsum([0, *(int(part.offsets[-1]) for part in parts[:-1])]).astype(np.int32)
+    splats = _union([part.splats for part in parts], job.splats)
+    met = _union([part.evidence_splats for part in parts], job.splats)
+
+    def entries() -> Iterator[SomeRows]:
+        for part, base in zip(parts, bases, strict=True):
+            values = part.region.numpy() + base, part.weight.numpy()
+            yield SomeRows(np.searchsorted(splats, part.splats.numpy()), part.indptr.numpy(), values)
+
+    def evidence() -> Iterator[SomeRows]:
+        for part in parts:
+            rows = np.searchsorted(met, part.evidence_splats.numpy())
+            yield SomeRows(rows, np.arange(rows.size + 1), [part.evidence.numpy()])
+
+    starts, (region, weight) = gather_rows(entries, splats.size, [torch.int32, torch.float32])
+    met_starts, (sums,) = gather_rows(evidence, met.size, [torch.float32])
+    tensors = {"splats": splats, "starts": starts, "evidence_splats": met, "evidence_starts": met_starts}
+    tensors = {name: torch.from_numpy(array) for name, array in tensors.items()}
+    write_tensors(job.weights_file(piece), tensors | {"region": region, "weight": weight, "evidence": sums}, {})
+
+
+def _union(parts: list[Tensor], count: int) -> np.ndarray:
+    """[n] i32 ascending, the splats of so many that any of the parts has."""
+    found = np.zeros(count, np.bool_)
+    for part in parts:
+        found[part.numpy()] = True
+    return np.flatnonzero(found).astype(np.int32)
+
+
+def read_weights(job: Job, piece: int) -> FoundWeights:
+    """W of a piece of views, mapped."""
+    return FoundWeights(**map_tensors(job.weights_file(piece))[0])

@@ -71,7 +71,7 @@ if TYPE_CHECKING:
     from liftcore.lifting.engines.base import Work
 
 PIECE = re.compile(
-    r"(view|relate|rows|tuples|contain|labels-\d+|share|cosines-\d+|factors-\d+|measure|columns|solved|guard|taken"
+    r"(view|entries|weights|relate|rows|tuples|contain|labels-\d+|share|cosines-\d+|factors-\d+|measure|columns|solved|guard|taken"
     r"|features)-\d+\.safetensors"
 )
 PACKED = 64  # views of a pack
@@ -382,8 +382,8 @@ def _share_regions(job: Job, plan: Plan) -> WeighedViews:
         view = read_view(job.view_file(number))
         counts.append(view.codebook.regions)
         levels.append(view.levels.copy())
-        entries += view.weights.region.shape[0]
-        if not view.weights.evidence.numel():
+        entries += view.entries
+        if view.blind:
             blind.append(name)
     together = {"offsets": np.cumsum(counts), "levels": np.concatenate(levels)}
     if together["offsets"][-1] > MOST_REGIONS:

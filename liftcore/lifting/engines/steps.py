@@ -21,7 +21,7 @@ M, of which those of codebooks and directions are at most TABLE_BYTES.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
@@ -34,9 +34,8 @@ from torch import Tensor
 
 from liftcore.io.safetensors_file import map_tensors, write_tensors
 from liftcore.io.shards import shard_at, write_rows
-from liftcore.lifting.engines.blocks import Job, file_version, read_view, scene_of
+from liftcore.lifting.engines.blocks import Job, file_version, read_weights, scene_of
 from liftcore.runtime.device import choose_device
-from liftcore.runtime.memory import zeros
 from liftcore.runtime.one_thread import one_thread
 from liftcore.solve.aggregate import cluster_sums, guard, with_feature
 from liftcore.solve.aggregate import spread as give_features
@@ -55,9 +54,9 @@ from liftcore.solve.objects import (
     view_shares,
 )
 from liftcore.solve.reweight import SceneAgreement, ViewConsistency, reweighted
-from liftcore.solve.rows import SomeRows, fill_rows, row_starts, take_rows
+from liftcore.solve.rows import SomeRows, fill_rows, gather_rows, take_rows, values_of
 from liftcore.solve.sums import PieceSums, packed
-from liftcore.values.region_weights import MEMORY_LIMIT, RegionWeights
+from liftcore.values.region_weights import RegionWeights
 
 # What the driver shares, of the size of M.
 REGIONS = "regions.safetensors"  # offsets [V + 1] i64, levels [M] i8
@@ -119,44 +118,19 @@ class ViewBlock(NamedTuple):
 
 
 def _view_block(job: Job, piece: int) -> ViewBlock:
-    numbers, offsets = job.views_of(piece), offsets_of(job)
-    parts = [read_view(job.view_file(number)).weights for number in numbers]
-    seen = np.zeros(job.splats, np.bool_)
-    for part in parts:
-        seen[part.splats.numpy()] = True
-    splats = np.flatnonzero(seen).astype(np.int32)
-    rows = [
-        SomeRows(
-            np.searchsorted(splats, part.splats.numpy()),
-            part.indptr.numpy(),
-            [part.region.numpy() + np.int32(offsets[number]), part.weight.numpy()],
-        )
-        for number, part in zip(numbers, parts, strict=True)
-    ]
-    own = offsets[numbers.start : numbers.stop + 1] - offsets[numbers.start]
-    return ViewBlock(int(offsets[numbers.start]), splats, _weights(lambda: rows, splats.size, own))
+    found, numbers, offsets = read_weights(job, piece), job.views_of(piece), offsets_of(job)
+    base = int(offsets[numbers.start])
+    region = values_of(found.region.size, torch.int32)
+    np.add(found.region, np.int32(base), out=region.numpy())
+    own = offsets[numbers.start : numbers.stop + 1] - base
+    return ViewBlock(base, found.splats, _weights(found.starts, region, torch.from_numpy(found.weight), own))
 
 
-def _weights(parts: Callable[[], Iterable[SomeRows]], count: int, offsets: np.ndarray) -> RegionWeights:
-    """W of so many splats from rows of regions and weights."""
-    starts = row_starts(parts(), count)
-    region, weight = _values(int(starts[-1]), torch.int32), _values(int(starts[-1]), torch.float32)
-    fill_rows(parts(), starts, [region.numpy(), weight.numpy()])
-    every, none = torch.arange(count, dtype=torch.int32), torch.zeros(0, dtype=torch.int32)
-    return RegionWeights(
-        every,
-        torch.from_numpy(starts),
-        region,
-        weight,
-        none,
-        torch.zeros(0, dtype=torch.float32),
-        torch.from_numpy(offsets),
-    )
-
-
-def _values(count: int, dtype: torch.dtype) -> Tensor:
-    """Zeros [n], in a mapped file where they are many."""
-    return zeros((count,), dtype, name="weights", in_file=count * dtype.itemsize > MEMORY_LIMIT >> 1)
+def _weights(starts: np.ndarray, region: Tensor, weight: Tensor, offsets: np.ndarray) -> RegionWeights:
+    """W of as many splats as rows begin."""
+    every, none = torch.arange(starts.size - 1, dtype=torch.int32), torch.zeros(0, dtype=torch.int32)
+    begins, evidence, own = torch.from_numpy(starts), torch.zeros(0, dtype=torch.float32), torch.from_numpy(offsets)
+    return RegionWeights(every, begins, region, weight, none, evidence, own)
 
 
 @one_thread()
@@ -179,7 +153,7 @@ def _tuples_of(job: Job, splats: np.ndarray) -> tuple[SplatTuples, np.ndarray]:
     ends = np.searchsorted(splats, np.arange(job.solutions + 1) * job.rows)
     starts, totals = np.zeros(splats.size + 1, np.int64), np.zeros(splats.size)
     for target in (None, "filled"):
-        tuples = _values(int(starts[-1]) if target else 0, torch.int32).numpy()
+        tuples = values_of(int(starts[-1]) if target else 0, torch.int32).numpy()
         for block, (first, last) in enumerate(pairwise(ends.tolist())):
             if first == last:
                 continue
@@ -251,13 +225,23 @@ def _part(splats: np.ndarray, starts: np.ndarray, values: Iterable[np.ndarray], 
     )
 
 
-def _view_rows(job: Job, ends: tuple[int, int]) -> Iterator[SomeRows]:
-    """The rows of W of a block in each view, of which one view's file is open at a time."""
-    for number, base in enumerate(offsets_of(job)[:-1]):
-        own = read_view(job.view_file(number)).weights
-        values = own.region.numpy(), own.weight.numpy()
-        part = _part(own.splats.numpy(), own.indptr.numpy(), values, ends)
-        yield SomeRows(part.rows, part.starts, [part.values[0] + np.int32(base), part.values[1]])
+def _weight_rows(job: Job, ends: tuple[int, int]) -> Iterator[SomeRows]:
+    """The rows of W of a block in each piece of views, of which one's file is open at a time."""
+    offsets = offsets_of(job)
+    for piece in range(job.weighings):
+        own, base = read_weights(job, piece), np.int32(offsets[job.views_of(piece).start])
+        part = _part(own.splats, own.starts, (own.region, own.weight), ends)
+        yield SomeRows(part.rows, part.starts, [part.values[0] + base, part.values[1]])
+
+
+def _evidence(job: Job, ends: tuple[int, int]) -> Tensor:
+    """The evidence of a block [n] f32: sums over views, in their order."""
+    sums = np.zeros(ends[1] - ends[0])
+    for piece in range(job.weighings):
+        own = read_weights(job, piece)
+        part = _part(own.evidence_splats, own.evidence_starts, (own.evidence,), ends)
+        np.add.at(sums, np.repeat(part.rows, np.diff(part.starts)), part.values[0].astype(np.float64))
+    return torch.from_numpy(sums).float()
 
 
 @one_thread()
@@ -267,20 +251,17 @@ def gather(job: Job, piece: int, threads: int | None) -> None:
     if path.exists():
         return
     ends = first, last = _bounds(job, piece)
-    W = _weights(lambda: _view_rows(job, ends), last - first, offsets_of(job))
-    evidence, sums = torch.zeros(last - first, dtype=torch.float64), W.row_sums()
+    starts, values = gather_rows(lambda: _weight_rows(job, ends), last - first, (torch.int32, torch.float32))
+    W = _weights(starts, values[0], values[1], offsets_of(job))
+    sums = W.row_sums()
     if job.related:
         _gather_tuples(job, piece, ends, sums)
-    for number in range(len(job.names)):
-        view = read_view(job.view_file(number)).weights
-        begin, end = torch.searchsorted(view.evidence_splats, torch.tensor(ends, dtype=torch.int32)).tolist()
-        evidence[view.evidence_splats[begin:end].long() - first] += view.evidence[begin:end].double()
     means = scene_of(job).means[first:last][W.indptr.diff() > 0].double()
     none = torch.zeros(0, 3, dtype=torch.float64)
     bounds = torch.stack([means.amin(dim=0), means.amax(dim=0)]) if means.numel() else none
     arrays = {"indptr": W.indptr, "region": W.region, "weight": W.weight, "sums": sums}
     totals = list(region_totals(W, threads)) if job.settings.robust_steps else None
-    write_piece(path, arrays | {"evidence": evidence.float(), "bounds": bounds}, totals)
+    write_piece(path, arrays | {"evidence": _evidence(job, ends), "bounds": bounds}, totals)
 
 
 def _gather_tuples(job: Job, piece: int, ends: tuple[int, int], totals: Tensor) -> None:
@@ -292,9 +273,7 @@ def _gather_tuples(job: Job, piece: int, ends: tuple[int, int], totals: Tensor) 
             part = _part(own["splats"], own["starts"], [own["tuples"]], ends)
             yield SomeRows(part.rows, part.starts, [part.values[0] + np.int32(base)])
 
-    starts = row_starts(parts(), ends[1] - ends[0])
-    tuples = _values(int(starts[-1]), torch.int32)
-    fill_rows(parts(), starts, [tuples.numpy()])
+    starts, (tuples,) = gather_rows(parts, ends[1] - ends[0], (torch.int32,))
     write_piece(job.piece_file("tuples", piece), {"starts": starts, "tuples": tuples, "totals": totals})
 
 
@@ -312,10 +291,8 @@ class SplatBlock:
 def _splat_block(job: Job, piece: int) -> SplatBlock:
     first, last = _bounds(job, piece)
     arrays = map_tensors(job.piece_file("rows", piece))[0]
-    indptr, region, weight = (torch.from_numpy(arrays[name]) for name in ("indptr", "region", "weight"))
-    every, none = torch.arange(last - first, dtype=torch.int32), torch.zeros(0, dtype=torch.int32)
-    offsets = torch.from_numpy(offsets_of(job))
-    W = RegionWeights(every, indptr, region, weight, none, torch.zeros(0, dtype=torch.float32), offsets)
+    region, weight = (torch.from_numpy(arrays[name]) for name in ("region", "weight"))
+    W = _weights(arrays["indptr"], region, weight, offsets_of(job))
     return SplatBlock(first, last, W, scene_of(job).means[first:last], arrays)
 
 
@@ -346,7 +323,7 @@ def _consensus(job: Job, block: SplatBlock, threads: int | None) -> Tensor | Non
     """c_jm of the entries of a block [nnz] f32, where views have masks."""
     if job.usual_share is None:
         return None
-    sums, views = _values(block.W.region.shape[0], torch.float32), _values(block.W.region.shape[0], torch.uint8)
+    sums, views = values_of(block.W.region.shape[0], torch.float32), values_of(block.W.region.shape[0], torch.uint8)
     ends = block.first, block.last
 
     def parts() -> Iterator[SomeRows]:
@@ -381,7 +358,7 @@ def _weighed(
     """The factors after so many steps, at least one, and the scores of splats."""
     cosines = torch.from_numpy(map_tensors(job.piece_file(f"cosines-{step - 1}", piece))[0]["cosines"])
     before = _before(job, piece, step - 1)
-    factors = _values(cosines.shape[0], torch.float32).copy_(cosines)
+    factors = values_of(cosines.shape[0], torch.float32).copy_(cosines)
     scores = judge.weigh(factors, before, scene_agreement(job, step - 1), _consensus(job, block, threads))
     return factors, scores
 

@@ -151,11 +151,11 @@ def all_tuples(parts: list[ViewBlock]) -> SplatTuples:
             for part, base in zip(parts, bases, strict=False)
         ),
         SPLATS,
-        [np.int32],
+        [torch.int32],
     )
     own = [np.where(p.tuples.parents < 0, -1, p.tuples.parents + b) for p, b in zip(parts, bases, strict=False)]
     parents, members = np.concatenate(own).astype(np.int32), np.concatenate([p.tuples.members for p in parts])
-    return SplatTuples(starts, tuples, parents, members)
+    return SplatTuples(starts, tuples.numpy(), parents, members)
 
 
 @pytest.mark.parametrize("size", [1, 4])
@@ -178,11 +178,11 @@ def test_consensus_by_blocks_of_views_is_that_of_the_whole_scene(
             for part, share in zip(parts, shares, strict=True)
         ),
         SPLATS,
-        [np.float32, np.uint8],
+        [torch.float32, torch.uint8],
     )
-    assert np.unique(counts).size > 3
+    assert np.unique(counts.numpy()).size > 3
     expected = mask_consensus(W, LEVELS, 2, means=means)
-    np.testing.assert_array_equal(with_mean(sums, counts, usual, 1), expected)
+    np.testing.assert_array_equal(with_mean(sums.numpy(), counts.numpy(), usual, 1), expected)
 
 
 def test_objects_by_blocks_are_those_of_the_whole_scene(
