@@ -168,10 +168,10 @@ def region_weights(
     device = choose_device(inputs.settings.device)
     raster = open_raster(inputs.splats, device, threads)
     count = inputs.splats.count
-    with shown_progress(progress) as shown:
-        geometry = weigh_views(raster, count, inputs.views, inputs.settings, shown, by_rows=True, threads=threads)
+    with shown_progress(progress) as reporter:
+        geometry = weigh_views(raster, count, inputs.views, inputs.settings, reporter, by_rows=True, threads=threads)
         W = SceneWeights(raster, device, None, inputs.views, geometry)
         if reweight:
-            steps = InMemory(inputs.splats, inputs.settings, Timings(shown), threads)
+            steps = InMemory(inputs.splats, inputs.settings, Timings(reporter), threads)
             W, _ = reweigh(steps, W, bool((geometry.levels >= 0).any()), inputs.settings, steps.timings)
     return W.weights.cpu()

@@ -83,8 +83,8 @@ def lift(
     """
     inputs = LiftInputs.of(splats, cameras, views, preset, settings, threads)
     checkpoint, warn = _checkpoint(checkpoint), _WarnOnce()
-    with shown_progress(progress) as shown:
-        timings = Timings(shown)
+    with shown_progress(progress) as reporter:
+        timings = Timings(reporter)
         if engine is None:
             steps = InMemory(inputs.splats, inputs.settings, timings, threads, checkpoint)
             result = run(steps, inputs, timings, on_plan or warn.of_plan)

@@ -20,6 +20,7 @@ from liftcore.query.objects import largest_box
 from liftcore.query.question import SceneObject
 from liftcore.query.scene import QueryScene, as_numpy
 from liftcore.query.scores import cosines, norms_of
+from liftcore.runtime.one_line import one_line
 from liftcore.scene.origin import MAP_REACH
 
 MOST_WORDS = 65_536  # of a vocabulary: their vectors take 130 MB at 512 channels
@@ -38,6 +39,10 @@ class Catalogue:
     objects: tuple[SceneObject, ...]
     explanation: str  # why there are as many as there are
     features: np.ndarray  # [N, F] f32, unit means; zero where no splat has a feature
+
+    def __repr__(self) -> str:
+        some = ", ".join(f"{one.name or one.id}: {one.splats}" for one in self.objects)
+        return one_line(self, f"{len(self.objects)} objects", f"features={list(self.features.shape)}", some or "none")
 
 
 def catalogue(scene: QueryScene, words: Sequence[str] = (), vectors: Any = None) -> Catalogue:

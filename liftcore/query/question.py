@@ -27,6 +27,7 @@ from pydantic_core import CoreSchema, core_schema
 from liftcore.errors import InvalidQuery
 from liftcore.query.terms import NOTATIONS, Example, OneSplat, Pixel, Region, Term, Vector, parse_example
 from liftcore.runtime.fields import Body, NoBoolean, takes
+from liftcore.runtime.one_line import one_line, value_text
 from liftcore.scene.compositing import MAX_SIDE
 
 if TYPE_CHECKING:
@@ -280,6 +281,9 @@ class Value(BaseModel):
     """A part of an answer."""
 
     model_config = ConfigDict(frozen=True, defer_build=True)
+
+    def __repr__(self) -> str:
+        return one_line(self, *(f"{name}={value_text(value)}" for name, value in self))
 
 
 def _finite(value: float) -> float | None:

@@ -28,6 +28,7 @@ from liftcore.query.scene import QueryScene, as_numpy
 from liftcore.query.scores import cosines, norms_of
 from liftcore.query.terms import Example
 from liftcore.query.threshold import find_threshold
+from liftcore.runtime.one_line import one_line
 from liftcore.runtime.progress import Progress, silent
 
 if TYPE_CHECKING:
@@ -39,7 +40,6 @@ LEAST_OWN = 0.25  # of a word's answer, by evidence, that no other word is neare
 MOST_WORDS = 4_096
 AT_ONCE = 16  # words whose cosines are held at a time: [P, AT_ONCE] f32
 SHOWN = 20  # words of a drawn legend
-SHOWN_WORDS = 6  # of what Python shows
 
 
 @dataclass(frozen=True)
@@ -53,9 +53,8 @@ class Segmentation:
     found: tuple[NamedSplats, ...]  # those that are there, with the most evidence first
 
     def __repr__(self) -> str:
-        found = ", ".join(f"{one.word!r}: {one.splats}" for one in self.found[:SHOWN_WORDS])
-        more = ", ..." if len(self.found) > SHOWN_WORDS else ""
-        return f"Segmentation({len(self.labels)} splats, {len(self.found)} of {len(self.words)} words: {found}{more})"
+        found = ", ".join(f"{one.word!r}: {one.splats}" for one in self.found)
+        return one_line(self, f"{len(self.labels)} splats", f"{len(self.found)} of {len(self.words)} words: {found}")
 
     @property
     def values(self) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 
 from liftcore.errors import InvalidCameras, NotFound
 from liftcore.runtime.nearest import nearest
+from liftcore.runtime.one_line import one_line
 from liftcore.scene.compositing import MAX_SIDE
 from liftcore.scene.distortion import Distortion, Lens, Rectangle, shared_lens
 from liftcore.scene.origin import FILE_ORIGIN, MAP_REACH, Origin
@@ -174,9 +175,10 @@ class Camera:
         return replace(self, viewmat=pose)
 
     def __repr__(self) -> str:
-        focal, name = f"fx={self.fx:.6g}, fy={self.fy:.6g}", repr(self.name[-NAME_SHOWN:])
-        lens = ", distorted" if self.lens else ", of a panorama" if self.face else ""
-        return f"Camera({name}, {self.width}x{self.height}, {focal}, cx={self.cx:.6g}, cy={self.cy:.6g}{lens})"
+        kind = ["distorted"] * bool(self.lens) + ["of a panorama"] * bool(self.face)
+        numbers = {"fx": self.fx, "fy": self.fy, "cx": self.cx, "cy": self.cy}
+        K = [f"{name}={value:.6g}" for name, value in numbers.items()]
+        return one_line(self, repr(self.name[-NAME_SHOWN:]), f"{self.width}x{self.height}", *K, *kind)
 
     def replace(self, **changes: Any) -> Camera:
         """The same camera with other fields, or with another ``fx``, ``fy``, ``cx`` or ``cy``."""
@@ -352,7 +354,7 @@ class Cameras(Mapping[str, Camera]):
 
     def __repr__(self) -> str:
         some = ", ".join(repr(name[-NAME_SHOWN:]) for name in list(self)[:2]) + (", ..." if len(self) > 2 else "")
-        return f"Cameras({len(self)} views: {some})"
+        return one_line(self, f"{len(self)} views: {some}")
 
     def transformed(
         self,

@@ -5,10 +5,11 @@ Nothing here loads torch: settings share these values with processes that never 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 
 from liftcore.errors import InvalidInput, InvalidSettings
+from liftcore.runtime.one_line import one_line
 from liftcore.scene.kernel import Kernel
 
 # The constants of the field, named once. They move results at the 1e-3 level: state them with every number.
@@ -40,6 +41,10 @@ class CompositingParams:
     antialiased: bool = False  # the mip filter's opacity compensation, 3DGS only
     stride: int = 1  # region weights look at every n-th pixel in x and in y; renders at all of them
     offset: tuple[int, int] = (0, 0)  # the first such pixel (x, y), each below the stride
+
+    def __repr__(self) -> str:
+        others = [field for field in fields(self) if getattr(self, field.name) != field.default]
+        return one_line(self, *(f"{field.name}={getattr(self, field.name)!r}" for field in others))
 
 
 class Selection(StrEnum):

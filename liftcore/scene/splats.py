@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from liftcore.errors import InvalidSplats
+from liftcore.runtime.one_line import one_line, point_text
 from liftcore.scene.harmonics import SH_C0, band_rotation
 from liftcore.scene.kernel import DARK_LOBE, LOBE_COLOURS, NORMALS, Kernel, kernel_named, scale_count
 from liftcore.scene.origin import FILE_ORIGIN, Origin, extent_of_most, float32_step, local_origin, usual_size
@@ -198,8 +199,8 @@ class Splats:
 
     def __repr__(self) -> str:
         colour = "no colour" if self.sh is None else f"sh degree {self.sh_degree}"
-        about = "" if self.origin == FILE_ORIGIN else f", about {tuple(round(value, 1) for value in self.origin)}"
-        return f"Splats({self.count} of {self.kernel}, {colour}{about}, on {self.means.device})"
+        about = [] if self.origin == FILE_ORIGIN else [f"about {point_text(self.origin)}"]
+        return one_line(self, f"{self.count} of {self.kernel}", colour, *about, f"on {self.means.device}")
 
     def __len__(self) -> int:
         return self.count

@@ -12,6 +12,7 @@ import numpy as np
 from liftcore.errors import InvalidQuery, InvalidTable
 from liftcore.io.safetensors_file import check_header, map_tensors
 from liftcore.runtime import nearest
+from liftcore.runtime.one_line import one_line
 from liftcore.text import check_texts
 
 _HALF = re.compile("[\ud800-\udfff]")  # half a surrogate pair, which UTF-8 cannot carry
@@ -62,6 +63,9 @@ class TableEncoder:
         self._unit = (wide / lengths).astype(np.float32)
         # The first of two equal words wins: reversed, so that it is written last.
         self._rows = {plain(word): row for row, word in reversed(list(enumerate(words)))}
+
+    def __repr__(self) -> str:
+        return one_line(self, repr(self.name), f"{len(self.words)} words", f"{self.channels} channels")
 
     @classmethod
     def open(cls, path: Path) -> Self:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 from pydantic import AfterValidator, BaseModel, ConfigDict
 
 from liftcore.errors import InvalidSplats
+from liftcore.runtime.one_line import one_line
 from liftcore.scene.origin import FILE_ORIGIN, Origin
 from liftcore.scene.views import composed
 from liftcore.text.table import TableEncoder, own_words
@@ -90,8 +91,8 @@ class Lift:
 
     def __repr__(self) -> str:
         splats, channels = self.features.shape
-        what = f"{splats} splats, {channels} channels from {len(self.views)} views"
-        return f"{type(self).__name__}({what}, preset={str(self.settings.preset)!r}, on {self.features.device})"
+        what = f"{splats} splats", f"{channels} channels from {len(self.views)} views"
+        return one_line(self, *what, f"preset={str(self.settings.preset)!r}", f"on {self.features.device}")
 
     @property
     def settings(self) -> LiftSettings:

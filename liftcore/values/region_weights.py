@@ -20,6 +20,7 @@ from liftcore.errors import InvalidInput, Unavailable
 from liftcore.io.safetensors_file import map_tensors, write_tensors
 from liftcore.runtime.device import out_of_memory
 from liftcore.runtime.memory import zeros
+from liftcore.runtime.one_line import one_line
 from liftcore.runtime.one_thread import one_thread
 
 FORMAT = "splatlift-weights/1"
@@ -50,7 +51,7 @@ class RegionWeights:
 
     def __repr__(self) -> str:
         sizes = {"splats": self.splats.shape[0], "regions": int(self.offsets[-1]), "entries": self.region.shape[0]}
-        return f"RegionWeights({', '.join(f'{name}={size}' for name, size in sizes.items())}, on {self.device})"
+        return one_line(self, *(f"{name}={size}" for name, size in sizes.items()), f"on {self.device}")
 
     @property
     def nbytes(self) -> int:

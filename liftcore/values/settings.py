@@ -16,6 +16,7 @@ from pydantic_core import PydanticCustomError
 from liftcore.errors import InvalidSettings
 from liftcore.runtime.device_name import device_name
 from liftcore.runtime.nearest import nearest
+from liftcore.runtime.one_line import one_line
 from liftcore.scene.compositing import MOST_OF_A_RAY, CompositingParams, Selection, Weighting, check_antialiased
 
 if TYPE_CHECKING:  # it loads torch
@@ -218,6 +219,11 @@ class LiftSettings(BaseModel):
             told = "robust_steps of 1 or more beside reliability, consensus and aggregation_guard, which need a step"
             raise PydanticCustomError("whole_regions", "{expected}", {"expected": told})
         return self
+
+    def __repr__(self) -> str:
+        own = self.model_dump(mode="json", include=self.model_fields_set - {"preset", "speed"})
+        named = {"preset": str(self.preset), "speed": str(self.speed), **own}
+        return one_line(self, *(f"{name}={value!r}" for name, value in named.items()))
 
     @property
     def lift_params(self) -> CompositingParams:

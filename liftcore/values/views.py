@@ -14,6 +14,7 @@ from torch import Tensor
 
 from liftcore.errors import InvalidFeatures
 from liftcore.io.npy import without_unit_axes
+from liftcore.runtime.one_line import one_line
 from liftcore.scene.splats import shared_tensor
 
 NO_LABEL = -1  # a pixel that a level leaves unlabelled
@@ -109,7 +110,7 @@ class Regions:
 
     def __repr__(self) -> str:
         sizes = f"labels={list(self.labels.shape)}, codebook={list(self.codebook.shape)}"
-        return f"Regions({sizes} {_dtype_name(self.codebook)}, on {self.codebook.device})"
+        return one_line(self, f"{sizes} {_dtype_name(self.codebook)}", f"on {self.codebook.device}")
 
     def cpu(self) -> Self:
         """The same with its tensors on the CPU."""
@@ -148,7 +149,7 @@ class FeatureGrid:
         object.__setattr__(self, "grid", found)
 
     def __repr__(self) -> str:
-        return f"FeatureGrid({list(self.grid.shape)} {_dtype_name(self.grid)}, on {self.grid.device})"
+        return one_line(self, f"{list(self.grid.shape)} {_dtype_name(self.grid)}", f"on {self.grid.device}")
 
     def cpu(self) -> Self:
         """The same with its tensor on the CPU."""

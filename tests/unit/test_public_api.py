@@ -418,15 +418,32 @@ def test_two_threads_lift_alike_beside_another_default_dtype(scene):
         assert torch.get_default_dtype() == torch.float64
 
 
-def test_results_are_shown_in_a_line(scene):
+def test_every_public_value_is_shown_in_a_line_that_says_its_size(scene):
     _, splats, cameras, views = scene
-    made = lc.lift(splats, cameras, views)
+    made = lc.lift(splats, cameras, views, aggregation=True, aggregation_cluster_size=2)
     vectors = torch.eye(2, made.features.shape[1])
-    shown = [made, lc.region_weights(splats, cameras, views), made.query(vectors)]
-    shown.append(made.segment(["a", "b"], vectors, splats))
-    for result in shown:
-        assert repr(result).startswith(type(result).__name__) and len(repr(result)) < 120
-        assert str(splats.count) in repr(result)
+    answer, words = made.query(vectors, splats=splats, threshold=0.1), ["a" * 90, "b"]
+    segmentation, catalogue = made.segment(words, vectors, splats), made.objects(splats, words, vectors)
+    sized = [splats, made, lc.region_weights(splats, cameras, views), answer, segmentation]
+    sized += [lc.plan(splats, cameras, views), lc.plan_photos(splats, cameras)]
+    long = lc.LiftSettings.of(**dict(lc.LiftSettings.of(speed="fast")))
+    others = [cameras, cameras["v0"].replace(name="x" * 300), *views.values(), long, lc.LiftSettings.of()]
+    others += [
+        answer.objects,
+        *(answer.objects.found if answer.objects else ()),
+        *segmentation.found,
+        catalogue,
+        *catalogue.objects,
+    ]
+    others += [lc.CompositingParams(), lc.CompositingParams(stride=3), lc.LocalEngine(), lc.open_encoder("lvis")]
+    for value in (*sized, *others, lc.FeatureGrid(np.ones((3, 4, 5)))):
+        line = repr(value)
+        assert line.startswith(type(value).__name__ + "(") and line.endswith(")")
+        assert len(line) <= 120 and "\n" not in line
+    assert all(str(splats.count) in repr(value) for value in sized)
+    assert "[3, 4, 5]" in repr(lc.FeatureGrid(np.ones((3, 4, 5)))) and "stride=3" in repr(
+        lc.CompositingParams(stride=3)
+    )
 
 
 def test_what_a_caller_set_stays_when_a_call_names_another_speed_or_preset() -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Protocol
 
+from liftcore.runtime.one_line import one_line
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -46,6 +48,9 @@ class LocalEngine:
 
     def __init__(self, threads: int | None = None) -> None:
         self.threads = threads
+
+    def __repr__(self) -> str:
+        return one_line(self, f"threads={self.threads}")
 
     def run(self, work: Work, job: Job, pieces: int) -> Iterator[int]:
         """See the protocol."""

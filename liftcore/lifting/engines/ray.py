@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.errors import InvalidInput, SplatliftError, Unavailable
+from liftcore.runtime.one_line import one_line
 
 if TYPE_CHECKING:
     from liftcore.lifting.engines.base import Work
@@ -53,6 +54,9 @@ class RayEngine:
         self.scratch = None if scratch is None else Path(scratch)
         self._address, self._cpus, self._gpus = address, cpus, gpus
         self._ray: Any = _connected(address)
+
+    def __repr__(self) -> str:
+        return one_line(self, repr(self._address), f"cpus={self._cpus}", f"gpus={self._gpus}")
 
     def run(self, work: Work, job: Job, pieces: int) -> Iterator[int]:
         """See `lifting.engines.base.Engine`."""

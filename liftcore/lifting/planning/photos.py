@@ -30,6 +30,7 @@ from liftcore.lifting.planning.views import SAMPLE, WELL_COVERED, greedy, spread
 from liftcore.raster import check_given
 from liftcore.raster.base import ViewRequest
 from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.runtime.one_line import one_line
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, shown_progress, silent
 from liftcore.runtime.torch_modes import usual_modes
@@ -73,6 +74,10 @@ class PhotoPlan:
     seen_share: float  # of the splats, that some photo sees
     row_sum: float  # mean sum of the weights of a ray
     warnings: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        photos = f"{len(self.order)} photos", f"{len(self.spare)} of them spare", f"first {self.order[0][-40:]!r}"
+        return one_line(self, f"{self.splats} of {self.kernel}", *photos, f"seen_share={self.seen_share:.3g}")
 
     def facts(self) -> dict[str, Any]:
         """Plain values, as JSON has them."""
@@ -127,8 +132,8 @@ def plan_photos(
     views = list(known.values())[:: settings.view_stride]
     rows = spread(splats.count, min(SAMPLE, splats.count))
     raster = CpuRaster(splats, threads)
-    with one_thread(), shown_progress(progress) as shown:
-        evidence, row_sum = evidence_of_views(raster, views, rows, settings, shown)
+    with one_thread(), shown_progress(progress) as reporter:
+        evidence, row_sum = evidence_of_views(raster, views, rows, settings, reporter)
         seconds = _seconds(raster, views[len(views) // 2], settings)
     weight, seen = evidence.sum(axis=0, dtype=np.float64), sees(evidence)
     order = list(photo_order(seen, weight))

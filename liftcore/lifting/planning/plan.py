@@ -30,6 +30,7 @@ from liftcore.raster import open_raster
 from liftcore.raster.base import Raster
 from liftcore.runtime.device import CPU, Device
 from liftcore.runtime.memory import check_disk, lack_of_disk
+from liftcore.runtime.one_line import one_line
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import silent
 from liftcore.scene.cameras import Camera, distortion_warning
@@ -94,6 +95,12 @@ class Plan:
     seconds: float | None  # that looking through the views takes on this machine today, about; None for few views
     warnings: tuple[str, ...]  # of this machine, today
     told: tuple[str, ...]  # warnings of what is lifted, which the certificate of the lift has too
+
+    def __repr__(self) -> str:
+        views = f"{len(self.views)} of {self.there} views"
+        memory = f"{self.memory_bytes / 2**30:.1f} GiB"
+        warnings = f"{len(self.warnings) + len(self.told)} warnings"
+        return one_line(self, f"{self.splats} of {self.kernel}", views, f"{self.channels} channels", memory, warnings)
 
     @property
     def memory_bytes(self) -> int:
