@@ -33,6 +33,7 @@ from liftcore.solve.reweight import Agreement, agreement_factors, reweighted, wh
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import LiftSettings
+from liftcore.values.views import ViewFeatures
 
 LEAST_KEPT = 0.5  # of a splat's weight, in regions that the aggregation kept, for it to be solved for again
 
@@ -100,18 +101,11 @@ class InMemory(Steps[SceneWeights]):
             on_plan(plans[-1])
 
         geometry = weigh_views(
-            raster,
-            self.splats.count,
-            views,
-            self.settings,
-            self.timings.progress,
-            by_rows=self.settings.weighs_rows,
+            raster, self.splats.count, views, self.settings, self.timings.progress,
+            by_rows=self.settings.weighs_rows, device_bytes=plan.kept_on_card, threads=self.threads,
             checkpoint=self.checkpoint.of(self.splats, plan.device.facts()) if self.checkpoint else None,
-            device_bytes=plan.kept_on_card,
-            threads=self.threads,
-            first=first,
-            on_first=look,
-        )
+            first=first, on_first=look,
+        )  # fmt: skip
         W = SceneWeights(raster, plan.device, plan.features_room, views, geometry)
         return W, WeighedViews(plans[-1], geometry.levels, W.weights.region.shape[0], geometry.blind)
 
@@ -126,15 +120,10 @@ class InMemory(Steps[SceneWeights]):
     def reweight(self, W: SceneWeights) -> tuple[SceneWeights, float | None]:
         weights = W.weights.cpu()
         agreement = agreement_factors(
-            weights,
-            W.geometry.codebook,
-            self.settings.robust_steps,
-            self.timings.progress,
-            means=self.splats.means,
-            threads=self.threads,
-            reliability=whole_regions(self.settings.reliability, W.geometry.levels),
-            consensus=W.consensus,
-        )
+            weights, W.geometry.codebook, self.settings.robust_steps, self.timings.progress,
+            means=self.splats.means, threads=self.threads,
+            reliability=whole_regions(self.settings.reliability, W.geometry.levels), consensus=W.consensus,
+        )  # fmt: skip
         W = replace(W.times(weights, agreement.factors), consensus=None, agreement=agreement)
         return W, agreement.reliability
 
@@ -144,29 +133,20 @@ class InMemory(Steps[SceneWeights]):
 
     def solve(self, W: SceneWeights, clusters: RegionObjects | None) -> tuple[Tensor, Support]:
         solution = solve(
-            W.weights,
-            W.geometry.codebook,
-            getattr(torch, self.settings.dtype),
-            self.timings.progress,
-            means=self.splats.means,
-            threads=self.threads,
-            device=W.device,
-            memory=W.memory,
-        )
+            W.weights, W.geometry.codebook, getattr(torch, self.settings.dtype), self.timings.progress,
+            means=self.splats.means, threads=self.threads, device=W.device, memory=W.memory,
+        )  # fmt: skip
         confidence = W.agreement.confidence if W.agreement else None
         return solution.features, Support(W.row_sums(), W.geometry.evidence(), solution.agreement, confidence)
 
     def refine(self, W: SceneWeights, X: Tensor, seen: np.ndarray) -> tuple[Tensor, dict[str, Any]]:
         settings, progress, books, facts = self.settings, self.timings.progress, W.geometry.books, dict[str, Any]()
         views = W.views
-        rays = AllRays(
-            W.raster,
-            self.splats.count,
-            views.lifted,
-            lambda number: as_read(views[number][1], settings, views.names[number]),
-            settings.lift_params,
-            progress,
-        )
+
+        def observed(number: int) -> ViewFeatures:
+            return as_read(views[number][1], settings, views.names[number])
+
+        rays = AllRays(W.raster, self.splats.count, views.lifted, observed, settings.lift_params, progress)
         if settings.cg_steps:
             with self.timings.stage("refine"):
                 refinement = refine(rays, X, seen, books, settings, progress)
@@ -181,17 +161,9 @@ class InMemory(Steps[SceneWeights]):
         if settings.aggregation_guard and agreement and agreement.explained is not None:
             judged = W.weights.cpu(), agreement.directions, agreement.explained
         X, found = aggregate(
-            X,
-            W.geometry.evidence().numpy(),
-            self.splats,
-            W.raster,
-            W.views,
-            settings,
-            self.timings.progress,
-            self.threads,
-            things=clusters,
-            judged=judged,
-        )
+            X, W.geometry.evidence().numpy(), self.splats, W.raster, W.views, settings, self.timings.progress,
+            self.threads, things=clusters, judged=judged,
+        )  # fmt: skip
         if not settings.aggregation_resolve:
             return X, found
         with self.timings.stage("resolve"):

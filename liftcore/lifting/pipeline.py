@@ -83,15 +83,16 @@ def lift(
     """
     inputs = LiftInputs.of(splats, cameras, views, preset, settings, threads)
     checkpoint, warn = _checkpoint(checkpoint), _WarnOnce()
+    show = on_plan or (lambda plan: warn((*plan.warnings, *plan.told)))
     with shown_progress(progress) as reporter:
         timings = Timings(reporter)
         if engine is None:
             steps = InMemory(inputs.splats, inputs.settings, timings, threads, checkpoint)
-            result = run(steps, inputs, timings, on_plan or warn.of_plan)
+            result = run(steps, inputs, timings, show)
         else:
             with steps_in_blocks(engine, inputs, timings, checkpoint.folder if checkpoint else None) as steps:
-                result = run(steps, inputs, timings, on_plan or warn.of_plan)
-    warn.of(result.diagnostics["warnings"] if on_plan is None else ())
+                result = run(steps, inputs, timings, show)
+    warn(result.diagnostics["warnings"] if on_plan is None else ())
     return result
 
 
@@ -247,12 +248,7 @@ class _WarnOnce:
     def __init__(self) -> None:
         self._said = set[str]()
 
-    def of_plan(self, plan: Plan) -> None:
-        """What the plan warns of, before the first view."""
-        self.of((*plan.warnings, *plan.told))
-
-    def of(self, warnings: Iterable[str]) -> None:
-        """Those that were not logged yet."""
+    def __call__(self, warnings: Iterable[str]) -> None:
         for warning in dict.fromkeys(warnings):
             if warning not in self._said:
                 log.warning(warning)

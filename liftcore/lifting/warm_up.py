@@ -26,17 +26,9 @@ if TYPE_CHECKING:
 def warm_up_lift(kernel: Kernel, device: Device, settings: LiftSettings) -> None:
     """Compile what a lift with these settings runs, or load it from the disk cache; its diagnostics excepted."""
     warm_up(kernel, device, settings.lift_params, settings.weighting)
-    one = torch.zeros(1, dtype=torch.int32)
-    W = one_view(
-        one,
-        torch.tensor([0, 1]),
-        one,
-        torch.ones(1, dtype=torch.float32),
-        one,
-        torch.ones(1, dtype=torch.float32),
-        regions=1,
-    )
-    book = Codebook((ViewCodebook(torch.ones(1, 1, dtype=torch.float32)),))
+    first, one = torch.zeros(1, dtype=torch.int32), torch.ones(1, dtype=torch.float32)
+    W = one_view(first, torch.tensor([0, 1]), first, one, first, one, regions=1)
+    book = Codebook((ViewCodebook(one[None]),))
     if settings.objects or settings.aggregation:
         region_objects(W, np.zeros(1, np.int8), np.ones(1), 1)
     if settings.consensus:
@@ -46,4 +38,4 @@ def warm_up_lift(kernel: Kernel, device: Device, settings: LiftSettings) -> None
     if settings.loss == "huber":
         huber_factors(W, book, threads=1)
     if settings.aggregation:
-        explained_by(W, RegionDirections.of_weights(W, book), one, torch.ones(1, 1, dtype=torch.float32), 1)
+        explained_by(W, RegionDirections.of_weights(W, book), first, one[None], 1)

@@ -15,6 +15,11 @@ from liftcore.errors import Unavailable
 
 MOUNTS = Path("/proc/self/mounts")
 IN_MEMORY = ("tmpfs", "ramfs")
+CONTROL_GROUPS = (  # folder, and the files of limit, use and statistics: versions 2 and 1
+    ("/sys/fs/cgroup", ("memory.max", "memory.current", "memory.stat")),
+    ("/sys/fs/cgroup/memory", ("memory.limit_in_bytes", "memory.usage_in_bytes", "memory.stat")),
+)
+FILE_PAGES = ("inactive_file", "active_file")
 
 
 def zeros(shape: tuple[int, ...], dtype: torch.dtype, *, name: str, in_file: bool = False) -> Tensor:
@@ -84,3 +89,32 @@ def _no_disk(size: int, name: str, got: str) -> Unavailable:
         got=got,
         hint="set TMPDIR to a folder with more room, or try fewer views, fewer splats or fewer channels",
     )
+
+
+def free_memory() -> int | None:
+    """Bytes that this process may still take: of the machine, or of its control group; None where neither says."""
+    found = []
+    with suppress(OSError, ValueError):  # not Linux
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        found += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
+    for folder, names in CONTROL_GROUPS:
+        with suppress(OSError, ValueError):  # a machine has one of the two, or none
+            limit, used, stat = (Path(folder, name).read_text(encoding="ascii") for name in names)
+            found += [group_memory(limit, used, stat)]
+    return min((room for room in found if room is not None), default=None)
+
+
+def group_memory(limit: str, used: str, stat: str) -> int | None:
+    """Bytes that a control group has left, from the texts of its files; None where it has no limit.
+
+    What is used counts the files that were read, which make room when memory is asked for: they are free.
+
+    Raises:
+        ValueError: the texts are not those of a control group.
+    """
+    if limit.strip() == "max":
+        return None
+    counts = dict(line.split() for line in stat.splitlines())
+    names = [f"total_{name}" if f"total_{name}" in counts else name for name in FILE_PAGES]  # version 1: all below it
+    cached = sum(int(counts.get(name, 0)) for name in names)
+    return max(0, int(limit) - max(0, int(used) - cached))

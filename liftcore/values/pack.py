@@ -126,6 +126,10 @@ class Views(Mapping[str, ViewFeatures]):
         seeing = {name: self._cameras.get(view, cameras[name]) for name, view in views.items()}
         return replace(self, _sources=sources, _cameras=seeing)
 
+    def only(self, views: Iterable[str]) -> "Views":
+        """These of the views, as they are."""
+        return replace(self, _sources={view: self._find(view) for view in views})
+
     def seeing(self, view: str) -> Camera | None:
         """The camera whose pinhole sees the view; None of views that are not paired."""
         return self._cameras.get(composed(view))

@@ -28,15 +28,7 @@ from liftcore.lifting.base import Steps, Support, WeighedViews
 from liftcore.lifting.checkpoint import Checkpoint
 from liftcore.lifting.engines import steps
 from liftcore.lifting.engines.base import Engine
-from liftcore.lifting.engines.blocks import (
-    SCENE,
-    SELECTED,
-    WEIGHED,
-    Job,
-    read_view,
-    weigh,
-    write_scene,
-)
+from liftcore.lifting.engines.blocks import SCENE, SELECTED, WEIGHED, Job, read_view, weigh, write_scene
 from liftcore.lifting.inputs import LiftInputs
 from liftcore.lifting.planning.plan import Plan, plan_lift
 from liftcore.query.result import LiftResult, load_lift
@@ -65,7 +57,6 @@ from liftcore.solve.sums import added, unpacked
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.pack import Views, write_pack
 from liftcore.values.region_weights import MOST_REGIONS
-from liftcore.values.settings import LiftSettings
 
 if TYPE_CHECKING:
     from liftcore.lifting.engines.base import Work
@@ -78,21 +69,6 @@ PACKED = 64  # views of a pack
 IDENTITY = "lift.json"  # of what the pieces in a folder are
 
 
-def check_engine(engine: Engine, settings: LiftSettings, masks: bool) -> None:
-    """Refuse, before the work, what is no engine, and what needs rays or features in one place.
-
-    Args:
-        masks: whether any view has masks, which make clusters in blocks.
-
-    Raises:
-        InvalidSettings: it is no engine; or as `LiftSettings.check_blocks` has it.
-    """
-    if not hasattr(engine, "run"):
-        hint = "LocalEngine() or RayEngine(address) makes one"
-        raise InvalidSettings("engine", expected="an engine, or None", got=repr(engine)[:80], hint=hint)
-    settings.check_blocks(masks)
-
-
 @contextmanager
 def steps_in_blocks(
     engine: Engine,
@@ -103,7 +79,7 @@ def steps_in_blocks(
     rows: int = ROWS,
     selected: int = SELECTED,
 ) -> Iterator[InBlocks]:
-    """The steps of a lift by an engine: each piece is a file in a folder.
+    """The steps of a lift by an engine: each piece is a file in a folder. What needs all rays or features is refused.
 
     Args:
         folder: that all workers share. A lift that was cut off goes on from the pieces there; None: one that is gone
@@ -111,10 +87,13 @@ def steps_in_blocks(
         rows: splats that are solved together, whole pages of X. selected: splats of scenes that workers hold whole.
 
     Raises:
-        InvalidSettings: the settings need W or X in one place.
+        InvalidSettings: it is no engine; or as `LiftSettings.check_blocks` has it.
     """
+    if not hasattr(engine, "run"):
+        hint = "LocalEngine() or RayEngine(address) makes one"
+        raise InvalidSettings("engine", expected="an engine, or None", got=repr(engine)[:80], hint=hint)
     views = inputs.views
-    check_engine(engine, inputs.settings, any(views.features.is_regions(name) for name in views.names))
+    inputs.settings.check_blocks(any(views.features.is_regions(name) for name in views.names))
     with _folder(folder or engine.scratch, kept=folder is not None) as place, one_thread():
         yield InBlocks(engine, place, inputs, timings, rows, selected)
 
@@ -145,24 +124,9 @@ def _packs(given: Views, found: LiftViews, folder: Path) -> list[Path]:
     packs = []
     for number, begin in enumerate(range(0, len(names), PACKED)):
         packs.append(folder / f"views-{number:05}.safetensors")
-        some = names[begin : begin + PACKED]
         told = {"encoder": given.encoder, "text_space": given.text_space}
-        write_pack(packs[-1], _Some(given, some), told)
+        write_pack(packs[-1], given.only(names[begin : begin + PACKED]), told)
     return packs
-
-
-class _Some(dict[str, Any]):
-    """Some views of many, each read when it is asked for."""
-
-    def __init__(self, views: Views, names: list[str]) -> None:
-        super().__init__(dict.fromkeys(names))
-        self._views = views
-
-    def __getitem__(self, name: str) -> Any:
-        return self._views[name]
-
-    def items(self) -> Any:
-        return ((name, self._views[name]) for name in self)
 
 
 def _begin(job: Job, splats: Splats, given: Views) -> None:
@@ -225,18 +189,9 @@ class InBlocks(Steps[Job]):
         """Write what all workers read."""
         splats, given, settings = self.inputs.splats, self.inputs.given, self.inputs.settings
         packs = tuple(Path(path).resolve() for path in given.paths or _packs(given, views, self.folder))
-        job = Job(
-            self.folder,
-            packs,
-            views.cameras,
-            views.names,
-            settings,
-            splats.kernel,
-            splats.count,
-            views.features.channels,
-            rows=self.rows,
-            selected=self.selected,
-        )
+        sizes = splats.count, views.features.channels
+        job = Job(self.folder, packs, views.cameras, views.names, settings, splats.kernel, *sizes)
+        job = replace(job, rows=self.rows, selected=self.selected)
         _begin(job, splats, given)
         return job
 

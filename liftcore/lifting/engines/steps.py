@@ -21,12 +21,12 @@ M, of which those of codebooks and directions are at most TABLE_BYTES.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, wraps
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -57,6 +57,9 @@ from liftcore.solve.reweight import SceneAgreement, ViewConsistency, reweighted
 from liftcore.solve.rows import SomeRows, fill_rows, gather_rows, take_rows, values_of
 from liftcore.solve.sums import PieceSums, packed
 from liftcore.values.region_weights import RegionWeights
+
+if TYPE_CHECKING:
+    from liftcore.lifting.engines.base import Work
 
 # What the driver shares, of the size of M.
 REGIONS = "regions.safetensors"  # offsets [V + 1] i64, levels [M] i8
@@ -100,10 +103,29 @@ def groups_of(job: Job) -> RegionGroups:
     return RegionGroups.of(offsets_of(job), mapped(job.folder / REGIONS)["levels"])
 
 
-def write_piece(path: Path, arrays: dict[str, Any], sums: Sequence[PieceSums] | None = None) -> None:
+def write_piece(path: Path, arrays: dict[str, Any], sums: Sequence[PieceSums] = ()) -> None:
     """Write the arrays or tensors of a piece, and sums of its pieces of splats."""
     tensors = {name: part if isinstance(part, Tensor) else torch.from_numpy(part) for name, part in arrays.items()}
     write_tensors(path, tensors | (packed(sums) if sums else {}), {})
+
+
+Piece = tuple[dict[str, Any], Sequence[PieceSums]]  # arrays by name, and sums of its pieces of splats
+
+
+def piece_of(step: str) -> Callable[[Callable[[Job, int, int | None], Piece]], Work]:
+    """A step that writes what it finds of a piece under that name, unless that lies there already."""
+
+    def written(find: Callable[[Job, int, int | None], Piece]) -> Work:
+        @wraps(find)
+        @one_thread()
+        def work(job: Job, number: int, threads: int | None) -> None:
+            path = job.piece_file(step.format(step=job.step), number)
+            if not path.exists():
+                write_piece(path, *find(job, number, threads))
+
+        return work
+
+    return written
 
 
 # ---- blocks of views
@@ -127,25 +149,21 @@ def _view_block(job: Job, piece: int) -> ViewBlock:
 
 
 def _weights(starts: np.ndarray, region: Tensor, weight: Tensor, offsets: np.ndarray) -> RegionWeights:
-    """W of as many splats as rows begin."""
-    every, none = torch.arange(starts.size - 1, dtype=torch.int32), torch.zeros(0, dtype=torch.int32)
-    begins, evidence, own = torch.from_numpy(starts), torch.zeros(0, dtype=torch.float32), torch.from_numpy(offsets)
-    return RegionWeights(every, begins, region, weight, none, evidence, own)
+    """W of as many splats as rows begin, without their evidence."""
+    every, begins = torch.arange(starts.size - 1, dtype=torch.int32), torch.from_numpy(starts)
+    return RegionWeights(every, begins, region, weight, every[:0], weight[:0], torch.from_numpy(offsets))
 
 
-@one_thread()
-def relate(job: Job, piece: int, threads: int | None) -> None:
+@piece_of("relate")
+def relate(job: Job, piece: int, threads: int | None) -> Piece:
     """Write the tuples of the splats of some views, and how many splats belong to each of their regions."""
-    path = job.piece_file("relate", piece)
-    if path.exists():
-        return
     block, groups = _view_block(job, piece), groups_of(job)
     own = memberships(block.W, groups, threads).own
     tuples = splat_tuples(block.W, own, groups, np.arange(block.splats.size), threads)
     sizes = np.bincount(block.W.region.numpy()[own] - block.base, minlength=int(block.W.offsets[-1]))
     arrays = {"splats": block.splats, "sizes": sizes}
     arrays |= {name: getattr(tuples, name) for name in ("starts", "tuples", "parents", "members")}
-    write_piece(path, arrays)
+    return arrays, ()
 
 
 def _tuples_of(job: Job, splats: np.ndarray) -> tuple[SplatTuples, np.ndarray]:
@@ -173,12 +191,9 @@ def _taken(tuples: SplatTuples, rows: np.ndarray) -> SplatTuples:
     return SplatTuples(*take_rows(tuples.starts, rows, tuples.tuples), tuples.parents, tuples.members)
 
 
-@one_thread()
-def contain(job: Job, piece: int, threads: int | None) -> None:
+@piece_of("contain")
+def contain(job: Job, piece: int, threads: int | None) -> Piece:
     """Write what the levels and views of all nodes say of those of some views."""
-    path = job.piece_file("contain", piece)
-    if path.exists():
-        return
     block, groups, nodes = _view_block(job, piece), groups_of(job), mapped(job.folder / NODES)["nodes"]
     own = memberships(block.W, groups, threads).own
     begins, rows = sampled_splats(block.W, own, nodes, block.base)
@@ -189,15 +204,12 @@ def contain(job: Job, piece: int, threads: int | None) -> None:
     found = node_views(
         sampled_nodes(begins, numbers, tuples, totals, nodes, groups.view.size), nodes, groups, threads
     )
-    write_piece(path, {"container": found.container, "sees": found.sees})
+    return {"container": found.container, "sees": found.sees}, ()
 
 
-@one_thread()
-def share(job: Job, piece: int, threads: int | None) -> None:
+@piece_of("share")
+def share(job: Job, piece: int, threads: int | None) -> Piece:
     """Write what other views say of the entries of some views."""
-    path = job.piece_file("share", piece)
-    if path.exists():
-        return
     block, groups = _view_block(job, piece), groups_of(job)
     own, splats = memberships(block.W, groups, threads).own, torch.from_numpy(block.splats).long()
     bounds = torch.from_numpy(mapped(job.folder / CURVE)["bounds"])
@@ -206,7 +218,7 @@ def share(job: Job, piece: int, threads: int | None) -> None:
     tuples = _taken(tuples, rows)
     found = region_shares(block.W, own, groups, rows, totals[rows], tuples, base=block.base, threads=threads)
     arrays = {"splats": block.splats, "starts": block.W.indptr, "sums": found.sums, "views": found.views}
-    write_piece(path, arrays | {"told": np.array([found.told, found.asked])})
+    return arrays | {"told": np.array([found.told, found.asked])}, ()
 
 
 # ---- blocks of splats
@@ -244,12 +256,9 @@ def _evidence(job: Job, ends: tuple[int, int]) -> Tensor:
     return torch.from_numpy(sums).float()
 
 
-@one_thread()
-def gather(job: Job, piece: int, threads: int | None) -> None:
+@piece_of("rows")
+def gather(job: Job, piece: int, threads: int | None) -> Piece:
     """Write W of a range of splats in all views, what supports them, and their tuples."""
-    path = job.piece_file("rows", piece)
-    if path.exists():
-        return
     ends = first, last = _bounds(job, piece)
     starts, values = gather_rows(lambda: _weight_rows(job, ends), last - first, (torch.int32, torch.float32))
     W = _weights(starts, values[0], values[1], offsets_of(job))
@@ -260,8 +269,8 @@ def gather(job: Job, piece: int, threads: int | None) -> None:
     none = torch.zeros(0, 3, dtype=torch.float64)
     bounds = torch.stack([means.amin(dim=0), means.amax(dim=0)]) if means.numel() else none
     arrays = {"indptr": W.indptr, "region": W.region, "weight": W.weight, "sums": sums}
-    totals = list(region_totals(W, threads)) if job.settings.robust_steps else None
-    write_piece(path, arrays | {"evidence": _evidence(job, ends), "bounds": bounds}, totals)
+    totals = list(region_totals(W, threads)) if job.settings.robust_steps else []
+    return arrays | {"evidence": _evidence(job, ends), "bounds": bounds}, totals
 
 
 def _gather_tuples(job: Job, piece: int, ends: tuple[int, int], totals: Tensor) -> None:
@@ -296,12 +305,9 @@ def _splat_block(job: Job, piece: int) -> SplatBlock:
     return SplatBlock(first, last, W, scene_of(job).means[first:last], arrays)
 
 
-@one_thread()
-def label(job: Job, piece: int, threads: int | None) -> None:
+@piece_of("labels-{step}")
+def label(job: Job, piece: int, threads: int | None) -> Piece:
     """Write the object of each splat, and what objects weigh: in step 0 in other regions, then in views."""
-    path = job.piece_file(f"labels-{job.step}", piece)
-    if path.exists():
-        return
     block, clusters = _splat_block(job, piece), mapped(job.folder / CLUSTERS)["clusters"]
     number = int(clusters.max(initial=-1)) + 1
     labels = object_labels(block.W, clusters, number, threads)
@@ -310,7 +316,7 @@ def label(job: Job, piece: int, threads: int | None) -> None:
         sums = object_shares(block.W, labels, number, others, threads)
     else:
         sums = view_shares(block.W, groups_of(job), labels, number, threads)
-    write_piece(path, {"labels": labels}, list(sums))
+    return {"labels": labels}, list(sums)
 
 
 def labels_of(job: Job, piece: int) -> np.ndarray:
@@ -370,19 +376,16 @@ def _before(job: Job, piece: int, step: int) -> Tensor | None:
     return torch.from_numpy(map_tensors(job.piece_file(f"factors-{step}", piece))[0]["factors"])
 
 
-@one_thread()
-def compare(job: Job, piece: int, threads: int | None) -> None:
+@piece_of("cosines-{step}")
+def compare(job: Job, piece: int, threads: int | None) -> Piece:
     """Write the cosines of a step, and what the scene is to learn of them; and the factors of the step before."""
-    path = job.piece_file(f"cosines-{job.step}", piece)
-    if path.exists():
-        return
     block = _splat_block(job, piece)
     judge, sums, before = ViewConsistency(block.W, block.means, threads), list[PieceSums](), None
     if job.step:
         before, _ = _weighed(job, piece, block, judge, job.step, threads)
         write_piece(job.piece_file(f"factors-{job.step}", piece), {"factors": before})
     directions = StoredDirections(job.folder)
-    write_piece(path, {"cosines": judge.cosines(directions, before, job.by_region, sums.append)}, sums)
+    return {"cosines": judge.cosines(directions, before, job.by_region, sums.append)}, sums
 
 
 def _reweighted(job: Job, piece: int, block: SplatBlock, threads: int | None) -> tuple[RegionWeights, Tensor | None]:
@@ -394,16 +397,13 @@ def _reweighted(job: Job, piece: int, block: SplatBlock, threads: int | None) ->
     return reweighted(block.W, factors), scores
 
 
-@one_thread()
-def measure(job: Job, piece: int, threads: int | None) -> None:
+@piece_of("measure")
+def measure(job: Job, piece: int, threads: int | None) -> Piece:
     """Write what the distances of regions from the first closed form add up to."""
-    path = job.piece_file("measure", piece)
-    if path.exists():
-        return
     block = _splat_block(job, piece)
     W, _ = _reweighted(job, piece, block, threads)
     distances = RegionDistances(W, codebook_of(job), block.means, threads)
-    write_piece(path, {}, list(distances.sums(distances.after(torch.ones_like(W.weight)))))
+    return {}, list(distances.sums(distances.after(torch.ones_like(W.weight))))
 
 
 @one_thread()
@@ -423,7 +423,7 @@ def solve(job: Job, piece: int, threads: int | None) -> None:
     columns = {"agreement": squares.sqrt().clamp(0.0, 1.0).float()}
     if scores is not None:
         columns["confidence"] = scores[0]
-    parts = None
+    parts = list[PieceSums]()
     if job.clusters:
         labels = labels_of(job, piece)
         parts = list(cluster_sums(X, block.arrays["evidence"], labels, job.clusters, threads))

@@ -6,9 +6,7 @@ import math
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,7 +27,7 @@ from liftcore.lifting.planning.views import (
 from liftcore.raster import open_raster
 from liftcore.raster.base import Raster
 from liftcore.runtime.device import CPU, Device
-from liftcore.runtime.memory import check_disk, lack_of_disk
+from liftcore.runtime.memory import check_disk, free_memory, lack_of_disk
 from liftcore.runtime.one_line import one_line
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import silent
@@ -63,11 +61,6 @@ TOUCHING_BYTES = 1_000  # of a splat, where those that touch are told
 SPARE = 0.9  # of the free memory: 10 % are left to other processes
 CARD_SPARE = 0.8  # of a card's free memory: what is freed does not lie in one piece
 CARD_SPLAT_BYTES = 400  # of a splat on a card, walked in the smallest pieces
-CONTROL_GROUPS = (  # folder, and the files of limit, use and statistics: versions 2 and 1
-    ("/sys/fs/cgroup", ("memory.max", "memory.current", "memory.stat")),
-    ("/sys/fs/cgroup/memory", ("memory.limit_in_bytes", "memory.usage_in_bytes", "memory.stat")),
-)
-FILE_PAGES = ("inactive_file", "active_file")
 
 
 @dataclass(frozen=True)
@@ -411,32 +404,3 @@ def check_weights(size: int) -> list[str]:
         return []
     told = f"region weights of about {size / GIB:.1f} GiB go to files in {tempfile.gettempdir()}, and there is {got}"
     return [f"{told}: set TMPDIR to a folder with more room on a disk, or try fewer views (coverage)"]
-
-
-def free_memory() -> int | None:
-    """Bytes that this process may still take: of the machine, or of its control group; None where neither says."""
-    found = []
-    with suppress(OSError, ValueError):  # not Linux
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        found += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
-    for folder, names in CONTROL_GROUPS:
-        with suppress(OSError, ValueError):  # a machine has one of the two, or none
-            limit, used, stat = (Path(folder, name).read_text(encoding="ascii") for name in names)
-            found += [group_memory(limit, used, stat)]
-    return min((room for room in found if room is not None), default=None)
-
-
-def group_memory(limit: str, used: str, stat: str) -> int | None:
-    """Bytes that a control group has left, from the texts of its files; None where it has no limit.
-
-    What is used counts the files that were read, which make room when memory is asked for: they are free.
-
-    Raises:
-        ValueError: the texts are not those of a control group.
-    """
-    if limit.strip() == "max":
-        return None
-    counts = dict(line.split() for line in stat.splitlines())
-    names = [f"total_{name}" if f"total_{name}" in counts else name for name in FILE_PAGES]  # version 1: all below it
-    cached = sum(int(counts.get(name, 0)) for name in names)
-    return max(0, int(limit) - max(0, int(used) - cached))
