@@ -36,7 +36,9 @@ from liftcore.lifting.planning.contradictions import (
 from liftcore.lifting.planning.views import visibility
 from liftcore.query.render import in_photo
 from liftcore.query.splat_colours import seen_colours
-from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.raster import open_raster
+from liftcore.raster.base import Raster
+from liftcore.runtime.device import CPU
 from liftcore.runtime.progress import Progress, silent
 from liftcore.scene.cameras import Camera, Cameras, photo_size
 from liftcore.scene.compositing import CompositingParams
@@ -124,7 +126,7 @@ def check_scene(
     names = _some(list(alike) or list(cameras), VIEWS)
     shown = [name for name in names if name in alike]
     pictures = {name: _photo(files[name], sizes[name], photo_size(cameras[name]), whole[name]) for name in shown}
-    raster, views, renders = CpuRaster(splats, threads=None), [], {}
+    raster, views, renders = open_raster(splats, CPU), [], {}
     unfilled: dict[str, np.ndarray] = {}
     for number, name in enumerate(names):
         renders[name], unfilled[name] = _render(raster, splats, cameras[name], trained)
@@ -192,7 +194,7 @@ def _some(names: Sequence[str], count: int) -> list[str]:
 
 
 def _render(
-    raster: CpuRaster, splats: Splats, camera: Camera, params: CompositingParams
+    raster: Raster, splats: Splats, camera: Camera, params: CompositingParams
 ) -> tuple[np.ndarray, np.ndarray]:
     """A view over black [H, W, 3] f32 in the pixels of its photo, and what splats leave of each ray [H, W, 1] f32."""
     values = torch.cat([seen_colours(splats, camera), torch.ones(splats.count, 1, dtype=torch.float32)], dim=1)
@@ -279,7 +281,7 @@ def _wrong_cameras(views: Sequence[ViewCheck], in_view: float) -> list[str]:
 class _Scaled:
     """Renders of a scene with its cameras' positions times a factor."""
 
-    raster: CpuRaster
+    raster: Raster
     splats: Splats
     cameras: Cameras
     params: CompositingParams

@@ -29,7 +29,8 @@ from liftcore.query.render import view_mask
 from liftcore.query.scene import QueryScene
 from liftcore.query.scores import DEFAULT_NEGATIVES, relevancy
 from liftcore.query.threshold import find_threshold
-from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.raster import open_raster
+from liftcore.runtime.device import CPU
 from liftcore.scene.cameras import Camera
 from liftcore.text import TextEncoder
 
@@ -161,7 +162,7 @@ class SelectedSplats(Segmenter):
         splats, found = self.scene.splats, {}
         for text, selected in self._selected.items():
             logits = torch.where(torch.from_numpy(selected), splats.opacity_logits, -1e4)  # an opacity of nothing
-            alone = CpuRaster(replace(splats, opacity_logits=logits))
+            alone = open_raster(replace(splats, opacity_logits=logits), CPU)
             sums = self.scene.image(view, lambda camera, alone=alone: alone.row_sums(camera, self.scene.compositing))
             found[text] = Prediction((sums > SOLID).numpy(), None)
         return found

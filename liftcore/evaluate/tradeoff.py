@@ -38,8 +38,8 @@ from liftcore.query.question import Query
 from liftcore.query.render import in_photo, view_mask
 from liftcore.query.result import LiftResult
 from liftcore.query.scene import QueryScene
-from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.runtime.device import choose_device
+from liftcore.raster import open_raster
+from liftcore.runtime.device import CPU, choose_device
 from liftcore.runtime.progress import Progress
 from liftcore.scene.cameras import Cameras
 from liftcore.scene.splats import Splats
@@ -292,7 +292,7 @@ def measured(spec: RunSpec) -> dict[str, Any]:
 
 def _judge(spec: RunSpec, splats: Splats, cameras: Cameras, features: Views, made: LiftResult) -> dict[str, Any]:
     """How near the run is to the exact one, and what `liftcore.evaluate.ranking` judges it by, a view at a time."""
-    raster, params = CpuRaster(splats, spec.threads), made.metadata.settings.render_params
+    raster, params = open_raster(splats, CPU, spec.threads), made.metadata.settings.render_params
     cosines = centred_cosines(
         raster, [(cameras[view], features[view]) for view in spec.held_out], made.features, params
     )

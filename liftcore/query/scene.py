@@ -304,9 +304,10 @@ class QueryScene:
     @cached_property
     def raster(self) -> Raster:
         """A for this scene."""
-        from liftcore.raster.cpu.raster import CpuRaster
+        from liftcore.raster import open_raster
+        from liftcore.runtime.device import CPU
 
-        return CpuRaster(self.splats, threads=None)
+        return open_raster(self.splats, CPU)
 
     @property
     def compositing(self) -> CompositingParams:

@@ -26,17 +26,17 @@ import torch
 from liftcore.errors import InvalidSettings
 from liftcore.lifting.geometry import strided
 from liftcore.lifting.planning.contradictions import LEAST_IN_VIEW, LEAST_ROW_SUM, empty, unseen
+from liftcore.lifting.planning.scene import PlannedScene, first_names, planned_scene, scene_warnings
 from liftcore.lifting.planning.views import SAMPLE, WELL_COVERED, greedy, spread
-from liftcore.raster import check_given
-from liftcore.raster.base import ViewRequest
-from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.raster import check_given, open_raster
+from liftcore.raster.base import Raster, ViewRequest
+from liftcore.runtime.device import CPU
 from liftcore.runtime.one_line import one_line
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, shown_progress, silent
 from liftcore.runtime.torch_modes import usual_modes
-from liftcore.scene.cameras import Camera, Cameras, distortion_warning
+from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.compositing import CompositingParams
-from liftcore.scene.render_mode import rendering_reason, rendering_warnings
 from liftcore.scene.splats import Splats
 from liftcore.values.settings import LiftSettings
 from liftcore.values.views import Regions
@@ -61,13 +61,9 @@ class Shown:
 
 
 @dataclass(frozen=True)
-class PhotoPlan:
+class PhotoPlan(PlannedScene):
     """Which photos to encode first. Plain values; but for the seconds, the same inputs give the same plan."""
 
-    kernel: str
-    antialiased: bool  # opacities are compensated for the low-pass
-    rendering: str  # why: what says so, or who
-    splats: int  # P
     order: tuple[str, ...]  # all photos, the one to encode first at first
     spare: tuple[str, ...]  # of those: what they see, WELL_COVERED before them in the order see too
     shown: tuple[Shown, ...]  # by the first 4, 8, 16, ... and all of them
@@ -90,15 +86,14 @@ class PhotoPlan:
             verbose: all names, not the first ones.
         """
         most = None if verbose else SHOWN_PHOTOS
-        how = f"{self.kernel}, antialiased: {self.rendering}" if self.antialiased else self.kernel
-        yield f"plan: {self.splats} splats ({how}), {len(self.order)} photos, no features yet"
+        yield f"plan: {self.splats} splats ({self.rendered}), {len(self.order)} photos, no features yet"
         yield "  photos  see of the weight  twice or more  to look through"
         for row in self.shown:
             seconds = f"about {max(row.seconds, 1):.0f} s"
             yield f"  {row.photos:>6}  {row.once:>17.1%}  {row.twice:>13.1%}  {seconds:>15}"
-        yield f"encode first: {_some(self.order, most)}"
+        yield f"encode first: {first_names(self.order, most)}"
         if self.spare:
-            named = _some(self.spare, most)
+            named = first_names(self.spare, most)
             yield f"{len(self.spare)} add nothing that {WELL_COVERED} before them do not show: {named}"
         yield from (f"warning: {warning}" for warning in self.warnings)
 
@@ -131,7 +126,7 @@ def plan_photos(
     known = cameras if isinstance(cameras, Cameras) else Cameras(cameras)
     views = list(known.values())[:: settings.view_stride]
     rows = spread(splats.count, min(SAMPLE, splats.count))
-    raster = CpuRaster(splats, threads)
+    raster = open_raster(splats, CPU, threads)
     with one_thread(), shown_progress(progress) as reporter:
         evidence, row_sum = evidence_of_views(raster, views, rows, settings, reporter)
         seconds = _seconds(raster, views[len(views) // 2], settings)
@@ -142,27 +137,18 @@ def plan_photos(
     if not told and row_sum < LEAST_ROW_SUM:
         told.append(empty(row_sum))
     return PhotoPlan(
-        kernel=str(splats.kernel),
-        antialiased=settings.lift_params.antialiased,
-        rendering=rendering_reason(splats.render_mode, settings.lift_params.antialiased),
-        splats=splats.count,
+        **vars(planned_scene(splats, settings)),
         order=tuple(views[k].name for k in order),
         spare=tuple(views[k].name for k in spare_photos(seen, weight, order)),
         shown=tuple(shown_by(seen, weight, order, seconds)),
         seen_share=seen_share,
         row_sum=row_sum,
-        warnings=(
-            *splats.warnings,
-            *rendering_warnings(splats.render_mode, settings.lift_params.antialiased, splats.kernel),
-            *known.warnings,
-            *distortion_warning(views),
-            *told,
-        ),
+        warnings=(*scene_warnings(splats, known, views, settings), *told),
     )
 
 
 def evidence_of_views(
-    raster: CpuRaster, views: Sequence[Camera], rows: np.ndarray, settings: LiftSettings, progress: Progress = silent
+    raster: Raster, views: Sequence[Camera], rows: np.ndarray, settings: LiftSettings, progress: Progress = silent
 ) -> tuple[np.ndarray, float]:
     """Evidence [V, n] f32 of the views in the splats ``rows`` [n] i64, and the mean sum of weights of a ray.
 
@@ -233,13 +219,9 @@ def _coarse(settings: LiftSettings, camera: Camera, number: int) -> CompositingP
     return strided(settings.lift_params, settings.model_copy(update={"stride": stride}), camera, number)
 
 
-def _seconds(raster: CpuRaster, camera: Camera, settings: LiftSettings) -> float:
+def _seconds(raster: Raster, camera: Camera, settings: LiftSettings) -> float:
     """About how long a lift looks at a view like this one."""
     begin = time.perf_counter()
     params = strided(settings.lift_params, settings, camera, 0)
     raster.region_weights(camera, ONE_REGION, params, settings.weighting)
     return time.perf_counter() - begin
-
-
-def _some(names: Sequence[str], most: int | None) -> str:
-    return ", ".join(names[:most]) + (", ..." if most is not None and len(names) > most else "")

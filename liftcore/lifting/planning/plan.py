@@ -14,6 +14,7 @@ import numpy as np
 from liftcore.errors import Unavailable
 from liftcore.lifting.geometry import weigh_views
 from liftcore.lifting.planning.contradictions import contradictions
+from liftcore.lifting.planning.scene import PlannedScene, first_names, planned_scene, scene_warnings
 from liftcore.lifting.planning.views import (
     PILOT_VIEWS,
     WELL_COVERED,
@@ -31,9 +32,8 @@ from liftcore.runtime.memory import check_disk, free_memory, lack_of_disk
 from liftcore.runtime.one_line import one_line
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import silent
-from liftcore.scene.cameras import Camera, distortion_warning
+from liftcore.scene.cameras import Camera
 from liftcore.scene.compositing import TILE
-from liftcore.scene.render_mode import rendering_reason, rendering_warnings
 from liftcore.scene.splats import Splats
 from liftcore.solve.codebook import TABLE_BYTES
 from liftcore.solve.consensus import BLOCK_ENTRIES
@@ -64,13 +64,9 @@ CARD_SPLAT_BYTES = 400  # of a splat on a card, walked in the smallest pieces
 
 
 @dataclass(frozen=True)
-class Plan:
+class Plan(PlannedScene):
     """What a lift is about to do. Plain values: the same inputs and settings give the same plan."""
 
-    kernel: str
-    antialiased: bool  # opacities are compensated for the low-pass
-    rendering: str  # why: what says so, or who
-    splats: int  # P
     views: tuple[str, ...]  # that will be lifted, in the order of the sums
     left_out: tuple[str, ...]  # that the settings' coverage or view_cosine leaves out
     there: int  # views with features and a camera, whatever the settings take of them
@@ -130,8 +126,7 @@ class Plan:
         """The plan in short, for people: what is lifted, what it is made of, and what that takes."""
         seen = f"{self.seen_share:.1%} in some view's field"
         spare = f", {len(self.spare)} of them see nothing that {WELL_COVERED} others do not" if self.spare else ""
-        how = f"{self.kernel}, antialiased: {self.rendering}" if self.antialiased else self.kernel
-        yield f"{self.splats} splats ({how}), {seen}; {len(self.views)} of {self.there} views{spare}"
+        yield f"{self.splats} splats ({self.rendered}), {seen}; {len(self.views)} of {self.there} views{spare}"
         yield f"{self.channels} channels, stored as {self.dtype}"
         files = f", {self.in_files / MIB:.0f} MiB of region weights in files" if self.in_files else ""
         yield f"about {self.memory_bytes / MIB:.0f} MiB at the peak{files}, on {self.device.name}"
@@ -153,7 +148,7 @@ class Plan:
     def _spare_line(self) -> str:
         if not self.spare:
             return ""
-        some = ", ".join(self.spare[:SHOWN_VIEWS]) + (", ..." if len(self.spare) > SHOWN_VIEWS else "")
+        some = first_names(self.spare, SHOWN_VIEWS)
         return f"; {len(self.spare)} add nothing that {WELL_COVERED} others do not show: {some}"
 
 
@@ -203,10 +198,7 @@ def plan_lift(
     in_files = 0 if apart else max(0, weights - MEMORY_LIMIT - kept)
     lifted = set(names)
     return Plan(
-        kernel=str(splats.kernel),
-        antialiased=settings.lift_params.antialiased,
-        rendering=rendering_reason(splats.render_mode, settings.lift_params.antialiased),
-        splats=splats.count,
+        **vars(planned_scene(splats, settings)),
         views=tuple(names),
         left_out=tuple(name for name in views.names if name not in lifted),
         there=len(features),
@@ -224,10 +216,7 @@ def plan_lift(
         seconds=seconds,
         warnings=(*short, *check_memory(parts, free), *check_weights(in_files)),
         told=(
-            *splats.warnings,
-            *rendering_warnings(splats.render_mode, settings.lift_params.antialiased, splats.kernel),
-            *views.cameras.warnings,
-            *distortion_warning(cameras),
+            *scene_warnings(splats, views.cameras, cameras, settings),
             *shape_warnings(features, cameras),
             *wrong,
         ),
