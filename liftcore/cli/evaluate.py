@@ -54,7 +54,7 @@ def run(options: argparse.Namespace) -> int:
     """Judge every lift whose scene is labelled, and print what was measured beside what was published."""
     from liftcore.evaluate.judging import evaluate_scene
     from liftcore.evaluate.published import published
-    from liftcore.query.scene import QueryScene
+    from liftcore.query.scene import Scene
 
     scenes = _labelled(options.dataset, options.data)
     lifts = find_lifts(options.lifts, scenes)
@@ -63,7 +63,7 @@ def run(options: argparse.Namespace) -> int:
     warnings: list[str] = []
     with progress_bars() as progress:
         for name, path in lifts.items():
-            scene = QueryScene.open(path)
+            scene = Scene(path)
             encoder = text_encoder(options, scene)
             found, said = evaluate_scene(scenes[name], scene, encoder, settings, progress)
             results += found

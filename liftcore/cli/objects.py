@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,8 @@ from liftcore.io.remote import place
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from liftcore.query.scene import QueryScene
+    from liftcore.query.scene import Scene
+    from liftcore.text import TextEncoder
 
 
 def add_arguments(parser: Parser) -> None:
@@ -34,41 +36,40 @@ def run(options: argparse.Namespace) -> int:
     files = {"csv": options.csv} if options.csv else {}
     given = [path for path in (options.lift, options.table, options.vocabulary) if path]
     free_outputs(files, given)
-    from liftcore.query.catalogue import catalogue, one_object_ply, table_csv
-    from liftcore.query.scene import QueryScene
+    from liftcore.query.catalogue import table_csv
+    from liftcore.query.export import blocks_of
+    from liftcore.query.scene import Scene
 
-    scene = QueryScene.open(options.lift)
+    scene = Scene(options.lift)
     if files or options.splats:
         free_outputs(files, made_from(scene))
-    encoder, words, vectors = _vocabulary(options, scene)
-    found = catalogue(scene, words, vectors)
+    encoder, words = _vocabulary(options, scene)
+    found = scene.catalogue(words, encoder=encoder)
     things = [dict(one) for one in found.objects]
     if options.features:
         things = [one | {"feature": row.tolist()} for one, row in zip(things, found.features, strict=True)]
-    document: dict[str, Any] = {"encoder": encoder, "explanation": found.explanation, "objects": things}
+    document: dict[str, Any] = {"encoder": None if encoder is None else encoder.name}
+    document |= {"explanation": found.explanation, "objects": things}
     contents: dict[str, Any] = {"csv": lambda: [table_csv(found)]}
     if options.splats:
         for one in found.objects:
             name = f"object-{one.id}"
             files[name] = free_output(options.splats / f"{name}.ply", [*given, *made_from(scene)], PLY)
-            contents[name] = lambda number=one.id: one_object_ply(scene, number)
+            contents[name] = partial(blocks_of, scene, one.id)
     document["files"] = write_files(files, contents)
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
 
 
-def _vocabulary(options: argparse.Namespace, scene: QueryScene) -> tuple[str | None, list[str], Any]:
-    """The encoder's name, the words and their vectors; none where objects get no names."""
+def _vocabulary(options: argparse.Namespace, scene: Scene) -> tuple[TextEncoder | None, list[str]]:
+    """The encoder and the words; none where objects get no names."""
     if options.vocabulary is None and not options.table and not options.encoder and scene.table is None:
-        return None, [], None
+        return None, []
     if options.vocabulary is not None and options.vocabulary.suffix == ".safetensors":
-        from liftcore.text import open_encoder
-
-        encoder, file = open_encoder(f"table:{options.vocabulary}"), None
+        encoder, file = scene.encoder(f"table:{options.vocabulary}"), None
     else:
         encoder, file = text_encoder(options, scene), options.vocabulary
-    words = read_words(file, encoder)
-    return encoder.name, words, encoder.encode(words)
+    return encoder, read_words(file, encoder)
 
 
 def _lines(document: dict[str, Any]) -> Iterable[str]:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from pydantic import BaseModel
 
-    from liftcore.query.scene import QueryScene
+    from liftcore.query.scene import Scene
     from liftcore.text import TextEncoder
 
 BAD_INPUT = 2
@@ -165,15 +165,15 @@ def add_lift(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def opened_lift(options: argparse.Namespace) -> QueryScene:
+def opened_lift(options: argparse.Namespace) -> Scene:
     """The lift that the options name.
 
     Raises:
         InvalidLift: it is none.
     """
-    from liftcore.query.scene import QueryScene
+    from liftcore.query.scene import Scene
 
-    return QueryScene.open(options.lift, splats=options.splats, cameras=options.cameras)
+    return Scene(options.lift, splats=options.splats, cameras=options.cameras)
 
 
 def add_verbose(parser: argparse.ArgumentParser) -> None:
@@ -227,9 +227,7 @@ def whole(text: str) -> int:
     return int(text)
 
 
-def text_encoder(
-    options: argparse.Namespace, scene: QueryScene, hint: str = "", *, stand_in: bool = False
-) -> TextEncoder:
+def text_encoder(options: argparse.Namespace, scene: Scene, hint: str = "", *, stand_in: bool = False) -> TextEncoder:
     """The encoder that ``--table`` or ``--encoder`` names, else the lift's own words, else that of its text space.
 
     Args:

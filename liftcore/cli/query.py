@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,9 +29,8 @@ if TYPE_CHECKING:
 
     from liftcore.query.question import Answer, Objects, Query
     from liftcore.query.render import ViewMask
-    from liftcore.query.scene import QueryScene
+    from liftcore.query.scene import Scene
     from liftcore.query.terms import Example
-    from liftcore.scene.cameras import Camera
     from liftcore.text import TextEncoder
 
 
@@ -78,8 +78,7 @@ def run(options: argparse.Namespace) -> int:
     view = view_of(options, "mask", "attention", "overlay")
     files = {kind: path for kind in OUTPUTS if (path := getattr(options, kind)) is not None}
     free_outputs(files, [path for path in (options.lift, options.table, options.camera) if path])
-    from liftcore.query.ask import ask, located
-    from liftcore.query.objects import objects
+    from liftcore.query.export import blocks_of
 
     query = _query(options)
     scene = opened_lift(options)
@@ -87,16 +86,16 @@ def run(options: argparse.Namespace) -> int:
         free_outputs(files, made_from(scene))
     hint = "or ask by example, with --like"
     encoder = text_encoder(options, scene, hint, stand_in=True) if query.texts else None
-    answer = ask(scene, query, encoder)
-    seen = None
-    if view is not None:
-        from liftcore.query.render import view_mask  # with torch, which numbers do without
-
-        seen = view_mask(scene, answer, view)
-    answer = located(scene, answer) if options.top else answer
-    found = objects(scene, answer) if options.objects else None
+    answer = scene.ask(query, encoder=encoder, places=options.top > 0)
+    seen = None if view is None else scene.look(answer, view)
+    found = scene.objects(answer) if options.objects else None
     document = _document(answer, found, seen, encoder)
-    document["files"] = write_files(files, _contents(options, scene, answer, seen, view))
+    photo = None if seen is None else _picture(options.photo, seen.mask.shape[::-1])
+    contents = {
+        kind: partial(blocks_of, scene, answer, kind, view=view, suffix=path.suffix.lower(), seen=seen, photo=photo)
+        for kind, path in files.items()
+    }
+    document["files"] = write_files(files, contents)
     if options.object is not None and options.object.suffix.lower() in LOCAL_SUFFIXES and any(scene.splats.origin):
         document["origin"] = scene.splats.origin
     reply(document, as_json=options.json, lines=_lines(document))
@@ -163,35 +162,13 @@ def _keys_of_before(answer: Answer, found: Objects | None) -> dict[str, Any]:
     return document
 
 
-def _contents(
-    options: argparse.Namespace, scene: QueryScene, answer: Answer, seen: ViewMask | None, view: str | Camera | None
-) -> dict[str, Callable[[], Iterable[bytes]]]:
-    from liftcore.query.export import coloured_ply, npy, object_splats
-
-    contents: dict[str, Callable[[], Iterable[bytes]]] = {
-        "object": lambda: object_splats(scene, answer, options.object.suffix.lower()),
-        "coloured": lambda: coloured_ply(scene, answer),
-        "scores": lambda: [npy(answer.scores)],
-    }
-    if seen is not None and view is not None:
-        from liftcore.query.render import attention_png, mask_png, overlay_png
-
-        contents |= {"mask": lambda: [mask_png(seen.mask)], "attention": lambda: [attention_png(seen)]}
-        named = ", ".join(map(str, answer.query.positives))
-        height, width = seen.mask.shape
-        contents["overlay"] = lambda: [
-            overlay_png(scene, seen, view, named, _picture(options.photo, (width, height)))
-        ]
-    return contents
-
-
 def _picture(photo: Path | None, size: tuple[int, int]) -> Image | None:
     from liftcore.features.encoders.encode import read_image
 
     return None if photo is None else read_image(photo, size)[0]
 
 
-def made_from(scene: QueryScene) -> list[Path]:
+def made_from(scene: Scene) -> list[Path]:
     """The files that a lift remembers."""
     return [Path(file.path) for file in (scene.metadata.splats, scene.metadata.cameras, *scene.metadata.features)]
 

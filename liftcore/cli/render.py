@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 
 from liftcore.cli.options import Parser, add_fields, add_lift, add_view, opened_lift, view_of
@@ -27,10 +28,10 @@ def run(options: argparse.Namespace) -> int:
     if view is None:
         raise InvalidQuery("--view", expected="a view to see it from", got="no --view and no --camera")
     free_outputs(files, [path for path in (options.lift, options.camera) if path])
-    from liftcore.query.render import render_png
+    from liftcore.query.export import blocks_of
 
     scene = opened_lift(options)
     free_outputs(files, made_from(scene))
-    written = write_files(files, {"output": lambda: [render_png(scene, view, options.what)]})
+    written = write_files(files, {"output": partial(blocks_of, scene, None, options.what, view=view)})
     reply({"what": options.what, "out": written["output"]}, as_json=options.json, lines=[written["output"]])
     return 0

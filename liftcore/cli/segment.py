@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from functools import cache
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,11 +14,8 @@ from liftcore.errors import InvalidQuery
 from liftcore.runtime.progress import progress_bars
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Iterable
 
-    from liftcore.query.scene import QueryScene
-    from liftcore.query.segment import Segmentation
-    from liftcore.scene.cameras import Camera
     from liftcore.text import TextEncoder
 
 OUTPUTS = ("labels", "picture", "coloured", "splat_labels", "labelled")  # options that name a file to write
@@ -49,25 +46,23 @@ def run(options: argparse.Namespace) -> int:
         files["names"] = options.labelled.with_name(f"{options.labelled.name}.json")
     given = [path for path in (options.lift, options.table, options.words, options.camera) if path]
     free_outputs(files, given)
-    from liftcore.query.presence import references_of
-    from liftcore.query.segment import best_words, segment
+    from liftcore.query.export import blocks_of
 
     scene = opened_lift(options)
     if files:
         free_outputs(files, made_from(scene))
     encoder = text_encoder(options, scene)
     words = read_words(options.words, encoder)
-    vectors = encoder.encode(words)
     document: dict[str, Any] = {"encoder": encoder.name, "words": len(words)}
     if options.what:
         named = zip(options.what, examples_of(options.what, "--what"), strict=True)
         document["what"] = {
-            said: [vars(word) for word in best_words(scene, example, words, vectors, options.top)]
+            said: [vars(word) for word in scene.what(example, words, top=options.top, encoder=encoder)]
             for said, example in named
         }
     if files or not options.what:
         with progress_bars() as progress:
-            found = segment(scene, words, vectors, progress, references_of(encoder, scene.metadata.text_space))
+            found = scene.segment(words, encoder=encoder, progress=progress)
         document |= {
             "splats": len(found.labels),
             "none": int((found.labels < 0).sum()),
@@ -76,7 +71,8 @@ def run(options: argparse.Namespace) -> int:
                 for value, named in enumerate(found.found, 1)
             ],
         }
-        document["files"] = write_files(files, _contents(scene, found, view))
+        contents = {kind: partial(blocks_of, scene, found, kind, view=view) for kind in files}
+        document["files"] = write_files(files, contents)
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
 
@@ -92,27 +88,6 @@ def read_words(path: Path | None, encoder: TextEncoder) -> list[str]:
     except (OSError, UnicodeDecodeError) as error:
         raise InvalidQuery("--words", expected="a file of words, one a line", got=str(error)[:120]) from None
     return list(dict.fromkeys(line.strip() for line in lines if line.strip()))
-
-
-def _contents(scene: QueryScene, found: Segmentation, view: str | Camera) -> dict[str, Callable[[], Iterable[bytes]]]:
-    from liftcore.query.export import npy
-    from liftcore.query.labels import document_bytes, labelled_ply, labels
-    from liftcore.query.segment import map_png, named_ply, picture_png, word_map
-
-    def picture() -> bytes:
-        from liftcore.query.render import render
-
-        return picture_png(render(scene, view), word_map(scene, found, view), found)
-
-    made = cache(lambda: labels(scene, found))
-    return {
-        "labelled": lambda: labelled_ply(scene, made()),
-        "names": lambda: [document_bytes(made())],
-        "coloured": lambda: named_ply(scene, found),
-        "splat_labels": lambda: [npy(found.values)],
-        "labels": lambda: [map_png(word_map(scene, found, view), found)],
-        "picture": lambda: [picture()],
-    }
 
 
 def _lines(document: dict[str, Any]) -> Iterable[str]:

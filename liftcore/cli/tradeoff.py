@@ -45,11 +45,11 @@ def run(options: argparse.Namespace) -> int:
     LiftSettings.of(**settings)
     if "speed" in settings:
         raise InvalidSettings("--set", expected="settings that are the same in all runs", got="speed")
-    from liftcore.evaluate.tradeoff import Scene, compare
+    from liftcore.evaluate.tradeoff import SceneFiles, compare
     from liftcore.evaluate.tradeoff_report import page_of, save
 
     free_output(options.out / "tradeoff.json", [], JSON)
-    scene = Scene(
+    scene = SceneFiles(
         options.splats,
         options.cameras,
         tuple(options.features),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from liftcore.errors import InvalidInput, InvalidQuery
 from liftcore.evaluate.labels import LabelledObject, LabelledScene
 from liftcore.evaluate.protocols import SEGMENTERS, EvaluationProtocol, Prediction
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.query.scores import DEFAULT_NEGATIVES
 from liftcore.runtime.progress import Progress, silent
 from liftcore.scene.cameras import photo_size
@@ -172,7 +172,7 @@ class SceneResult:
 
 def evaluate_scene(
     labels: LabelledScene,
-    scene: QueryScene,
+    scene: Scene,
     encoder: TextEncoder,
     settings: EvaluationSettings,
     progress: Progress = silent,
@@ -276,7 +276,7 @@ def mean_over_scenes(results: Sequence[SceneResult]) -> dict[EvaluationProtocol,
 
 
 def _truth(
-    labels: LabelledScene, scene: QueryScene, held_out: Collection[str] | None
+    labels: LabelledScene, scene: Scene, held_out: Collection[str] | None
 ) -> tuple[dict[str, list[LabelledObject]], list[str]]:
     """Frame -> its objects, of the frames that are asked for and have a camera; the others are warned of."""
     wanted = [view for view in labels.views if held_out is None or view in held_out]

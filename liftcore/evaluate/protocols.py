@@ -26,7 +26,7 @@ from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.objects import Objects, objects
 from liftcore.query.question import Answer, Query
 from liftcore.query.render import view_mask
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.query.scores import DEFAULT_NEGATIVES, relevancy
 from liftcore.query.threshold import find_threshold
 from liftcore.raster import open_raster
@@ -68,7 +68,7 @@ class Segmenter(ABC):
 
     def __init__(
         self,
-        scene: QueryScene,
+        scene: Scene,
         texts: Sequence[str],
         encoder: TextEncoder,
         threshold: str | float = "auto",
@@ -210,7 +210,7 @@ class OwnMasks(Segmenter):
         return {text: self._look(text, view) for text in self._answers}
 
     def _look(self, text: str, view: str) -> Prediction:
-        def group(scene: QueryScene, answer: Answer) -> Objects:
+        def group(scene: Scene, answer: Answer) -> Objects:
             if text not in self._objects:
                 self._objects[text] = objects(scene, answer)
             return self._objects[text]

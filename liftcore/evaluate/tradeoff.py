@@ -37,7 +37,7 @@ from liftcore.query.objects import objects
 from liftcore.query.question import Query
 from liftcore.query.render import in_photo, view_mask
 from liftcore.query.result import LiftResult
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.raster import open_raster
 from liftcore.runtime.device import CPU, choose_device
 from liftcore.runtime.progress import Progress
@@ -110,7 +110,7 @@ def _allowed(settings: Mapping[str, Any], candidate: Candidate) -> LiftSettings 
 
 
 @dataclass(frozen=True)
-class Scene:
+class SceneFiles:
     """The files, and what to judge by.
 
     Raises:
@@ -141,7 +141,7 @@ class Scene:
 class RunSpec:
     """One run in a process of its own."""
 
-    scene: Scene
+    scene: SceneFiles
     settings: dict[str, Any]
     lifted: tuple[str, ...]  # views
     held_out: tuple[str, ...]  # views with features
@@ -152,7 +152,7 @@ class RunSpec:
 
 
 def compare(
-    scene: Scene, budget: float, settings: Mapping[str, Any], threads: int | None, progress: Progress
+    scene: SceneFiles, budget: float, settings: Mapping[str, Any], threads: int | None, progress: Progress
 ) -> dict[str, Any]:
     """Measure what fits the budget, and choose.
 
@@ -208,7 +208,7 @@ def compare(
     }
 
 
-def _plan_runs(scene: Scene, settings: Mapping[str, Any], threads: int | None, folder: Path) -> RunSpec:
+def _plan_runs(scene: SceneFiles, settings: Mapping[str, Any], threads: int | None, folder: Path) -> RunSpec:
     """The views of each kind. Every HOLD_OUT-th view is held out, and what has masks is."""
     cameras = read_cameras(scene.cameras)
     packs = pair(read_features(*scene.features), cameras)[0]
@@ -304,11 +304,11 @@ def _judge(spec: RunSpec, splats: Splats, cameras: Cameras, features: Views, mad
             shared, joined = shared_pixels(_resized(scores.argmax(dim=2), masks[view]), masks[view], len(classes))
             judged["intersections"].append(shared.tolist())
             judged["unions"].append(joined.tolist())
-        judged["phrase_iou"] = _phrase_ious(spec, QueryScene(made, splats, cameras), masks)
+        judged["phrase_iou"] = _phrase_ious(spec, Scene(made, splats, cameras), masks)
     return {**cosine_figures(made.features, *_reference(spec, made)), "judged": judged}
 
 
-def _phrase_ious(spec: RunSpec, scene: QueryScene, masks: Mapping[str, Tensor]) -> list[float]:
+def _phrase_ious(spec: RunSpec, scene: Scene, masks: Mapping[str, Tensor]) -> list[float]:
     """IoU of the masks that words give, each class asked for alone, in labelled views that show it."""
     assert spec.scene.table is not None  # there are labels
     encoder, ious = TableEncoder.open(spec.scene.table), list[float]()

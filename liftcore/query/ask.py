@@ -26,18 +26,16 @@ from liftcore.query.presence import (
     together,
 )
 from liftcore.query.question import Answer, Box, Objects, Point, Presence, Query, Threshold, TopSplat
-from liftcore.query.scene import QueryScene, as_numpy
+from liftcore.query.scene import Scene, as_numpy
 from liftcore.query.scores import LEAST_LIKENESS, LOWEST_COSINE, combine, cosines, cosines_about
 from liftcore.query.selection import LEAST_FIRST, Rivals, contest, nearer_than_rivals, whole_things
 from liftcore.query.terms import Vector
 from liftcore.query.threshold import find_threshold, nothing_alike
-from liftcore.text import TextEncoder, encoder_of_space, open_encoder
+from liftcore.text import TextEncoder
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from liftcore.scene.splats import Splats
-    from liftcore.values.lift import Lift
 
 _QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 
@@ -72,7 +70,7 @@ class VectorAnswer:
         return f"VectorAnswer({found}, present={self.present}, clear={self.clear})"
 
 
-def ask(scene: QueryScene, query: Query | str, encoder: TextEncoder | None = None) -> Answer:
+def ask(scene: Scene, query: Query | str, encoder: TextEncoder | None = None) -> Answer:
     """Score every splat for a query and choose those that answer it.
 
     A splat counts in the histogram by its evidence: what hardly a ray met scores by the chance of a few pixels. It is
@@ -98,52 +96,27 @@ def ask(scene: QueryScene, query: Query | str, encoder: TextEncoder | None = Non
     return answers(scene, [question(scene, query, encoder)])[0]
 
 
-def encoder_for(scene: QueryScene, encoder: TextEncoder | str | Path | None) -> TextEncoder:
-    """The encoder, or that of its specification; None: the lift's own words, else that of its text space.
-
-    Raises:
-        InvalidQuery: it is something else, or the lift's text space names none.
-        Unavailable: its weights are not on this machine.
-    """
-    if encoder is None:
-        return scene.table or encoder_of_space(scene.metadata.text_space, "give encoder=, or vectors", stand_in=True)
-    if isinstance(encoder, str | Path):
-        return open_encoder(encoder)
-    if not all(hasattr(encoder, name) for name in ("encode", "channels", "name")):
-        expected = "a text encoder (open_encoder) or its specification"
-        raise InvalidQuery("encoder", expected=expected, got=type(encoder).__name__)
-    return encoder
-
-
 def query_vectors(
-    result: Lift,
+    scene: Scene,
     positives: Any,
     negatives: Any = (),
     *,
-    splats: Splats | None = None,
-    threshold: str | float = "auto",
-    instances: int | None = None,
-    keep: str = "all",
-    absent: str = "drop",
-    weigh: str = "evidence",
     references: Any = None,
     encoder: TextEncoder | str | Path | None = None,
+    grouped: bool = False,
+    **fields: Any,
 ) -> VectorAnswer:
-    """Ask a lift for words, or for vectors of its text space.
+    """Ask a lift for words, or for vectors of its text space, which count as words.
 
     Args:
-        result: the lift.
+        scene: an opened lift.
         positives: a text or several, or [n, F] or [F], torch or numpy: what is looked for; rows of any length above
             zero.
         negatives: the same, what takes away from the scores (`scores.combine`).
-        splats: that were lifted; with them the answer has objects.
-        threshold: as in `find_threshold`. instances: keep so many objects, the best. keep: all or the largest.
-        absent: drop what is not there, so that nothing is selected, or keep what is most like it.
-        weigh: what splats count by in the threshold's histogram and in objects: evidence, or that times confidence.
         references: [n, F], the vectors of 200 words or more, by which presence is known; None = those of the lift's
             text space, where it has some (`liftcore.query.presence`).
-        encoder: of texts and of reference words, or its specification; None: the lift's own words, else that of its
-            text space, opened for this question, or the table of it that ships.
+        encoder: of texts and of reference words, as in `Scene.ask`. grouped: whether to make objects.
+        fields: of `Query`.
 
     Raises:
         InvalidQuery: a vector of another length, of zeros or not finite; a text that the encoder cannot read, or none
@@ -152,21 +125,19 @@ def query_vectors(
     """
     import torch
 
-    scene = QueryScene(result.cpu(), splats)
-    groups = [_terms(values) for values in (positives, negatives)]
-    query = Query.of(*groups, threshold=threshold, instances=instances, keep=keep, absent=absent, weigh=weigh)
-    encoder = encoder_for(scene, encoder) if query.texts or encoder is not None else None
-    rows = directions(scene, query, encoder)
+    query = Query.of(_terms(positives), _terms(negatives), **fields)
+    reader = scene.encoder(encoder) if query.texts or encoder is not None else None
+    rows = directions(scene, query, reader)
     if references is not None:
         others = References.of(references, scene.channels)
-    elif encoder is not None:
-        others = references_of(encoder, scene.metadata.text_space)
+    elif reader is not None:
+        others = references_of(reader, scene.metadata.text_space)
     else:
         others = references_beside(rows, scene.metadata.text_space)
-    pack = None if encoder is None else pack_of(encoder)
+    pack = None if reader is None else pack_of(reader)
     answer = answers(scene, [Question(query, rows, np.ones(len(rows), np.bool_), others, pack)])[0]
     scores, selected = map(torch.from_numpy, (answer.scores, answer.selected))
-    found = None if splats is None else objects(scene, answer)
+    found = objects(scene, answer) if grouped else None
     cut, known = answer.threshold, (answer.present, answer.presence, answer.why)
     return VectorAnswer(scores, selected, cut.value, cut.explanation, answer.clear, *known, found)
 
@@ -183,7 +154,7 @@ def _terms(values: Any) -> tuple[str | Vector, ...]:
     return tuple(Vector(tuple(row.tolist())) for row in np.atleast_2d(rows)) if rows.size else ()
 
 
-def question(scene: QueryScene, query: Query, encoder: TextEncoder | None, names: Sequence[str] = ()) -> Question:
+def question(scene: Scene, query: Query, encoder: TextEncoder | None, names: Sequence[str] = ()) -> Question:
     """A query with the directions of its terms; what can be wrong with a query is found here (see `ask`).
 
     Args:
@@ -198,7 +169,7 @@ def question(scene: QueryScene, query: Query, encoder: TextEncoder | None, names
     return Question(query, rows, words, references_of(encoder, scene.metadata.text_space), pack_of(encoder))
 
 
-def answers(scene: QueryScene, questions: Sequence[Question]) -> list[Answer]:
+def answers(scene: Scene, questions: Sequence[Question]) -> list[Answer]:
     """Answer several queries in one pass over the features; each to the same bits as alone."""
     similarities = _similarities(scene, questions)
     if len(questions) == 1:
@@ -207,7 +178,7 @@ def answers(scene: QueryScene, questions: Sequence[Question]) -> list[Answer]:
         return list(pool.map(lambda asked, similar: _answer(scene, asked, similar), questions, similarities))
 
 
-def located(scene: QueryScene, answer: Answer, count: int | None = None) -> Answer:
+def located(scene: Scene, answer: Answer, count: int | None = None) -> Answer:
     """An answer with its best splats, and the box around all selected ones.
 
     A single outlier stretches the box; ``objects`` tells outliers from things.
@@ -233,7 +204,7 @@ def located(scene: QueryScene, answer: Answer, count: int | None = None) -> Answ
     return answer.model_copy(update={"top": top, "box": Box(*map(_point, ends)) if ends else None})
 
 
-def _similarities(scene: QueryScene, questions: Sequence[Question]) -> list[np.ndarray]:
+def _similarities(scene: Scene, questions: Sequence[Question]) -> list[np.ndarray]:
     """For each query [P, n] f32, how like each of its terms every splat is."""
     features, norms = scene.features, scene.norms
     of_words = np.concatenate([asked.rows[asked.plain] for asked in questions])
@@ -250,7 +221,7 @@ def _similarities(scene: QueryScene, questions: Sequence[Question]) -> list[np.n
     return found
 
 
-def _answer(scene: QueryScene, asked: Question, similarities: np.ndarray) -> Answer:
+def _answer(scene: Scene, asked: Question, similarities: np.ndarray) -> Answer:
     query, seen = asked.query, scene.seen
     presence, kept = _presence(scene, asked, similarities)
     scores = combine(similarities if kept.all() else similarities[:, kept], int(kept[: len(query.positives)].sum()))
@@ -271,7 +242,7 @@ def _answer(scene: QueryScene, asked: Question, similarities: np.ndarray) -> Ans
 
 
 def _selected(
-    scene: QueryScene, asked: Question, kept: np.ndarray, scores: np.ndarray, weights: np.ndarray
+    scene: Scene, asked: Question, kept: np.ndarray, scores: np.ndarray, weights: np.ndarray
 ) -> tuple[Threshold, np.ndarray]:
     """The threshold of a question and what it selects, [P] bool.
 
@@ -325,7 +296,7 @@ def _rivals(asked: Question, directions: np.ndarray) -> list[Rivals]:
     return [some for some in rivals if len(some.vectors)]
 
 
-def _presence(scene: QueryScene, asked: Question, similarities: np.ndarray) -> tuple[Presence, np.ndarray]:
+def _presence(scene: Scene, asked: Question, similarities: np.ndarray) -> tuple[Presence, np.ndarray]:
     """Whether any of the positives is there; and the terms that count, [n] bool: all, or without absent words."""
     kept, positives = np.ones(len(asked.rows), np.bool_), len(asked.query.positives)
     words = np.flatnonzero(asked.plain[:positives]).tolist()

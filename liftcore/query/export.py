@@ -4,19 +4,127 @@ Splat files are copies of the file that was lifted, in its dialect and in the or
 file opens them, and they can be lifted again.
 """
 
+from __future__ import annotations
+
 import io
 from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from liftcore.errors import InvalidQuery
+from liftcore.query.catalogue import one_object_ply
 from liftcore.query.colours import NOT_SEEN_COLOUR, cluster_colours, heat_colours
 from liftcore.query.objects import MOST_SPLATS, objects
 from liftcore.query.question import Answer
-from liftcore.query.scene import QueryScene, as_numpy
+from liftcore.query.scene import Scene, as_numpy
+
+if TYPE_CHECKING:  # these load torch
+    from PIL.Image import Image
+
+    from liftcore.query.render import ViewMask
+    from liftcore.query.segment import Segmentation
+    from liftcore.scene.cameras import Camera
+
+FILES = {  # of what a file is made -> the files that there are of it
+    "answer": ("object", "coloured", "scores", "selection", "mask", "attention", "overlay"),
+    "segmentation": ("coloured", "labels", "picture", "splat_labels", "labelled", "names"),
+    "object": ("object",),
+    "scene": ("rgb", "depth", "pca", "cluster", "confidence", "splats"),
+}
 
 
-def object_splats(scene: QueryScene, answer: Answer, suffix: str = ".ply") -> Iterable[bytes]:
+def blocks_of(
+    scene: Scene,
+    source: Answer | Segmentation | int | None,
+    what: str = "",
+    *,
+    view: str | Camera | None = None,
+    suffix: str = "",
+    seen: ViewMask | None = None,
+    photo: Image | None = None,
+) -> Iterable[bytes]:
+    """A file, in blocks: of an answer, of a segmentation, of one object of the lift by its id, or of the scene.
+
+    Args:
+        what: which file, by its name in FILES; empty = the first of its kind.
+        view: of pictures; None: the query's own. suffix: of its name, where there are several formats.
+        seen: the answer as the view shows it, where that is known. photo: of the view, for an overlay.
+
+    Raises:
+        InvalidQuery: there is no such file; or nothing was found that it could hold.
+        NotFound, InvalidLift: as what makes it.
+    """
+    kind = "object" if isinstance(source, int) else "scene" if source is None else type(source).__name__.lower()
+    what = what or FILES[kind][0]
+    if what not in FILES[kind]:
+        raise InvalidQuery("what", expected=f"one of {', '.join(FILES[kind])}", got=repr(what))
+    if isinstance(source, int):
+        return one_object_ply(scene, source)
+    if isinstance(source, Answer):
+        return _of_answer(scene, source, what, view, suffix, seen, photo)
+    if source is not None:
+        return _of_words(scene, source, what, view)
+    if what == "splats":
+        return viewer_splats(scene)
+    from liftcore.query.render import render_png
+
+    return [render_png(scene, _needed(view), what)]
+
+
+def _of_answer(
+    scene: Scene,
+    answer: Answer,
+    what: str,
+    view: str | Camera | None,
+    suffix: str,
+    seen: ViewMask | None,
+    photo: Image | None,
+) -> Iterable[bytes]:
+    if what == "object":
+        return object_splats(scene, answer, suffix or ".ply")
+    if what == "coloured":
+        return coloured_ply(scene, answer)
+    if what in ("scores", "selection"):
+        return [npy(answer.scores if what == "scores" else answer.selected)]
+    from liftcore.query.render import attention_png, mask_png, overlay_png, view_mask
+
+    place = answer.query.seen_from() if view is None else view
+    seen = view_mask(scene, answer, place) if seen is None else seen
+    if what == "overlay":
+        named = ", ".join(map(str, answer.query.positives))
+        return [overlay_png(scene, seen, place, named, photo)]
+    return [mask_png(seen.mask) if what == "mask" else attention_png(seen)]
+
+
+def _of_words(scene: Scene, found: Segmentation, what: str, view: str | Camera | None) -> Iterable[bytes]:
+    from liftcore.query.labels import document_bytes, labelled_ply, labels
+    from liftcore.query.segment import map_png, named_ply, picture_png, word_map
+
+    if what == "coloured":
+        return named_ply(scene, found)
+    if what == "splat_labels":
+        return [npy(found.values)]
+    if what in ("labelled", "names"):
+        if scene.labelled is None or scene.labelled[0] is not found:
+            scene.labelled = found, labels(scene, found)
+        made = scene.labelled[1]
+        return labelled_ply(scene, made) if what == "labelled" else [document_bytes(made)]
+    values = word_map(scene, found, _needed(view))
+    if what == "labels":
+        return [map_png(values, found)]
+    from liftcore.query.render import render
+
+    return [picture_png(render(scene, _needed(view)), values, found)]
+
+
+def _needed(view: str | Camera | None) -> str | Camera:
+    if view is None:
+        raise InvalidQuery("view", expected="a view's name or a camera", got="nothing")
+    return view
+
+
+def object_splats(scene: Scene, answer: Answer, suffix: str = ".ply") -> Iterable[bytes]:
     """The splats of an answer's objects, as a file in blocks: a PLY with every property to the byte, .splat or .spz.
 
     They are those that `objects` and masks show, without strays; of more than are grouped, all that were selected.
@@ -42,7 +150,7 @@ def object_splats(scene: QueryScene, answer: Answer, suffix: str = ".ply") -> It
     return some_rows(scene.splat_file, answer.selected if whole else objects(scene, answer).numbers >= 0, suffix)
 
 
-def coloured_ply(scene: QueryScene, answer: Answer) -> Iterable[bytes]:
+def coloured_ply(scene: Scene, answer: Answer) -> Iterable[bytes]:
     """All splats in the colours of their scores, as a file in blocks.
 
     The colour map spans the scores of the seen splats as a picture of the attention spans its pixels. Splats without
@@ -67,7 +175,7 @@ def npy(values: np.ndarray) -> bytes:
     return content.getvalue()
 
 
-def viewer_splats(scene: QueryScene) -> Iterator[bytes]:
+def viewer_splats(scene: Scene) -> Iterator[bytes]:
     """The scene in the ``.splat`` format of web viewers, in the lift's order, in blocks.
 
     Raises:
@@ -78,7 +186,7 @@ def viewer_splats(scene: QueryScene) -> Iterator[bytes]:
     return splat_blocks(scene.splats)
 
 
-def layer_colours(scene: QueryScene, what: str) -> np.ndarray:
+def layer_colours(scene: Scene, what: str) -> np.ndarray:
     """Colours of all splats, [P, 3] u8 sRGB.
 
     ``pca`` are three principal components of the features, ``cluster`` a colour a cluster; ``evidence`` (by its

@@ -15,7 +15,7 @@ from liftcore.query.colours import cluster_colours, heat_colours, map_colours
 from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.objects import objects
 from liftcore.query.question import Answer, Objects
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.query.splat_colours import seen_colours
 from liftcore.scene.cameras import Camera, drawn_by
 from liftcore.scene.compositing import CompositingParams
@@ -55,7 +55,7 @@ class ShownDepth:
 
 
 def view_mask(
-    scene: QueryScene, answer: Answer, view: str | Camera, group: Callable[[QueryScene, Answer], Objects] = objects
+    scene: Scene, answer: Answer, view: str | Camera, group: Callable[[Scene, Answer], Objects] = objects
 ) -> ViewMask:
     """See an answer from a camera: attention, and a mask of the objects that were found.
 
@@ -99,7 +99,7 @@ def attention_png(seen: ViewMask) -> bytes:
     return _png(heat_colours(seen.attention, seen.row_sums > 0))
 
 
-def render_png(scene: QueryScene, view: str | Camera, what: str = "rgb") -> bytes:
+def render_png(scene: Scene, view: str | Camera, what: str = "rgb") -> bytes:
     """The scene as a camera sees it, RGB [H, W, 3] on black: its colours, features (``pca``) or clusters.
 
     Its ``depth`` is one 8-bit channel [H, W], near bright, whose PNG tells its range as text (`ShownDepth`).
@@ -113,7 +113,7 @@ def render_png(scene: QueryScene, view: str | Camera, what: str = "rgb") -> byte
     return _png(render(scene, view, what))
 
 
-def render(scene: QueryScene, view: str | Camera, what: str = "rgb") -> np.ndarray:
+def render(scene: Scene, view: str | Camera, what: str = "rgb") -> np.ndarray:
     """The colours of a view, [H, W, 3] u8 sRGB on black, with the opacities as trained.
 
     ``rgb`` takes the splats' own colours, ``pca`` the first three principal components of their features, and
@@ -138,7 +138,7 @@ def render(scene: QueryScene, view: str | Camera, what: str = "rgb") -> np.ndarr
     return np.round(levels, out=levels).astype(np.uint8)
 
 
-def _render_clusters(scene: QueryScene, view: str | Camera) -> np.ndarray:
+def _render_clusters(scene: Scene, view: str | Camera) -> np.ndarray:
     if scene.cluster is None or scene.cluster_features is None:
         hint = "lift again with the setting aggregation=true"
         raise InvalidQuery("what", expected="a lift with clusters", got="a lift without aggregation", hint=hint)
@@ -150,7 +150,7 @@ def _render_clusters(scene: QueryScene, view: str | Camera) -> np.ndarray:
     return picture
 
 
-def _render_confidence(scene: QueryScene, view: str | Camera) -> np.ndarray:
+def _render_confidence(scene: Scene, view: str | Camera) -> np.ndarray:
     if scene.confidence is None:
         hint = "lift again with the preset default, or with robust_steps"
         raise InvalidQuery("what", expected="a lift with confidence", got="a lift that was not reweighted", hint=hint)
@@ -161,7 +161,7 @@ def _render_confidence(scene: QueryScene, view: str | Camera) -> np.ndarray:
     return map_colours(means, sums >= MINIMUM_ROW_SUM)
 
 
-def expected_depth(scene: QueryScene, view: str | Camera) -> tuple[np.ndarray, np.ndarray]:
+def expected_depth(scene: Scene, view: str | Camera) -> tuple[np.ndarray, np.ndarray]:
     """The expected depth of the rays of a view, ``sum_j w_j z_j / sum_j w_j``.
 
     z_j is the depth of a splat's centre along the camera's axis, not along the ray. Opacities are as trained.
@@ -180,7 +180,7 @@ def expected_depth(scene: QueryScene, view: str | Camera) -> tuple[np.ndarray, n
     return torch.where(covered, image[..., 0] / image[..., 1], 0.0).numpy(), covered.numpy()
 
 
-def shown_depth(scene: QueryScene, view: str | Camera) -> ShownDepth:
+def shown_depth(scene: Scene, view: str | Camera) -> ShownDepth:
     """The expected depths of a view, near bright, from the 1st to the 99th percentile of the covered pixels.
 
     Raises:
@@ -196,7 +196,7 @@ def shown_depth(scene: QueryScene, view: str | Camera) -> ShownDepth:
     return ShownDepth(levels, (near, far))
 
 
-def _as_trained(scene: QueryScene) -> CompositingParams:
+def _as_trained(scene: Scene) -> CompositingParams:
     return CompositingParams(antialiased=scene.compositing.antialiased)
 
 
@@ -241,7 +241,7 @@ def _read(image: Tensor, u: Tensor, v: Tensor) -> Tensor:
 
 
 def overlay_png(
-    scene: QueryScene, seen: ViewMask, view: str | Camera, name: str, photo: Image.Image | None = None
+    scene: Scene, seen: ViewMask, view: str | Camera, name: str, photo: Image.Image | None = None
 ) -> bytes:
     """What was found, in the photo of its view or else a render, with a caption that says its share of the picture.
 

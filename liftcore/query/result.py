@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from liftcore.query.ask import VectorAnswer
     from liftcore.query.catalogue import Catalogue
+    from liftcore.query.scene import Scene
     from liftcore.query.segment import Segmentation
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
@@ -27,7 +28,26 @@ class LiftResult(Lift):
     @classmethod
     def of(cls, lift: Lift) -> Self:
         """The same values, which answer questions too."""
-        return cls(**vars(lift))
+        return cls(**{field.name: getattr(lift, field.name) for field in fields(lift)})
+
+    def scene(
+        self, splats: Splats | None = None, cameras: Mapping[str, Camera] | None = None, *, device: str = "cpu"
+    ) -> Scene:
+        """The lift opened for questions (`liftcore.Scene`): once, while splats, cameras and device are the same.
+
+        Args:
+            splats: that were lifted. cameras: of its views. Both may be left out where the lift was made of files
+                that are where they were. device: that draws.
+        """
+        from liftcore.query.scene import Scene
+
+        parts = (splats, cameras, device)
+        kept = self.__dict__.get("_scene")  # no field, so that copies with other values do not have it
+        if kept is None or any(one is not other for one, other in zip(kept[0], parts, strict=True)):
+            if isinstance(splats, str | Path):  # of a scene that may be another: values alone belong to a result
+                self.require_splats(splats)
+            kept = self.__dict__["_scene"] = parts, Scene(self, splats, cameras, device=device)
+        return kept[1]
 
     def query(
         self,
@@ -35,13 +55,9 @@ class LiftResult(Lift):
         negatives: Any = (),
         *,
         splats: Splats | None = None,
-        threshold: str | float = "auto",
-        instances: int | None = None,
-        keep: str = "all",
-        absent: str = "drop",
-        weigh: str = "evidence",
         references: Any = None,
         encoder: TextEncoder | str | Path | None = None,
+        **fields: Any,
     ) -> VectorAnswer:
         """Which splats answer words, or vectors of the lift's text space.
 
@@ -50,16 +66,12 @@ class LiftResult(Lift):
                 above zero.
             negatives: the same, what takes away from the scores.
             splats: that were lifted; with them the answer has objects with boxes.
-            threshold: auto, valley, paper, otsu, stability or a number on the scores.
-            instances: how many things there are, where the caller knows. keep: of the objects, all or the largest.
-            absent: drop what is not there, so that nothing is selected, or keep what is most like it.
-            weigh: what splats count by in the threshold's histogram and in objects: evidence, or that times
-                `confidence`.
             references: [n, F], the vectors of 200 words or more, by which presence is known; None = those of the
                 lift's text space, where it has some.
-            encoder: of texts and of reference words, or the specification of one (`liftcore.open_encoder`). None: the
-                lift's own words (`table`), else the encoder of its text space, opened for this question (give one for
-                many), or the table of it that ships, where its weights cannot be had.
+            encoder: of texts and of reference words, or the specification of one (`liftcore.open_encoder`), which is
+                opened once. None: the lift's own words (`table`), else the encoder of its text space, or the table of
+                it that ships, where its weights cannot be had.
+            fields: of `liftcore.Query`: threshold, instances, keep, absent, weigh.
 
         Raises:
             InvalidQuery: a vector of another length, of zeros or not finite; a text that the encoder cannot read, or
@@ -68,10 +80,8 @@ class LiftResult(Lift):
         """
         from liftcore.query.ask import query_vectors
 
-        return query_vectors(
-            self, positives, negatives, splats=splats, threshold=threshold, instances=instances, keep=keep,
-            absent=absent, weigh=weigh, references=references, encoder=encoder,
-        )  # fmt: skip
+        more = {"references": references, "encoder": encoder, "grouped": splats is not None}
+        return query_vectors(self.scene(splats), positives, negatives, **more, **fields)
 
     def segment(
         self,
@@ -94,16 +104,7 @@ class LiftResult(Lift):
                 the encoder cannot read, or no encoder of the space.
             Unavailable: the encoder's weights are not on this machine.
         """
-        from liftcore.query.ask import encoder_for
-        from liftcore.query.presence import references_of
-        from liftcore.query.scene import QueryScene
-        from liftcore.query.segment import segment
-
-        scene, references = QueryScene(self.cpu(), splats), None
-        if vectors is None:
-            encoder = encoder_for(scene, encoder)
-            vectors, references = encoder.encode(words), references_of(encoder, scene.metadata.text_space)
-        return segment(scene, words, vectors, references=references)
+        return self.scene(splats).segment(words, vectors, encoder=encoder)
 
     def objects(
         self,
@@ -126,14 +127,7 @@ class LiftResult(Lift):
                 no encoder of the space.
             Unavailable: the encoder's weights are not on this machine.
         """
-        from liftcore.query.ask import encoder_for
-        from liftcore.query.catalogue import catalogue
-        from liftcore.query.scene import QueryScene
-
-        scene = QueryScene(self.cpu(), splats)
-        if words and vectors is None:
-            vectors = encoder_for(scene, encoder).encode(words)
-        return catalogue(scene, words, vectors)
+        return self.scene(splats).catalogue(words, vectors, encoder=encoder)
 
     def save(self, path: Path | str) -> None:
         """Write a lift file (`liftcore.values.lift_file`), whole or not at all."""

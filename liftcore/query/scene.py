@@ -2,28 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext, suppress
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from liftcore.errors import InvalidLift, InvalidQuery
 from liftcore.io.splats import quick_count
 from liftcore.query.scores import mean_direction, norms_of
+from liftcore.runtime.progress import Progress, silent
 from liftcore.scene.kernel import Kernel
 from liftcore.text.table import TableEncoder, own_words
 from liftcore.values.lift_file import read_lift
 
-if TYPE_CHECKING:  # these load torch or pydantic, which scores do without
+if TYPE_CHECKING:  # these load torch or what comes after a scene
     from torch import Tensor
 
+    from liftcore.query.catalogue import Catalogue
+    from liftcore.query.labels import Labels
+    from liftcore.query.question import Answer, BestWord, CoveringRegion, Objects, Query
+    from liftcore.query.render import ViewMask
+    from liftcore.query.segment import Segmentation
+    from liftcore.query.terms import Example
     from liftcore.raster.base import Raster
     from liftcore.scene.cameras import Camera, Cameras
     from liftcore.scene.compositing import CompositingParams
     from liftcore.scene.splats import Splats
+    from liftcore.text import TextEncoder
     from liftcore.values.lift import InputFile, Lift, LiftMetadata
     from liftcore.values.pack import Views
 
@@ -32,16 +41,23 @@ MOST_OF_THING = 512  # splats of a thing, likewise
 MOST_PIXELS = 1 << 26  # of a picture: 67 million take a minute of one core and 2 GB
 
 
-class QueryScene:
-    """What queries read of a lift, and on demand the scene that it was made from.
+class Scene:
+    """A lift opened for questions, with the splats and cameras of its scene.
 
-    Scores need the lift alone, and no torch. Splats, cameras and packs that are not given are found where the lift
-    remembers them, are checked against their digests when first used, and are loaded once.
+    What questions share is made once and kept: norms, mean, axes, encoders. Scores need the lift alone, and no torch.
+    Splats, cameras and packs that are not given are found where the lift remembers them, are checked against their
+    digests when first used, and are loaded once.
 
     Args:
-        result: the lift. splats: that were lifted. cameras: of the scene. packs: that were lifted.
+        source: the lift, or the path of its file, which is mapped and not read.
+        splats: that were lifted, or where they lie now, if they moved since the lift. cameras: of the scene, or where
+            they lie.
+        packs: that were lifted.
+        device: that draws: cpu, cuda or auto. Scores are computed on the CPU.
 
     Raises:
+        InvalidLift: the file is missing, is not a lift, or has other rows than the file of ``splats``, where these
+            are counted without reading them.
         InvalidSplats: other splats than were lifted (`Lift.require_splats`).
     """
 
@@ -57,20 +73,37 @@ class QueryScene:
 
     def __init__(
         self,
-        result: Lift,
-        splats: Splats | None = None,
-        cameras: Cameras | None = None,
+        source: Lift | Path | str,
+        splats: Splats | Path | str | None = None,
+        cameras: Mapping[str, Camera] | Path | str | None = None,
         packs: Views | None = None,
+        *,
+        device: str = "cpu",
     ) -> None:
-        names = ("features", "evidence", "seen", "cluster", "cluster_features", "confidence", "embeddings")
-        names += ("object", "object_views")
-        if splats is not None:
-            result.require_splats(splats)
-            splats = splats.cpu()
-        self._hold({name: as_numpy(getattr(result, name)) for name in names})
-        self.path = Path("lift")
-        given = {"lift": result, "metadata": result.metadata, "splats": splats, "cameras": cameras, "packs": packs}
-        self.__dict__.update({name: value for name, value in given.items() if value is not None})
+        self.device = device
+        self.labelled: tuple[Segmentation, Labels] | None = None  # the last one, for the two files of it
+        self._encoders: dict[str | None, TextEncoder] = {}
+        places = {"splats": splats, "cameras": cameras}
+        self._moved = {role: Path(at) if isinstance(at, str | Path) else None for role, at in places.items()}
+        if isinstance(source, str | Path):
+            self.path = Path(source)
+            arrays, self._told = read_lift(self.path)
+            moved = self._moved["splats"]
+            given: dict[str, Any] = {}
+        else:
+            names = ("features", "evidence", "seen", "cluster", "cluster_features", "confidence", "embeddings")
+            arrays = {name: as_numpy(getattr(source, name)) for name in (*names, "object", "object_views")}
+            self.path, moved = Path("lift"), None
+            given = {"lift": source, "metadata": self._with_places(source.metadata)}
+        self._hold(arrays)
+        if moved is not None and moved.exists():
+            self._require_rows(quick_count(moved))
+        given |= {"cameras": cameras} if cameras is not None and self._moved["cameras"] is None else {}
+        given |= {"packs": packs} if packs is not None else {}
+        self.__dict__.update(given)
+        if splats is not None and not isinstance(splats, str | Path):
+            self.lift.require_splats(splats)
+            self.__dict__["splats"] = splats.cpu()
 
     def _hold(self, arrays: dict[str, Any]) -> None:
         self.features, self.evidence, self._has_feature = (arrays[n] for n in ("features", "evidence", "seen"))
@@ -79,24 +112,224 @@ class QueryScene:
         self._embeddings = arrays.get("embeddings")
         self.object, self.object_views = arrays.get("object"), arrays.get("object_views")
 
-    @classmethod
-    def open(cls, path: Path, *, splats: Path | None = None, cameras: Path | None = None) -> Self:
-        """Open a lift file; its features are mapped, not read.
+    def ask(
+        self, query: Query | str, *, encoder: TextEncoder | str | Path | None = None, places: bool | None = None
+    ) -> Answer:
+        """Score every splat for a query and choose those that answer it (`liftcore.query.ask`).
 
         Args:
-            path: the lift. splats, cameras: where these lie now, if they moved since the lift.
+            query: words and examples, or one text.
+            encoder: of texts, or the specification of one, which is opened once. None: the lift's own words, else
+                that of its text space, or the table of it that ships.
+            places: whether to list the best splats and the box of what is selected, which needs the splats; None:
+                where these are found.
 
         Raises:
-            InvalidLift: the file is missing, is not a lift, or has other rows than ``splats``, where these are
-                counted without reading them.
+            InvalidQuery: a text that the encoder cannot read or no encoder of the lift's space, a term that has no
+                feature, or a lift without the confidence that is asked for.
+            NotFound: an example names a view or a region that is not there.
+            InvalidLift: an example or ``places`` need the scene's files, and they moved or changed.
+            Unavailable: the encoder's weights are not on this machine.
         """
-        scene = cls.__new__(cls)
-        arrays, scene._told = read_lift(path)
-        scene._hold(arrays)
-        scene.path, scene._moved = path, {"splats": splats, "cameras": cameras}
-        if splats is not None and splats.exists():
-            scene._require_rows(quick_count(splats))
-        return scene
+        from liftcore.query.ask import ask, located
+        from liftcore.query.question import Query
+
+        query = Query.of(query) if isinstance(query, str) else query
+        needed = bool(query.texts) or encoder is not None
+        answer = ask(self, query, self.encoder(encoder) if needed else None)
+        if places is False:
+            return answer
+        with nullcontext() if places else suppress(InvalidLift):
+            return located(self, answer)
+        return answer
+
+    def look(
+        self,
+        query: Query | str | Answer,
+        view: str | Camera | None = None,
+        *,
+        encoder: TextEncoder | str | Path | None = None,
+    ) -> ViewMask:
+        """See an answer from a camera: its attention, and a mask of the objects that were found.
+
+        Args:
+            query: as in `ask`, or the answer to it. view: the name of a camera of the scene, or any camera in the
+                frame of the splats; None: the query's own.
+
+        Raises:
+            InvalidQuery, NotFound, InvalidLift, Unavailable: as `ask` and `liftcore.query.render.view_mask`.
+        """
+        from liftcore.query.render import view_mask
+
+        answer = self._answer(query, encoder)
+        return view_mask(self, answer, answer.query.seen_from() if view is None else view)
+
+    def mask(
+        self,
+        query: Query | str | Answer,
+        view: str | Camera | None = None,
+        *,
+        encoder: TextEncoder | str | Path | None = None,
+    ) -> np.ndarray:
+        """[H, W] bool, the pixels of a view that are mostly of what was found; arguments as in `look`."""
+        return self.look(query, view, encoder=encoder).mask
+
+    def attention(
+        self,
+        query: Query | str | Answer,
+        view: str | Camera | None = None,
+        *,
+        encoder: TextEncoder | str | Path | None = None,
+    ) -> np.ndarray:
+        """[H, W] f32, the scores as a view shows them; arguments as in `look`."""
+        return self.look(query, view, encoder=encoder).attention
+
+    def render(self, view: str | Camera, what: str = "rgb") -> np.ndarray:
+        """A view: [H, W, 3] u8 sRGB of ``rgb``, ``pca``, ``cluster`` or ``confidence``; [H, W] f32 of ``depth``.
+
+        Depths are expected ones, in scene units, 0 where no splat is.
+
+        Raises:
+            NotFound, InvalidQuery, InvalidLift: as `liftcore.query.render.render`.
+        """
+        from liftcore.query.render import expected_depth, render
+
+        return expected_depth(self, view)[0] if what == "depth" else render(self, view, what)
+
+    def objects(self, query: Query | str | Answer, *, encoder: TextEncoder | str | Path | None = None) -> Objects:
+        """The things that a question finds: splats that touch, each with its box (`liftcore.query.objects`)."""
+        from liftcore.query.objects import objects
+
+        return objects(self, self._answer(query, encoder))
+
+    def catalogue(
+        self, words: Sequence[str] = (), vectors: Any = None, *, encoder: TextEncoder | str | Path | None = None
+    ) -> Catalogue:
+        """The things that masks of many views agree on, found when it was lifted; words name them.
+
+        Args:
+            words: n. vectors: [n, F], torch or numpy, their text vectors, of any length above zero. None: the encoder
+                makes them.
+        """
+        from liftcore.query.catalogue import catalogue
+
+        if words and vectors is None:
+            vectors = self.encoder(encoder).encode(words)
+        return catalogue(self, words, vectors)
+
+    def segment(
+        self,
+        words: Sequence[str] | None = None,
+        vectors: Any = None,
+        *,
+        encoder: TextEncoder | str | Path | None = None,
+        progress: Progress = silent,
+    ) -> Segmentation:
+        """Name every splat by the word that it is most like, or by none (`liftcore.query.segment`).
+
+        Args:
+            words: n different ones; None: all words of the encoder, which is a table. vectors: as in `catalogue`.
+        """
+        from liftcore.query.presence import references_of
+        from liftcore.query.segment import segment, words_of
+
+        if vectors is not None:
+            return segment(self, words or (), vectors, progress)
+        reader = self.encoder(encoder)
+        words = words_of(reader) if words is None else words
+        references = references_of(reader, self.metadata.text_space)
+        return segment(self, words, reader.encode(words), progress, references)
+
+    def what(
+        self,
+        example: Example | str,
+        words: Sequence[str] | None = None,
+        *,
+        top: int = 5,
+        encoder: TextEncoder | str | Path | None = None,
+    ) -> tuple[BestWord, ...]:
+        """The words that a pixel, a region, a splat or a vector is most like, the nearest first.
+
+        Args:
+            example: or its notation, as in `Query.like`. words: None: all words of the encoder, which is a table.
+        """
+        from liftcore.query.segment import best_words, words_of
+        from liftcore.query.terms import parse_example
+
+        reader = self.encoder(encoder)
+        words = words_of(reader) if words is None else words
+        example = parse_example(example, "example") if isinstance(example, str) else example
+        return best_words(self, example, words, reader.encode(words), top)
+
+    def regions(self, view: str, x: int, y: int) -> tuple[CoveringRegion, ...]:
+        """The regions of the lift's feature packs that cover a pixel of a view's photo, the smallest first."""
+        from liftcore.query.regions import regions_at
+
+        return regions_at(self, view, x, y)
+
+    def export(
+        self,
+        path: Path | str,
+        source: Query | str | Answer | Segmentation | int | None = None,
+        what: str = "",
+        *,
+        view: str | Camera | None = None,
+        encoder: TextEncoder | str | Path | None = None,
+    ) -> None:
+        """Write a file, whole or not at all (`liftcore.query.export.blocks_of`).
+
+        Args:
+            path: its suffix says the format where there are several.
+            source: a question or its answer, a segmentation, the id of an object of the catalogue; None: the scene.
+            what: of an answer object, coloured, scores, selection, mask, attention or overlay; of a segmentation
+                coloured, labels, picture, splat_labels, labelled or names; of the scene what `render` draws. Empty:
+                the first of these.
+            view: of pictures, as in `look`.
+
+        Raises:
+            InvalidQuery: there is no such file of it, or nothing was found that it could hold.
+            NotFound, InvalidLift, Unavailable: as the question, or as pictures.
+        """
+        from liftcore.io.files import whole_file
+        from liftcore.query.export import blocks_of
+        from liftcore.query.question import Query
+
+        source = self._answer(source, encoder) if isinstance(source, str | Query) else source
+        content = blocks_of(self, source, what, view=view, suffix=Path(path).suffix.lower())
+        with whole_file(Path(path)) as handle:
+            handle.writelines(content)
+
+    def encoder(self, encoder: TextEncoder | str | Path | None = None) -> TextEncoder:
+        """The encoder of a specification, opened once and with its last texts remembered; one of yours as it is.
+
+        None: the lift's own words, else that of its text space, or the table of it that ships.
+
+        Raises:
+            InvalidQuery: it is something else, or the lift's text space names none.
+            Unavailable: its weights are not on this machine.
+        """
+        from liftcore.text import RememberingEncoder, encoder_of_space, open_encoder
+
+        if encoder is not None and not isinstance(encoder, str | Path):
+            if not all(hasattr(encoder, name) for name in ("encode", "channels", "name")):
+                expected = "a text encoder (open_encoder) or its specification"
+                raise InvalidQuery("encoder", expected=expected, got=type(encoder).__name__)
+            return encoder
+        if encoder is None and self.table is not None:
+            return self.table
+        key = None if encoder is None else str(encoder)
+        if key not in self._encoders:
+            hint = "give encoder=, or vectors"
+            opened = (
+                encoder_of_space(self.metadata.text_space, hint, stand_in=True) if key is None else open_encoder(key)
+            )
+            self._encoders[key] = RememberingEncoder(opened)
+        return self._encoders[key]
+
+    def _answer(self, query: Query | str | Answer, encoder: TextEncoder | str | Path | None) -> Answer:
+        from liftcore.query.question import Answer
+
+        return query if isinstance(query, Answer) else self.ask(query, encoder=encoder, places=False)
 
     @cached_property
     def metadata(self) -> LiftMetadata:
@@ -115,12 +348,16 @@ class QueryScene:
             # Another file may lie there now, which says nothing of this lift.
             if count not in (None, len(self.features)) and input_file(splats).sha256 == metadata.splats.sha256:
                 self._require_rows(count)
+        return self._with_places(metadata)
+
+    def _with_places(self, metadata: LiftMetadata) -> LiftMetadata:
+        """The metadata with the files that moved where they are now."""
         files = {
             name: getattr(metadata, name).model_copy(update={"path": str(place)})
             for name, place in self._moved.items()
             if place is not None
         }
-        return metadata.model_copy(update=files)
+        return metadata.model_copy(update=files) if files else metadata
 
     @cached_property
     def table(self) -> TableEncoder | None:
@@ -303,11 +540,11 @@ class QueryScene:
 
     @cached_property
     def raster(self) -> Raster:
-        """A for this scene."""
+        """A for this scene, on the device that draws."""
         from liftcore.raster import open_raster
-        from liftcore.runtime.device import CPU
+        from liftcore.runtime.device import choose_device
 
-        return open_raster(self.splats, CPU)
+        return open_raster(self.splats, choose_device(self.device))
 
     @property
     def compositing(self) -> CompositingParams:
@@ -351,11 +588,11 @@ class QueryScene:
         """The path of an input, once its bytes are known to be those that were lifted."""
         if not remembered.path:
             raise InvalidLift(str(self.path), expected=f"a lift that knows its {role}", got="one of values in memory",
-                              hint=f"give the {role} to QueryScene, too")  # fmt: skip
+                              hint=f"give the {role} to Scene, too")  # fmt: skip
         from liftcore.io.transforms import FRAME_FILE
         from liftcore.values.lift_file import found_input
 
-        path, moved = Path(remembered.path), getattr(self, "_moved", {}).get(role) is not None
+        path, moved = Path(remembered.path), self._moved.get(role) is not None
         found = found_input(role, remembered, self.metadata, None if moved else self.path)
         if found is not None:
             return found

@@ -5,7 +5,7 @@ Its metadata are read without torch, so that a question to a file loads none.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict
@@ -211,7 +211,8 @@ class Lift:
         """The same with its tensors there; where they are, if there is no room for them."""
         from liftcore.runtime.device import out_of_memory
 
-        tensors = {name: part for name, part in vars(self).items() if name != "metadata" and part is not None}
+        parts = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "metadata"}
+        tensors = {name: part for name, part in parts.items() if part is not None}
         if all(part.device == place for part in tensors.values()):
             return self
         try:

@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from liftcore.evaluate.tradeoff import Scene, candidates_of, compare
+from liftcore.evaluate.tradeoff import SceneFiles, candidates_of, compare
 from liftcore.evaluate.tradeoff_report import page_of, save
 from liftcore.io.json_file import finite
 from liftcore.lifting.warm_up import warm_up_lift
@@ -52,11 +52,11 @@ def _compile(kernel: Kernel, device: Device, settings: dict[str, Any]) -> None:
         warm_up_lift(kernel, device, LiftSettings.of(**settings | candidate.settings))
 
 
-def _scene(order: dict[str, Any]) -> Scene:
+def _scene(order: dict[str, Any]) -> SceneFiles:
     files = Path(order["splats"]), Path(order["cameras"]), tuple(Path(path) for path in order["features"])
     labels = order["labels"]
     if not labels:
-        return Scene(*files)
-    return Scene(
+        return SceneFiles(*files)
+    return SceneFiles(
         *files, Path(labels["masks"]), Path(labels["table"]), tuple(order["parameters"]["labels"]["classes"])
     )

@@ -31,7 +31,7 @@ from liftcore.query.presence import references_of
 from liftcore.query.question import Answer, Found, Objects, OwnCamera, Query, Seen
 from liftcore.query.regions import region_mask, regions_at
 from liftcore.query.render import ViewMask, attention_png, mask_png, render, render_png, view_mask
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.query.scores import warm_up as warm_up_scores
 from liftcore.query.segment import Segmentation, best_words, map_png, picture_png, segment, word_map, words_of
 from liftcore.query.terms import Example, Region, Vector, parse_example
@@ -112,7 +112,7 @@ class Answers:
     """
 
     def __init__(self, *, scenes: int, cache_bytes: int) -> None:
-        self._scenes: Kept[QueryScene] = Kept(scenes)
+        self._scenes: Kept[Scene] = Kept(scenes)
         self._cache: Kept[Answer | Objects | ViewMask | Segmentation | Catalogue] = Kept(cache_bytes, bytes_of)
         self._encoders: dict[str, tuple[object, TextEncoder]] = {}  # spec -> version of its file, encoder
         self._opening = threading.RLock()  # of encoders, which the warm-up opens too
@@ -189,13 +189,13 @@ class Answers:
             for key, answer in zip(asked, answers(scene, list(asked.values())), strict=True):
                 self._cache.put(key, answer)
 
-    def _scene(self, request: dict[str, Any]) -> QueryScene:
+    def _scene(self, request: dict[str, Any]) -> Scene:
         scene = self._scenes.get(request["lift"], lambda: self._open(request))
         if "features" in request:
             scene.find_packs([Path(path) for path in request["features"]])
         return scene
 
-    def _open(self, request: dict[str, Any]) -> QueryScene:
+    def _open(self, request: dict[str, Any]) -> Scene:
         # Pictures come after numbers, so what draws them is loaded meanwhile.
         threading.Thread(target=self._warm_kernel, args=(Kernel(request["kernel"]),), daemon=True).start()
         return open_scene(request)
@@ -435,10 +435,10 @@ def view_of(request: dict[str, Any]) -> str | Camera:
     return Seen(view=request.get("view"), camera=request.get("camera")).seen_from()
 
 
-def open_scene(request: dict[str, Any]) -> QueryScene:
+def open_scene(request: dict[str, Any]) -> Scene:
     """The lift, with its splats and cameras where the store has them now: data directories may move."""
     splats, cameras = Path(request["splats"]), Path(request["cameras"])
-    return QueryScene.open(Path(request["lift"]), splats=splats, cameras=cameras)
+    return Scene(Path(request["lift"]), splats=splats, cameras=cameras)
 
 
 def describe_words(found: Segmentation) -> dict[str, Any]:

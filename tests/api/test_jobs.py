@@ -23,7 +23,7 @@ from fastapi.testclient import TestClient
 from liftcore.errors import Unavailable
 from liftcore.lifting.files import open_files
 from liftcore.lifting.pipeline import plan as plan_of
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.runtime.device import choose_device
 from liftcore.runtime.progress import Progress
 from liftcore.values.settings import LiftSettings
@@ -303,7 +303,7 @@ def test_lift_and_its_files_are_found_where_they_were_downloaded(
     [made] = tmp_path.glob("lift-*.safetensors")
     assert str(data).encode() not in made.read_bytes()  # paths of the server are nobody's business
     monkeypatch.chdir(tmp_path)
-    scene = QueryScene.open(made)
+    scene = Scene(made)
     assert scene.splats.count == COUNT and {camera.name for camera in scene.cameras.values()} == set(VIEWS)
     assert set(scene.packs.views) == set(VIEWS)
 

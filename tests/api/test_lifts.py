@@ -19,7 +19,7 @@ from safetensors.numpy import load, save
 
 from liftcore.io.splat import ROW
 from liftcore.lifting.files import lift_files
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.values.settings import LiftSettings
 from service.photos import PhotoIndexes
 from service.store.__main__ import main
@@ -303,7 +303,7 @@ def test_other_kernels_are_shown_as_near_gaussians() -> None:
     betas = Splats(means, quats, np.zeros((2, 3), "f4"), logits, "dbs", beta=np.zeros(2, "f4"))
     shown = []
     for splats in (discs, betas):
-        scene = QueryScene.__new__(QueryScene)
+        scene = Scene.__new__(Scene)
         scene.__dict__["splats"] = splats
         shown.append(np.frombuffer(b"".join(viewer_splats(scene)), ROW))
     np.testing.assert_allclose(shown[0]["scales"], [[0.5, 0.5, 0.005]] * 2, rtol=1e-5)

@@ -25,7 +25,7 @@ from torch import Tensor
 import liftcore as lc
 from liftcore.query.ask import ask
 from liftcore.query.question import Query
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.query.terms import Pixel
 from liftcore.query.threshold import METHODS, find_threshold
 from tests.benchmarks.base import PACKS, PRESETS, command_line, read_pack, read_scene, tell
@@ -42,7 +42,7 @@ def deepest_pixel(truth: Tensor) -> tuple[int, int]:
     return int(x), int(y)
 
 
-def measure(scene: QueryScene, cases: Iterable[Case]) -> dict[str, float]:
+def measure(scene: Scene, cases: Iterable[Case]) -> dict[str, float]:
     """Mean IoU over examples and views by column, how many were asked, and how many had no feature."""
     rows: dict[str, list[float]] = {name: [] for name in (*METHODS, "anywhere", "rendered", "best")}
     asked = refused = 0
@@ -71,7 +71,7 @@ def objects_of(truth: Truth) -> Iterator[Case]:
             yield Pixel(first, *deepest_pixel(shown)), [(view, mask) for view, mask in rest if mask.any()]
 
 
-def regions_of(scene: QueryScene, level: int) -> Iterator[Case]:
+def regions_of(scene: Scene, level: int) -> Iterator[Case]:
     """The regions of a level of every third view, and where their own views show them."""
     for view in scene.lift.views[::3]:
         camera, observed = scene.cameras[view], scene.packs[view]
@@ -108,7 +108,7 @@ def main() -> None:
         (splats, cameras), views = read_scene(folder), lc.read_features(folder / "regions.safetensors")
         for preset in options.presets:
             lifted = lc.lift(splats, cameras, views, preset=preset, certificate_rays=0)
-            scene = QueryScene(lifted, splats, cameras, views)
+            scene = Scene(lifted, splats, cameras, views)
             for level in range(3):
                 head = {"scene": folder.name, "features": f"regions {level}", "preset": preset}
                 rows.append(head | measure(scene, regions_of(scene, level)))

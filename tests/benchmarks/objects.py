@@ -26,7 +26,7 @@ import numpy as np
 from liftcore.query.ask import ask
 from liftcore.query.objects import objects
 from liftcore.query.question import Answer
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.solve.clusters import cluster_splats
 from liftcore.text import open_encoder
 from tests.benchmarks.base import PACKS, PRESETS, box_iou, command_line, read_pack, tell
@@ -36,7 +36,7 @@ FOUND = 0.75  # IoU of splats
 CLOTHS = ("tablecloth", "curtain")  # what the things stand on and before
 
 
-def measure_lift(scene: QueryScene, answers: dict[int, Answer], owners: np.ndarray) -> dict[str, Any]:
+def measure_lift(scene: Scene, answers: dict[int, Answer], owners: np.ndarray) -> dict[str, Any]:
     """The figures of one lift: answers by a thing's number, owners [P] int, the thing of each splat."""
     means, ious, of_all, middles, alone = scene.splats.means.numpy(), [], [], [], 0
     for thing, answer in answers.items():
@@ -55,7 +55,7 @@ def measure_lift(scene: QueryScene, answers: dict[int, Answer], owners: np.ndarr
     }  # fmt: skip
 
 
-def _are_two(scene: QueryScene, answers: dict[int, Answer], owners: np.ndarray) -> bool:
+def _are_two(scene: Scene, answers: dict[int, Answer], owners: np.ndarray) -> bool:
     """Whether the splats of two answers make exactly two objects, most of one's splats of each thing."""
     first, second = answers.values()
     both = objects(scene, replace(first, selected=first.selected | second.selected))

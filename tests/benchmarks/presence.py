@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from liftcore.query.presence import References, judge, references_of
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.query.scores import cosines
 from liftcore.text import open_encoder
 from liftcore.text.table import TableEncoder
@@ -34,7 +34,7 @@ NOT_THERE = ("a sofa", "a dog", "a car", "a guitar", "a bicycle", "a shoe", "an 
              "something to wear", "a place to sleep", "a penguin", "a bus")  # fmt: skip
 
 
-def told(scene: QueryScene, vectors: np.ndarray, references: References) -> np.ndarray:
+def told(scene: Scene, vectors: np.ndarray, references: References) -> np.ndarray:
     """[n] f64, the presence of words with these vectors [n, F]."""
     scores = np.ascontiguousarray(cosines(scene.features, scene.norms, vectors).T)
     found = (judge(scene, "", vector, row, references) for vector, row in zip(vectors, scores, strict=True))
@@ -47,7 +47,7 @@ def figures(present: np.ndarray, absent: np.ndarray) -> dict[str, Any]:
     return {"missed": missed, "lowest": float(present.min()), "nothing": nothing}
 
 
-def measured(scene: QueryScene, table: TableEncoder, present: Sequence[int]) -> dict[str, Any]:
+def measured(scene: Scene, table: TableEncoder, present: Sequence[int]) -> dict[str, Any]:
     """A row, of the table's words at these rows."""
     others = np.setdiff1d(np.arange(len(table.words)), present)
     absent = np.random.default_rng(0).choice(others, ABSENT, replace=False)

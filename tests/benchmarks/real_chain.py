@@ -46,7 +46,7 @@ from liftcore.query.ask import ask
 from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.question import Query
 from liftcore.query.render import overlay, view_mask
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.query.terms import Pixel
 from liftcore.text.table import TableEncoder
 from liftcore.values.pack import read_features
@@ -305,7 +305,7 @@ def of_lift(
     name: str, questions: Sequence[Question], words: TableEncoder, photos: Mapping[str, Path], out: Path
 ) -> Iterator[dict[str, Any]]:
     """A row a question to a lift; its masks and a picture of them are written."""
-    scene = QueryScene.open(out / f"{name}.lift.safetensors")
+    scene = Scene(out / f"{name}.lift.safetensors")
     sheet: list[np.ndarray] = []
     for number, (asked, word, terms) in enumerate(questions):
         answer = ask(scene, Query.of(terms), words)

@@ -20,7 +20,7 @@ from torch import Tensor
 
 import liftcore as lc
 from liftcore.evaluate.accuracy import class_ious
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.raster.base import Raster
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.values.views import NO_LABEL, ViewFeatures
@@ -52,11 +52,12 @@ class Truth:
 
     def lift(self, views: Mapping[str, ViewFeatures], **settings: Any) -> lc.LiftResult:
         """A lift of views onto the scene, without the certificate unless the settings ask for it."""
-        return lc.lift(self.raster.splats, self.cameras, views, **{"certificate_rays": 0, **settings}).cpu()
+        chosen: dict[str, Any] = {"certificate_rays": 0, **settings}
+        return lc.lift(self.raster.splats, self.cameras, views, **chosen).cpu()
 
-    def opened(self, lifted: lc.LiftResult) -> QueryScene:
+    def opened(self, lifted: lc.LiftResult) -> Scene:
         """A lift to ask questions of."""
-        scene = QueryScene(lifted, self.raster.splats, self.cameras)
+        scene = Scene(lifted, self.raster.splats, self.cameras)
         scene.raster = self.raster
         return scene
 

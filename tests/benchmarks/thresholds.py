@@ -32,7 +32,7 @@ from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.objects import objects
 from liftcore.query.question import Answer, Query
 from liftcore.query.render import LEAST_SHARE, MOST_GROUPED, view_mask
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.query.threshold import METHODS, find_threshold
 from liftcore.text import TextEncoder, open_encoder
 from liftcore.text.table import TableEncoder
@@ -67,7 +67,7 @@ def best_iou(attention: np.ndarray, met: np.ndarray, truth: Tensor) -> float:
 
 
 def judged(
-    scene: QueryScene, answers: Mapping[str, Answer], truths: Iterable[tuple[str, Tensor]]
+    scene: Scene, answers: Mapping[str, Answer], truths: Iterable[tuple[str, Tensor]]
 ) -> dict[str, list[float]]:
     """IoU of the masks of answers to the same question in views, by their names, one of which is ``auto``.
 
@@ -96,7 +96,7 @@ def judged(
     return rows
 
 
-def measure_phrases(scene: QueryScene, truth: Truth, encoder: TextEncoder) -> dict[str, float]:
+def measure_phrases(scene: Scene, truth: Truth, encoder: TextEncoder) -> dict[str, float]:
     """Means over the words and the held-out views, each word asked for alone; ``worst`` is the mean of one word."""
     of_words = []
     for number, word in enumerate(truth.words):
@@ -126,7 +126,7 @@ def still_life_rows(lifts: Iterable[str]) -> Iterator[dict[str, Any]]:
             yield {"scene": "still life", "features": kind, "lift": name} | measure_phrases(scene, truth, encoder)
 
 
-def measure_alone(scene: QueryScene, truth: Truth, encoder: TextEncoder, absent: Sequence[str]) -> dict[str, Any]:
+def measure_alone(scene: Scene, truth: Truth, encoder: TextEncoder, absent: Sequence[str]) -> dict[str, Any]:
     """What ``auto`` selects of each word, ``absent=keep``, and of words for what is not there."""
     told = [ask(scene, Query.of((word,), absent="keep"), encoder) for word in truth.words]
     found = [objects(scene, one).numbers >= 0 if one.count <= MOST_GROUPED else one.selected for one in told]

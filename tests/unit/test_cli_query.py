@@ -17,7 +17,7 @@ from liftcore.errors import InvalidInput
 from liftcore.io.splats import read_splats
 from liftcore.query.question import Query
 from liftcore.query.result import load_lift
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.text import BUILT_IN, open_encoder
 from liftcore.values.lift_file import save_lift
 
@@ -245,6 +245,6 @@ def test_rows_of_another_number_of_splats_are_refused_wherever_a_lift_is_asked(
         status, out, err = run(capsys, *question, *more)
         assert (status, out) == (2, "") and "row" in err and str(len(cropped.features)) in err
     with pytest.raises(InvalidInput, match="row"):
-        QueryScene(cropped).axes  # noqa: B018
+        Scene(cropped).axes  # noqa: B018
     with pytest.raises(InvalidInput, match="row"):
-        QueryScene(cropped).splats  # noqa: B018
+        Scene(cropped).splats  # noqa: B018

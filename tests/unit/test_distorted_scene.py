@@ -19,7 +19,7 @@ from liftcore.query.ask import ask
 from liftcore.query.question import Query
 from liftcore.query.render import render_png, view_mask
 from liftcore.query.result import LiftResult
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.query.terms import Pixel, Region
 from liftcore.scene.cameras import Camera
 from liftcore.values.lift_file import save_lift
@@ -84,7 +84,7 @@ def is_lifted(camera: Camera) -> np.ndarray:
 @pytest.mark.parametrize("lens", ["barrel", "fisheye"])
 def test_masks_lie_over_the_photo(lens: str, tmp_path: Path) -> None:
     save_lift(lifted(tmp_path, lens), tmp_path / "made.safetensors")
-    scene = QueryScene.open(tmp_path / "made.safetensors")
+    scene = Scene(tmp_path / "made.safetensors")
     for view in VIEWS:
         photo = np.where(is_lifted(scene.cameras[view]), photo_of(view, lens, CLEAR), -1)
         for part in np.unique(photo[photo >= 0]):
@@ -108,7 +108,7 @@ def test_masks_lie_over_the_photo(lens: str, tmp_path: Path) -> None:
 def test_a_pixel_at_the_rim_of_a_wide_photo_has_no_pinhole(tmp_path: Path) -> None:
     document = {"w": 400, "h": 40, "fl_x": 100, "fl_y": 100, "camera_model": "OPENCV_FISHEYE"}
     save_lift(lifted(tmp_path, "fisheye"), tmp_path / "made.safetensors")
-    scene = QueryScene.open(tmp_path / "made.safetensors")
+    scene = Scene(tmp_path / "made.safetensors")
     frame = {"file_path": "wide.jpg", "transform_matrix": np.diag([1.0, -1.0, -1.0, 1.0]).tolist()}
     (tmp_path / "wide.json").write_text(json.dumps({**document, "frames": [frame]}))
     scene.__dict__["cameras"] = read_cameras(tmp_path / "wide.json")
@@ -135,7 +135,7 @@ def test_a_model_that_comes_later_changes_no_lift(tmp_path: Path) -> None:
             )
     with pytest.raises(InvalidCameras, match="not both"):
         read_cameras(scene)
-    opened = QueryScene.open(tmp_path / "made.safetensors")
+    opened = Scene(tmp_path / "made.safetensors")
     assert opened.cameras.distorted == tuple(VIEWS)
     with pytest.raises(InvalidCameras, match="cameras without distortion, got 'left'; keep these"):
         write_inria_cameras(opened.cameras, tmp_path / "cameras.json")

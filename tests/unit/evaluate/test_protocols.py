@@ -26,7 +26,7 @@ from liftcore.evaluate.published import published
 from liftcore.query.ask import ask
 from liftcore.query.question import Query
 from liftcore.query.render import view_mask
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.query.threshold import find_threshold
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.text import open_encoder
@@ -36,11 +36,11 @@ P1, P2, P3, _ = EvaluationProtocol
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> QueryScene:
-    return QueryScene.open(write_lift(tmp_path_factory.mktemp("lift")))
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return Scene(write_lift(tmp_path_factory.mktemp("lift")))
 
 
-def words(scene: QueryScene):
+def words(scene: Scene):
     return open_encoder(scene.lift.metadata.text_space)
 
 
@@ -133,7 +133,7 @@ def test_p1_segments_a_map_as_langsplat_does(height: int, width: int) -> None:
     assert not flat.mask.any()
 
 
-def test_p1_compares_rendered_features(scene: QueryScene) -> None:
+def test_p1_compares_rendered_features(scene: Scene) -> None:
     texts = ["red apple", "book"]
     found = RenderedFeatures(scene, texts, words(scene)).cosines("frame_00002")
     rendered = scene.raster.render(scene.cameras["frame_00002"], scene.lift.features.float(), scene.compositing)
@@ -142,7 +142,7 @@ def test_p1_compares_rendered_features(scene: QueryScene) -> None:
     torch.testing.assert_close(found, unit @ vectors.T, atol=1e-5, rtol=0)
 
 
-def test_p2_sees_the_selected_splats_alone(scene: QueryScene) -> None:
+def test_p2_sees_the_selected_splats_alone(scene: Scene) -> None:
     texts, encoder = ["red apple", "unicorn"], words(scene)
     protocol = SelectedSplats(scene, texts, encoder, threshold=0.5)
     chosen = ask(scene, Query.of(("red apple",), threshold=0.5), encoder).selected
@@ -159,7 +159,7 @@ def test_p2_sees_the_selected_splats_alone(scene: QueryScene) -> None:
 
 
 @pytest.mark.parametrize("threshold", ["auto", 0.4])
-def test_p3_cuts_the_rendered_scores_of_a_query(scene: QueryScene, threshold: str | float) -> None:
+def test_p3_cuts_the_rendered_scores_of_a_query(scene: Scene, threshold: str | float) -> None:
     texts, encoder = ["book", "red apple"], words(scene)
     found = RenderedScores(scene, texts, encoder, threshold).look("frame_00002")
     for text in texts:

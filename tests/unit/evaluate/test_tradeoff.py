@@ -21,7 +21,7 @@ from liftcore.evaluate import tradeoff as comparison
 from liftcore.evaluate import tradeoff_report as report
 from liftcore.evaluate.accuracy import centred_cosines, class_ious, cosine_figures, shared_pixels
 from liftcore.evaluate.ranking import accuracy_of, choose
-from liftcore.evaluate.tradeoff import RunSpec, Scene, candidates_of, measured
+from liftcore.evaluate.tradeoff import RunSpec, SceneFiles, candidates_of, measured
 from liftcore.evaluate.tradeoff_report import table_of
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import dense_view, reading_matrix
@@ -141,7 +141,7 @@ def test_cosines_count_splats_that_the_exact_run_saw():
 
 def order_of(folder: Path, **parts) -> RunSpec:
     paths = write_scene(folder, 2)
-    scene = Scene(paths[0], paths[1], (paths[2],), **parts)
+    scene = SceneFiles(paths[0], paths[1], (paths[2],), **parts)
     return RunSpec(scene, {"certificate_rays": 0}, ("v0", "v1"), ("v2",), (), 1, folder, exact=True)
 
 
@@ -185,7 +185,7 @@ def test_a_short_budget_takes_fewer_views_and_runs_the_exact_one_alone(tmp_path,
     monkeypatch.setattr(comparison, "_run", told)
     monkeypatch.setattr(comparison, "LEAST_VIEWS", 1)
     paths = write_scene(tmp_path, 2)
-    scene = Scene(paths[0], paths[1], (paths[2],))
+    scene = SceneFiles(paths[0], paths[1], (paths[2],))
     found = comparison.compare(scene, 1.0, {}, 1, silent)
     assert [name for name, _ in calls] == ["draft", "exact"]
     assert [run["name"] for run in found["runs"]] == ["exact"]
@@ -280,7 +280,7 @@ def test_a_scene_of_which_the_exact_run_sees_nothing_is_refused(tmp_path, monkey
     monkeypatch.setattr(comparison, "_run", lambda *_: run_of("exact", 10, VIEWS) | blind)
     paths = write_scene(tmp_path, 2)
     with pytest.raises(InvalidInput, match="gave no splat a feature"):
-        comparison.compare(Scene(paths[0], paths[1], (paths[2],)), 1.0, {}, 1, silent)
+        comparison.compare(SceneFiles(paths[0], paths[1], (paths[2],)), 1.0, {}, 1, silent)
 
 
 def test_every_nth_view_is_compared_when_the_settings_say_so(tmp_path, monkeypatch):
@@ -294,7 +294,7 @@ def test_every_nth_view_is_compared_when_the_settings_say_so(tmp_path, monkeypat
 
     monkeypatch.setattr(comparison, "_run", told)
     paths = write_scene(tmp_path, 2)
-    scene = Scene(paths[0], paths[1], (paths[2],))
+    scene = SceneFiles(paths[0], paths[1], (paths[2],))
     found = comparison.compare(scene, 1e5, {"view_stride": 2}, 1, silent)
     assert (orders[-1].lifted, orders[-1].held_out) == (("v0",), ("v2",))
     assert measured(replace(orders[-1], reference=tmp_path))["views"] == 1

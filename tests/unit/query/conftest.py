@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from liftcore.lifting.files import lift_files
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.values.lift_file import save_lift
 from liftcore.values.settings import LiftSettings
 from tests.api.tiny_scene import make_scene
@@ -33,6 +33,6 @@ def tiny_lift(lift_tiny: Callable[..., Path], tmp_path_factory: pytest.TempPathF
 
 
 @pytest.fixture
-def scene(tiny_lift: Path) -> QueryScene:
+def scene(tiny_lift: Path) -> Scene:
     """It, opened."""
-    return QueryScene.open(tiny_lift)
+    return Scene(tiny_lift)

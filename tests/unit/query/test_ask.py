@@ -20,7 +20,7 @@ from liftcore.query.ask import answers, ask, located, question
 from liftcore.query.directions import directions, read_vector
 from liftcore.query.question import Query
 from liftcore.query.result import LiftResult, load_lift
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.query.terms import Example, OneSplat, Pixel, Region, Vector, parse_example
 from liftcore.query.threshold import find_threshold
 from liftcore.values.lift_file import save_lift
@@ -45,22 +45,22 @@ class Axes:
         return np.eye(self.channels, dtype=np.float32)[["xyz".index(text) for text in texts]]
 
 
-def of(scene: QueryScene, rows: np.ndarray, **fields: torch.Tensor) -> QueryScene:
+def of(scene: Scene, rows: np.ndarray, **fields: torch.Tensor) -> Scene:
     """A lift of other features [P, F], all seen, of evidence one."""
     ones = torch.ones(len(rows))
     given = {"evidence": ones, "agreement": ones, "seen": ones > 0} | fields
-    return QueryScene(replace(scene.lift, features=torch.from_numpy(rows.astype(np.float32)), **given))
+    return Scene(replace(scene.lift, features=torch.from_numpy(rows.astype(np.float32)), **given))
 
 
 @pytest.fixture
-def exact(scene: QueryScene) -> QueryScene:
+def exact(scene: Scene) -> Scene:
     """Splats j, j + 3, .. mean the same axis, and the last one nothing."""
     rows = np.eye(CHANNELS)[np.arange(COUNT) % 3] + 0.01
     rows[-1] = 0
     return of(scene, rows, seen=torch.arange(COUNT) < COUNT - 1)
 
 
-def test_splats_that_mean_the_text_are_selected_the_best_with_places_and_a_box(exact: QueryScene) -> None:
+def test_splats_that_mean_the_text_are_selected_the_best_with_places_and_a_box(exact: Scene) -> None:
     answer = ask(exact, "x", Axes())
     assert np.flatnonzero(answer.selected).tolist() == list(range(0, COUNT - 1, 3))
     assert answer.count == len(range(0, COUNT - 1, 3))
@@ -74,7 +74,7 @@ def test_splats_that_mean_the_text_are_selected_the_best_with_places_and_a_box(e
     assert located(exact, ask(exact, Query.of(("x",), ("y",), threshold=1.0), Axes()), 1).box is None
 
 
-def test_negatives_take_away_and_unseen_splats_are_never_selected(exact: QueryScene) -> None:
+def test_negatives_take_away_and_unseen_splats_are_never_selected(exact: Scene) -> None:
     plain, answer = ask(exact, "x", Axes()), ask(exact, Query.of(("x",), ("y", "z"), threshold=0.5), Axes())
     assert (answer.scores <= plain.scores).all() and answer.threshold.method == "fixed"
     assert np.flatnonzero(answer.selected).tolist() == list(range(0, COUNT - 1, 3))
@@ -85,7 +85,7 @@ def test_negatives_take_away_and_unseen_splats_are_never_selected(exact: QuerySc
 
 
 @pytest.mark.parametrize("weigh", ["evidence", "confidence"])
-def test_splats_without_evidence_or_confidence_do_not_decide_the_threshold(exact: QueryScene, weigh: str) -> None:
+def test_splats_without_evidence_or_confidence_do_not_decide_the_threshold(exact: Scene, weigh: str) -> None:
     plain = ask(exact, "x", Axes())
     stray = np.zeros((COUNT, CHANNELS))
     stray[:, 0], stray[:, 1] = 1.0, np.linspace(0.0, 3.0, COUNT)  # scores all over the range
@@ -101,7 +101,7 @@ def test_splats_without_evidence_or_confidence_do_not_decide_the_threshold(exact
     assert answer.selected[COUNT] and answer.count > plain.count  # they are selected all the same
 
 
-def test_questions_together_have_the_bits_of_each_alone(scene: QueryScene) -> None:
+def test_questions_together_have_the_bits_of_each_alone(scene: Scene) -> None:
     queries = [Query.of(("x",)), Query.of(("y", OneSplat(3)), ("z",)), Query.of((OneSplat(1),)), Query.of(("z", "x"))]
     asked = [question(scene, query, Axes()) for query in queries]
     for together, one in zip(answers(scene, asked), asked, strict=True):
@@ -109,9 +109,9 @@ def test_questions_together_have_the_bits_of_each_alone(scene: QueryScene) -> No
         assert np.array_equal(together.scores, alone.scores) and together.threshold == alone.threshold
 
 
-def test_what_cannot_be_asked_is_refused(scene: QueryScene) -> None:
-    def of_space(space: str) -> QueryScene:
-        return QueryScene(replace(scene.lift, metadata=scene.metadata.model_copy(update={"text_space": space})))
+def test_what_cannot_be_asked_is_refused(scene: Scene) -> None:
+    def of_space(space: str) -> Scene:
+        return Scene(replace(scene.lift, metadata=scene.metadata.model_copy(update={"text_space": space})))
 
     for refused, message in (
         (lambda: ask(scene, "x", Axes(5)), r"8 channels.*axes with 5"),
@@ -134,7 +134,7 @@ def test_what_cannot_be_asked_is_refused(scene: QueryScene) -> None:
     assert torch.equal(told.splats, plain.splats) and told.threshold == plain.threshold
 
 
-def test_vectors_are_asked_as_their_words_are(scene: QueryScene) -> None:
+def test_vectors_are_asked_as_their_words_are(scene: Scene) -> None:
     words = ask(scene, Query.of(("x",), ("y",)), Axes())
     for positive in (torch.eye(CHANNELS)[0], 7 * np.eye(CHANNELS)[:1]):
         found = LiftResult.of(scene.lift).query(positive, torch.eye(CHANNELS)[1], splats=scene.splats)
@@ -149,22 +149,22 @@ def test_vectors_are_asked_as_their_words_are(scene: QueryScene) -> None:
             LiftResult.of(scene.lift).query(wrong)
 
 
-def test_scene_made_of_values_needs_no_files(scene: QueryScene) -> None:
+def test_scene_made_of_values_needs_no_files(scene: Scene) -> None:
     nowhere = scene.metadata.splats.model_copy(update={"path": ""})
     lift = replace(scene.lift, metadata=scene.metadata.model_copy(update={"splats": nowhere}))
-    bare = QueryScene(lift, scene.splats, scene.cameras, scene.packs)
+    bare = Scene(lift, scene.splats, scene.cameras, scene.packs)
     query = Query.of((Pixel("middle", 6, HEIGHT // 2), Region("left", 0, 1)))
     assert np.array_equal(ask(bare, query).selected, ask(scene, query).selected)
     with pytest.raises(InvalidLift, match="give the splats"):
-        _ = QueryScene(lift).splats
+        _ = Scene(lift).splats
 
 
 def test_words_of_a_table_are_asked_without_torch(tiny_lift: Path) -> None:
     code = (
         "import sys; from pathlib import Path; from liftcore.query.ask import ask, located; "
-        "from liftcore.query.scene import QueryScene; from liftcore.query.question import Query; "
+        "from liftcore.query.scene import Scene; from liftcore.query.question import Query; "
         "import liftcore.text.table; "
-        "scene = QueryScene.open(Path(sys.argv[1])); answer = ask(scene, Query(like=['splat:0'])); "
+        "scene = Scene(Path(sys.argv[1])); answer = ask(scene, Query(like=['splat:0'])); "
         "assert located(scene, answer, 3).top and 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code, str(tiny_lift)], check=True)
@@ -178,15 +178,15 @@ def test_lift_finds_its_files_beside_it_or_where_told(lift_tiny: Callable[..., P
     lift = lift_tiny(before).name
     before.rename(after)
     (after / "s.ply").rename(after / "another.ply")
-    scene = QueryScene.open(after / lift)
+    scene = Scene(after / lift)
     assert scene.splats.count == COUNT and len(scene.cameras) == 3
     assert ask(scene, Query.of((Region("left", 0, 0),))).count > 0
     (after / "another.ply").rename(away / "s.ply")
-    lost = QueryScene.open(after / lift)
+    lost = Scene(after / lift)
     assert ask(lost, Query.of((OneSplat(0),))).count > 0  # scores need no splats
     with pytest.raises(InvalidLift, match=r"splats at .*s\.ply, or beside the lift.*--splats"):
         _ = lost.splats
-    assert QueryScene.open(after / lift, splats=away / "s.ply").splats.count == COUNT
+    assert Scene(after / lift, splats=away / "s.ply").splats.count == COUNT
 
 
 def test_cameras_may_be_added_but_not_moved(lift_tiny: Callable[..., Path], tmp_path: Path) -> None:
@@ -194,19 +194,19 @@ def test_cameras_may_be_added_but_not_moved(lift_tiny: Callable[..., Path], tmp_
     document = json.loads(file.read_text())
     document["frames"].append({**document["frames"][0], "file_path": "images/new.png"})
     file.write_text(json.dumps(document))
-    assert "new" in QueryScene.open(lift).cameras
+    assert "new" in Scene(lift).cameras
     document["frames"][0]["transform_matrix"][0][3] += 0.5
     file.write_text(json.dumps(document))
     with pytest.raises(InvalidLift, match="cameras changed since the lift"):
-        _ = QueryScene.open(lift).cameras
+        _ = Scene(lift).cameras
     with (tmp_path / "f.st").open("a") as pack:
         pack.write(" ")
     with pytest.raises(InvalidLift, match="features changed since the lift"):
-        ask(QueryScene.open(lift), Query.of((Region("left", 0, 0),)))
+        ask(Scene(lift), Query.of((Region("left", 0, 0),)))
 
 
 @pytest.mark.parametrize("cluster", range(3))
-def test_every_kind_of_example_finds_its_cluster(scene: QueryScene, cluster: int) -> None:
+def test_every_kind_of_example_finds_its_cluster(scene: Scene, cluster: int) -> None:
     splats = slice(cluster * SPLATS_A_CLUSTER, (cluster + 1) * SPLATS_A_CLUSTER)
     kinds: list[Example] = [
         Pixel("middle", (6, 16, 26)[cluster], HEIGHT // 2),
@@ -220,7 +220,7 @@ def test_every_kind_of_example_finds_its_cluster(scene: QueryScene, cluster: int
         assert answer.count <= 1.3 * SPLATS_A_CLUSTER, example
 
 
-def test_pixel_is_the_feature_rendered_there(scene: QueryScene) -> None:
+def test_pixel_is_the_feature_rendered_there(scene: Scene) -> None:
     features = torch.from_numpy(scene.features).float()
     image = scene.raster.render(scene.cameras["middle"], features, scene.compositing)
     for x, y in ((5, 12), (16, 12), (26, 10)):
@@ -229,7 +229,7 @@ def test_pixel_is_the_feature_rendered_there(scene: QueryScene) -> None:
         np.testing.assert_allclose(found, expected.numpy(), atol=1e-5)
 
 
-def test_threshold_of_examples_is_above_a_least_likeness(scene: QueryScene) -> None:
+def test_threshold_of_examples_is_above_a_least_likeness(scene: Scene) -> None:
     """Ten splats as the example, fifteen a little like it: together they stand apart most from all others."""
     rows = np.zeros((COUNT, CHANNELS))
     rows[:10, 0], rows[10:25, :3], rows[25:, 1] = 1.0, [0.3, 0.3, 0.9], -1.0
@@ -262,7 +262,7 @@ def test_threshold_of_examples_is_above_a_least_likeness(scene: QueryScene) -> N
     ],
 )
 def test_term_without_a_feature_says_why_under_its_name(
-    scene: QueryScene, example: Example, error: type[SplatliftError], said: str
+    scene: Scene, example: Example, error: type[SplatliftError], said: str
 ) -> None:
     with pytest.raises(error, match=said):
         ask(scene, Query.of((example,)))
@@ -300,12 +300,12 @@ def test_vectors_come_from_numpy_files(tmp_path: Path) -> None:
         read_vector(tmp_path / "v.npy")
 
 
-def test_lift_read_as_arrays_and_as_tensors_is_one(scene: QueryScene, tmp_path: Path) -> None:
+def test_lift_read_as_arrays_and_as_tensors_is_one(scene: Scene, tmp_path: Path) -> None:
     assert torch.equal(load_lift(scene.path).features, torch.from_numpy(scene.features))
     clusters = (torch.arange(COUNT) % 3 - 1).to(torch.int32)
     rows = torch.ones(2, CHANNELS, dtype=scene.lift.features.dtype)
     save_lift(replace(scene.lift, cluster=clusters, cluster_features=rows), tmp_path / "clustered")
-    opened = QueryScene.open(tmp_path / "clustered")
+    opened = Scene(tmp_path / "clustered")
     assert opened.cluster is not None and opened.cluster.tolist() == clusters.tolist()
 
 
@@ -318,12 +318,12 @@ def test_a_lift_with_other_rows_than_its_splats_answers_nothing(
     rows = ("features", "evidence", "agreement", "seen", "confidence", "cluster", "object")
     cropped = {name: getattr(lift, name)[:-1] for name in rows if getattr(lift, name) is not None}
     save_lift(replace(lift, **cropped), tmp_path / "cropped.lift")
-    ask(QueryScene.open(path), Query.of((OneSplat(0),)))
+    ask(Scene(path), Query.of((OneSplat(0),)))
     with pytest.raises(InvalidLift, match="a row for each of its"):
-        ask(QueryScene.open(tmp_path / "cropped.lift"), Query.of((OneSplat(0),)))  # scores alone, without places
+        ask(Scene(tmp_path / "cropped.lift"), Query.of((OneSplat(0),)))  # scores alone, without places
     splats.write_bytes(b"".join(some_rows(tmp_path / "s.ply", np.arange(len(lift.features)) > 0, suffix)))
     request = {"lift": str(path), "splats": str(splats), "cameras": str(tmp_path / "c.json")}
     with pytest.raises(InvalidLift, match="a row for each of its"):
         open_scene(request)
     (tmp_path / "s.ply").write_bytes(splats.read_bytes())  # another file lies there now: places alone are lost
-    ask(QueryScene.open(path), Query.of((OneSplat(0),)))
+    ask(Scene(path), Query.of((OneSplat(0),)))

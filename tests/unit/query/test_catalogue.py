@@ -15,14 +15,14 @@ from liftcore.cli import main
 from liftcore.errors import InvalidLift, InvalidQuery
 from liftcore.query.catalogue import NOT_LOOKED_FOR, catalogue, table_csv
 from liftcore.query.result import load_lift
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.values.lift_file import save_lift
 from tests.api.tiny_scene import CHANNELS, SPLATS_A_CLUSTER, VIEWS, WORDS, text_table
 
 EYE = np.eye(3, CHANNELS, dtype=np.float32)
 
 
-def test_each_object_has_its_place_its_views_and_the_nearest_word(scene: QueryScene) -> None:
+def test_each_object_has_its_place_its_views_and_the_nearest_word(scene: Scene) -> None:
     found = catalogue(scene, WORDS, 3.0 * EYE)
     assert [one.id for one in found.objects] == [0, 1, 2] and found.features.shape == (3, CHANNELS)
     assert sorted(one.share for one in found.objects)[::-1] == [one.share for one in found.objects]
@@ -37,9 +37,9 @@ def test_each_object_has_its_place_its_views_and_the_nearest_word(scene: QuerySc
     assert [int(line["splats"]) for line in lines] == [SPLATS_A_CLUSTER] * 3
 
 
-def test_a_lift_from_before_opens_and_says_that_it_holds_none(scene: QueryScene, tmp_path: Path) -> None:
+def test_a_lift_from_before_opens_and_says_that_it_holds_none(scene: Scene, tmp_path: Path) -> None:
     save_lift(replace(scene.lift, object=None, object_views=None), tmp_path / "old.lift")
-    old = catalogue(QueryScene.open(tmp_path / "old.lift"))
+    old = catalogue(Scene(tmp_path / "old.lift"))
     assert (old.objects, old.explanation) == ((), NOT_LOOKED_FOR)
     save_lift(replace(scene.lift, object_views=None), tmp_path / "half.lift")
     with pytest.raises(InvalidLift, match="object and object_views, or neither"):
@@ -47,7 +47,7 @@ def test_a_lift_from_before_opens_and_says_that_it_holds_none(scene: QueryScene,
 
 
 @pytest.mark.parametrize("vectors", [None, EYE[:2], np.zeros((3, CHANNELS)), np.ones((3, CHANNELS + 1))])
-def test_words_without_directions_are_refused(scene: QueryScene, vectors: np.ndarray | None) -> None:
+def test_words_without_directions_are_refused(scene: Scene, vectors: np.ndarray | None) -> None:
     with pytest.raises(InvalidQuery, match="words: expected"):
         catalogue(scene, WORDS, vectors)
 

@@ -13,7 +13,7 @@ from liftcore.query.ask import ask
 from liftcore.query.colours import NOT_SEEN_COLOUR, colour_map
 from liftcore.query.export import coloured_ply, object_splats
 from liftcore.query.question import Answer, Query
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.query.terms import Region
 from liftcore.scene.harmonics import SH_C0
 from liftcore.values.settings import LiftSettings
@@ -21,18 +21,18 @@ from tests.api.tiny_scene import SPLATS_A_CLUSTER, ply, splat_rows
 
 
 @pytest.fixture
-def scene(lift_tiny: Callable[..., Path], tmp_path: Path) -> QueryScene:
+def scene(lift_tiny: Callable[..., Path], tmp_path: Path) -> Scene:
     """The tiny scene lifted, and one splat more that no camera sees."""
     hidden = splat_rows()[:1].copy()
     hidden[0, 2] = 40.0
-    return QueryScene.open(lift_tiny(tmp_path, splats=ply(np.concatenate([splat_rows(), hidden]))))
+    return Scene(lift_tiny(tmp_path, splats=ply(np.concatenate([splat_rows(), hidden]))))
 
 
-def of_lamp(scene: QueryScene, threshold: float = 0.5) -> Answer:
+def of_lamp(scene: Scene, threshold: float = 0.5) -> Answer:
     return ask(scene, Query.of((Region("left", 0, 2),), threshold=threshold))
 
 
-def test_the_object_is_what_was_selected_and_can_be_lifted_again(scene: QueryScene, tmp_path: Path) -> None:
+def test_the_object_is_what_was_selected_and_can_be_lifted_again(scene: Scene, tmp_path: Path) -> None:
     answer = of_lamp(scene)
     (tmp_path / "lamp.ply").write_bytes(b"".join(object_splats(scene, answer)))
     rows = splat_rows()[answer.selected[:-1]]
@@ -47,7 +47,7 @@ def test_the_object_is_what_was_selected_and_can_be_lifted_again(scene: QuerySce
 
 
 @pytest.mark.parametrize("suffix", [".splat", ".spz"])
-def test_the_object_as_an_editors_file_has_the_same_rows(suffix: str, scene: QueryScene, tmp_path: Path) -> None:
+def test_the_object_as_an_editors_file_has_the_same_rows(suffix: str, scene: Scene, tmp_path: Path) -> None:
     answer = of_lamp(scene)
     for name in ("lamp.ply", f"lamp{suffix}"):
         (tmp_path / name).write_bytes(b"".join(object_splats(scene, answer, Path(name).suffix)))
@@ -60,7 +60,7 @@ def test_the_object_as_an_editors_file_has_the_same_rows(suffix: str, scene: Que
     np.testing.assert_allclose(made.sh, plain.sh, atol=0.02)
 
 
-def test_scores_have_the_colours_of_the_map_and_what_was_not_seen_is_grey(scene: QueryScene, tmp_path: Path) -> None:
+def test_scores_have_the_colours_of_the_map_and_what_was_not_seen_is_grey(scene: Scene, tmp_path: Path) -> None:
     answer = of_lamp(scene)
     assert not answer.seen[-1]
     (tmp_path / "scores.ply").write_bytes(b"".join(coloured_ply(scene, answer)))
@@ -74,12 +74,12 @@ def test_scores_have_the_colours_of_the_map_and_what_was_not_seen_is_grey(scene:
     assert {tuple(colour) for colour in colours[:-1].tolist()} <= known
 
 
-def test_exports_load_no_splats_and_know_when_their_file_changed(scene: QueryScene, tmp_path: Path) -> None:
+def test_exports_load_no_splats_and_know_when_their_file_changed(scene: Scene, tmp_path: Path) -> None:
     answer = of_lamp(scene)
     assert list(coloured_ply(scene, answer)) and "splats" not in scene.__dict__
     assert list(object_splats(scene, answer)) and "raster" not in scene.__dict__
     (tmp_path / "s.ply").write_bytes(ply(splat_rows()))
-    other = QueryScene.open(scene.path)
+    other = Scene(scene.path)
     for make in (object_splats, coloured_ply):
         with pytest.raises(InvalidLift, match="splats changed since the lift"):
             make(other, answer)

@@ -12,7 +12,7 @@ from liftcore.query.ask import ask
 from liftcore.query.export import object_splats
 from liftcore.query.objects import objects
 from liftcore.query.question import Answer, Query
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.query.terms import Region
 from tests.api.tiny_scene import SPLATS_A_CLUSTER, ply, splat_rows
 
@@ -20,7 +20,7 @@ from .made_up import answer_with
 
 
 def of(
-    scene: QueryScene, *clusters: int, keep: str = "all", instances: int | None = None, rows: tuple[int, ...] = ()
+    scene: Scene, *clusters: int, keep: str = "all", instances: int | None = None, rows: tuple[int, ...] = ()
 ) -> Answer:
     """An answer that selected these clusters and rows, with scores of .5 and more the later they stand."""
     answer = ask(scene, Query.of((Region("left", 0, 2),), threshold=0.5, keep=keep, instances=instances))
@@ -31,16 +31,16 @@ def of(
     return answer_with(answer, selected=selected, scores=np.linspace(0.5, 1.0, len(selected), dtype=np.float32))
 
 
-def means(scene: QueryScene, cluster: int) -> np.ndarray:
+def means(scene: Scene, cluster: int) -> np.ndarray:
     return scene.splats.means.numpy()[cluster * SPLATS_A_CLUSTER : (cluster + 1) * SPLATS_A_CLUSTER]
 
 
 @pytest.mark.parametrize("weigh", ["evidence", "confidence"])
-def test_clusters_that_are_apart_are_objects_with_their_boxes(weigh: str, scene: QueryScene) -> None:
+def test_clusters_that_are_apart_are_objects_with_their_boxes(weigh: str, scene: Scene) -> None:
     confidence = torch.rand(len(scene.features), generator=torch.Generator().manual_seed(0))
     answer = of(scene, 0, 2)
     answer = answer_with(answer, weigh=weigh)
-    found = objects(QueryScene(replace(scene.lift, confidence=confidence), scene.splats), answer)
+    found = objects(Scene(replace(scene.lift, confidence=confidence), scene.splats), answer)
     assert len(found.found) == 2 and found.strays == 0
     evidence = scene.evidence * (confidence.numpy() if weigh == "confidence" else 1)
     for number, thing in enumerate(found.found):
@@ -61,7 +61,7 @@ def test_clusters_that_are_apart_are_objects_with_their_boxes(weigh: str, scene:
     assert (nothing.found, nothing.strays) == ((), 0) and (nothing.numbers == -1).all()
 
 
-def test_single_splats_elsewhere_are_strays_and_stretch_no_box(scene: QueryScene) -> None:
+def test_single_splats_elsewhere_are_strays_and_stretch_no_box(scene: Scene) -> None:
     alone, with_stray = objects(scene, of(scene, 0)), objects(scene, of(scene, 0, rows=(2 * SPLATS_A_CLUSTER,)))
     assert len(with_stray.found) == 1 and with_stray.strays == 1
     assert with_stray.numbers[2 * SPLATS_A_CLUSTER] == -1
@@ -74,7 +74,7 @@ def test_single_splats_elsewhere_are_strays_and_stretch_no_box(scene: QueryScene
     assert module.trimmed_box(scene.splats.means.numpy()[strayed], np.ones(len(strayed))) != box
 
 
-def test_who_keeps_the_largest_gets_it_alone_also_as_a_file(scene: QueryScene) -> None:
+def test_who_keeps_the_largest_gets_it_alone_also_as_a_file(scene: Scene) -> None:
     both, largest = objects(scene, of(scene, 0, 2)), objects(scene, of(scene, 0, 2, keep="largest"))
     assert largest.found == both.found[:1]
     assert largest.strays == both.found[1].splats
@@ -84,7 +84,7 @@ def test_who_keeps_the_largest_gets_it_alone_also_as_a_file(scene: QueryScene) -
     assert b"".join(object_splats(scene, with_stray)) == ply(splat_rows()[both.numbers >= 0])
 
 
-def test_so_many_instances_are_kept_by_their_scores(scene: QueryScene) -> None:
+def test_so_many_instances_are_kept_by_their_scores(scene: Scene) -> None:
     all_three, two = objects(scene, of(scene, 0, 1, 2)), objects(scene, of(scene, 0, 1, 2, instances=2))
     assert len(all_three.found) == 3 and two.strays == SPLATS_A_CLUSTER
     assert (two.numbers[:SPLATS_A_CLUSTER] == -1).all()  # the later clusters have the higher scores
@@ -108,21 +108,21 @@ def test_tails_of_a_thousandth_are_not_in_the_box() -> None:
     assert module.trimmed_box(means[:1], np.ones(1))[0] == (0, 0, 0)
 
 
-def test_more_splats_than_are_grouped_are_refused(scene: QueryScene, monkeypatch) -> None:
+def test_more_splats_than_are_grouped_are_refused(scene: Scene, monkeypatch) -> None:
     monkeypatch.setattr(module, "MOST_SPLATS", SPLATS_A_CLUSTER)
     assert objects(scene, of(scene, 0)).found
     with pytest.raises(InvalidQuery, match=r"threshold: expected at most 20 splats.*got 21; name a higher"):
         objects(scene, of(scene, 0, rows=(2 * SPLATS_A_CLUSTER,)))
 
 
-def test_a_twentieth_of_the_evidence_of_the_largest_makes_an_object(scene: QueryScene) -> None:
+def test_a_twentieth_of_the_evidence_of_the_largest_makes_an_object(scene: Scene) -> None:
     rows = len(scene.features)
     for share, count in ((0.049, 1), (0.051, 2), (1.0, 2)):
         evidence = torch.ones(rows)
         evidence[2 * SPLATS_A_CLUSTER :] = share
-        weighed = QueryScene(replace(scene.lift, evidence=evidence))
+        weighed = Scene(replace(scene.lift, evidence=evidence))
         assert len(objects(weighed, of(scene, 0, 2)).found) == count
-    bare = QueryScene(replace(scene.lift, evidence=torch.zeros(rows)))  # without any, splats count alike
+    bare = Scene(replace(scene.lift, evidence=torch.zeros(rows)))  # without any, splats count alike
     found = objects(bare, of(scene, 0, rows=(2 * SPLATS_A_CLUSTER, 2 * SPLATS_A_CLUSTER + 1)))
     assert found.found[0].splats == SPLATS_A_CLUSTER
     assert sum(thing.share for thing in found.found) <= 1.0

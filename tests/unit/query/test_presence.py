@@ -17,7 +17,7 @@ from liftcore.query.presence import References, references_of
 from liftcore.query.question import Answer, Query
 from liftcore.query.render import view_mask
 from liftcore.query.result import LiftResult
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.query.segment import segment
 from liftcore.query.terms import OneSplat
 from liftcore.text import LVIS_TABLE, RememberingEncoder
@@ -34,7 +34,7 @@ def table() -> TableEncoder:
 
 
 @pytest.fixture
-def clip(scene: QueryScene, table: TableEncoder) -> QueryScene:
+def clip(scene: Scene, table: TableEncoder) -> Scene:
     """The three clusters are a cat, a boat and a pizza, as photos are: .29 like their words, .22 like others."""
     rng = np.random.default_rng(0)
     words = np.repeat(table.encode(THINGS), SPLATS_A_CLUSTER, axis=0)
@@ -50,10 +50,10 @@ def clip(scene: QueryScene, table: TableEncoder) -> QueryScene:
     ones = torch.ones(COUNT)
     given = {"evidence": ones, "agreement": ones, "seen": ones > 0}
     lifted = replace(scene.lift, features=torch.from_numpy(rows.astype(np.float32)), **given)
-    return QueryScene(lifted, scene.splats, scene.cameras)
+    return Scene(lifted, scene.splats, scene.cameras)
 
 
-def test_absent_words_select_nothing_and_present_ones_do(clip: QueryScene, table: TableEncoder) -> None:
+def test_absent_words_select_nothing_and_present_ones_do(clip: Scene, table: TableEncoder) -> None:
     others = [word for word in table.words if word not in THINGS]
     absent = np.random.default_rng(1).choice(others, 60, replace=False).tolist()
     for word in THINGS:
@@ -64,7 +64,7 @@ def test_absent_words_select_nothing_and_present_ones_do(clip: QueryScene, table
     assert all((one.present is False) == (one.count == 0) for one in answers)
 
 
-def test_absent_thing_shows_nothing_unless_kept(clip: QueryScene, table: TableEncoder) -> None:
+def test_absent_thing_shows_nothing_unless_kept(clip: Scene, table: TableEncoder) -> None:
     nothing = ask(clip, "sofa", table)
     assert nothing.threshold.value == np.inf and nothing.threshold.explanation == nothing.why
     assert objects(clip, nothing).found == ()
@@ -79,7 +79,7 @@ def test_absent_thing_shows_nothing_unless_kept(clip: QueryScene, table: TableEn
         Query.of(("sofa",), absent="hide")
 
 
-def test_of_several_words_the_absent_ones_are_left_out(clip: QueryScene, table: TableEncoder) -> None:
+def test_of_several_words_the_absent_ones_are_left_out(clip: Scene, table: TableEncoder) -> None:
     def same(one: Answer, other: Answer) -> bool:
         return np.array_equal(one.scores, other.scores) and np.array_equal(one.selected, other.selected)
 
@@ -95,7 +95,7 @@ def test_of_several_words_the_absent_ones_are_left_out(clip: QueryScene, table: 
     assert ask(clip, Query.of((OneSplat(0),))).present is None
 
 
-def test_references_that_mean_the_same_hide_nothing(clip: QueryScene, table: TableEncoder) -> None:
+def test_references_that_mean_the_same_hide_nothing(clip: Scene, table: TableEncoder) -> None:
     rng = np.random.default_rng(2)
     near = table.encode(["cat"] * 30) + 0.01 * rng.normal(size=(30, 512))
     crowded = TableEncoder("crowded", (*table.words, *(f"cat {k}" for k in range(30))),
@@ -104,14 +104,14 @@ def test_references_that_mean_the_same_hide_nothing(clip: QueryScene, table: Tab
     assert ask(clip, "sofa", crowded).present is False
 
 
-def test_small_evidence_does_not_make_a_thing(clip: QueryScene, table: TableEncoder) -> None:
+def test_small_evidence_does_not_make_a_thing(clip: Scene, table: TableEncoder) -> None:
     stray = torch.cat([clip.lift.features, torch.from_numpy(table.encode(["sofa"]))])
     ones = torch.ones(COUNT + 1)
     given = {"features": stray, "agreement": ones, "seen": ones > 0}
     evidence = torch.cat([torch.ones(COUNT), torch.tensor([1e-4])])
     for weight, present in ((1e-4, False), (1.0, True)):
         evidence[-1] = weight
-        lifted = QueryScene(replace(clip.lift, evidence=evidence.clone(), **given))
+        lifted = Scene(replace(clip.lift, evidence=evidence.clone(), **given))
         assert ask(lifted, "sofa", table).present is present
 
 
@@ -143,7 +143,7 @@ def test_an_encoder_makes_its_references_once(tmp_path: Path, monkeypatch: pytes
     assert isinstance(anew, References) and len(other.texts) > len(anew.words)
 
 
-def test_without_references_presence_is_not_known(clip: QueryScene, table: TableEncoder) -> None:
+def test_without_references_presence_is_not_known(clip: Scene, table: TableEncoder) -> None:
     axes = TableEncoder("axes", ("cat",), np.eye(512, dtype=np.float32)[:1])
     unknown = ask(clip, "cat", axes)
     assert (unknown.present, unknown.presence) == (None, None) and unknown.count > 0
@@ -152,7 +152,7 @@ def test_without_references_presence_is_not_known(clip: QueryScene, table: Table
     assert ask(clip, "sofa", few).presence == ask(clip, "sofa", table).presence
 
 
-def test_vectors_of_words_are_present_or_absent_too(clip: QueryScene, table: TableEncoder) -> None:
+def test_vectors_of_words_are_present_or_absent_too(clip: Scene, table: TableEncoder) -> None:
     cat, sofa = table.encode(["cat", "sofa"])
     assert LiftResult.of(clip.lift).query(cat).present and LiftResult.of(clip.lift).query(sofa).present is False
     assert not LiftResult.of(clip.lift).query(sofa, splats=clip.splats).splats.any()
@@ -168,7 +168,7 @@ def test_vectors_of_words_are_present_or_absent_too(clip: QueryScene, table: Tab
 
 
 def test_texts_are_asked_as_their_vectors_are(
-    clip: QueryScene, table: TableEncoder, monkeypatch: pytest.MonkeyPatch
+    clip: Scene, table: TableEncoder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lift = LiftResult.of(clip.lift)
     cat = lift.query(table.encode(["cat"]), table.encode(["pizza"]))
@@ -178,7 +178,7 @@ def test_texts_are_asked_as_their_vectors_are(
         opened.append(space)
         return table
 
-    monkeypatch.setattr("liftcore.query.ask.encoder_of_space", encoder_of_space)
+    monkeypatch.setattr("liftcore.text.encoder_of_space", encoder_of_space)
     for encoder in (table, "lvis", LVIS_TABLE, None):
         told = lift.query("cat", ["pizza"], encoder=encoder)
         assert torch.equal(told.scores, cat.scores) and torch.equal(told.splats, cat.splats)
@@ -193,7 +193,7 @@ def test_texts_are_asked_as_their_vectors_are(
             lift.query(wrong)
 
 
-def test_many_words_follow_the_same_rule(clip: QueryScene, table: TableEncoder) -> None:
+def test_many_words_follow_the_same_rule(clip: Scene, table: TableEncoder) -> None:
     words = ["cat", "sofa", "lamp"]  # without its nearest words, a sofa would have splats of its own
     found = segment(clip, words, table.encode(words))
     assert [one.word for one in found.found] == ["cat"]

@@ -7,7 +7,7 @@ import pytest
 
 from liftcore.errors import InvalidQuery, NotFound
 from liftcore.query.regions import region_mask, regions_at
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.query.terms import Region
 from liftcore.values.pack import as_views
 from liftcore.values.views import FeatureGrid, Regions
@@ -15,16 +15,16 @@ from tests.api.tiny_scene import CHANNELS, HEIGHT, WIDTH, codebook
 
 
 @pytest.fixture
-def levels(scene: QueryScene) -> QueryScene:
+def levels(scene: Scene) -> Scene:
     """The tiny lift with other packs: a map of half the size, its left half on one level, a cell on another."""
     labels = np.full((3, HEIGHT // 2, WIDTH // 2), -1, np.int32)
     labels[0, :, : WIDTH // 4], labels[2, 3, 5] = 0, 2
     grid = FeatureGrid(np.ones((2, 2, CHANNELS), np.float32))
     packs = as_views({"left": Regions(labels, codebook()), "middle": grid})
-    return QueryScene(scene.lift, scene.splats, scene.cameras, packs)
+    return Scene(scene.lift, scene.splats, scene.cameras, packs)
 
 
-def test_regions_of_a_pixel_come_with_the_smallest_first(levels: QueryScene) -> None:
+def test_regions_of_a_pixel_come_with_the_smallest_first(levels: Scene) -> None:
     found = regions_at(levels, "left", 11, 6)
     assert [one.example for one in found] == ["region:left:2:2", "region:left:0:0"]
     assert [one.share for one in found] == [4 / (WIDTH * HEIGHT), 0.5]
@@ -44,8 +44,6 @@ def test_regions_of_a_pixel_come_with_the_smallest_first(levels: QueryScene) -> 
         ("nowhere", 0, NotFound, "a view of the lift's feature packs"),
     ],
 )
-def test_where_no_regions_are_is_told(
-    levels: QueryScene, view: str, x: int, error: type[Exception], said: str
-) -> None:
+def test_where_no_regions_are_is_told(levels: Scene, view: str, x: int, error: type[Exception], said: str) -> None:
     with pytest.raises(error, match=said):
         regions_at(levels, view, x, 0)

@@ -29,7 +29,7 @@ from liftcore.query.render import (
     shown_depth,
     view_mask,
 )  # fmt: skip
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.query.splat_colours import principal_colours, seen_colours
 from liftcore.query.terms import Region
 from liftcore.raster.reference import ReferenceRaster
@@ -53,11 +53,11 @@ def lifted(lift_tiny: Callable[..., Path], tmp_path_factory: pytest.TempPathFact
 
 
 @pytest.fixture
-def scene(lifted: Path) -> QueryScene:
-    return QueryScene.open(lifted)
+def scene(lifted: Path) -> Scene:
+    return Scene(lifted)
 
 
-def of(scene: QueryScene, *clusters: int, keep: str = "all", rows: tuple[int, ...] = ()) -> Answer:
+def of(scene: Scene, *clusters: int, keep: str = "all", rows: tuple[int, ...] = ()) -> Answer:
     """An answer that selected these clusters and rows."""
     answer = ask(scene, Query.of((Region("left", 0, 0),), threshold=0.5, keep=keep))
     selected = np.zeros_like(answer.selected)
@@ -67,7 +67,7 @@ def of(scene: QueryScene, *clusters: int, keep: str = "all", rows: tuple[int, ..
     return answer_with(answer, selected=selected)
 
 
-def mostly(scene: QueryScene, members: np.ndarray) -> np.ndarray:
+def mostly(scene: Scene, members: np.ndarray) -> np.ndarray:
     """[H, W] bool, where these splats have at least half of a ray that meets the scene, by the oracle."""
     camera, oracle = scene.cameras["middle"], ReferenceRaster(scene.splats)
     weights = oracle.render(camera, torch.from_numpy(members).float()[:, None], scene.compositing)[..., 0]
@@ -76,7 +76,7 @@ def mostly(scene: QueryScene, members: np.ndarray) -> np.ndarray:
     return ((row_sums >= 0.5) & (weights >= 0.5 * row_sums)).numpy()
 
 
-def test_attention_is_the_scores_rendered_with_the_lifts_gain(scene: QueryScene) -> None:
+def test_attention_is_the_scores_rendered_with_the_lifts_gain(scene: Scene) -> None:
     answer, camera = of(scene, 0), scene.cameras["middle"]
     seen = view_mask(scene, answer, "middle")
     scores = torch.from_numpy(np.where(answer.seen, answer.scores, np.float32(0)))[:, None]
@@ -85,7 +85,7 @@ def test_attention_is_the_scores_rendered_with_the_lifts_gain(scene: QueryScene)
     assert scene.compositing.opacity_logit_scale == scene.metadata.settings.render_gain == 1.2
 
 
-def test_a_mask_is_where_most_of_a_ray_is_of_what_was_found(scene: QueryScene) -> None:
+def test_a_mask_is_where_most_of_a_ray_is_of_what_was_found(scene: Scene) -> None:
     answer = of(scene, 0, 2)
     seen = view_mask(scene, answer, "middle")
     assert seen.mask.shape == (HEIGHT, WIDTH)
@@ -97,7 +97,7 @@ def test_a_mask_is_where_most_of_a_ray_is_of_what_was_found(scene: QueryScene) -
     assert not nothing.mask.any() and "the 0 objects that were found" in nothing.explanation
 
 
-def test_strays_are_not_in_a_mask(scene: QueryScene) -> None:
+def test_strays_are_not_in_a_mask(scene: Scene) -> None:
     large = scene.splats.log_scales.clone()
     large[STRAY] = np.log(0.2)
     opaque = scene.splats.opacity_logits.clone()
@@ -111,7 +111,7 @@ def test_strays_are_not_in_a_mask(scene: QueryScene) -> None:
     assert "1 object that was found" in seen.explanation
 
 
-def test_of_very_many_splats_strays_stay(scene: QueryScene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_very_many_splats_strays_stay(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     answer = of(scene, 0, rows=(STRAY,))
     monkeypatch.setattr(module, "MOST_GROUPED", answer.count)
     assert "1 object" in view_mask(scene, answer, "middle").explanation
@@ -127,7 +127,7 @@ def test_of_very_many_splats_strays_stay(scene: QueryScene, monkeypatch: pytest.
         view_mask(scene, largest, "middle")
 
 
-def test_objects_that_are_known_are_not_made_again_and_none_for_no_view(scene: QueryScene) -> None:
+def test_objects_that_are_known_are_not_made_again_and_none_for_no_view(scene: Scene) -> None:
     answer, asked = of(scene, 0, 1), []
     known = objects(scene, of(scene, 1))
 
@@ -143,12 +143,12 @@ def test_objects_that_are_known_are_not_made_again_and_none_for_no_view(scene: Q
     assert asked == [(scene, answer)]
 
 
-def test_clusters_have_their_colours_and_the_rest_is_grey(scene: QueryScene) -> None:
+def test_clusters_have_their_colours_and_the_rest_is_grey(scene: Scene) -> None:
     with pytest.raises(InvalidQuery, match="aggregation"):
         render_png(scene, "middle", "cluster")
     clusters = (torch.arange(3 * SPLATS_A_CLUSTER) // SPLATS_A_CLUSTER - 1).to(torch.int32)
     features = torch.ones(2, scene.channels, dtype=scene.lift.features.dtype)
-    clustered = QueryScene(replace(scene.lift, cluster=clusters, cluster_features=features))
+    clustered = Scene(replace(scene.lift, cluster=clusters, cluster_features=features))
     shown = render(clustered, "middle", "cluster")
     labels = scene.raster.strongest_labels(scene.cameras["middle"], clusters, scene.compositing).numpy()
     met = scene.raster.row_sums(scene.cameras["middle"], scene.compositing).numpy() > 0
@@ -158,7 +158,7 @@ def test_clusters_have_their_colours_and_the_rest_is_grey(scene: QueryScene) -> 
     assert not shown[~met].any()
 
 
-def test_pictures_have_the_size_and_the_mode_they_promise(scene: QueryScene) -> None:
+def test_pictures_have_the_size_and_the_mode_they_promise(scene: Scene) -> None:
     seen = view_mask(scene, of(scene, 0), "middle")
     assert overlay(render(scene, "middle"), seen.mask).shape == (HEIGHT, WIDTH, 3)
     made = {"L": [mask_png(seen.mask)], "RGB": [attention_png(seen), render_png(scene, "middle"),
@@ -171,7 +171,7 @@ def test_pictures_have_the_size_and_the_mode_they_promise(scene: QueryScene) -> 
         assert np.array_equal(np.asarray(picture) > 0, seen.mask)
 
 
-def test_pictures_have_a_limit(scene: QueryScene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_have_a_limit(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     answer = ask(scene, Query.of((Region("left", 0, 0),)))
 
     def draw(what: str) -> object:
@@ -240,16 +240,16 @@ def test_groups_get_colours_that_can_be_told_apart_at_every_run() -> None:
 NEAR, FAR = 2.0, 5.0
 
 
-def scene_of(given: QueryScene, splats: Splats, camera: Camera) -> QueryScene:
+def scene_of(given: Scene, splats: Splats, camera: Camera) -> Scene:
     """A lift of nothing, over those splats and that camera."""
     ones = torch.ones(splats.count)
     metadata = given.metadata.model_copy(update={"landmarks": ()})
     made = replace(given.lift, features=torch.ones(splats.count, 1), evidence=ones, seen=ones > 0, metadata=metadata)
-    return QueryScene(made, splats, Cameras((camera,)))
+    return Scene(made, splats, Cameras((camera,)))
 
 
 @pytest.fixture
-def two(scene: QueryScene) -> QueryScene:
+def two(scene: Scene) -> Scene:
     """Two opaque balls side by side before a camera, one near and one far, and nothing between them."""
     pose = np.eye(4)
     pose[2, 3] = 1.0  # the camera stands at z = -1
@@ -262,7 +262,7 @@ def two(scene: QueryScene) -> QueryScene:
     return scene_of(scene, splats, Camera.pinhole("front", 48, 24, 24.0, 24.0, 24.0, 12.0, pose))
 
 
-def test_what_is_near_is_bright_and_what_is_nowhere_is_black(two: QueryScene) -> None:
+def test_what_is_near_is_bright_and_what_is_nowhere_is_black(two: Scene) -> None:
     depths, covered = expected_depth(two, "front")
     shown = shown_depth(two, "front")
     assert shown.span == pytest.approx((NEAR, FAR), abs=1e-5)
@@ -274,7 +274,7 @@ def test_what_is_near_is_bright_and_what_is_nowhere_is_black(two: QueryScene) ->
 
 @pytest.mark.parametrize("kernel", Kernel)
 @pytest.mark.usefixtures("every_kernel")
-def test_depth_is_the_weighted_mean_of_what_the_ray_meets(kernel: Kernel, scene: QueryScene) -> None:
+def test_depth_is_the_weighted_mean_of_what_the_ray_meets(kernel: Kernel, scene: Scene) -> None:
     splats, camera = random_splats(5, 40, kernel=kernel), random_camera(5)
     depths, covered = expected_depth(scene_of(scene, splats, camera), "v0")
     pixels = torch.tensor([(x, y) for y in range(camera.height) for x in range(camera.width)], dtype=torch.int32)
@@ -294,7 +294,7 @@ def test_depth_is_the_weighted_mean_of_what_the_ray_meets(kernel: Kernel, scene:
     assert float(close.double().mean()) > 0.995
 
 
-def test_a_picture_tells_its_depths_and_can_be_read_back(two: QueryScene) -> None:
+def test_a_picture_tells_its_depths_and_can_be_read_back(two: Scene) -> None:
     depths, covered = expected_depth(two, "front")
     with Image.open(io.BytesIO(render_png(two, "front", "depth"))) as picture:
         near, far = (float(picture.info[name]) for name in ("depth-near", "depth-far"))
@@ -304,7 +304,7 @@ def test_a_picture_tells_its_depths_and_can_be_read_back(two: QueryScene) -> Non
     np.testing.assert_allclose(read, depths[covered].clip(near, far), atol=0.51 * (far - near) / 254)
 
 
-def test_a_flat_scene_is_bright_and_an_empty_view_says_nothing(two: QueryScene) -> None:
+def test_a_flat_scene_is_bright_and_an_empty_view_says_nothing(two: Scene) -> None:
     splats, camera = two.splats, two.cameras["front"]
     one = Splats(splats.means[:1], splats.quats[:1], splats.log_scales[:1], splats.opacity_logits[:1])
     flat = shown_depth(scene_of(two, one, camera), "front")

@@ -20,7 +20,7 @@ from liftcore.io.splats import read_splats
 from liftcore.query.colours import NO_CLUSTER_COLOUR
 from liftcore.query.render import render
 from liftcore.query.result import LiftResult
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.query.segment import best_words, map_png, named_ply, picture_png, segment, word_map
 from liftcore.query.splat_colours import seen_colours
 from liftcore.query.terms import OneSplat, Pixel, Vector
@@ -33,17 +33,17 @@ CLUSTER = np.arange(COUNT) // SPLATS_A_CLUSTER
 
 
 @pytest.fixture
-def clear(scene: QueryScene) -> QueryScene:
+def clear(scene: Scene) -> Scene:
     """Each cluster is an axis with noise on all others."""
     rows = EYE[CLUSTER] + np.random.default_rng(0).normal(0, 0.05, (COUNT, CHANNELS)).astype(np.float32)
     ones = torch.ones(COUNT)
     lift = replace(scene.lift, features=torch.from_numpy(rows), evidence=ones, seen=ones > 0)
-    lifted = QueryScene(lift, scene.splats, scene.cameras)
+    lifted = Scene(lift, scene.splats, scene.cameras)
     lifted.splat_file = scene.splat_file
     return lifted
 
 
-def test_every_splat_gets_the_word_that_it_is_most_like(clear: QueryScene) -> None:
+def test_every_splat_gets_the_word_that_it_is_most_like(clear: Scene) -> None:
     found = segment(clear, ["lamp", "apple", "book"], EYE[[2, 0, 1]])
     assert np.array_equal(found.labels, np.array([1, 2, 0])[CLUSTER])
     assert (found.margin > 0.5).all()
@@ -56,24 +56,24 @@ def test_every_splat_gets_the_word_that_it_is_most_like(clear: QueryScene) -> No
     assert [found.found[value - 1].word for value in found.values[::SPLATS_A_CLUSTER]] == ["apple", "book", "lamp"]
 
 
-def test_words_that_are_not_there_name_nothing(clear: QueryScene) -> None:
+def test_words_that_are_not_there_name_nothing(clear: Scene) -> None:
     between = (EYE[0] + EYE[5]) / np.sqrt(2)  # what the first cluster is most like, but for its own word
     found = segment(clear, ["apple", "pear", "book", "lamp", "void"], np.stack([EYE[0], between, *EYE[[1, 2, 7]]]))
     assert {named.word for named in found.found} == {"apple", "book", "lamp"}
     assert np.array_equal(found.labels, np.array([0, 2, 3])[CLUSTER])
 
 
-def test_splats_of_no_word_and_unseen_ones_are_named_none(clear: QueryScene) -> None:
+def test_splats_of_no_word_and_unseen_ones_are_named_none(clear: Scene) -> None:
     found, rest = segment(clear, ["apple", "book"], EYE[:2]), slice(2 * SPLATS_A_CLUSTER, None)
     assert np.array_equal(found.labels == -1, CLUSTER == 2) and np.array_equal(found.values == 0, CLUSTER == 2)
     assert not found.margin[rest].any()
-    hidden = QueryScene(replace(clear.lift, seen=torch.arange(COUNT) != 3), clear.splats)
+    hidden = Scene(replace(clear.lift, seen=torch.arange(COUNT) != 3), clear.splats)
     assert segment(hidden, ["apple", "book", "lamp"], EYE[:3]).labels[3] == -1
-    flat = QueryScene(replace(clear.lift, features=torch.ones(COUNT, CHANNELS)), clear.splats)  # of equal scores
+    flat = Scene(replace(clear.lift, features=torch.ones(COUNT, CHANNELS)), clear.splats)  # of equal scores
     assert segment(flat, ["apple", "book"], EYE[:2]).found == ()
 
 
-def test_order_and_number_of_words_change_no_label(clear: QueryScene) -> None:
+def test_order_and_number_of_words_change_no_label(clear: Scene) -> None:
     words, vectors = [f"w{k}" for k in range(40)], np.random.default_rng(1).normal(size=(40, CHANNELS))
     words[:3], vectors[:3] = ["apple", "book", "lamp"], EYE[:3]
     mixed = np.random.default_rng(2).permutation(40)
@@ -88,17 +88,17 @@ def test_order_and_number_of_words_change_no_label(clear: QueryScene) -> None:
     ("words", "vectors"),
     [([], EYE[:0]), (["a", "a"], EYE[:2]), (["a"], EYE[:2]), (["a"], EYE[:1, :5]), (["a"], 0 * EYE[:1])],
 )
-def test_words_without_directions_of_their_own_are_refused(clear: QueryScene, words: list, vectors) -> None:
+def test_words_without_directions_of_their_own_are_refused(clear: Scene, words: list, vectors) -> None:
     with pytest.raises(InvalidQuery):
         segment(clear, words, vectors)
 
 
-def test_a_lift_in_memory_is_segmented_by_one_call(clear: QueryScene) -> None:
+def test_a_lift_in_memory_is_segmented_by_one_call(clear: Scene) -> None:
     found = LiftResult.of(clear.lift).segment(["apple", "book", "lamp"], torch.eye(CHANNELS)[:3], clear.splats)
     assert np.array_equal(found.labels, CLUSTER)
 
 
-def test_words_need_no_vectors_where_there_is_an_encoder(clear: QueryScene, tmp_path: Path) -> None:
+def test_words_need_no_vectors_where_there_is_an_encoder(clear: Scene, tmp_path: Path) -> None:
     """A specification, an opened encoder, and at last none of the lift's space."""
     words, table = ["apple", "book", "lamp"], tmp_path / "table.safetensors"
     table.write_bytes(text_table())
@@ -114,7 +114,7 @@ def test_words_need_no_vectors_where_there_is_an_encoder(clear: QueryScene, tmp_
             LiftResult.of(clear.lift).segment(nothing, splats=clear.splats, encoder=f"table:{table}")
 
 
-def test_pictures_show_the_words_of_the_pixels(clear: QueryScene) -> None:
+def test_pictures_show_the_words_of_the_pixels(clear: Scene) -> None:
     found = segment(clear, ["apple", "book"], EYE[:2])
     values = word_map(clear, found, "middle")
     with Image.open(io.BytesIO(map_png(values, found))) as picture:
@@ -129,7 +129,7 @@ def test_pictures_show_the_words_of_the_pixels(clear: QueryScene) -> None:
         assert picture.width > WIDTH and picture.height >= HEIGHT
 
 
-def test_coloured_splats_have_the_colours_of_their_words(clear: QueryScene, tmp_path: Path) -> None:
+def test_coloured_splats_have_the_colours_of_their_words(clear: Scene, tmp_path: Path) -> None:
     found = segment(clear, ["apple", "book"], EYE[:2])
     (tmp_path / "named.ply").write_bytes(b"".join(named_ply(clear, found)))
     seen = seen_colours(read_splats(tmp_path / "named.ply"), clear.cameras["middle"]).numpy()
@@ -162,7 +162,7 @@ def test_labels_go_out_as_columns_and_a_document(tiny_lift: Path, tmp_path: Path
     assert cli.main([*command, str(tiny_lift)]) == 2
 
 
-def test_best_words_of_an_example_come_first(clear: QueryScene) -> None:
+def test_best_words_of_an_example_come_first(clear: Scene) -> None:
     words = ["apple", "book", "lamp"]
     for example in (OneSplat(SPLATS_A_CLUSTER), Pixel("middle", 16, HEIGHT // 2), Vector(tuple(2 * EYE[1]))):
         best = best_words(clear, example, words, EYE[:3], 2)

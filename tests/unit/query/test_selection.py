@@ -10,7 +10,7 @@ import torch
 
 from liftcore.query.ask import answers, ask, question
 from liftcore.query.question import Query
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.query.threshold import METHODS, find_threshold
 from liftcore.text import LVIS_TABLE
 from liftcore.text.table import TableEncoder
@@ -24,11 +24,11 @@ def table() -> TableEncoder:
     return TableEncoder.open(LVIS_TABLE)
 
 
-def lifted(scene: QueryScene, features: np.ndarray, **fields: Any) -> QueryScene:
+def lifted(scene: Scene, features: np.ndarray, **fields: Any) -> Scene:
     """A lift of other features [P, F], of evidence one."""
     ones = torch.ones(len(features))
     given = {"evidence": ones, "agreement": ones, "seen": ones > 0, "object": None, "object_views": None}
-    return QueryScene(replace(scene.lift, features=torch.from_numpy(features.astype(np.float32)), **given | fields))
+    return Scene(replace(scene.lift, features=torch.from_numpy(features.astype(np.float32)), **given | fields))
 
 
 def noisy(vectors: np.ndarray, noise: float, seed: int = 0) -> np.ndarray:
@@ -47,13 +47,13 @@ def pictures(table: TableEncoder, words: Sequence[str], noise: float, hub: float
 
 
 @pytest.fixture
-def thin(scene: QueryScene, table: TableEncoder) -> QueryScene:
+def thin(scene: Scene, table: TableEncoder) -> Scene:
     """A thin cat before a large cow and a curtain, whose scores part far below the cat."""
     words = np.array(["cat", "cow", "curtain"])[THINGS].tolist()
     return lifted(scene, pictures(table, words, 0.2))
 
 
-def test_thin_thing_does_not_take_the_scene(thin: QueryScene, table: TableEncoder) -> None:
+def test_thin_thing_does_not_take_the_scene(thin: Scene, table: TableEncoder) -> None:
     scores = ask(thin, Query.of(("cat",), threshold=0.0), table).scores
     plain = scores >= find_threshold(scores).value
     assert plain.mean() > 0.5  # which the histogram alone selects
@@ -67,14 +67,14 @@ def test_thin_thing_does_not_take_the_scene(thin: QueryScene, table: TableEncode
         assert np.array_equal(found.selected, found.scores >= np.float32(found.threshold.value))
 
 
-def test_competition_keeps_what_the_histogram_finds_well(thin: QueryScene, table: TableEncoder) -> None:
+def test_competition_keeps_what_the_histogram_finds_well(thin: Scene, table: TableEncoder) -> None:
     answer = ask(thin, "curtain", table)
     assert answer.threshold.value == find_threshold(answer.scores).value
     assert np.array_equal(answer.selected, answer.scores >= np.float32(answer.threshold.value))
     assert answer.selected[THINGS == 2].mean() > 0.9 and answer.clear
 
 
-def test_selection_has_the_same_bits_together_and_alone(thin: QueryScene, table: TableEncoder) -> None:
+def test_selection_has_the_same_bits_together_and_alone(thin: Scene, table: TableEncoder) -> None:
     asked = [question(thin, Query.of((word,), absent="keep"), table) for word in ("cat", "cow", "sofa")]
     for together, one in zip(answers(thin, asked), asked, strict=True):
         (alone,) = answers(thin, [one])
@@ -83,9 +83,7 @@ def test_selection_has_the_same_bits_together_and_alone(thin: QueryScene, table:
 
 @pytest.mark.parametrize("method", [*METHODS, 0.0, -1.0])
 @pytest.mark.parametrize("level", [0.0, 0.25])
-def test_equal_or_zero_scores_select_nothing_and_say_why(
-    scene: QueryScene, method: str | float, level: float
-) -> None:
+def test_equal_or_zero_scores_select_nothing_and_say_why(scene: Scene, method: str | float, level: float) -> None:
     rows = np.zeros((60, 4))
     rows[:, :2] = level, (1 - level**2) ** 0.5
     axis = TableEncoder("axis", ("x",), np.eye(4, dtype=np.float32)[:1])
@@ -94,7 +92,7 @@ def test_equal_or_zero_scores_select_nothing_and_say_why(
     assert answer.threshold.value == np.inf and "nothing is selected" in answer.threshold.explanation
 
 
-def test_words_of_a_pack_compete_with_each_other(scene: QueryScene) -> None:
+def test_words_of_a_pack_compete_with_each_other(scene: Scene) -> None:
     """Four words in a table of their own: where another one is nearer, a splat is not selected."""
     axes = np.eye(8, dtype=np.float32)
     rows = np.repeat(axes[:3], 20, axis=0)
@@ -109,7 +107,7 @@ def test_words_of_a_pack_compete_with_each_other(scene: QueryScene) -> None:
     assert np.flatnonzero(both.selected).tolist() == list(range(40))
 
 
-def test_what_hubs_hide_is_not_sure_and_shown(scene: QueryScene, table: TableEncoder) -> None:
+def test_what_hubs_hide_is_not_sure_and_shown(scene: Scene, table: TableEncoder) -> None:
     """Splats that all lie nearer to some words than to their own, as images may: contrast tells them apart."""
     words = [word for word in ("cat", "boat", "pizza") for _ in range(200)]
     drawn = lifted(scene, pictures(table, words, 0.2, hub=0.3))
@@ -120,9 +118,7 @@ def test_what_hubs_hide_is_not_sure_and_shown(scene: QueryScene, table: TableEnc
     assert ask(drawn, "sofa", table).present is False
 
 
-def test_thing_that_is_mostly_selected_is_taken_whole_unless_it_holds_two(
-    scene: QueryScene, table: TableEncoder
-) -> None:
+def test_thing_that_is_mostly_selected_is_taken_whole_unless_it_holds_two(scene: Scene, table: TableEncoder) -> None:
     words = ["cat"] * 300 + ["boat"] * 200 + ["pizza"] * 200
     rows = pictures(table, words, 0.1)
     rows[200:300] = pictures(table, ["cat"] * 100, 0.1) * 0.6 + 0.4 * pictures(table, ["zebra"] * 100, 0.1)

@@ -30,7 +30,7 @@ from liftcore.query.labels import labels
 from liftcore.query.objects import objects
 from liftcore.query.question import Query
 from liftcore.query.render import expected_depth, render
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.query.segment import segment
 from liftcore.query.terms import Vector
 from liftcore.raster.reference import dense_view
@@ -89,7 +89,7 @@ def test_a_moved_scene_has_the_same_features_pictures_and_plan(kernel: Kernel) -
     apart = (far.features - here.features).norm(dim=1) / here.features.norm(dim=1).clamp_min(1e-9)
     assert float(apart[here.seen].quantile(0.95)) < 1e-3  # rays at the edge of a splat may fall on its other side
     assert torch.allclose(far.evidence, here.evidence, rtol=1e-2, atol=1e-2)
-    first, second = QueryScene(here, splats, Cameras(cameras)), QueryScene(far, there, Cameras(there_cameras))
+    first, second = Scene(here, splats, Cameras(cameras)), Scene(far, there, Cameras(there_cameras))
     for name in ("v0", "v3"):
         for one, other in zip(expected_depth(first, name), expected_depth(second, name), strict=True):
             assert np.mean(~np.isclose(one, other, atol=1e-3)) < 0.01
@@ -296,14 +296,14 @@ def test_cameras_whose_rotation_has_few_digits_stand_where_their_file_says() -> 
 def asked_of(splats: Splats, cameras: Cameras, views: dict[str, Any]) -> dict[str, Any]:
     """Every answer that has a place in it: boxes and points [n, 3], and the rows that they are of."""
     lift = lc.lift(splats, cameras, views, LiftSettings.of(dtype="float32"))
-    scene = QueryScene(lift, splats, cameras)
+    scene = Scene(lift, splats, cameras)
     vectors = np.eye(6, dtype=np.float32)[:2]
     answer = ask(scene, Query.of((Vector(tuple(vectors[0].tolist())),), threshold=0.2, absent="keep"))
     best, parts = located(scene, answer, 5), objects(scene, answer)
     words = segment(scene, ["one", "two"], vectors)
     told = labels(scene, words).document
     whole = replace(lift, object=torch.arange(len(lift.features)).int() % 2, object_views=torch.zeros(2, 5).int())
-    things = catalogue(QueryScene(whole, splats, cameras))
+    things = catalogue(Scene(whole, splats, cameras))
     rows = [line.split(",")[5:14] for line in table_csv(things).decode().splitlines()[1:]]
     return {
         "top": [one.position for one in best.top],

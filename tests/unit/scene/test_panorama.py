@@ -16,7 +16,7 @@ from liftcore.errors import InvalidCameras, NotFound
 from liftcore.evaluate.check import check_scene
 from liftcore.io.cameras import read_cameras
 from liftcore.query.regions import region_mask, regions_at
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.query.terms import Region
 from liftcore.scene.cameras import Cameras, faces_of
 from liftcore.scene.panorama import with_panoramas
@@ -160,7 +160,7 @@ def test_things_all_around_are_found_and_asked_by_their_masks() -> None:
         assert isinstance(seen, lc.Regions) and isinstance(found, lc.Regions)
         assert torch.equal(seen.labels, found.labels)
     assert result.metadata.poses == poses_of([cameras[view] for view in result.views])
-    scene = QueryScene(result, splats, cameras, as_views({"pano": regions}))
+    scene = Scene(result, splats, cameras, as_views({"pano": regions}))
     camera = cameras["pano@back"]
     [found] = regions_at(scene, "pano@back", camera.width // 2, camera.height // 2)
     assert found.example == "region:pano@back:0:0"  # the heap behind

@@ -11,7 +11,7 @@ import torch
 from liftcore.errors import InvalidSplats
 from liftcore.evaluate.inspect import inspect_file
 from liftcore.io.splats import read_places, read_splats
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.scene.splats import Splats
 from liftcore.values.lift_file import input_file
 from tests.scenes import random_splats, write_scene
@@ -75,7 +75,7 @@ def test_every_command_says_that_one_rank_is_a_part_and_takes_the_folder(
         assert words in text
         status, text, err = run(capsys, command, folder, *more, *(lift if command == "lift" else ()))
         assert status == 0 and "beside" not in text, (command, text, err)
-    scene = QueryScene.open(out)
+    scene = Scene(out)
     assert scene.splats.count == 50 and scene.axes.shape == (3, 50)
 
 

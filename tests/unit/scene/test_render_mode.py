@@ -19,7 +19,7 @@ from liftcore.evaluate.inspect import inspect_file
 from liftcore.io.splats import read_splats, some_rows, with_columns, write_splats
 from liftcore.lifting.files import lift_files
 from liftcore.query.render import _as_trained as params_of_renders
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
 from liftcore.values.settings import LiftSettings
@@ -236,13 +236,13 @@ def test_commands_follow_the_file_tell_it_and_take_a_setting_by_hand(
     assert "set by hand" in run(capsys, "plan", splats, cameras, "--set", "antialiased=false")[1]
     assert "render mode" in run(capsys, "inspect", splats)[1]
     assert run(capsys, "lift", splats, cameras, packs, "-o", out, "--set", "preset=row-sum")[0] == 0
-    scene = QueryScene.open(out)
+    scene = Scene(out)
     assert scene.compositing.antialiased and params_of_renders(scene).antialiased
     found = inspect_file(out)
     assert found["settings"]["antialiased"] is True
     assert "says so" in found["certificate"]["plan"]["rendering"]
     assert run(capsys, "lift", splats, cameras, packs, "-o", out, "--set", "antialiased=false")[0] == 0
-    assert not QueryScene.open(out).compositing.antialiased
+    assert not Scene(out).compositing.antialiased
 
 
 def test_a_lift_from_before_keeps_the_kernel_that_it_was_lifted_with(tmp_path: Path) -> None:
@@ -252,7 +252,7 @@ def test_a_lift_from_before_keeps_the_kernel_that_it_was_lifted_with(tmp_path: P
     settings = result.settings.model_copy(update={"kernel": "auto", "antialiased": False})
     metadata = result.metadata.model_copy(update={"settings": settings})
     replace(result, metadata=metadata).save(tmp_path / "old.safetensors")
-    scene = QueryScene.open(tmp_path / "old.safetensors")
+    scene = Scene(tmp_path / "old.safetensors")
     assert scene.splats.kernel is Kernel.GAUSSIAN_3D and not scene.compositing.antialiased
 
 

@@ -19,7 +19,7 @@ from liftcore.lifting.geometry import strided
 from liftcore.query.directions import directions
 from liftcore.query.question import Query
 from liftcore.query.result import LiftResult, load_lift
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.query.terms import Region
 from liftcore.raster.reference import counted_weights, dense_view, reading_matrix, strided_rays
 from liftcore.scene.cameras import Cameras
@@ -175,7 +175,7 @@ def test_discs_written_with_three_scales_are_discs_where_the_settings_say_so(tmp
     assert torch.equal(got.features, wanted.features)
     assert not torch.equal(lifted((solid, cameras, features)).features, wanted.features)
     save_lift(got, tmp_path / "made.safetensors")
-    assert QueryScene.open(tmp_path / "made.safetensors").splats.kernel is Kernel.GAUSSIAN_2D  # in pictures too
+    assert Scene(tmp_path / "made.safetensors").splats.kernel is Kernel.GAUSSIAN_2D  # in pictures too
     with pytest.raises(InvalidSplats, match="'beta' of a dbs splat"):
         lifted((solid, cameras, features), kernel="dbs")
 
@@ -255,7 +255,7 @@ def test_folders_before_the_names_of_views_change_no_bit(tmp_path):
     regions = observed(3, 1)
     assert isinstance(regions, Regions)
     label = int(regions.labels[0].max())  # the region is asked for by the lift's name of the view
-    (direction,) = directions(QueryScene.open(tmp_path / "rig.lift"), Query.of((Region("v1", 0, label),)), None)
+    (direction,) = directions(Scene(tmp_path / "rig.lift"), Query.of((Region("v1", 0, label),)), None)
     expected = torch.nn.functional.normalize(regions.codebook[label], dim=0)
     assert torch.allclose(torch.as_tensor(direction), expected, atol=1e-3)
 

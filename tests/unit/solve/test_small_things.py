@@ -12,7 +12,7 @@ import liftcore as lc
 from liftcore.query.ask import ask
 from liftcore.query.question import Query
 from liftcore.query.render import view_mask
-from liftcore.query.scene import QueryScene
+from liftcore.query.scene import Scene
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.text.table import TableEncoder
 from tests.benchmarks.base import mask_iou
@@ -26,7 +26,7 @@ SMALL = ("sword", "ring", "nut")
 FEW = Mistakes(merged=0.1, split=0.05, misnamed=0.05, unlabelled=0.03, displacement=0.7, noise=0.35)
 
 
-class Scene:
+class Observed:
     """The scene, what views observe of it, and words: those of steel are alike."""
 
     def __init__(self) -> None:
@@ -47,25 +47,25 @@ class Scene:
         made = lc.lift(
             self.made.splats, self.made.cameras, self.views, preset="default", certificate_rays=0, **settings
         )
-        scene = QueryScene(made, self.made.splats, self.made.cameras)
+        scene = Scene(made, self.made.splats, self.made.cameras)
         scene.raster = self.raster
         return {
             thing: float(np.mean([self._iou(scene, thing, view) for view in self.truth]))
             for thing in self.made.things
         }
 
-    def _iou(self, scene: QueryScene, thing: str, view: str) -> float:
+    def _iou(self, scene: Scene, thing: str, view: str) -> float:
         mask = view_mask(scene, ask(scene, Query.of((thing,), absent="keep"), self.encoder), view).mask
         return mask_iou(mask, self.truth[view] == self.made.things.index(thing))
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
-    return Scene()
+def scene() -> Observed:
+    return Observed()
 
 
 @pytest.mark.parametrize("clusters", ["hdbscan", "graph"])
-def test_small_things_keep_their_masks_where_the_guard_stands(scene: Scene, clusters: str) -> None:
+def test_small_things_keep_their_masks_where_the_guard_stands(scene: Observed, clusters: str) -> None:
     # In two channels steel is one cluster, of which the sword has most.
     merged = {"aggregation": True, "aggregation_clusters": clusters, "aggregation_channels": 2}
     guarded = scene.ious(**merged)

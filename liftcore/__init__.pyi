@@ -1,0 +1,53 @@
+"""The public names of liftcore, and where they live: the one list of them."""
+
+from liftcore.errors import InvalidCameras as InvalidCameras
+from liftcore.errors import InvalidFeatures as InvalidFeatures
+from liftcore.errors import InvalidInput as InvalidInput
+from liftcore.errors import InvalidLift as InvalidLift
+from liftcore.errors import InvalidQuery as InvalidQuery
+from liftcore.errors import InvalidSettings as InvalidSettings
+from liftcore.errors import InvalidSplats as InvalidSplats
+from liftcore.errors import NotFound as NotFound
+from liftcore.errors import SplatliftError as SplatliftError
+from liftcore.errors import Unavailable as Unavailable
+from liftcore.io.cameras import read_cameras as read_cameras
+from liftcore.io.splats import read_splats as read_splats
+from liftcore.io.splats import write_splats as write_splats
+from liftcore.lifting.engines.base import LocalEngine as LocalEngine
+from liftcore.lifting.engines.ray import RayEngine as RayEngine
+from liftcore.lifting.operators import region_weights as region_weights
+from liftcore.lifting.operators import render as render
+from liftcore.lifting.pipeline import lift as lift
+from liftcore.lifting.pipeline import plan as plan
+from liftcore.lifting.planning.photos import PhotoPlan as PhotoPlan
+from liftcore.lifting.planning.photos import plan_photos as plan_photos
+from liftcore.lifting.planning.plan import Plan as Plan
+from liftcore.query.ask import VectorAnswer as VectorAnswer
+from liftcore.query.catalogue import Catalogue as Catalogue
+from liftcore.query.question import Answer as Answer
+from liftcore.query.question import BestWord as BestWord
+from liftcore.query.question import CoveringRegion as CoveringRegion
+from liftcore.query.question import FoundObject as FoundObject
+from liftcore.query.question import NamedSplats as NamedSplats
+from liftcore.query.question import Objects as Objects
+from liftcore.query.question import Query as Query
+from liftcore.query.question import SceneObject as SceneObject
+from liftcore.query.render import ViewMask as ViewMask
+from liftcore.query.result import LiftResult as LiftResult
+from liftcore.query.result import load_lift as load_lift
+from liftcore.query.scene import Scene as Scene
+from liftcore.query.segment import Segmentation as Segmentation
+from liftcore.runtime.version import __version__ as __version__
+from liftcore.scene.cameras import Camera as Camera
+from liftcore.scene.cameras import Cameras as Cameras
+from liftcore.scene.compositing import CompositingParams as CompositingParams
+from liftcore.scene.splats import Splats as Splats
+from liftcore.text import TextEncoder as TextEncoder
+from liftcore.text import open_encoder as open_encoder
+from liftcore.values.pack import read_features as read_features
+from liftcore.values.region_weights import RegionWeights as RegionWeights
+from liftcore.values.settings import LiftSettings as LiftSettings
+from liftcore.values.views import FeatureGrid as FeatureGrid
+from liftcore.values.views import Regions as Regions
+
+__all__: list[str]
