@@ -78,19 +78,11 @@ class Steps(Protocol[Weights]):
         ...
 
     def solve(self, W: Weights, clusters: RegionObjects | None) -> tuple[Tensor, Support]:
-        """X [P, F] in closed form, and what supports it.
-
-        Args:
-            clusters: whose features splats may take in `aggregate`.
-        """
+        """X [P, F] in closed form, and what supports it; `aggregate` may take the clusters' features."""
         ...
 
     def refine(self, W: Weights, X: Tensor, seen: np.ndarray) -> tuple[Tensor, dict[str, Any]]:
-        """X after the steps of least squares that the settings ask for, and what is known of the optimum.
-
-        Args:
-            seen: [P] bool.
-        """
+        """X after the least squares of the settings, for the splats seen [P] bool; and what is known of it."""
         ...
 
     def aggregate(self, W: Weights, X: Tensor, clusters: RegionObjects | None) -> tuple[Tensor, Aggregation]:

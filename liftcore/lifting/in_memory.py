@@ -22,8 +22,8 @@ from liftcore.raster.base import Raster
 from liftcore.runtime.device import Device
 from liftcore.runtime.progress import Timings
 from liftcore.scene.splats import Splats
-from liftcore.solve.aggregate import Aggregation, aggregate
-from liftcore.solve.closed_form import solve, solve_rows
+from liftcore.solve.aggregate import Aggregation, aggregate, resolved
+from liftcore.solve.closed_form import solve
 from liftcore.solve.consensus import mask_consensus
 from liftcore.solve.diagnostics import ViewMeasures, measure_samples
 from liftcore.solve.least_squares import AllRays, reference, refine
@@ -34,8 +34,6 @@ from liftcore.values.lift_views import LiftViews
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import LiftSettings
 from liftcore.values.views import ViewFeatures
-
-LEAST_KEPT = 0.5  # of a splat's weight, in regions that the aggregation kept, for it to be solved for again
 
 
 @dataclass(frozen=True)
@@ -167,27 +165,11 @@ class InMemory(Steps[SceneWeights]):
         if not settings.aggregation_resolve:
             return X, found
         with self.timings.stage("resolve"):
-            X, share = self._resolve(W, X, found)
-        return X, replace(found, facts=found.facts | {"resolved": share})
-
-    def _resolve(self, W: SceneWeights, X: Tensor, aggregation: Aggregation) -> tuple[Tensor, float]:
-        """X, solved again from the kept regions alone for splats that took no cluster's feature; their share of all.
-
-        Only those most of whose weight lies in kept regions: it is their neighbours' regions that reach the others.
-        """
-        if all(rows is None for rows in aggregation.kept):
-            return X, 0.0
-        weights = W.weights.cpu()
-        counted = [
-            torch.ones(book.shape[0], dtype=torch.float32) if rows is None else torch.from_numpy(rows).float()
-            for book, rows in zip(W.geometry.books, aggregation.kept, strict=True)
-        ]
-        fewer = reweighted(weights, torch.cat(counted).index_select(0, weights.region))
-        most = fewer.row_sums().numpy()
-        chosen = aggregation.own & torch.from_numpy((most > 0) & (most >= LEAST_KEPT * W.row_sums()))
-        rows, how = torch.nonzero(chosen)[:, 0], {"means": self.splats.means, "threads": self.threads}
-        solve_rows(X, rows, fewer, W.geometry.codebook, self.timings.progress, **how)
-        return X, float(chosen.float().mean())
+            X, facts = resolved(
+                X, found, W.weights.cpu(), W.geometry.codebook, W.row_sums(), self.timings.progress,
+                means=self.splats.means, threads=self.threads,
+            )  # fmt: skip
+        return X, replace(found, facts=found.facts | facts)
 
     def measure(self, W: SceneWeights, X: Tensor) -> ViewMeasures:
         return measure_samples(W.geometry.samples, X, W.geometry.books, self.threads)

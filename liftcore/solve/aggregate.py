@@ -40,10 +40,12 @@ from liftcore.runtime.jit import kernel
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress
 from liftcore.scene.splats import Splats
+from liftcore.solve.closed_form import solve_rows
 from liftcore.solve.clusters import BLOCK, NO_CLUSTER, RESOLUTION, Clustering, cluster_splats, parted
-from liftcore.solve.codebook import TABLE_BYTES
+from liftcore.solve.codebook import TABLE_BYTES, Codebook
 from liftcore.solve.directions import RegionDirections
 from liftcore.solve.objects import RegionObjects
+from liftcore.solve.reweight import reweighted
 from liftcore.solve.sums import PieceSums, added, piece_sums
 from liftcore.values.levels import at_levels
 from liftcore.values.lift_views import LiftViews
@@ -52,6 +54,7 @@ from liftcore.values.settings import LiftSettings
 from liftcore.values.views import Regions, ViewFeatures, cells_under
 
 MASKS_MADE = {"filter": "none: masks made the clusters"}
+LEAST_KEPT = 0.5  # of a splat's weight, in regions that were kept, for it to be solved for again
 LEAST_LIGHT = 0.5  # of a ray, that splats must take for it to show a cluster: as for masks of answers
 
 
@@ -136,6 +139,38 @@ def aggregate(
     facts = facts | aggregation_facts(clustering, merged, taken, guarded)
     kept = tuple(masks.get(name) for name in names)
     return features, Aggregation(clustering.labels, merged, facts, ~taken, kept)
+
+
+def resolved(
+    X: Tensor,
+    aggregation: Aggregation,
+    W: RegionWeights,
+    codebook: Codebook,
+    sums: np.ndarray,
+    progress: Progress,
+    *,
+    means: Tensor,
+    threads: int | None = None,
+) -> tuple[Tensor, dict[str, Any]]:
+    """X, solved again from the kept regions alone for splats that took no cluster's feature; and their share of all.
+
+    Only those most of whose weight lies in kept regions: it is their neighbours' regions that reach the others.
+
+    Args:
+        X: [P, F], changed in place. W: reweighted, on the CPU. sums: [P] f64, of rows of W as it was weighed.
+        means: [P, 3] of the splats.
+    """
+    if all(rows is None for rows in aggregation.kept):
+        return X, {"resolved": 0.0}
+    counted = [
+        torch.ones(view.rows.shape[0], dtype=torch.float32) if rows is None else torch.from_numpy(rows).float()
+        for view, rows in zip(codebook.views, aggregation.kept, strict=True)
+    ]
+    fewer = reweighted(W, torch.cat(counted).index_select(0, W.region))
+    most = fewer.row_sums().numpy()
+    chosen = aggregation.own & torch.from_numpy((most > 0) & (most >= LEAST_KEPT * sums))
+    solve_rows(X, torch.nonzero(chosen)[:, 0], fewer, codebook, progress, means=means, threads=threads)
+    return X, {"resolved": float(chosen.float().mean())}
 
 
 def aggregation_facts(

@@ -134,7 +134,10 @@ def _begin(job: Job, splats: Splats, given: Views) -> None:
     facts = choose_device(job.settings.device).facts()
     told = [Checkpoint(job.folder).of(splats, facts).identity, job.settings.model_dump_json(), job.names, job.rows]
     told += [job.kernel]
-    told += [[_facts(camera) for camera in job.cameras.values()]]
+    told += [
+        [one.name, one.width, one.height, one.K.tolist(), one.viewmat.tolist(), repr(one.lens or one.face)]
+        for one in job.cameras.values()
+    ]
     told += [[(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in job.packs] if given.paths else []]
     identity = hashlib.sha256(json.dumps(told).encode()).hexdigest()
     kept = job.folder / IDENTITY

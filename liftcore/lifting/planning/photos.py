@@ -26,7 +26,7 @@ import torch
 from liftcore.errors import InvalidSettings
 from liftcore.lifting.geometry import strided
 from liftcore.lifting.planning.contradictions import LEAST_IN_VIEW, LEAST_ROW_SUM, empty, unseen
-from liftcore.lifting.planning.scene import PlannedScene, first_names, planned_scene, scene_warnings
+from liftcore.lifting.planning.plan import PlannedScene, first_names, planned_scene, scene_warnings
 from liftcore.lifting.planning.views import SAMPLE, WELL_COVERED, greedy, spread
 from liftcore.raster import check_given, open_raster
 from liftcore.raster.base import Raster, ViewRequest

@@ -14,7 +14,6 @@ import numpy as np
 from liftcore.errors import Unavailable
 from liftcore.lifting.geometry import weigh_views
 from liftcore.lifting.planning.contradictions import contradictions
-from liftcore.lifting.planning.scene import PlannedScene, first_names, planned_scene, scene_warnings
 from liftcore.lifting.planning.views import (
     PILOT_VIEWS,
     WELL_COVERED,
@@ -32,8 +31,9 @@ from liftcore.runtime.memory import check_disk, free_memory, lack_of_disk
 from liftcore.runtime.one_line import one_line
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import silent
-from liftcore.scene.cameras import Camera
+from liftcore.scene.cameras import Camera, Cameras, distortion_warning
 from liftcore.scene.compositing import TILE
+from liftcore.scene.render_mode import rendering_reason, rendering_warnings
 from liftcore.scene.splats import Splats
 from liftcore.solve.codebook import TABLE_BYTES
 from liftcore.solve.consensus import BLOCK_ENTRIES
@@ -61,6 +61,42 @@ TOUCHING_BYTES = 1_000  # of a splat, where those that touch are told
 SPARE = 0.9  # of the free memory: 10 % are left to other processes
 CARD_SPARE = 0.8  # of a card's free memory: what is freed does not lie in one piece
 CARD_SPLAT_BYTES = 400  # of a splat on a card, walked in the smallest pieces
+
+
+@dataclass(frozen=True)
+class PlannedScene:
+    """How many splats there are, and how rays meet them."""
+
+    kernel: str
+    antialiased: bool  # opacities are compensated for the low-pass
+    rendering: str  # why: what says so, or who
+    splats: int  # P
+
+    @property
+    def rendered(self) -> str:
+        """The kernel and the rendering, for people."""
+        return f"{self.kernel}, antialiased: {self.rendering}" if self.antialiased else self.kernel
+
+
+def first_names(names: Sequence[str], most: int | None) -> str:
+    """So many of the names, for people; None for all."""
+    return ", ".join(names[:most]) + (", ..." if most is not None and len(names) > most else "")
+
+
+def planned_scene(splats: Splats, settings: LiftSettings) -> PlannedScene:
+    """Of these splats, as a lift with the settings has them."""
+    antialiased = settings.lift_params.antialiased
+    return PlannedScene(
+        str(splats.kernel), antialiased, rendering_reason(splats.render_mode, antialiased), splats.count
+    )
+
+
+def scene_warnings(
+    splats: Splats, cameras: Cameras, views: Sequence[Camera], settings: LiftSettings
+) -> tuple[str, ...]:
+    """Warnings of splats and cameras, and of lenses of the views among these."""
+    rendering = rendering_warnings(splats.render_mode, settings.lift_params.antialiased, splats.kernel)
+    return *splats.warnings, *rendering, *cameras.warnings, *distortion_warning(views)
 
 
 @dataclass(frozen=True)

@@ -15,13 +15,13 @@ from liftcore.io.cameras import read_cameras
 from liftcore.io.inria import write_inria_cameras
 from liftcore.io.splats import read_splats, write_splats
 from liftcore.lifting.files import lift_files
-from liftcore.lifting.in_memory import LEAST_KEPT
 from liftcore.query.result import load_lift
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import ReferenceRaster, dense_view
 from liftcore.runtime.progress import silent
 from liftcore.scene.cameras import Cameras
 from liftcore.solve.aggregate import (
+    LEAST_KEPT,
     evidence_means,
     filter_regions,
 )
@@ -150,7 +150,7 @@ def weights_of(splats, cameras, maps, settings) -> np.ndarray:
 
 @pytest.mark.parametrize("least", [LEAST_KEPT, 0.0])
 def test_what_takes_no_cluster_is_solved_again_as_if_the_other_regions_had_never_been(tmp_path, monkeypatch, least):
-    monkeypatch.setattr("liftcore.lifting.in_memory.LEAST_KEPT", least)
+    monkeypatch.setattr("liftcore.solve.aggregate.LEAST_KEPT", least)
     (splats, cameras, features), _ = write_scene(tmp_path, "regions")
     # A tenth of the first view is a region that no cluster confirms.
     packs = read_features(features)
