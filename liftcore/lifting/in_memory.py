@@ -22,7 +22,7 @@ from liftcore.raster.base import Raster
 from liftcore.runtime.device import Device
 from liftcore.runtime.progress import Timings
 from liftcore.scene.splats import Splats
-from liftcore.solve.aggregate import Aggregation, aggregate, resolved
+from liftcore.solve.aggregate import Aggregation, aggregate, solve_from_kept_regions
 from liftcore.solve.closed_form import solve
 from liftcore.solve.consensus import mask_consensus
 from liftcore.solve.diagnostics import ViewMeasures, measure_samples
@@ -58,7 +58,7 @@ class SceneWeights:
         """[P] f64, of W as it was weighed."""
         return self.weights.row_sums().cpu().numpy() if self.sums is None else self.sums
 
-    def times(self, W: RegionWeights, factors: Tensor) -> SceneWeights:
+    def with_factors(self, W: RegionWeights, factors: Tensor) -> SceneWeights:
         """The same with each entry of W times its factor [nnz] f32.
 
         Args:
@@ -122,12 +122,12 @@ class InMemory(Steps[SceneWeights]):
             means=self.splats.means, threads=self.threads,
             reliability=whole_regions(self.settings.reliability, W.geometry.levels), consensus=W.consensus,
         )  # fmt: skip
-        W = replace(W.times(weights, agreement.factors), consensus=None, agreement=agreement)
+        W = replace(W.with_factors(weights, agreement.factors), consensus=None, agreement=agreement)
         return W, agreement.reliability
 
     def discount_distance(self, W: SceneWeights) -> SceneWeights:
         weights, how = W.weights.cpu(), {"means": self.splats.means, "threads": self.threads}
-        return W.times(weights, huber_factors(weights, W.geometry.codebook, self.timings.progress, **how))
+        return W.with_factors(weights, huber_factors(weights, W.geometry.codebook, self.timings.progress, **how))
 
     def solve(self, W: SceneWeights, clusters: RegionObjects | None) -> tuple[Tensor, Support]:
         solution = solve(
@@ -165,7 +165,7 @@ class InMemory(Steps[SceneWeights]):
         if not settings.aggregation_resolve:
             return X, found
         with self.timings.stage("resolve"):
-            X, facts = resolved(
+            X, facts = solve_from_kept_regions(
                 X, found, W.weights.cpu(), W.geometry.codebook, W.row_sums(), self.timings.progress,
                 means=self.splats.means, threads=self.threads,
             )  # fmt: skip

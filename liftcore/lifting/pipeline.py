@@ -83,15 +83,15 @@ def lift(
     """
     inputs = LiftInputs.of(splats, cameras, views, preset, settings, threads)
     checkpoint, warn = _checkpoint(checkpoint), _WarnOnce()
-    show = on_plan or (lambda plan: warn((*plan.warnings, *plan.told)))
+    tell_plan = on_plan or (lambda plan: warn((*plan.warnings, *plan.told)))
     with shown_progress(progress) as reporter:
         timings = Timings(reporter)
         if engine is None:
             steps = InMemory(inputs.splats, inputs.settings, timings, threads, checkpoint)
-            result = run(steps, inputs, timings, show)
+            result = run(steps, inputs, timings, tell_plan)
         else:
             with steps_in_blocks(engine, inputs, timings, checkpoint.folder if checkpoint else None) as steps:
-                result = run(steps, inputs, timings, show)
+                result = run(steps, inputs, timings, tell_plan)
     warn(result.diagnostics["warnings"] if on_plan is None else ())
     return result
 

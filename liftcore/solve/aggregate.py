@@ -141,7 +141,7 @@ def aggregate(
     return features, Aggregation(clustering.labels, merged, facts, ~taken, kept)
 
 
-def resolved(
+def solve_from_kept_regions(
     X: Tensor,
     aggregation: Aggregation,
     W: RegionWeights,
