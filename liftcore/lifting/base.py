@@ -93,6 +93,6 @@ class Steps(Protocol[Weights]):
         """The measures of all views' sampled rays."""
         ...
 
-    def deliver(self, lift: LiftResult, plan: Plan) -> LiftResult:
+    def deliver(self, W: Weights, lift: LiftResult) -> LiftResult:
         """The lift where its owner expects it."""
         ...

@@ -56,15 +56,19 @@ class Checkpoint:
     seconds: float = 2.0  # between writes, of work that is lost with the process; views in work may be lost too
     identity: str = ""  # of the splats, the code and the device that all answers are of (`of`)
 
-    def of(self, splats: Splats, device: Mapping[str, Any]) -> Checkpoint:
+    def of(
+        self, splats: Splats, device: Mapping[str, Any], packages: Iterable[str] = ("raster", "scene")
+    ) -> Checkpoint:
         """The same for answers about these splats.
 
         Args:
             device: the facts of the device that answers: devices agree within rounding only.
+            packages: of `liftcore`, whose code answers.
         """
         digest = hashlib.sha256(json.dumps([FORMAT, __version__, get_host_cpu_name(), device]).encode())
-        for source in sorted((Path(__file__).parents[1] / "raster").rglob("*.py")):
-            digest.update(source.read_bytes())
+        for package in packages:
+            for source in sorted((Path(__file__).parents[1] / package).rglob("*.py")):
+                digest.update(source.read_bytes())
         digest.update(splats.kernel.value.encode())
         for part in (splats.means, splats.quats, splats.log_scales, splats.opacity_logits, splats.beta):
             digest.update(b"" if part is None else tensor_bytes(part))

@@ -174,7 +174,6 @@ class InMemory(Steps[SceneWeights]):
     def measure(self, W: SceneWeights, X: Tensor) -> ViewMeasures:
         return measure_samples(W.geometry.samples, X, W.geometry.books, self.threads)
 
-    def deliver(self, lift: LiftResult, plan: Plan) -> LiftResult:
+    def deliver(self, W: SceneWeights, lift: LiftResult) -> LiftResult:
         """See the protocol: on the device that lifted, but for an X in a mapped file, which stays there."""
-        room = plan.features_room
-        return lift if room is not None and lift.features.nbytes > room else lift.to(plan.device.place)
+        return lift if W.memory is not None and lift.features.nbytes > W.memory else lift.to(W.device.place)

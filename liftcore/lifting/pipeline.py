@@ -157,7 +157,7 @@ def _run(
         object=torch.from_numpy(objects.labels) if objects else None,
         object_views=torch.from_numpy(objects.views) if objects else None,
     )
-    return steps.deliver(lift, plan)
+    return steps.deliver(W, lift)
 
 
 def reweigh(

@@ -374,8 +374,8 @@ class Attempt:
         return f", asked for by request {self._job.request_id}" if self._job.request_id else ""
 
     def _kept(self) -> str:
-        blocks = len(list(self._store.files.work(self._job.id).glob("*.safetensors")))
-        return f", {blocks} blocks of walked views are kept" if blocks else ""
+        kept = sum(1 for _ in self._store.files.work(self._job.id).rglob("*.safetensors"))
+        return f", {kept} files of earlier work are kept" if kept else ""
 
     def _order(self, draft: Path) -> dict[str, Any]:
         job, files, kept = self._job, self._store.files, self._store.assets

@@ -119,7 +119,7 @@ def _kill_jobs(
         figures["jobs"] += 1
         figures["lost"] += not succeeded or insist(service, body, key) != job
         figures["doubled"] += service.times_succeeded(job) > 1
-        figures["resumed"] += "blocks of walked views are kept" in service.client.get(f"/jobs/{job}/events").text
+        figures["resumed"] += "files of earlier work are kept" in service.client.get(f"/jobs/{job}/events").text
         figures["digests_equal"] += succeeded and service.digest(job) == wanted
     figures["doubled"] += len(service.client.get("/jobs").json()["jobs"]) - figures["jobs"] - 1
     head = {"kills": victims.total(), "victims": victims, "killed_while": stages, **figures}

@@ -488,7 +488,7 @@ def test_job_of_an_engine_is_lifted_in_blocks_by_the_default_too(tmp_path: Path)
     (tmp_path / "work").mkdir()
     lift_as_ordered(order, Reporter(io.BytesIO()))
     assert lc.load_lift(order["output"]).confidence is not None
-    assert list((tmp_path / "work").glob("rows-*.safetensors"))
+    assert list((tmp_path / "work").rglob("rows-*.safetensors"))
 
 
 def test_lift_in_a_data_directory_behind_a_link_names_its_inputs_as_clients_do(tmp_path: Path) -> None:

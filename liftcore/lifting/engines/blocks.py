@@ -36,7 +36,7 @@ from liftcore.solve.codebook import ViewCodebook
 from liftcore.solve.rays import Readout, SampledRays
 from liftcore.solve.rows import SomeRows, gather_rows
 from liftcore.values.lift_views import LiftViews
-from liftcore.values.pack import pair, read_features
+from liftcore.values.pack import Views, pair, read_features
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import LiftSettings
 
@@ -151,7 +151,8 @@ def weigh(job: Job, piece: int, threads: int | None) -> None:
 
 def _weigh_views(job: Job, numbers: list[int], threads: int | None) -> None:
     device = choose_device(job.settings.device)
-    views = LiftViews(job.cameras, pair(_packs(*job.packs), job.cameras)[0], job.names, [])
+    packs = _packs(job.packs, tuple(map(file_version, job.packs)))
+    views = LiftViews(job.cameras, pair(packs, job.cameras)[0], job.names, [])
     cameras = [views.camera(number) for number in numbers]
     splats, ids = seen_splats(job, cameras, threads)
     warm_up_lift(job.kernel, device, job.settings)
@@ -232,7 +233,10 @@ def _rows(splats: Splats, rows: slice | Tensor) -> Splats:
     return Splats(*parts, splats.kernel, beta=beta, origin=splats.origin)
 
 
-_packs = lru_cache(maxsize=1)(read_features)  # whose headers are read once a worker
+@lru_cache(maxsize=1)
+def _packs(paths: tuple[Path, ...], _versions: tuple[tuple[int, int], ...]) -> Views:
+    """The views of packs, whose headers are read once a worker; anew where a file has taken another's place."""
+    return read_features(*paths)
 
 
 def _renumbered(view: ViewWeights, ids: Tensor) -> ViewWeights:

@@ -10,8 +10,10 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import secrets
+import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -27,12 +29,12 @@ from liftcore.io.shards import ROWS, map_rows, shard_at, write_index
 from liftcore.lifting.base import Steps, Support, WeighedViews
 from liftcore.lifting.checkpoint import Checkpoint
 from liftcore.lifting.engines import steps
-from liftcore.lifting.engines.base import Engine
+from liftcore.lifting.engines.base import Engine, LocalEngine
 from liftcore.lifting.engines.blocks import SCENE, SELECTED, WEIGHED, Job, read_view, weigh, write_scene
 from liftcore.lifting.inputs import LiftInputs
 from liftcore.lifting.planning.plan import Plan, plan_lift
 from liftcore.query.result import LiftResult, load_lift
-from liftcore.runtime.device import Device, choose_device
+from liftcore.runtime.device import CPU, Device, choose_device
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Timings
 from liftcore.scene.cameras import Camera
@@ -61,12 +63,9 @@ from liftcore.values.region_weights import MOST_REGIONS
 if TYPE_CHECKING:
     from liftcore.lifting.engines.base import Work
 
-PIECE = re.compile(
-    r"(view|entries|weights|relate|rows|tuples|contain|labels-\d+|share|cosines-\d+|factors-\d+|measure|columns|solved|guard|taken"
-    r"|features)-\d+\.safetensors"
-)
 PACKED = 64  # views of a pack
-IDENTITY = "lift.json"  # of what the pieces in a folder are
+PIECES = re.compile("blocks-[0-9a-f]{64}")  # the folder of the pieces of one lift
+PACKAGES = ("lifting", "raster", "scene", "solve", "values")  # whose code makes pieces
 
 
 @contextmanager
@@ -82,8 +81,8 @@ def steps_in_blocks(
     """The steps of a lift by an engine: each piece is a file in a folder. What needs all rays or features is refused.
 
     Args:
-        folder: that all workers share. A lift that was cut off goes on from the pieces there; None: one that is gone
-            at the end.
+        folder: that all workers share. A lift of packs that was cut off goes on from the pieces there; None: one that
+            is gone at the end.
         rows: splats that are solved together, whole pages of X. selected: splats of scenes that workers hold whole.
 
     Raises:
@@ -118,9 +117,9 @@ def _folder(folder: Path | None, *, kept: bool) -> Iterator[Path]:
         yield Path(own).resolve()
 
 
-def _packs(given: Views, found: LiftViews, folder: Path) -> list[Path]:
-    """Views that lie in no pack, written into some: whoever works on a view reads it there."""
-    names = [name for name in given if name in found.features or name in found.names]
+def _packs(given: Views, unpaired: Collection[str], folder: Path) -> list[Path]:
+    """Views that lie in no pack, written into some: whoever works on a view reads it there, and pairs it anew."""
+    names = [name for name in given if name not in unpaired]
     packs = []
     for number, begin in enumerate(range(0, len(names), PACKED)):
         packs.append(folder / f"views-{number:05}.safetensors")
@@ -129,24 +128,28 @@ def _packs(given: Views, found: LiftViews, folder: Path) -> list[Path]:
     return packs
 
 
-def _begin(job: Job, splats: Splats, given: Views) -> None:
-    """Write the scene, and leave of earlier pieces those of this same lift."""
+def _identity(job: Job, splats: Splats) -> str:
+    """All that the pieces of a lift depend on, in hex. Views that lie in no pack are told from all others."""
     facts = choose_device(job.settings.device).facts()
-    told = [Checkpoint(job.folder).of(splats, facts).identity, job.settings.model_dump_json(), job.names, job.rows]
-    told += [job.kernel]
-    told += [
-        [one.name, one.width, one.height, one.K.tolist(), one.viewmat.tolist(), repr(one.lens or one.face)]
-        for one in job.cameras.values()
-    ]
-    told += [[(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in job.packs] if given.paths else []]
-    identity = hashlib.sha256(json.dumps(told).encode()).hexdigest()
-    kept = job.folder / IDENTITY
-    if not kept.is_file() or kept.read_text() != identity or not given.paths:
-        for path in (*job.folder.glob("*.safetensors"), *(job.folder / "lift").glob("features-*.safetensors")):
-            if PIECE.fullmatch(path.name):
-                path.unlink()
-        write_scene(splats, job.folder / SCENE)
-        kept.write_text(identity)
+    depends = [Checkpoint(job.folder).of(splats, facts, PACKAGES).identity, job.settings.model_dump_json()]
+    depends += [job.names, job.rows, job.kernel, [_facts(camera) for camera in job.cameras.values()]]
+    packs = [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in job.packs]
+    return hashlib.sha256(json.dumps([*depends, packs or secrets.token_hex()]).encode()).hexdigest()
+
+
+def _open_pieces(folder: Path, identity: str) -> Path:
+    """The folder of a lift's pieces, those of the same lift; other lifts' go, and drafts of workers that died.
+
+    Each lift has a folder of its own: what a worker of a killed one still writes lies in no other's way.
+    """
+    own = folder / f"blocks-{identity}"
+    for other in folder.glob("blocks-*"):
+        if other != own and PIECES.fullmatch(other.name):
+            shutil.rmtree(other, ignore_errors=True)
+    own.mkdir(exist_ok=True)
+    for draft in own.rglob(".*.part"):
+        draft.unlink(missing_ok=True)
+    return own
 
 
 def _facts(camera: Camera) -> list[Any]:
@@ -170,12 +173,14 @@ class InBlocks(Steps[Job]):
 
     def plan(self, views: LiftViews, device: Device) -> Plan:
         look = bool(views.features.paths)
+        if self.inputs.settings.device == "auto" and not isinstance(self.engine, LocalEngine):
+            device = CPU  # workers elsewhere may have other cards than this machine, or none
         return plan_lift(self.inputs.splats, views, self.inputs.settings, device, apart=True, look=look)
 
     def weigh(self, views: LiftViews, plan: Plan, on_plan: Callable[[Plan], None]) -> tuple[Job, WeighedViews]:
         on_plan(replace(plan, memory=_memory_of_a_worker(plan), weight_bytes=0))
         with self.timings.step("share"):
-            job = self._share(views)
+            job = self._share(views, plan)
         for done, _ in enumerate(self.engine.run(weigh, job, job.weighings), start=1):
             self.timings.progress("geometry", min(done * WEIGHED, len(job.names)), len(job.names), "views")
         with self.timings.stage("gather"):
@@ -188,15 +193,18 @@ class InBlocks(Steps[Job]):
             self._gather(job)
         return job, weighed
 
-    def _share(self, views: LiftViews) -> Job:
-        """Write what all workers read."""
-        splats, given, settings = self.inputs.splats, self.inputs.given, self.inputs.settings
-        packs = tuple(Path(path).resolve() for path in given.paths or _packs(given, views, self.folder))
+    def _share(self, views: LiftViews, plan: Plan) -> Job:
+        """Write what all workers read, who all take the device of the plan."""
+        splats, given = self.inputs.splats, self.inputs.given
+        settings = self.inputs.settings.model_copy(update={"device": plan.device.kind})
+        packs = tuple(Path(path).resolve() for path in given.paths)
         sizes = splats.count, views.features.channels
         job = Job(self.folder, packs, views.cameras, views.names, settings, splats.kernel, *sizes)
         job = replace(job, rows=self.rows, selected=self.selected)
-        _begin(job, splats, given)
-        return job
+        job = replace(job, folder=_open_pieces(self.folder, _identity(job, splats)))
+        if not (job.folder / SCENE).exists():
+            write_scene(splats, job.folder / SCENE)
+        return job if packs else replace(job, packs=tuple(_packs(given, views.unpaired, job.folder)))
 
     def _gather(self, job: Job) -> None:
         """W by blocks of splats, and what places of the curve mean."""
@@ -227,11 +235,11 @@ class InBlocks(Steps[Job]):
         labels, evidence = _column(W, "labels-1", "labels"), _column(W, "rows", "evidence")
         shown = _sums(W, "labels-1", (1, number * groups.views))
         place = object_numbers(labels, evidence, number)
-        steps.write_piece(W.folder / steps.CLUSTERS, {"place": place})
+        steps.write_piece(W.folder / steps.OBJECTS, {"place": place})
         return numbered(labels, clusters, place, shown.reshape(number, groups.views))
 
     def _label(self, job: Job, step: int, clusters: np.ndarray) -> None:
-        steps.write_piece(job.folder / steps.CLUSTERS, {"clusters": clusters})
+        steps.write_piece(job.folder / steps.CLUSTERS.format(step), {"clusters": clusters})
         self.run("objects", steps.label, replace(job, step=step), job.solutions)
 
     def compare_masks(self, W: Job) -> Job:
@@ -282,8 +290,7 @@ class InBlocks(Steps[Job]):
         )
         if job.clusters:
             merged = cluster_means(_sums(job, "columns", (job.channels + 1, job.clusters)), job.dtype)
-            place = map_tensors(job.folder / steps.CLUSTERS)[0]["place"]
-            steps.write_piece(job.folder / steps.CLUSTERS, {"place": place, "merged": merged})
+            steps.write_piece(job.folder / steps.MERGED, {"merged": merged})
             self.run("aggregate", steps.spread, job, job.solutions)
             taken = torch.from_numpy(_column(job, "taken", "taken"))
             guarded = torch.from_numpy(_column(job, "taken", "guarded")) if job.guarded else None
@@ -297,12 +304,11 @@ class InBlocks(Steps[Job]):
         views = (read_view(W.view_file(number)) for number in range(len(W.names)))
         return joined([measure_view(view.sample, X, view.codebook.rows) for view in views])
 
-    def deliver(self, lift: LiftResult, plan: Plan) -> LiftResult:
+    def deliver(self, W: Job, lift: LiftResult) -> LiftResult:
         """See the protocol: a lift in shards, mapped, whose files may lose their names."""
         columns = {name: part for name, part in vars(lift).items() if isinstance(part, Tensor) and name != "features"}
-        shards = -(-lift.features.shape[0] // self.rows)
-        write_index(self.folder / "lift", columns, shards, lift.metadata.model_dump_json())
-        return load_lift(self.folder / "lift")
+        write_index(W.folder / "lift", columns, W.solutions, lift.metadata.model_dump_json())
+        return load_lift(W.folder / "lift")
 
 
 def _with_clusters(job: Job, clusters: RegionObjects | None) -> Job:

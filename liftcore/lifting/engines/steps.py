@@ -61,13 +61,15 @@ from liftcore.values.region_weights import RegionWeights
 if TYPE_CHECKING:
     from liftcore.lifting.engines.base import Work
 
-# What the driver shares, of the size of M.
+# What the driver shares, of the size of M: each under a name of its own, for nodes may see an older file for seconds.
 REGIONS = "regions.safetensors"  # offsets [V + 1] i64, levels [M] i8
 CODEBOOK = "codebook.safetensors"  # rows/v [M_v, F] and, where regions are tuples of rows, tuples/v [T_v, L] i32
 TUPLES = "tuples.safetensors"  # bases [pieces] i64, parents and members [T] i32
 CURVE = "curve.safetensors"  # bounds [2, 3] f64 of the splats with weight
 NODES = "nodes.safetensors"  # nodes and others, i64
-CLUSTERS = "clusters.safetensors"  # clusters [M] i32; merged [K, F] of the aggregation
+CLUSTERS = "clusters-{}.safetensors"  # clusters [M] i32, by the step of `label`
+OBJECTS = "objects.safetensors"  # place [K + 1] i32, the number of each cluster as an object
+MERGED = "merged.safetensors"  # merged [K, F], the features of the aggregation
 AGREEMENT = "agreement-{}.safetensors"  # regions [M] f32, numbers [3] f64
 
 
@@ -308,7 +310,7 @@ def _splat_block(job: Job, piece: int) -> SplatBlock:
 @piece_of("labels-{step}")
 def label(job: Job, piece: int, threads: int | None) -> Piece:
     """Write the object of each splat, and what objects weigh: in step 0 in other regions, then in views."""
-    block, clusters = _splat_block(job, piece), mapped(job.folder / CLUSTERS)["clusters"]
+    block, clusters = _splat_block(job, piece), mapped(job.folder / CLUSTERS.format(job.step))["clusters"]
     number = int(clusters.max(initial=-1)) + 1
     labels = object_labels(block.W, clusters, number, threads)
     if job.step == 0:
@@ -322,7 +324,7 @@ def label(job: Job, piece: int, threads: int | None) -> Piece:
 def labels_of(job: Job, piece: int) -> np.ndarray:
     """[n] i32: the object of each splat of a block, as the driver numbers them; -1 for none."""
     labels = map_tensors(job.piece_file("labels-1", piece))[0]["labels"]
-    return mapped(job.folder / CLUSTERS)["place"][labels]
+    return mapped(job.folder / OBJECTS)["place"][labels]
 
 
 def _consensus(job: Job, block: SplatBlock, threads: int | None) -> Tensor | None:
@@ -439,7 +441,7 @@ def spread(job: Job, piece: int, threads: int | None) -> None:
     if path.exists() and job.features_file(piece).exists():
         return
     block, labels = _splat_block(job, piece), torch.from_numpy(labels_of(job, piece))
-    merged = torch.from_numpy(map_tensors(job.folder / CLUSTERS)[0]["merged"])
+    merged = torch.from_numpy(map_tensors(job.folder / MERGED)[0]["merged"])
     shard = shard_at(job.solved_file(piece))
     X = torch.from_numpy(np.fromfile(shard.path, shard.dtype, offset=shard.begin).reshape(shard.shape))
     taken = with_feature(labels, merged)

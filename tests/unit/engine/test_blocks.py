@@ -132,13 +132,34 @@ def test_lift_goes_on_from_the_pieces_in_its_folder(scene: dict[str, Any], tmp_p
         in_blocks(LocalEngine(1), stored, settings, folder=folder, progress=stop)
     written = {path: path.stat().st_mtime_ns for path in folder.rglob("*-0000?.safetensors")}
     assert len(written) >= VIEWS + 3
+    draft = next(iter(written)).with_name(".columns-00001.safetensors.0123abcd.part")
+    draft.touch()  # of a worker that was killed
     found = in_blocks(LocalEngine(1), stored, settings, folder=folder)
     assert {path: path.stat().st_mtime_ns for path in written} == written
-    assert found.metadata.text_space == "words"
+    assert found.metadata.text_space == "words" and not draft.exists()
     assert_same(found, in_blocks(LocalEngine(1), scene, settings))
     settings = LiftSettings.of(preset="row-sum")
     other = in_blocks(LocalEngine(1), stored, settings, folder=folder)  # pieces of another lift
     assert_same(other, in_blocks(LocalEngine(1), scene, settings))
+
+
+def few_views(seed: int, folder: str = "") -> dict[str, lc.FeatureGrid]:
+    rng = np.random.default_rng(seed)
+    return {f"{folder}v{k}": lc.FeatureGrid(rng.normal(0, 1, (6, 8, 4)).astype(np.float32)) for k in range(3)}
+
+
+def test_features_in_the_place_of_others_are_lifted(tmp_path: Path) -> None:
+    names = "cam/v0", "cam/v1", "cam/v2"
+    cameras = lc.Cameras(
+        {name: look_at(name, np.array([0.3 * k, 0, -4]), 32, 24, 30.0) for k, name in enumerate(names)}
+    )
+    splats, pack = random_splats(3, 300), tmp_path / "pack.safetensors"
+    for seed in (1, 2):
+        write_pack(pack, few_views(seed, "cam/"), {})
+        expected = lc.lift(splats, cameras, few_views(seed, "cam/"), "row-sum")
+        for views in (few_views(seed), few_views(seed, "cam/"), lc.read_features(pack)):  # named without folders too
+            found = lc.lift(splats, cameras, views, "row-sum", engine=LocalEngine(1), checkpoint=tmp_path / "work")
+            assert_same(found, expected)
 
 
 @pytest.mark.slow
