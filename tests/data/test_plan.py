@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import torch
 
-from liftcore.lifting import pipeline
+from liftcore.lifting import in_memory
 from liftcore.lifting.files import lift_files
 from liftcore.lifting.planning.plan import ENTRY_BYTES
 from liftcore.solve import reweight
@@ -70,7 +70,7 @@ def test_fine_maps_are_planned_with_their_many_weights(shared_data, fine_maps, r
 
 
 def test_plan_has_room_for_what_reweighting_holds(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    held, made = [], (reweight.zeros, pipeline.mask_consensus)
+    held, made = [], (reweight.zeros, in_memory.mask_consensus)
 
     def array(*arguments: Any, **own: Any) -> torch.Tensor:
         held.append(made[0](*arguments, **own))
@@ -84,7 +84,7 @@ def test_plan_has_room_for_what_reweighting_holds(shared_data: Path, monkeypatch
         return found
 
     monkeypatch.setattr(reweight, "zeros", array)
-    monkeypatch.setattr(pipeline, "mask_consensus", consensus)
+    monkeypatch.setattr(in_memory, "mask_consensus", consensus)
     scene, own = shared_data / "tabletop", {"view_stride": 6, "preset": "default"}
     planned = certified(scene, scene / "features_hard.safetensors", own)["plan"]["memory"]["reweighting"]
     assert sum(part.nbytes for part in held) < planned
