@@ -1,0 +1,114 @@
+"""A question has the same answer from Python, the command line and HTTP, field by field."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import liftcore as lc
+from liftcore import cli
+from service.store.owners import SERVICE
+
+from .conftest import parts_of
+from .tiny_scene import HEIGHT, WORDS
+
+EXAMPLES = ("middle:6,12", f"middle:26,{HEIGHT // 2}", "splat:0", "splat:47", "region:left:0:1", "splat:60", "none")
+FLAGS = {"negatives": "--negative"}
+
+
+def values_of(name: str) -> st.SearchStrategy[Any]:
+    """Values of a field of a question, right ones for most, by what its schema says that it takes."""
+    field = lc.Query.model_json_schema()["properties"][name]
+    if name in ("text", "negatives"):
+        return st.lists(st.sampled_from((*WORDS, "zeppelin")), max_size=1, unique=True)
+    if name in ("like", "unlike"):
+        return st.lists(st.sampled_from(EXAMPLES), max_size=2, unique=True)
+    if name == "threshold":
+        return st.sampled_from(("auto", "otsu", "valley", "best")) | st.floats(-1, 1).map(lambda cut: round(cut, 3))
+    if "enum" in field:
+        return st.sampled_from(field["enum"])
+    low = next(part["minimum"] for part in (field, *field.get("anyOf", ())) if "minimum" in part)
+    return st.integers(low, low + 12)
+
+
+@st.composite
+def questions(draw: st.DrawFn) -> dict[str, Any]:
+    """The fields of a question, of which some are left out."""
+    chosen = draw(st.sets(st.sampled_from(lc.Query.deciding()), max_size=4)) | {
+        draw(st.sampled_from(("text", "like")))
+    }
+    return {name: draw(values_of(name)) for name in sorted(chosen)} | {"top": draw(st.integers(1, 9))}
+
+
+class Faces:
+    """One lift, asked in every way."""
+
+    def __init__(self, client: TestClient, lift: str, table: Path) -> None:
+        store = parts_of(client).store
+        job = store.jobs.get(SERVICE, lift)
+        self.client, self.lift, self.table = client, lift, table
+        self.path = store.lifts.get(SERVICE, lift).path
+        self.splats, self.cameras, self.pack = (
+            store.assets.get(SERVICE, asset).path for asset in (job.splats, job.cameras, job.features[0])
+        )
+        self.scene = lc.Scene(self.path, self.splats, self.cameras)
+        self.scene.find_packs([self.pack])
+
+    def python(self, asked: dict[str, Any]) -> dict[str, Any] | None:
+        """The answer with its objects; None where the question is refused."""
+        try:
+            answer = self.scene.ask(lc.Query(**asked), encoder=f"table:{self.table}", places=True)
+            found = self.scene.objects(answer)
+        except lc.SplatliftError:
+            return None
+        return answer.model_dump(mode="json") | found.model_dump(mode="json")
+
+    def http(self, method: str, asked: dict[str, Any]) -> dict[str, Any] | None:
+        """The same of GET or POST."""
+        told: dict[str, Any] = {}
+        for path in ("/query", "/query/objects"):
+            fields = asked if path == "/query" or method == "POST" else {**asked, "top": None}
+            given = {name: value for name, value in fields.items() if value is not None} | {"lift": self.lift}
+            reply = self.client.get(path, params=given) if method == "GET" else self.client.post(path, json=given)
+            assert reply.status_code in (200, 404, 422), reply.text
+            if reply.status_code != 200:
+                return None
+            told |= reply.json()
+        return {name: told[name] for name in (*lc.Answer.model_fields, *lc.Objects.model_fields)}
+
+    def command(self, asked: dict[str, Any]) -> dict[str, Any] | None:
+        """The same of the command line; it takes feature packs where the lift remembers them."""
+        words = ["query", self.path, "--splats", self.splats, "--cameras", self.cameras, "--objects", "--json"]
+        words += [text for text in asked.get("text", ()) if text]
+        for name, value in asked.items():
+            flag = FLAGS.get(name, f"--{name.replace('_', '-')}")
+            words += [part for one in (value if isinstance(value, list) else [value]) for part in (flag, one)]
+            words = words[: -2 * len(value)] if name == "text" and value else words
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(io.StringIO()):
+            status = cli.main([str(word) for word in (*words, "--table", self.table)])
+        assert status in (0, cli.BAD_INPUT)
+        return json.loads(printed.getvalue())["answer"] if status == 0 else None
+
+
+@pytest.fixture(scope="module")
+def faces(client: TestClient, lift: dict[str, Any], table: Path) -> Faces:
+    return Faces(client, lift["id"], table)
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(asked=questions())
+def test_every_face_gives_the_same_answer(faces: Faces, asked: dict[str, Any]) -> None:
+    expected = faces.python(asked)
+    assert faces.http("GET", asked) == expected
+    assert faces.http("POST", asked) == expected
+    if not any(example.startswith("region:") for name in ("like", "unlike") for example in asked.get(name, ())):
+        assert faces.command(asked) == expected
