@@ -21,9 +21,9 @@ def objects(scene: Scene, answer: Answer) -> Objects:
     """Group the selected splats of an answer into the things that they make up.
 
     Things are splats that touch (`touching`). What has less than a twentieth of the evidence of the largest is no
-    thing but strays: single splats and specks whose scores happen to reach the threshold, anywhere in the scene. A
-    query that knows how many instances there are has so many objects at most, those of the highest scores, and one
-    that keeps the largest has one; all else are strays.
+    thing but strays: single splats and specks whose scores happen to reach the threshold, anywhere in the scene. So
+    are groups of fewer splats than the query's ``min_size``. A query that knows how many instances there are has so
+    many objects at most, those of the highest scores, and one that keeps the largest has one; all else are strays.
 
     Raises:
         InvalidQuery: more splats were selected than are grouped.
@@ -41,7 +41,9 @@ def objects(scene: Scene, answer: Answer) -> Objects:
     groups = touching(scene.splats, rows)
     sums = np.bincount(groups, weights)
     order = np.argsort(-sums, kind="stable")
-    kept = order[: 1 if answer.query.keep == "largest" else int((sums >= LEAST_EVIDENCE * sums.max()).sum())]
+    order = order[np.bincount(groups)[order] >= answer.query.min_size]
+    large = int((sums[order] >= LEAST_EVIDENCE * sums.max()).sum())
+    kept = order[: min(1, large) if answer.query.keep == "largest" else large]
     if answer.query.instances is not None and len(kept) > answer.query.instances:
         scores = np.bincount(groups, weights * answer.scores[rows])[kept] / sums[kept]
         kept = kept[np.sort(np.argsort(-scores, kind="stable")[: answer.query.instances])]

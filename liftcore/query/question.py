@@ -175,6 +175,9 @@ class Query(Seen):
     instances: Count | None = Field(
         default=None, description="how many there are: so many objects are kept, the best"
     )
+    min_size: Annotated[int, Field(ge=1, le=10**9), NoBoolean] = Field(
+        default=1, description="objects of fewer splats are outliers"
+    )
     keep: Literal["all", "largest"] = Field(
         default="all", description="of what was found, in masks, splats and objects"
     )
@@ -237,7 +240,7 @@ class Query(Seen):
     @property
     def keeps_some(self) -> bool:
         """Whether some of the objects are kept and others not, as all else than outliers is."""
-        return self.keep == "largest" or self.instances is not None
+        return self.keep == "largest" or self.instances is not None or self.min_size > 1
 
     @property
     def texts(self) -> list[str]:

@@ -97,6 +97,20 @@ def test_so_many_instances_are_kept_by_their_scores(scene: Scene) -> None:
             of(scene, 0, instances=count)
 
 
+def test_objects_of_fewer_splats_are_outliers(scene: Scene) -> None:
+    stray = 5 * SPLATS_A_CLUSTER // 2
+    selected = np.arange(3 * SPLATS_A_CLUSTER) < 2 * SPLATS_A_CLUSTER
+    selected[:5] = False  # of the first cluster fewer splats are left
+    selected[stray] = True
+    answer = of(scene, 0)
+    for size, count in ((1, 2), (SPLATS_A_CLUSTER - 5, 2), (SPLATS_A_CLUSTER - 4, 1), (SPLATS_A_CLUSTER + 1, 0)):
+        found = objects(scene, answer_with(answer, selected=selected, min_size=size))
+        assert (len(found.found), found.numbers[stray]) == (count, -1)
+        assert found.strays == selected.sum() - sum(thing.splats for thing in found.found)
+    none = answer_with(answer, selected=selected, min_size=SPLATS_A_CLUSTER + 1, keep="largest")
+    assert objects(scene, none).found == ()
+
+
 def test_tails_of_a_thousandth_are_not_in_the_box() -> None:
     means = np.zeros((2001, 3))
     means[:, 0] = np.arange(2001)
