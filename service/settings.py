@@ -97,7 +97,8 @@ class ServiceSettings(BaseSettings):
     )
     engine: Literal["local", "ray"] | None = Field(
         None,
-        description="who lifts all jobs in blocks, of bounded memory: local or ray (a cluster); not set = in memory",
+        description="who makes lifts in blocks, of bounded memory: local or ray (a cluster); not set = in memory, as "
+        "the runs of trade-offs always are",
     )
     ray_address: str = Field("auto", description="of that cluster, host:port; auto takes RAY_ADDRESS")
     parallel_lifts: int = Field(1, ge=1, le=64, description="jobs that run at the same time")

@@ -41,6 +41,19 @@ def check_fit(cameras: AssetRecord, features: Sequence[AssetRecord]) -> None:
     require_pairs(owner, with_panoramas(cameras.counts["names"]))
 
 
+def check_settings(settings: LiftSettings, features: Sequence[AssetRecord], *, in_blocks: bool) -> None:
+    """Refuse settings that need masks where no pack has any, and what an engine cannot work on in blocks.
+
+    Raises:
+        InvalidSettings: as `LiftSettings` has it.
+    """
+    masks = any(pack.counts.get("region_maps", 1) for pack in features)  # where nothing was counted the job tells
+    settings.finds_objects(masks)
+    settings.asks_consensus(masks)
+    if in_blocks:
+        settings.check_blocks(masks)
+
+
 def check_kernel(splats: AssetRecord, settings: Mapping[str, Any]) -> None:
     """Refuse a kernel that the splats lack a property of, and what the kernel has no meaning for.
 

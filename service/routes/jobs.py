@@ -18,7 +18,7 @@ from service.child import error_of
 from service.content import Cursor, Limit, listed
 from service.errand import ErrandLimits, run_errand
 from service.errors import InvalidRequest, OverLimit
-from service.jobs.fit import check_fit, check_kernel, check_labels, scratch_bytes
+from service.jobs.fit import check_fit, check_kernel, check_labels, check_settings, scratch_bytes
 from service.observe import current_id
 from service.problems import problem_of
 from service.requests import described_body, json_body
@@ -95,20 +95,12 @@ async def submit_tradeoff(deps: Deps, order: models.TradeoffRequest = TRADEOFF_B
 
 
 def _lift(order: models.LiftRequest, deps: AppState, key: str | None) -> Response:
-    settings = _checked(order, deps)
+    settings = LiftSettings.of_json(order.settings).model_dump(mode="json")
     return _take(order, deps, key, sent=order.model_dump(mode="json"), settings=settings)
 
 
-def _checked(order: models.LiftRequest, deps: AppState) -> dict[str, Any]:
-    """The whole settings of an order, which the service's engine, where it has one, can lift by."""
-    settings = LiftSettings.of_json(order.settings)
-    if deps.settings.engine is not None:
-        settings.check_blocks()
-    return settings.model_dump(mode="json")
-
-
 def _planned(order: models.LiftRequest, deps: AppState) -> models.Plan:
-    settings = _checked(order, deps)
+    settings = LiftSettings.of_json(order.settings).model_dump(mode="json")
     wanted = JobOrder(order.splats, order.cameras, tuple(order.features), settings)
     _require_fit(wanted, deps)
     deps.devices.require(wanted.settings.get("device", "auto"))
@@ -170,6 +162,8 @@ def _require_fit(order: JobOrder, deps: AppState) -> None:
     splats = get(order.splats, models.AssetKind.SPLATS)
     check_kernel(splats, order.settings)
     check_fit(cameras, packs)
+    in_blocks = order.kind is models.JobKind.LIFT and deps.settings.engine is not None
+    check_settings(LiftSettings.of(**order.settings), packs, in_blocks=in_blocks)
     judges = [get(*named) for named in labels_of(order.parameters)]
     if judges:
         check_labels(order, cameras, packs, *judges)

@@ -37,7 +37,7 @@ from service.models import AssetKind
 from service.store.jobs import LINE_CHARACTERS, LOG_LINES, EventKind, log_line, note
 from service.store.owners import SERVICE
 from service.store.store import Store
-from tests.crash.conftest import order, until
+from tests.crash.conftest import asset_of, order, until
 from tests.crash.server import standing_in
 
 from .conftest import LIFT_REQUEST, Uploaded, parts_of, put
@@ -405,6 +405,21 @@ def test_order_that_the_services_engine_cannot_lift_is_refused_with_what_to_set(
         assert client.post("/lift", json=body).status_code == 202  # the default
     with standing_in(store, "answer") as (client, body):
         assert client.post("/lift", json=body | {"settings": {"cg_steps": 2}}).status_code == 202
+
+
+def test_order_over_grids_is_refused_what_only_masks_give(store: Store) -> None:
+    asset_of(store, AssetKind.FEATURES, {"names": ["v"], "channels": 1, "region_maps": 0, "grids": 1})
+    graph = {"aggregation": True, "aggregation_clusters": "graph"}
+    for engine, settings in (
+        ("local", {"aggregation": True}),  # by the default's clusters: of masks, else of features
+        *((None, settings) for settings in ({"objects": True}, {"consensus": True}, graph)),
+    ):
+        with standing_in(store, "answer", engine=engine) as (client, body):
+            reply = client.post("/lift", json=body | {"settings": settings})
+            assert reply.status_code == 422 and "grids" in assert_problem(reply)["detail"]
+            assert client.post("/lift/plan", json=body | {"settings": settings}).status_code == 422
+    with standing_in(store, "answer") as (client, body):
+        assert client.post("/lift", json=body | {"settings": {"aggregation": True}}).status_code == 202
 
 
 def test_warnings_of_the_machine_reach_the_client_without_its_paths(
