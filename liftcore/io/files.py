@@ -14,7 +14,7 @@ from io import BufferedReader
 from pathlib import Path, PurePath
 from typing import IO
 
-from liftcore.errors import InvalidCameras
+from liftcore.errors import InvalidCameras, InvalidInput
 
 LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 # What zipfile and its decompressors raise of a broken or foreign file.
@@ -108,7 +108,14 @@ def _directory_bytes(handle: IO[bytes]) -> int:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[IO[bytes]]:
-    """Write ``path`` through a draft beside it: synced and renamed at the end, removed after an error."""
+    """Write ``path`` through a draft beside it: synced and renamed at the end, removed after an error.
+
+    Raises:
+        InvalidInput: a folder lies there.
+    """
+    if path.is_dir():
+        hint = "name a file within it"
+        raise InvalidInput(str(path), expected="the path of a file to write", got="a folder there", hint=hint)
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:

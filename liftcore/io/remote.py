@@ -36,6 +36,18 @@ def place(text: str) -> Path | Elsewhere:
     return Elsewhere(text) if is_remote(text) else Path(text)
 
 
+def check_path(path: object, argument: str = "path") -> None:
+    """Refuse what names no file.
+
+    Raises:
+        InvalidInput: it is neither a path nor a text, or an empty text.
+    """
+    if not isinstance(path, str | os.PathLike) or not str(path):
+        got = f"{type(path).__name__} {path!r}"[:80]
+        hint = "give several paths one by one" if isinstance(path, list | tuple) else ""
+        raise InvalidInput(argument, expected="the path of a file or folder", got=got, hint=hint)
+
+
 def local_path(path: Path | str) -> Path:
     """The path of a file or folder of this machine: the given one, or that of a copy of what lies elsewhere.
 
@@ -44,6 +56,7 @@ def local_path(path: Path | str) -> Path:
     Raises:
         InvalidInput: nothing is there, or it cannot be opened or copied; the error says why.
     """
+    check_path(path)
     if not is_remote(path):
         return Path(path)
     url = str(path)
@@ -95,8 +108,9 @@ def landing(path: Path | str) -> Iterator[Path]:
     Of a folder the file that sorts last is sent last, and taken away first: of a lift in shards the index.
 
     Raises:
-        InvalidInput: it cannot be sent.
+        InvalidInput: it is no path, or cannot be sent.
     """
+    check_path(path)
     if not is_remote(path):
         yield Path(path)
         return

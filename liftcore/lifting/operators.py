@@ -115,9 +115,10 @@ def _rows(splats: Splats, values: Tensor | np.ndarray) -> Tensor:
     except (TypeError, ValueError) as error:
         got = f"{type(values).__name__} ({error})"[:120]
         raise InvalidSettings("values", expected="numbers or booleans of splats", got=got) from None
-    if given.ndim not in (1, 2) or given.shape[0] != splats.count:
-        expected = f"[{splats.count}] or [{splats.count}, F], a row a splat"
-        raise InvalidSettings("values", expected=expected, got=str(list(given.shape)))
+    if given.ndim not in (1, 2) or given.shape[0] != splats.count or given.is_complex():
+        expected = f"real numbers [{splats.count}] or [{splats.count}, F], a row a splat"
+        got = f"{str(given.dtype).removeprefix('torch.')} {list(given.shape)}"
+        raise InvalidSettings("values", expected=expected, got=got)
     return given.float()
 
 

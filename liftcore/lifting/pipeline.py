@@ -82,6 +82,8 @@ def lift(
     Source: Splat Feature Solver, Eq. 3 and 6.
     """
     inputs = LiftInputs.of(splats, cameras, views, preset, settings, threads)
+    if on_plan is not None and not callable(on_plan):
+        raise InvalidSettings("on_plan", expected="a function of the plan, or None", got=repr(on_plan)[:80])
     checkpoint, warn = _checkpoint(checkpoint), _WarnOnce()
     tell_plan = on_plan or (lambda plan: warn((*plan.warnings, *plan.told)))
     with shown_progress(progress) as reporter:

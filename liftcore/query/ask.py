@@ -31,7 +31,7 @@ from liftcore.query.scores import LEAST_LIKENESS, LOWEST_COSINE, combine, cosine
 from liftcore.query.selection import LEAST_FIRST, Rivals, contest, nearer_than_rivals, whole_things
 from liftcore.query.terms import Vector
 from liftcore.query.threshold import find_threshold, nothing_alike
-from liftcore.text import TextEncoder
+from liftcore.text import TextEncoder, check_texts
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -145,8 +145,11 @@ def query_vectors(
 def _terms(values: Any) -> tuple[str | Vector, ...]:
     words = (values,) if isinstance(values, str) else tuple(values) if isinstance(values, list | tuple) else ()
     if words and all(isinstance(word, str) for word in words):
+        check_texts(words)
         return words
     try:
+        if values is None:
+            raise TypeError
         rows = np.asarray(as_numpy(values), np.float64)
     except (TypeError, ValueError):
         what = type(values).__name__

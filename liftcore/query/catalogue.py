@@ -22,6 +22,7 @@ from liftcore.query.scene import Scene, as_numpy
 from liftcore.query.scores import cosines, norms_of
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.origin import MAP_REACH
+from liftcore.text import check_texts
 
 MOST_WORDS = 65_536  # of a vocabulary: their vectors take 130 MB at 512 channels
 NOT_LOOKED_FOR = (
@@ -107,6 +108,7 @@ def object_features(scene: Scene) -> np.ndarray:
 def _named(features: np.ndarray, words: Sequence[str], vectors: Any) -> tuple[list[str | None], list[float | None]]:
     """Name and cosine of each object; None without words, and for an object without a feature."""
     number = len(features)
+    check_texts(words, "words")
     if not words:
         return [None] * number, [None] * number
     rows = None if vectors is None else np.atleast_2d(np.asarray(as_numpy(vectors), np.float32))

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
     from liftcore.values.lift import InputFile, Lift, LiftMetadata
 
+LAST_PORT = 65_535
 ENDING_SECONDS = 10.0  # for a server that was interrupted
 
 
@@ -39,6 +40,9 @@ def show(
     lift: Lift, splats: Splats | None, cameras: Mapping[str, Camera] | None, *, port: int, browser: bool
 ) -> None:
     """Serve a lift until Ctrl-C: `LiftResult.show`."""
+    if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port <= LAST_PORT:
+        expected = f"a whole number in 0..{LAST_PORT}, 0 for a free one"
+        raise InvalidInput("port", expected=expected, got=repr(port)[:80])
     require_service()
     with tempfile.TemporaryDirectory(prefix="splatlift-show-", ignore_cleanup_errors=True) as folder:
         inputs = {

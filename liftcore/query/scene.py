@@ -588,7 +588,7 @@ class Scene:
         """The path of an input, once its bytes are known to be those that were lifted."""
         if not remembered.path:
             raise InvalidLift(str(self.path), expected=f"a lift that knows its {role}", got="one of values in memory",
-                              hint=f"give the {role} to Scene, too")  # fmt: skip
+                              hint=f"give the {role} that were lifted, {role}=")  # fmt: skip
         from liftcore.io.transforms import FRAME_FILE
         from liftcore.values.lift_file import found_input
 

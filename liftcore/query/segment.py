@@ -30,6 +30,7 @@ from liftcore.query.terms import Example
 from liftcore.query.threshold import find_threshold
 from liftcore.runtime.one_line import one_line
 from liftcore.runtime.progress import Progress, silent
+from liftcore.text import check_texts
 
 if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera
@@ -103,6 +104,7 @@ def segment(
         InvalidQuery: no words, one word twice, too many, or vectors that are no directions of the lift's space.
         InvalidLift: the splats moved or changed since the lift.
     """
+    check_texts(words, "words")
     words, rows = tuple(words), np.atleast_2d(np.asarray(as_numpy(vectors), np.float32))
     if not 1 <= len(words) <= MOST_WORDS or len(rows) != len(words):
         got = f"{len(words)} words and {len(rows)} vectors"
@@ -137,7 +139,8 @@ def segment(
     labels = np.where(named.score > -np.inf, named.row, NO_WORD).astype(np.int32)
     other = np.where(named.row == nearest.row, nearest.second, nearest.score)
     score = np.where(labels != NO_WORD, named.score, 0.0).astype(np.float32)
-    margin = np.where((labels != NO_WORD) & (other > -np.inf), named.score - other, 0.0).astype(np.float32)
+    apart = (labels != NO_WORD) & (other > -np.inf)
+    margin = np.subtract(named.score, other, out=np.zeros_like(score), where=apart)
     found = [
         NamedSplats(
             word=words[row],

@@ -41,7 +41,16 @@ def check_given(splats: Splats, threads: int | None) -> Splats:
     if not isinstance(splats, Splats):
         got, hint = f"{type(splats).__name__} {splats!r}"[:80], "read_splats(path) makes them of a file"
         raise InvalidSplats("splats", expected="Splats", got=got, hint=hint)
+    check_threads(threads)
+    return splats.cpu()
+
+
+def check_threads(threads: object) -> None:
+    """Refuse a number of threads that is none.
+
+    Raises:
+        InvalidSettings: it is no whole number of one or more, and not None.
+    """
     if threads is not None and (isinstance(threads, bool) or not isinstance(threads, Integral) or threads < 1):
         got = repr(threads)[:80]
         raise InvalidSettings("threads", expected="a whole number of one or more, or None for all cores", got=got)
-    return splats.cpu()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
@@ -94,6 +94,11 @@ class Camera:
         face: Face | None = None,
         name: str = "",
     ) -> None:
+        if not isinstance(name, str):
+            raise InvalidCameras("camera name", expected="a text, as of a photo", got=repr(name)[:SHOWN])
+        if lens is not None and not isinstance(lens, Lens):
+            hint = "read_cameras reads lenses of COLMAP and nerfstudio; undistorted photos need none"
+            raise InvalidCameras(f"camera {name!r} lens", expected="a Lens, or None", got=repr(lens)[:80], hint=hint)
         fields = {"viewmat": _matrix(viewmat), "K": _matrix(K), "width": _pixels(width), "height": _pixels(height)}
         for field, value in {**fields, "lens": lens, "face": face, "name": composed(name)}.items():
             object.__setattr__(self, field, value)
@@ -181,17 +186,32 @@ class Camera:
         return one_line(self, repr(self.name[-NAME_SHOWN:]), f"{self.width}x{self.height}", *K, *kind)
 
     def replace(self, **changes: Any) -> Camera:
-        """The same camera with other fields, or with another ``fx``, ``fy``, ``cx`` or ``cy``."""
-        K = np.array(changes.pop("K", self.K))
+        """The same camera with other fields, or with another ``fx``, ``fy``, ``cx`` or ``cy``.
+
+        Raises:
+            InvalidCameras: there is no such field, or as the constructor has it.
+        """
+        K = _matrix(changes.pop("K", self.K)).copy()
         for place, key in (((0, 0), "fx"), ((1, 1), "fy"), ((0, 2), "cx"), ((1, 2), "cy")):
-            K[place] = changes.pop(key, K[place])
+            if key in changes and K.shape == (3, 3):
+                value = changes.pop(key)
+                try:
+                    K[place] = value
+                except (TypeError, ValueError):
+                    self._refuse(key, "a number of pixels", repr(value)[:SHOWN])
+        known = [field.name for field in fields(self)]
+        for key in changes:
+            if key not in known:
+                self._refuse(repr(key), f"one of {', '.join([*known, 'fx', 'fy', 'cx', 'cy'])}", "an unknown field")
         return replace(self, K=K, **changes)
 
     def _check_intrinsics(self) -> None:
         K = self.K
         if K.shape != (3, 3) or (K[1, 0], *K[2].tolist()) != (0.0, 0.0, 0.0, 1.0) or K[0, 1] != 0:
             rows = "fx 0 cx; 0 fy cy; 0 0 1"
-            got = "; ".join(" ".join(f"{value:g}" for value in row) for row in np.atleast_2d(K)[:3])
+            got = f"shape {list(K.shape)}"
+            if K.shape == (3, 3):
+                got = "; ".join(" ".join(f"{value:g}" for value in row) for row in K)
             self._refuse("K", f"a 3x3 matrix ({rows}) without skew", got[:SHOWN])
         intrinsics = (self.fx, self.fy, self.cx, self.cy)
         if not all(math.isfinite(value) for value in intrinsics) or self.fx <= 0 or self.fy <= 0:
@@ -334,6 +354,9 @@ class Cameras(Mapping[str, Camera]):
         Raises:
             NotFound: no view has it; the error, which is a KeyError, names the nearest ones.
         """
+        if not isinstance(name, str):
+            expected, got = "the name of a camera", f"{type(name).__name__} {name!r}"[:SHOWN]
+            raise NotFound("view", expected=expected, got=got, hint="list(cameras) are the names, in their order")
         plain = without_image_suffix(name)  # a photo's file names its view
         found = self._by_name.get(composed(name)) or self._by_name.get(plain)
         found = found or self._by_name.get(cameras_of_views([plain], self).get(plain, ""))

@@ -5,8 +5,10 @@ Nothing here loads torch: settings share these values with processes that never 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 from enum import StrEnum
+from numbers import Real
 
 from liftcore.errors import InvalidInput, InvalidSettings
 from liftcore.runtime.one_line import one_line
@@ -22,6 +24,7 @@ MAX_LOG_SCALE = 60.0  # log scales are clamped to +-this, so that squares stay f
 TILE = 16  # px, side of a tile
 LARGEST_EXPONENT = 120.0  # a falloff below 2^-120 counts as none: float32 holds no smaller alphas
 EDGE_ON = 1e-6  # sine of a disc's plane with the ray of its centre; up to this only the low-pass counts (2DGS)
+LARGEST_ALPHA = 0.9999999  # nearer to one, float32 says one, and the ray has no light left to go on with
 MOST_OF_A_RAY = 64  # the largest k of top-k
 
 
@@ -41,6 +44,21 @@ class CompositingParams:
     antialiased: bool = False  # the mip filter's opacity compensation, 3DGS only
     stride: int = 1  # region weights look at every n-th pixel in x and in y; renders at all of them
     offset: tuple[int, int] = (0, 0)  # the first such pixel (x, y), each below the stride
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that mean nothing on a ray.
+
+        Raises:
+            InvalidSettings: one is out of its range; the error names it.
+        """
+        for name, fits, expected in (
+            ("opacity_logit_scale", lambda x: 0 < x < math.inf, "a finite number above 0"),
+            ("alpha_cap", lambda x: 0 < x <= LARGEST_ALPHA, f"a number above 0, at most {LARGEST_ALPHA}"),
+            ("transmittance_stop", lambda x: 0 <= x < 1, "a number from 0 to below 1"),
+        ):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, Real) or not fits(value):
+                raise InvalidSettings(name, expected=expected, got=repr(value)[:80])
 
     def __repr__(self) -> str:
         others = [field for field in fields(self) if getattr(self, field.name) != field.default]

@@ -94,7 +94,7 @@ class Splats:
         beta: Array | None = None,
         sh: Array | None = None,
         sb_params: Array | None = None,
-        extras: Mapping[str, Tensor] | None = None,
+        extras: Mapping[str, Array] | None = None,
         layout: tuple[str, ...] = (),
         header: tuple[str, ...] = (),
         render_mode: RenderMode | str | None = None,
@@ -124,7 +124,8 @@ class Splats:
         columns, repairs = _repaired(columns)
         for name in shapes:
             object.__setattr__(self, name, columns.get(name))
-        fixed = {"kernel": kernel, "extras": dict(extras or {}), "layout": tuple(layout), "header": tuple(header)}
+        others = {name: _extra(name, values, count) for name, values in (extras or {}).items()}
+        fixed = {"kernel": kernel, "extras": others, "layout": tuple(layout), "header": tuple(header)}
         mode = render_mode_of(render_mode)
         doubts = [*_doubts(mode, kernel), *_activation_warnings(columns)]
         told = tuple(dict.fromkeys((*warnings, *repairs, *doubts, *rounding)))
@@ -418,6 +419,18 @@ def shared_tensor(values: object) -> Tensor:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of arrays that must not be written to: nobody does
         return torch.from_numpy(np.ascontiguousarray(array))
+
+
+def _extra(name: str, values: Array, count: int) -> Tensor:
+    """A column [P] of any type that the model does not know."""
+    try:
+        column = shared_tensor(values)
+    except (TypeError, ValueError):
+        column = torch.zeros(0, 0)
+    if column.shape != (count,):
+        got = f"shape {list(column.shape)}" if column.numel() else repr(values)[:80]
+        raise InvalidSplats(f"extras[{name!r}]", expected=f"numbers [{count}], one a splat", got=got)
+    return column
 
 
 def _floats(name: str, values: Array) -> Tensor:

@@ -119,7 +119,7 @@ def encoder_of_space(text_space: str, hint: str = "", *, stand_in: bool = False)
         return open_encoder(ships)
 
 
-def check_texts(texts: Sequence[str]) -> None:
+def check_texts(texts: Sequence[str], argument: str = "texts") -> None:
     """Refuse what is no list of texts, and texts that say nothing.
 
     Raises:
@@ -127,7 +127,7 @@ def check_texts(texts: Sequence[str]) -> None:
     """
     listed = isinstance(texts, Collection) and not isinstance(texts, str)
     if not listed or not all(isinstance(text, str) for text in texts):
-        raise InvalidQuery("texts", expected="a list of texts", got=repr(texts)[:80], hint='such as ["a mug"]')
+        raise InvalidQuery(argument, expected="a list of texts", got=repr(texts)[:80], hint='such as ["a mug"]')
     if not all(text.strip() for text in texts):
         raise InvalidQuery("text", expected="a word or a sentence", got="an empty text")
 

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from math import ceil
+from numbers import Integral
 from pathlib import Path
 from typing import Any, Self
 
@@ -152,6 +153,9 @@ class RegionWeights:
         Raises:
             InvalidInput: a splat of W is beyond them.
         """
+        if isinstance(splats, bool) or not isinstance(splats, Integral) or splats < 0:
+            hint = "P of the scene is splats.count"
+            raise InvalidInput("splats", expected="a number of splats", got=repr(splats)[:80], hint=hint)
         if self.splats.numel() and int(self.splats[-1]) >= splats:
             raise InvalidInput("splats", expected=f"{int(self.splats[-1]) + 1} or more", got=str(splats))
         own, lengths = self.cpu(), np.zeros(splats, np.int64)

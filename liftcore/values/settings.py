@@ -17,13 +17,19 @@ from liftcore.errors import InvalidSettings
 from liftcore.runtime.device_name import device_name
 from liftcore.runtime.nearest import nearest
 from liftcore.runtime.one_line import one_line
-from liftcore.scene.compositing import MOST_OF_A_RAY, CompositingParams, Selection, Weighting, check_antialiased
+from liftcore.scene.compositing import (
+    LARGEST_ALPHA,
+    MOST_OF_A_RAY,
+    CompositingParams,
+    Selection,
+    Weighting,
+    check_antialiased,
+)
 
 if TYPE_CHECKING:  # it loads torch
     from liftcore.scene.splats import Splats
 
 TIKHONOV_GAIN = 1.2  # lambda of the paper's Tikhonov Guidance (App. Tikhonov, lambda sweep)
-LARGEST_ALPHA = 0.9999999  # nearer to one, float32 says one, and the ray has no light left to go on with
 VISIBLE_WEIGHT = 0.05  # a splat that weighs less at its centre is hidden there, or hardly there at all
 NO_MASKS = "grids, or maps without a label"
 _SHOWN = 80  # characters of a wrong value in an error

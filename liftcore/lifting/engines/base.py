@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Protocol
 
+from liftcore.raster import check_threads
 from liftcore.runtime.one_line import one_line
 
 if TYPE_CHECKING:
@@ -47,6 +48,7 @@ class LocalEngine:
     scratch: Path | None = None
 
     def __init__(self, threads: int | None = None) -> None:
+        check_threads(threads)
         self.threads = threads
 
     def __repr__(self) -> str:

@@ -207,3 +207,9 @@ def test_a_camera_of_ones_own_is_seen_from(tiny_lift: Path, tmp_path: Path, caps
     capsys.readouterr()
     assert cli.main([*command, str(tmp_path / "m.png"), "--camera", str(two)]) == 2
     assert "--camera: expected one camera, got 2 of them" in capsys.readouterr().err
+
+
+def test_one_word_names_splats_without_a_margin(clear: Scene) -> None:
+    words, vectors = ["a"], np.eye(1, CHANNELS)
+    found = segment(clear, words, vectors)
+    assert not found.margin.any() and set(np.unique(found.labels)) <= {-1, 0}
