@@ -221,10 +221,10 @@ def plan_lift(
     raster, seconds, wrong = None, None, list[str]()
     if look or _has_pilot(settings, len(names)):
         raster = open_raster(splats, device, threads)
-    if look and raster is not None:
-        wrong = contradictions(raster, views, settings, seen.seen_share)
     chosen, expected = _choose_views(raster, views, settings, seen)
     names, seen, cameras = [names[k] for k in chosen], seen.of(chosen), [cameras[k] for k in chosen]
+    if look and raster is not None:  # of the views that a lift takes: as it does
+        wrong = contradictions(raster, views.only(names), settings, seen.seen_share)
     if look and raster is not None and device.kind == "cpu":
         seconds = _seconds(raster, views, names, settings)
     weights = weight_bytes(seen, features, names, settings)

@@ -79,9 +79,9 @@ def assert_same(one: lc.LiftResult, other: lc.LiftResult) -> None:
             assert first.numpy().tobytes() == second.numpy().tobytes(), name
 
 
-def assert_same_diagnostics(one: lc.LiftResult, other: lc.LiftResult) -> None:
-    """The plan alone may differ: it tells of what a worker takes."""
-    first, second = ({**lift.diagnostics, "plan": None} for lift in (one, other))
+def assert_same_metadata(one: lc.LiftResult, other: lc.LiftResult) -> None:
+    """Compare all that lifts remember, the plan too; but for the seconds."""
+    first, second = (lift.metadata.model_dump(exclude={"timings"}) for lift in (one, other))
     assert first == second
 
 
@@ -99,7 +99,7 @@ def test_blocks_give_the_bits_of_a_lift_in_memory(scene: dict[str, Any], asked: 
     for engine in (LocalEngine(1), Shuffled(2)):
         found = in_blocks(engine, scene, settings)
         assert_same(found, whole)
-        assert_same_diagnostics(found, whole)
+        assert_same_metadata(found, whole)
     if settings.aggregation:
         assert found.cluster is not None and int(found.cluster.max()) >= 0
         assert 0 < found.diagnostics["aggregation"]["changed"] < 1
