@@ -62,6 +62,10 @@ def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool
     neither colours nor what else a lift has no use for are read or allocated, and what comes cannot be written back.
     More of PLYs is in `liftcore.io.ply.read_ply`. Checkpoints are opened for tensors alone: no code of theirs runs.
 
+    Args:
+        path: a file, a folder of a SOG or of a checkpoint's ranks, or where one lies elsewhere (`io.remote`).
+        kernel: auto, 3dgs, 2dgs or dbs. colour: whether colours and further columns are read.
+
     Raises:
         InvalidInput: it lies elsewhere (`io.remote`), and does not come.
         InvalidSplats: the file is malformed or of no such format, lacks a property of the kernel, or holds no splat

@@ -230,6 +230,9 @@ def plan(
     A few views are weighed to see whether splats, cameras and features contradict each other, as `lift` itself does
     with views that lie in files.
 
+    Args:
+        splats, cameras, views, preset, threads, settings: as `lift` has them.
+
     Raises:
         InvalidFeatures, InvalidSettings, Unavailable: as `lift` has it.
     """

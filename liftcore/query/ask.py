@@ -55,15 +55,24 @@ class Question:
 class VectorAnswer:
     """How a lift answers vectors (`query_vectors`); tensors lie on the CPU, where questions are answered."""
 
-    scores: Tensor  # [P] f32 in -1..1; -1 where not seen
-    splats: Tensor  # [P] bool, what answers (`ask`)
-    threshold: float  # on the scores
-    explanation: str  # one sentence on how it was found
-    clear: bool  # whether some splats were found that stand apart from the others
-    present: bool | None  # whether it is there; None: not known, or not sure
-    presence: float | None  # in 0..1, present from 0.5 on
-    why: str  # one sentence on how that is known
-    objects: Objects | None  # the things that they make up, with boxes; None where no splats were given
+    scores: Tensor
+    """[P] f32 in -1..1; -1 where not seen"""
+    splats: Tensor
+    """[P] bool, what answers (`ask`)"""
+    threshold: float
+    """on the scores"""
+    explanation: str
+    """one sentence on how it was found"""
+    clear: bool
+    """whether some splats were found that stand apart from the others"""
+    present: bool | None
+    """whether it is there; None: not known, or not sure"""
+    presence: float | None
+    """in 0..1, present from 0.5 on"""
+    why: str
+    """one sentence on how that is known"""
+    objects: Objects | None
+    """the things that they make up, with boxes; None where no splats were given"""
 
     def __repr__(self) -> str:
         found = f"{int(self.splats.sum())} of {len(self.splats)} splats at or above {self.threshold:.4g}"

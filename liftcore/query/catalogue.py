@@ -38,8 +38,10 @@ class Catalogue:
     """All objects of a lift."""
 
     objects: tuple[SceneObject, ...]
-    explanation: str  # why there are as many as there are
-    features: np.ndarray  # [N, F] f32, unit means; zero where no splat has a feature
+    explanation: str
+    """why there are as many as there are"""
+    features: np.ndarray
+    """[N, F] f32, unit means; zero where no splat has a feature"""
 
     def __repr__(self) -> str:
         some = ", ".join(f"{one.name or one.id}: {one.splats}" for one in self.objects)

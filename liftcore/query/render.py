@@ -35,11 +35,16 @@ _OUTLINE = np.array([255, 209, 64], dtype=np.uint8)  # sRGB of the line around w
 class ViewMask:
     """An answer seen from one camera."""
 
-    view: str  # the name of its camera
-    attention: np.ndarray  # [H, W] f32, A s: scores rendered with the lift's scale of opacity; 0 of an absent thing
-    row_sums: np.ndarray  # [H, W] f32, A 1
-    mask: np.ndarray  # [H, W] bool, where at least half of a ray that meets the scene is of what was found
-    explanation: str  # one sentence on what the mask shows
+    view: str
+    """the name of its camera"""
+    attention: np.ndarray
+    """[H, W] f32, A s: scores rendered with the lift's scale of opacity; 0 of an absent thing"""
+    row_sums: np.ndarray
+    """[H, W] f32, A 1"""
+    mask: np.ndarray
+    """[H, W] bool, where at least half of a ray that meets the scene is of what was found"""
+    explanation: str
+    """one sentence on what the mask shows"""
 
 
 @dataclass(frozen=True)

@@ -61,15 +61,24 @@ class Scene:
         InvalidSplats: other splats than were lifted (`Lift.require_splats`).
     """
 
-    features: np.ndarray  # [P, F] f16 or f32; zero rows where not seen
-    evidence: np.ndarray  # [P] f32
-    cluster: np.ndarray | None  # [P] i32, -1 = in no cluster; None without aggregation
-    cluster_features: np.ndarray | None  # [K, F] like features
-    confidence: np.ndarray | None  # [P] f32 in 0..1; None where the lift was not reweighted
-    object: np.ndarray | None  # [P] i32, -1 = of no object; None: objects were not looked for
-    object_views: np.ndarray | None  # [N, V] i32, of `Lift`
-    _told: str  # the metadata of a lift file, as JSON
-    _moved: dict[str, Path | None]  # files that lie elsewhere now, by their roles
+    features: np.ndarray
+    """[P, F] f16 or f32; zero rows where not seen"""
+    evidence: np.ndarray
+    """[P] f32"""
+    cluster: np.ndarray | None
+    """[P] i32, -1 = in no cluster; None without aggregation"""
+    cluster_features: np.ndarray | None
+    """[K, F] like features"""
+    confidence: np.ndarray | None
+    """[P] f32 in 0..1; None where the lift was not reweighted"""
+    object: np.ndarray | None
+    """[P] i32, -1 = of no object; None: objects were not looked for"""
+    object_views: np.ndarray | None
+    """[N, V] i32, of `Lift`"""
+    _told: str
+    """the metadata of a lift file, as JSON"""
+    _moved: dict[str, Path | None]
+    """files that lie elsewhere now, by their roles"""
 
     def __init__(
         self,

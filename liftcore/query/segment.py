@@ -47,11 +47,16 @@ SHOWN = 20  # words of a drawn legend
 class Segmentation:
     """What every splat is, of some words."""
 
-    words: tuple[str, ...]  # as asked
-    labels: np.ndarray  # [P] i32, rows of words; -1 where none of them is
-    score: np.ndarray  # [P] f32, the cosine to its word; 0 where it has none
-    margin: np.ndarray  # [P] f32, the cosine to its word less that to the nearest other; 0 where it has none
-    found: tuple[NamedSplats, ...]  # those that are there, with the most evidence first
+    words: tuple[str, ...]
+    """as asked"""
+    labels: np.ndarray
+    """[P] i32, rows of words; -1 where none of them is"""
+    score: np.ndarray
+    """[P] f32, the cosine to its word; 0 where it has none"""
+    margin: np.ndarray
+    """[P] f32, the cosine to its word less that to the nearest other; 0 where it has none"""
+    found: tuple[NamedSplats, ...]
+    """those that are there, with the most evidence first"""
 
     def __repr__(self) -> str:
         found = ", ".join(f"{one.word!r}: {one.splats}" for one in self.found)

@@ -75,8 +75,10 @@ class Camera:
         InvalidCameras: a size, an intrinsic or the pose is out of range; the error names which.
     """
 
-    viewmat: np.ndarray  # [4, 4] f64, read-only, on the CPU
-    K: np.ndarray  # [3, 3] f64, read-only, on the CPU
+    viewmat: np.ndarray
+    """[4, 4] f64, read-only, on the CPU"""
+    K: np.ndarray
+    """[3, 3] f64, read-only, on the CPU"""
     width: int
     height: int
     lens: Lens | None

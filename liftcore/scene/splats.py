@@ -68,20 +68,33 @@ class Splats:
         InvalidSplats: an array has another shape or holds no floats, or no splat is finite; the error names it.
     """
 
-    means: Tensor  # [P, 3] f32, world frame less the origin, scene units
-    quats: Tensor  # [P, 4] f32, w x y z, may be unnormalised; zero counts as identity
-    log_scales: Tensor  # [P, 3] f32 ([P, 2] for 2DGS), log of scene units
-    opacity_logits: Tensor  # [P] f32 (of [P] or [P, 1]), theta in alpha = sigmoid(theta)
+    means: Tensor
+    """[P, 3] f32, world frame less the origin, scene units"""
+    quats: Tensor
+    """[P, 4] f32, w x y z, may be unnormalised; zero counts as identity"""
+    log_scales: Tensor
+    """[P, 3] f32 ([P, 2] for 2DGS), log of scene units"""
+    opacity_logits: Tensor
+    """[P] f32 (of [P] or [P, 1]), theta in alpha = sigmoid(theta)"""
     kernel: Kernel
-    beta: Tensor | None  # [P] f32, DBS only: b in beta = 4 exp(b)
-    sh: Tensor | None  # [P, K, 3] f32, K = (degree + 1)^2, spherical harmonics
-    sb_params: Tensor | None  # [P, S, 6] f32, DBS only: spherical beta lobes (r g b theta phi beta)
-    extras: Mapping[str, Tensor]  # name -> [P], columns we do not model
-    layout: tuple[str, ...]  # the file's property names in order; () = the kernel's usual layout
-    header: tuple[str, ...]  # the file's header lines verbatim; () = made from the layout
-    render_mode: RenderMode | None  # how they were trained, where that is said; of a str, the model's name
-    origin: Origin  # [3] f64, world frame, scene units; zeros but for scenes in map coordinates
-    warnings: tuple[str, ...]  # of what in these splats, or in their file, is not as it should be
+    beta: Tensor | None
+    """[P] f32, DBS only: b in beta = 4 exp(b)"""
+    sh: Tensor | None
+    """[P, K, 3] f32, K = (degree + 1)^2, spherical harmonics"""
+    sb_params: Tensor | None
+    """[P, S, 6] f32, DBS only: spherical beta lobes (r g b theta phi beta)"""
+    extras: Mapping[str, Tensor]
+    """name -> [P], columns we do not model"""
+    layout: tuple[str, ...]
+    """the file's property names in order; () = the kernel's usual layout"""
+    header: tuple[str, ...]
+    """the file's header lines verbatim; () = made from the layout"""
+    render_mode: RenderMode | None
+    """how they were trained, where that is said; of a str, the model's name"""
+    origin: Origin
+    """[3] f64, world frame, scene units; zeros but for scenes in map coordinates"""
+    warnings: tuple[str, ...]
+    """of what in these splats, or in their file, is not as it should be"""
 
     def __init__(  # noqa: PLR0913 - a field each
         self,

@@ -77,17 +77,27 @@ class LiftMetadata(BaseModel):
 class Lift:
     """X and what supports it, one row a splat, in the splats' order."""
 
-    features: Tensor  # [P, F] f16 or f32; zero rows where not seen
-    evidence: Tensor  # [P] f32, sum of plain weights w over the feature views, each ray once
-    agreement: Tensor  # [P] f32 in 0..1, norm of the mean of unit regions or cells; says little of being right
-    seen: Tensor  # [P] bool, whether any labelled ray reached the splat
+    features: Tensor
+    """[P, F] f16 or f32; zero rows where not seen"""
+    evidence: Tensor
+    """[P] f32, sum of plain weights w over the feature views, each ray once"""
+    agreement: Tensor
+    """[P] f32 in 0..1, norm of the mean of unit regions or cells; says little of being right"""
+    seen: Tensor
+    """[P] bool, whether any labelled ray reached the splat"""
     metadata: LiftMetadata
-    confidence: Tensor | None = None  # [P] f32 in 0..1, how far views say the same; None: not reweighted
-    cluster: Tensor | None = None  # [P] i32, -1 = in no cluster; None without aggregation
-    cluster_features: Tensor | None = None  # [K, F] like features; a zero row: its splats keep their own
-    embeddings: Tensor | None = None  # [n, F] f32, the unit vectors of the metadata's words; None: it has none
-    object: Tensor | None = None  # [P] i32, -1 = of no object; None: objects were not looked for
-    object_views: Tensor | None = None  # [N, 5] i32, places in ``views`` that show most of each, -1 after the last
+    confidence: Tensor | None = None
+    """[P] f32 in 0..1, how far views say the same; None: not reweighted"""
+    cluster: Tensor | None = None
+    """[P] i32, -1 = in no cluster; None without aggregation"""
+    cluster_features: Tensor | None = None
+    """[K, F] like features; a zero row: its splats keep their own"""
+    embeddings: Tensor | None = None
+    """[n, F] f32, the unit vectors of the metadata's words; None: it has none"""
+    object: Tensor | None = None
+    """[P] i32, -1 = of no object; None: objects were not looked for"""
+    object_views: Tensor | None = None
+    """[N, 5] i32, places in ``views`` that show most of each, -1 after the last"""
 
     def __repr__(self) -> str:
         splats, channels = self.features.shape

@@ -41,14 +41,22 @@ class RegionWeights:
     file.
     """
 
-    splats: Tensor  # [n] i32 ascending, the splats that have a row; it may be empty
-    indptr: Tensor  # [n + 1] i64, where rows begin
-    region: Tensor  # [nnz] i32 ascending in a row: view v's region m, or cell of a grid, is offsets[v] + m
-    weight: Tensor  # [nnz] f32, sums over rays of the selected w^p times the reading S
-    evidence_splats: Tensor  # [m] i32 ascending, the splats that any ray met, labelled or not
-    evidence: Tensor  # [m] f32, sum of plain weights w (opacity_logit_scale 1, power 1), each ray once
-    offsets: Tensor  # [V + 1] i64, on the CPU: the first region of each view, and how many there are in all
-    views: tuple[str, ...] = ()  # their names, in the order of the offsets; () where nobody named them
+    splats: Tensor
+    """[n] i32 ascending, the splats that have a row; it may be empty"""
+    indptr: Tensor
+    """[n + 1] i64, where rows begin"""
+    region: Tensor
+    """[nnz] i32 ascending in a row: view v's region m, or cell of a grid, is offsets[v] + m"""
+    weight: Tensor
+    """[nnz] f32, sums over rays of the selected w^p times the reading S"""
+    evidence_splats: Tensor
+    """[m] i32 ascending, the splats that any ray met, labelled or not"""
+    evidence: Tensor
+    """[m] f32, sum of plain weights w (opacity_logit_scale 1, power 1), each ray once"""
+    offsets: Tensor
+    """[V + 1] i64, on the CPU: the first region of each view, and how many there are in all"""
+    views: tuple[str, ...] = ()
+    """their names, in the order of the offsets; () where nobody named them"""
 
     def __repr__(self) -> str:
         sizes = {"splats": self.splats.shape[0], "regions": int(self.offsets[-1]), "entries": self.region.shape[0]}

@@ -53,8 +53,10 @@ class Regions:
         InvalidFeatures: another shape or type, a label out of the codebook, or a value that is not finite.
     """
 
-    labels: Tensor  # [L, h, w] i32
-    codebook: Tensor  # [M, F] f16 or f32
+    labels: Tensor
+    """[L, h, w] i32"""
+    codebook: Tensor
+    """[M, F] f16 or f32"""
 
     def __init__(self, labels: Array, codebook: Array, *, where: str = "") -> None:
         rows = _features(codebook, "M, F", f"{where} codebook".strip())
@@ -141,7 +143,8 @@ class FeatureGrid:
         InvalidFeatures: another shape or type, or a value that is not finite.
     """
 
-    grid: Tensor  # [h, w, F] f16 or f32
+    grid: Tensor
+    """[h, w, F] f16 or f32"""
 
     def __init__(self, grid: Array, *, where: str = "") -> None:
         where = f"{where} grid".strip()
