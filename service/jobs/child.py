@@ -89,12 +89,14 @@ def run(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
     """
     kind = JobKind(order["kind"])
     order["names"][tempfile.gettempdir()] = "the server's temporary folder"
+    order["names"][str(Path(order["work"]).resolve())] = "the job's folder"
     try:
         return {"event": "done", **work_of(kind)(order, report)}
-    except SplatliftError as error:
-        return {"event": "fault", "fault": fault_of(error, order["names"])}
-    except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+    except (SplatliftError, OSError) as error:
+        cause = error.__cause__ or error  # a lift in blocks says in its own words that its folder is full
+        if not isinstance(cause, OSError) or cause.errno not in (errno.ENOSPC, errno.EDQUOT):
+            if isinstance(error, SplatliftError):
+                return {"event": "fault", "fault": fault_of(error, order["names"])}
             raise
         full = NoSpace(
             kind, expected=f"room on the server's disk for a {kind}", got="a full disk",

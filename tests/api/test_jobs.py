@@ -362,7 +362,7 @@ def test_look_that_fails_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def told(job: dict[str, Any]) -> dict[str, Any]:
-    return child.run({"kind": "lift", "names": {}} | job, Reporter(io.BytesIO()))["fault"]
+    return child.run({"kind": "lift", "names": {}, "work": "/data/work/1"} | job, Reporter(io.BytesIO()))["fault"]
 
 
 def test_fault_of_a_job_names_what_is_missing_and_no_folder_of_the_server(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -377,6 +377,10 @@ def test_fault_of_a_job_names_what_is_missing_and_no_folder_of_the_server(monkey
     assert told({})["kind"] == "no-space" and "delete" in told({})["hint"]
     error = Unavailable("features", expected=f"disk in {tempfile.gettempdir()}", got="none")
     assert told({})["expected"] == "disk in the server's temporary folder"
+    error = Unavailable("checkpoint", expected="room for blocks in /data/work/1", got="none")
+    assert told({})["expected"] == "room for blocks in the job's folder"
+    error.__cause__ = OSError(errno.ENOSPC, "No space left on device")
+    assert told({})["kind"] == "no-space"
 
 
 def test_what_a_comparison_refuses_is_the_users_problem_and_names_no_path(

@@ -57,7 +57,7 @@ from liftcore.solve.objects import (
 from liftcore.solve.reweight import SceneAgreement, whole_regions
 from liftcore.solve.sums import added, unpacked
 from liftcore.values.lift_views import LiftViews
-from liftcore.values.pack import Views, write_pack
+from liftcore.values.pack import NO_ROOM, Views, write_pack
 from liftcore.values.region_weights import MOST_REGIONS
 
 if TYPE_CHECKING:
@@ -87,13 +87,14 @@ def steps_in_blocks(
 
     Raises:
         InvalidSettings: it is no engine; or as `LiftSettings.check_blocks` has it.
+        Unavailable: the folder has no room, or workers do not see it.
     """
     if not hasattr(engine, "run"):
         hint = "LocalEngine() or RayEngine(address) makes one"
         raise InvalidSettings("engine", expected="an engine, or None", got=repr(engine)[:80], hint=hint)
     views = inputs.views
     inputs.settings.check_blocks(any(views.features.is_regions(name) for name in views.names))
-    with _folder(folder or engine.scratch, kept=folder is not None) as place, one_thread():
+    with _folder(folder or engine.scratch, kept=folder is not None) as place, _in_words(place), one_thread():
         yield InBlocks(engine, place, inputs, timings, rows, selected)
 
 
@@ -115,6 +116,27 @@ def _folder(folder: Path | None, *, kept: bool) -> Iterator[Path]:
         return
     with tempfile.TemporaryDirectory(dir=folder, prefix="splatlift-blocks-") as own:
         yield Path(own).resolve()
+
+
+@contextmanager
+def _in_words(folder: Path) -> Iterator[None]:
+    """Say what to do about a folder of pieces that is full, or that workers do not see."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in NO_ROOM:
+            expected, got = f"room for blocks in {folder}", error.strerror or str(error)
+            hint = "make room there, and the same lift goes on; or give a checkpoint folder on a larger disk"
+        elif isinstance(error, FileNotFoundError) and str(folder) in str(error):
+            expected, got = "a folder that all workers see under one path", f"one without {_missing(error, folder)}"
+            hint = f"mount {folder} on all nodes, or give a checkpoint folder that is"
+        else:
+            raise
+        raise Unavailable("checkpoint", expected=expected, got=got, hint=hint) from error
+
+
+def _missing(error: FileNotFoundError, folder: Path) -> str:
+    return Path(error.filename).name if error.filename else str(error).replace(f"{folder}/", "")
 
 
 def _packs(given: Views, unpaired: Collection[str], folder: Path) -> list[Path]:

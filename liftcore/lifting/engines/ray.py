@@ -89,7 +89,7 @@ class RayEngine:
         try:
             self._ray.get(done)
         except errors.RayTaskError as error:
-            if isinstance(error.cause, SplatliftError):
+            if isinstance(error.cause, SplatliftError | OSError | MemoryError):
                 raise error.cause from None
             raise
         except errors.RayError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -141,6 +142,21 @@ def test_lift_goes_on_from_the_pieces_in_its_folder(scene: dict[str, Any], tmp_p
     settings = LiftSettings.of(preset="row-sum")
     other = in_blocks(LocalEngine(1), stored, settings, folder=folder)  # pieces of another lift
     assert_same(other, in_blocks(LocalEngine(1), scene, settings))
+
+
+def test_folder_that_is_full_or_that_workers_do_not_see_is_named(scene: dict[str, Any], tmp_path: Path) -> None:
+    class Full(LocalEngine):
+        def run(self, work: Any, job: Any, pieces: int) -> Iterator[int]:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    class Elsewhere(LocalEngine):
+        def run(self, work: Any, job: Any, pieces: int) -> Iterator[int]:
+            (job.folder / blocks.SCENE).unlink()
+            return super().run(work, job, pieces)
+
+    for engine, message in ((Full(1), "room for blocks in .*No space left"), (Elsewhere(1), "under one path.*scene")):
+        with pytest.raises(lc.Unavailable, match=message):
+            in_blocks(engine, scene, LiftSettings.of(preset="row-sum"), folder=tmp_path)
 
 
 def few_views(seed: int, folder: str = "") -> dict[str, lc.FeatureGrid]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import fcntl
 import os
 import secrets
@@ -14,7 +15,8 @@ from contextlib import contextmanager
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
@@ -113,6 +115,13 @@ def test_workers_and_nodes_may_die(
     assert_same(in_blocks(RayEngine("auto"), scene, settings, progress=remove), expected)  # values, not files
     with pytest.raises(lc.InvalidFeatures, match="channels"):  # as the piece says it
         in_blocks(RayEngine("auto"), {**stored, "views": _broken(stored["views"])}, settings)
+    with pytest.raises(OSError, match="No space") as found:  # with its number, by which a full disk is known
+        list(RayEngine("auto").run(_full, cast("Any", SimpleNamespace(settings=settings)), 1))
+    assert found.value.errno == errno.ENOSPC
+
+
+def _full(job: Any, piece: int, threads: int | None) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 def _broken(views: Any) -> Any:
