@@ -65,8 +65,9 @@ def lift(
         checkpoint: a folder that keeps the weights of finished views. The same lift goes on from there, identical to
             the bit, and so does one that differs in features alone (another encoder's of the same regions).
         engine: who works on the lift in blocks of views and of splats, for scenes whose W or X is more than a machine
-            should hold: `LocalEngine` or `RayEngine`, with the same bits; the checkpoint is
-            then the folder of the blocks, which all workers share. None: the whole lift in this process's memory.
+            should hold: `LocalEngine` or `RayEngine`, with the same bits and threads of its own; the checkpoint is
+            then the folder of the blocks, which all workers share, and from which the same lift of feature packs goes
+            on. None: the whole lift in this process's memory.
         settings: fields of `LiftSettings` that differ from the preset's.
 
     Returns:
@@ -92,7 +93,8 @@ def lift(
             steps = InMemory(inputs.splats, inputs.settings, timings, threads, checkpoint)
             result = run(steps, inputs, timings, tell_plan)
         else:
-            with steps_in_blocks(engine, inputs, timings, checkpoint.folder if checkpoint else None) as steps:
+            folder = checkpoint.folder if checkpoint else None
+            with steps_in_blocks(engine, inputs, timings, folder, threads=threads) as steps:
                 result = run(steps, inputs, timings, tell_plan)
     warn(result.diagnostics["warnings"] if on_plan is None else ())
     return result

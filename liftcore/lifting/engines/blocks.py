@@ -151,7 +151,7 @@ def weigh(job: Job, piece: int, threads: int | None) -> None:
 
 def _weigh_views(job: Job, numbers: list[int], threads: int | None) -> None:
     device = choose_device(job.settings.device)
-    packs = _packs(job.packs, tuple(map(file_version, job.packs)))
+    packs = packs_at(job.packs, tuple(map(file_version, job.packs)))
     views = LiftViews(job.cameras, pair(packs, job.cameras)[0], job.names, [])
     cameras = [views.camera(number) for number in numbers]
     splats, ids = seen_splats(job, cameras, threads)
@@ -210,7 +210,7 @@ def write_scene(splats: Splats, path: Path) -> None:
 def scene_of(job: Job) -> Splats:
     """The geometry of all splats, mapped."""
     path = job.folder / SCENE
-    return _scene(path, file_version(path), job.kernel)
+    return mapped_scene(path, file_version(path), job.kernel)
 
 
 def file_version(path: Path) -> tuple[int, int]:
@@ -220,7 +220,8 @@ def file_version(path: Path) -> tuple[int, int]:
 
 
 @lru_cache(maxsize=1)
-def _scene(path: Path, _version: tuple[int, int], kernel: Kernel) -> Splats:
+def mapped_scene(path: Path, version: tuple[int, int], kernel: Kernel) -> Splats:
+    """The geometry of splats that `write_scene` wrote; ``version`` is of the file."""
     found = {name: torch.from_numpy(array) for name, array in map_tensors(path)[0].items()}
     means, quats, log_scales, logits = (found[name] for name in ("means", "quats", "log_scales", "opacity_logits"))
     origin = found["origin"].tolist()
@@ -234,7 +235,7 @@ def _rows(splats: Splats, rows: slice | Tensor) -> Splats:
 
 
 @lru_cache(maxsize=1)
-def _packs(paths: tuple[Path, ...], _versions: tuple[tuple[int, int], ...]) -> Views:
+def packs_at(paths: tuple[Path, ...], versions: tuple[tuple[int, int], ...]) -> Views:
     """The views of packs, whose headers are read once a worker; anew where a file has taken another's place."""
     return read_features(*paths)
 

@@ -75,6 +75,7 @@ def steps_in_blocks(
     timings: Timings,
     folder: Path | None = None,
     *,
+    threads: int | None = None,
     rows: int = ROWS,
     selected: int = SELECTED,
 ) -> Iterator[InBlocks]:
@@ -83,6 +84,7 @@ def steps_in_blocks(
     Args:
         folder: that all workers share. A lift of packs that was cut off goes on from the pieces there; None: one that
             is gone at the end.
+        threads: of the driver's own work; the engine has those of pieces. None takes the cores that it may use.
         rows: splats that are solved together, whole pages of X. selected: splats of scenes that workers hold whole.
 
     Raises:
@@ -95,7 +97,10 @@ def steps_in_blocks(
     views = inputs.views
     inputs.settings.check_blocks(any(views.features.is_regions(name) for name in views.names))
     with _folder(folder or engine.scratch, kept=folder is not None) as place, _in_words(place), one_thread():
-        yield InBlocks(engine, place, inputs, timings, rows, selected)
+        try:
+            yield InBlocks(engine, place, inputs, timings, threads, rows, selected)
+        finally:
+            steps.forget_files()
 
 
 def _memory_of_a_worker(plan: Plan) -> dict[str, int]:
@@ -183,10 +188,17 @@ class InBlocks(Steps[Job]):
     """Steps by an engine; see the protocol. W is a job, whose files have it, and X lies in shards that are mapped."""
 
     def __init__(
-        self, engine: Engine, folder: Path, inputs: LiftInputs, timings: Timings, rows: int, selected: int
+        self,
+        engine: Engine,
+        folder: Path,
+        inputs: LiftInputs,
+        timings: Timings,
+        threads: int | None,
+        rows: int,
+        selected: int,
     ) -> None:
         self.engine, self.folder, self.inputs, self.timings = engine, folder, inputs, timings
-        self.rows, self.selected = rows, selected
+        self.threads, self.rows, self.selected = threads, rows, selected
 
     def run(self, stage: str, work: Work, job: Job, pieces: int) -> None:
         """Have a step done for all pieces."""
@@ -197,7 +209,7 @@ class InBlocks(Steps[Job]):
         look = bool(views.features.paths)
         if self.inputs.settings.device == "auto" and not isinstance(self.engine, LocalEngine):
             device = CPU  # workers elsewhere may have other cards than this machine, or none
-        return plan_lift(self.inputs.splats, views, self.inputs.settings, device, apart=True, look=look)
+        return plan_lift(self.inputs.splats, views, self.inputs.settings, device, self.threads, apart=True, look=look)
 
     def weigh(self, views: LiftViews, plan: Plan, on_plan: Callable[[Plan], None]) -> tuple[Job, WeighedViews]:
         on_plan(replace(plan, memory=_memory_of_a_worker(plan), weight_bytes=0))
@@ -248,7 +260,7 @@ class InBlocks(Steps[Job]):
         self.run("objects", steps.contain, W, W.weighings)
         parts = [map_tensors(W.piece_file("contain", number))[0] for number in range(W.weighings)]
         together = NodeViews(*(np.concatenate([part[name] for part in parts]) for name in ("container", "sees")))
-        clusters = node_clusters(nodes, groups, together)
+        clusters = node_clusters(nodes, groups, together, self.threads)
         number = int(clusters.max(initial=-1)) + 1
         if number and others.size:
             self._label(W, 0, clusters)

@@ -34,6 +34,7 @@ from torch import Tensor
 
 from liftcore.io.safetensors_file import map_tensors, write_tensors
 from liftcore.io.shards import shard_at, write_rows
+from liftcore.lifting.engines import blocks
 from liftcore.lifting.engines.blocks import Job, file_version, read_weights, scene_of
 from liftcore.runtime.device import choose_device
 from liftcore.runtime.one_thread import one_thread
@@ -93,6 +94,12 @@ def codebook_of(job: Job) -> Codebook:
 def _codebook(path: Path, _version: tuple[int, int], views: int) -> Codebook:
     tensors = {name: torch.from_numpy(array) for name, array in map_tensors(path)[0].items()}
     return Codebook([ViewCodebook(tensors[f"rows/{v}"], tensors.get(f"tuples/{v}")) for v in range(views)])
+
+
+def forget_files() -> None:
+    """Let go of the files of a lift that this process has mapped: a disk is free of what has neither name nor map."""
+    for kept in (_mapped, _codebook, blocks.mapped_scene, blocks.packs_at):
+        kept.cache_clear()
 
 
 def offsets_of(job: Job) -> np.ndarray:

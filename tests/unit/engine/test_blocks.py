@@ -176,6 +176,8 @@ def test_features_in_the_place_of_others_are_lifted(tmp_path: Path) -> None:
         for views in (few_views(seed), few_views(seed, "cam/"), lc.read_features(pack)):  # named without folders too
             found = lc.lift(splats, cameras, views, "row-sum", engine=LocalEngine(1), checkpoint=tmp_path / "work")
             assert_same(found, expected)
+    maps = Path("/proc/self/maps")  # Linux
+    assert not maps.exists() or "scene.safetensors" not in maps.read_text()  # X alone stays mapped
 
 
 @pytest.mark.slow
