@@ -27,6 +27,7 @@ from liftcore.io.remote import landing, local_path
 from liftcore.io.sog import is_bundled, read_sog, sog_files
 from liftcore.io.splat import ROW, read_splat, splat_blocks
 from liftcore.io.spz import read_spz, spz_blocks
+from liftcore.runtime.plugins import Plugin, find_plugin
 from liftcore.scene.harmonics import constant_terms
 from liftcore.scene.kernel import Kernel, kernel_named
 from liftcore.scene.origin import lies_apart
@@ -39,6 +40,8 @@ if TYPE_CHECKING:
 
 
 COLUMN = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]{0,63}")  # a name that readers of PLY take
+PLUGINS = "splatlift.splat_formats"  # the entry points of other packages' readers, by suffix
+OWN_SUFFIXES = ("ply", "splat", "spz", "sog", "ckpt", "pt")
 EXPECTED = "splats as PLY, compressed PLY, .splat, .spz, .sog or a checkpoint"
 _READERS: dict[SplatFormat, Callable[..., Fields]] = {
     SplatFormat.COMPRESSED_PLY: read_compressed_ply,
@@ -58,7 +61,8 @@ def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool
     """Read trained splats from a file of any `SplatFormat`, recognised by content.
 
     With the kernel ``auto`` the columns of a PLY tell it, or what the file says of its training
-    (`liftcore.scene.render_mode`); what says nothing is of 3D Gaussians. Without ``colour``
+    (`liftcore.scene.render_mode`); what says nothing is of 3D Gaussians. A file of no such format is read by the
+    plugin of its suffix, if there is one (`liftcore.runtime.plugins`). Without ``colour``
     neither colours nor what else a lift has no use for are read or allocated, and what comes cannot be written back.
     More of PLYs is in `liftcore.io.ply.read_ply`. Checkpoints are opened for tensors alone: no code of theirs runs.
 
@@ -76,6 +80,8 @@ def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool
     with _naming(path):
         if found is SplatFormat.PLY:
             return ply.read_ply(path, kernel, colour=colour)
+        if isinstance(found, Plugin):
+            return found.call(path, needs=("means", "quats", "log_scales", "opacity_logits", "kernel", "count"))
         if kernel != "auto":
             require_kernel(path, kernel_named(kernel), str(path))
         from liftcore.scene.splats import Splats
@@ -176,6 +182,8 @@ def read_places(path: Path, kernel: Kernel | str = "auto") -> np.ndarray:
         InvalidSplats: the file is of no format of splats.
     """
     found = format_of(path)
+    if isinstance(found, Plugin):
+        return read_splats(path, kernel, colour=False).positions()
     places = ply.read_places(path) if found is SplatFormat.PLY else _READERS[found](path, colour=False)["means"]
     if lies_apart(places):
         return read_splats(path, kernel, colour=False).positions()
@@ -187,15 +195,19 @@ def read_places(path: Path, kernel: Kernel | str = "auto") -> np.ndarray:
     return places
 
 
-def format_of(path: Path) -> SplatFormat:
-    """The format of a file, by its content.
+def format_of(path: Path) -> SplatFormat | Plugin:
+    """The format of a file, by its content; else the plugin that reads files of its suffix.
 
     Raises:
         InvalidSplats: it is of none; the error says what it is, if that can be told.
+        Unavailable: two plugins read it.
     """
     found = identify(path)
     if found.format is not None:
         return found.format
+    suffix = path.suffix.lower().removeprefix(".")
+    if suffix and path.exists() and (plugin := find_plugin(PLUGINS, suffix, OWN_SUFFIXES)):
+        return plugin
     if error := wrong_kind(path, "splats", InvalidSplats, expected=EXPECTED):
         raise error
     hint = found.hint or (f"{ply.EXPORT}; or {CONVERT}" if path.is_file() else "")

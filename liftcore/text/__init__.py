@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from liftcore.errors import InvalidQuery, Unavailable
+from liftcore.runtime.plugins import find_plugin, plugin_names
 
 ENCODER_SPECS = (
     "table:FILE.safetensors",
@@ -21,6 +22,7 @@ ENCODER_SPECS = (
 # Encoders that need no file of the user's, and the text space of each: what answers when nobody chose an encoder.
 BUILT_IN = {"lvis": "open_clip:ViT-B-32/openai", "minilm": "minilm"}
 LVIS_TABLE = Path(__file__).with_name("lvis_clip_vit_b_32.safetensors")  # its licences: liftcore/demo/tabletop
+PLUGINS = "splatlift.text_encoders"  # the entry points of other packages' encoders
 TEMPLATES = (1, 7, 80)  # sentences that open_clip's encoders put a word into: the word alone, or CLIP's for ImageNet
 NO_WORDS = "none"  # the text space of features that no text encoder shares
 OWN_WORDS = "prompts"  # of features whose packs bring their words
@@ -65,11 +67,12 @@ def open_encoder(spec: str | Path) -> TextEncoder:
         spec: ``table:FILE`` or a path ending in ``.safetensors`` (precomputed embeddings); ``lvis`` (a table of the
             1,203 words of LVIS by CLIP ViT-B/32, shipped); ``minilm`` (a small sentence encoder, offline);
             ``open_clip:MODEL/TAG`` or ``open_clip:MODEL@FILE``, with ``#7`` or ``#80`` behind for the mean over as
-            many of CLIP's sentences for ImageNet ("a photo of the small mug.").
+            many of CLIP's sentences for ImageNet ("a photo of the small mug."); or ``NAME`` or ``NAME:REST`` of a
+            plugin (`liftcore.runtime.plugins`), which is called with the rest.
 
     Raises:
         InvalidQuery: the specification is none of these, or a table is malformed.
-        Unavailable: the encoder's weights are not on this machine.
+        Unavailable: the encoder's weights are not on this machine, or a plugin fails.
     """
     spec, templates = without_templates(str(spec))
     kind, _, rest = spec.partition(":")
@@ -88,7 +91,10 @@ def open_encoder(spec: str | Path) -> TextEncoder:
         from liftcore.text.open_clip import OpenClipEncoder
 
         return OpenClipEncoder.open(rest, templates)
-    raise InvalidQuery("encoder", expected=f"one of {', '.join(ENCODER_SPECS)}", got=repr(spec))
+    if plugin := find_plugin(PLUGINS, kind, ("table", "open_clip", *BUILT_IN)):
+        return plugin.call(rest, needs=("name", "channels", "encode"))
+    specs = [*ENCODER_SPECS, *(f"{name}:..." for name in plugin_names(PLUGINS) if name not in BUILT_IN)]
+    raise InvalidQuery("encoder", expected=f"one of {', '.join(specs)}", got=repr(spec))
 
 
 def encoder_of_space(text_space: str, hint: str = "", *, stand_in: bool = False) -> TextEncoder:

@@ -17,6 +17,7 @@ from liftcore.evaluate.inspect import describe_camera_file, describe_packs, desc
 from liftcore.io.json_file import finite
 from liftcore.io.kinds import EXPORT_PLY, SUFFIX, SplatFormat, identify, wrong_kind
 from liftcore.io.splats import format_of
+from liftcore.runtime.plugins import Plugin
 from liftcore.text.table import TableEncoder
 from liftcore.values.lift_file import has_poses, parse_metadata, read_lift
 from liftcore.values.pack import read_features
@@ -36,6 +37,8 @@ def check_splats(path: Path) -> dict[str, Any]:
     if found is SplatFormat.CHECKPOINT:
         got = "a checkpoint of a trainer, which is a Python pickle"
         raise InvalidSplats("splats", expected="a format that holds no code", got=got, hint=EXPORT_PLY)
+    if isinstance(found, Plugin):  # an upload has no suffix of its user's, so that none is found here
+        raise InvalidSplats("splats", expected="a format of splatlift's own", got=found.value, hint=EXPORT_PLY)
     return {"suffix": SUFFIX[found], "found": describe_splat_file(path)}
 
 

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from liftcore.errors import InvalidInput, Unavailable
+from liftcore.runtime.plugins import find_plugin, plugin_names
 
 IMAGE_ENCODERS = (
     "maskclip:MODEL/TAG",
@@ -16,6 +17,8 @@ IMAGE_ENCODERS = (
     "timm:NAME",
     "timm:NAME@FILE",
 )
+KINDS = ("maskclip", "clip", "timm")
+PLUGINS = "splatlift.image_encoders"  # the entry points of other packages' encoders
 
 
 @dataclass(frozen=True)
@@ -68,17 +71,23 @@ def open_image_encoder(spec: str, device: str = "cpu") -> ImageEncoder:
     | ``timm:...`` | the normed token of the last block, or the last feature map of a convolutional network |
 
     Args:
-        spec: one of ``IMAGE_ENCODERS``; weights by name are fetched by the library, or read from its cache.
+        spec: one of ``IMAGE_ENCODERS``; weights by name are fetched by the library, or read from its cache. Or
+            ``NAME`` or ``NAME:REST`` of a plugin (`liftcore.runtime.plugins`), which is called with the rest and the
+            device.
         device: as torch names it.
 
     Raises:
         InvalidInput: the specification is none of these, or a file is not weights of the model.
-        Unavailable: the weights, or the device, are not on this machine.
+        Unavailable: the weights, or the device, are not on this machine, or a plugin fails.
     """
     kind, _, rest = spec.partition(":")
-    if not rest or kind not in ("maskclip", "clip", "timm"):
+    if kind not in KINDS and (plugin := find_plugin(PLUGINS, kind, KINDS)):
+        needs = ("name", "text_space", "pixels", "channels", "encode")
+        return plugin.call(rest, device_named(device), needs=needs)
+    if not rest or kind not in KINDS:
+        specs = [*IMAGE_ENCODERS, *(f"{name}:..." for name in plugin_names(PLUGINS) if name not in KINDS)]
         hint = "SigLIP, MobileCLIP and the like are maskclip:MODEL/TAG; maps of FeatUp and others come by pack npy"
-        raise InvalidInput("--encoder", expected=f"one of {', '.join(IMAGE_ENCODERS)}", got=repr(spec), hint=hint)
+        raise InvalidInput("--encoder", expected=f"one of {', '.join(specs)}", got=repr(spec), hint=hint)
     where = device_named(device)
     if kind == "timm":
         from liftcore.features.encoders.timm_backbone import TimmEncoder
