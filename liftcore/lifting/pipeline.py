@@ -14,7 +14,7 @@ from liftcore.errors import InvalidSettings
 from liftcore.lifting.base import Steps, Support, WeighedViews, Weights
 from liftcore.lifting.checkpoint import Checkpoint
 from liftcore.lifting.engines.base import Engine
-from liftcore.lifting.engines.lift import steps_in_blocks
+from liftcore.lifting.engines.lift import plan_of_a_worker, steps_in_blocks
 from liftcore.lifting.in_memory import InMemory
 from liftcore.lifting.inputs import LiftInputs
 from liftcore.lifting.planning.plan import Plan, plan_lift
@@ -225,6 +225,7 @@ def plan(
     preset: Preset | str | LiftSettings = Preset.DEFAULT,
     *,
     threads: int | None = None,
+    in_blocks: bool = False,
     **settings: Unpack[LiftOptions],
 ) -> Plan:
     """What `lift` with the same arguments would do, and what it would take: views, memory, warnings.
@@ -234,13 +235,15 @@ def plan(
 
     Args:
         splats, cameras, views, preset, threads, settings: as `lift` has them.
+        in_blocks: plan the lift of an engine, whose memory is that of one worker.
 
     Raises:
         InvalidFeatures, InvalidSettings, Unavailable: as `lift` has it.
     """
     inputs = LiftInputs.of(splats, cameras, views, preset, settings, threads)
     device = choose_device(inputs.settings.device)
-    return plan_lift(inputs.splats, inputs.views, inputs.settings, device, threads, look=True)
+    found = plan_lift(inputs.splats, inputs.views, inputs.settings, device, threads, apart=in_blocks, look=True)
+    return plan_of_a_worker(found) if in_blocks else found
 
 
 def log_warnings(plan: Plan) -> None:

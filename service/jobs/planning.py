@@ -21,6 +21,7 @@ def run(file: str) -> dict[str, Any]:
         settings = LiftSettings.of(**order["settings"])
         packs = [Path(path) for path in order["features"]]
         sources = open_files(Path(order["splats"]), Path(order["cameras"]), packs, settings)
-        return {"event": "valid", "plan": plan_document(plan(*sources, settings), order["names"])}
+        found = plan(*sources, settings, in_blocks=order["engine"] is not None)
+        return {"event": "valid", "plan": plan_document(found, order["names"])}
     except SplatliftError as error:
         return {"event": "invalid", "fault": fault_of(error, order["names"])}

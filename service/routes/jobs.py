@@ -108,7 +108,8 @@ def _planned(order: models.LiftRequest, deps: AppState) -> models.Plan:
     splats, cameras, *packs = [deps.store.assets.get(deps.owner, *named) for named in wanted.assets()]
     document = {
         "splats": str(splats.path), "cameras": str(cameras.path), "features": [str(pack.path) for pack in packs],
-        "settings": settings, "names": {str(one.path): f"{one.kind} {one.id}" for one in (splats, cameras, *packs)},
+        "settings": settings, "engine": deps.settings.engine,
+        "names": {str(one.path): f"{one.kind} {one.id}" for one in (splats, cameras, *packs)},
     }  # fmt: skip
     with deps.store.files.scratch() as scratch:
         file = scratch / "order.json"

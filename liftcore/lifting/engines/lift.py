@@ -103,13 +103,14 @@ def steps_in_blocks(
             steps.forget_files()
 
 
-def _memory_of_a_worker(plan: Plan) -> dict[str, int]:
-    """Bytes of each part of a worker at its peak, about, from those of a lift in one place."""
+def plan_of_a_worker(plan: Plan) -> Plan:
+    """The plan of a lift in one place with what a worker takes: bytes of each part at its peak, about."""
     splats = min(1.0, ROWS / plan.splats)
     held = min(1.0, max(SELECTED, plan.splats_a_view) / plan.splats)
     shares = {"splats": held, "scene": held, "weights": min(1.0, WEIGHED / len(plan.views))}
     shares |= {"gathered": splats, "features": splats}
-    return {name: int(size * shares.get(name, 1.0)) for name, size in plan.memory.items()}
+    memory = {name: int(size * shares.get(name, 1.0)) for name, size in plan.memory.items()}
+    return replace(plan, memory=memory, weight_bytes=0)
 
 
 @contextmanager
@@ -212,7 +213,7 @@ class InBlocks(Steps[Job]):
         return plan_lift(self.inputs.splats, views, self.inputs.settings, device, self.threads, apart=True, look=look)
 
     def weigh(self, views: LiftViews, plan: Plan, on_plan: Callable[[Plan], None]) -> tuple[Job, WeighedViews]:
-        on_plan(replace(plan, memory=_memory_of_a_worker(plan), weight_bytes=0))
+        on_plan(plan_of_a_worker(plan))
         with self.timings.step("share"):
             job = self._share(views, plan)
         for done, _ in enumerate(self.engine.run(weigh, job, job.weighings), start=1):

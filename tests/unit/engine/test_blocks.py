@@ -159,6 +159,18 @@ def test_folder_that_is_full_or_that_workers_do_not_see_is_named(scene: dict[str
             in_blocks(engine, scene, LiftSettings.of(preset="row-sum"), folder=tmp_path)
 
 
+def test_plan_in_blocks_is_of_a_worker_and_asks_this_machine_for_no_room(
+    scene: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = pipeline.plan(**scene, preset="row-sum")
+    monkeypatch.setattr("liftcore.lifting.planning.plan.free_memory", lambda: 1)
+    with pytest.raises(lc.Unavailable, match="memory"):
+        pipeline.plan(**scene, preset="row-sum")
+    worker = pipeline.plan(**scene, preset="row-sum", in_blocks=True)
+    assert worker.views == whole.views and worker.memory["weights"] < whole.memory["weights"]
+    assert worker.in_files == 0
+
+
 def few_views(seed: int, folder: str = "") -> dict[str, lc.FeatureGrid]:
     rng = np.random.default_rng(seed)
     return {f"{folder}v{k}": lc.FeatureGrid(rng.normal(0, 1, (6, 8, 4)).astype(np.float32)) for k in range(3)}
