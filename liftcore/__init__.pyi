@@ -24,12 +24,14 @@ from liftcore.lifting.planning.photos import plan_photos as plan_photos
 from liftcore.lifting.planning.plan import Plan as Plan
 from liftcore.query.ask import VectorAnswer as VectorAnswer
 from liftcore.query.catalogue import Catalogue as Catalogue
+from liftcore.query.directions import read_example as read_example
 from liftcore.query.question import Answer as Answer
 from liftcore.query.question import BestWord as BestWord
 from liftcore.query.question import CoveringRegion as CoveringRegion
 from liftcore.query.question import FoundObject as FoundObject
 from liftcore.query.question import NamedSplats as NamedSplats
 from liftcore.query.question import Objects as Objects
+from liftcore.query.question import Picture as Picture
 from liftcore.query.question import Query as Query
 from liftcore.query.question import SceneObject as SceneObject
 from liftcore.query.render import ViewMask as ViewMask

@@ -16,8 +16,7 @@ from liftcore.io.remote import place
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from liftcore.query.scene import Scene
-    from liftcore.text import TextEncoder
+    from liftcore import Scene, TextEncoder
 
 
 def add_arguments(parser: Parser) -> None:
@@ -36,9 +35,7 @@ def run(options: argparse.Namespace) -> int:
     files = {"csv": options.csv} if options.csv else {}
     given = [path for path in (options.lift, options.table, options.vocabulary) if path]
     free_outputs(files, given)
-    from liftcore.query.catalogue import table_csv
-    from liftcore.query.export import blocks_of
-    from liftcore.query.scene import Scene
+    from liftcore import Scene
 
     scene = Scene(options.lift)
     if files or options.splats:
@@ -50,12 +47,12 @@ def run(options: argparse.Namespace) -> int:
         things = [one | {"feature": row.tolist()} for one, row in zip(things, found.features, strict=True)]
     document: dict[str, Any] = {"encoder": None if encoder is None else encoder.name}
     document |= {"explanation": found.explanation, "objects": things}
-    contents: dict[str, Any] = {"csv": lambda: [table_csv(found)]}
+    contents: dict[str, Any] = {"csv": partial(scene.blocks_of, found)}
     if options.splats:
         for one in found.objects:
             name = f"object-{one.id}"
             files[name] = free_output(options.splats / f"{name}.ply", [*given, *made_from(scene)], PLY)
-            contents[name] = partial(blocks_of, scene, one.id)
+            contents[name] = partial(scene.blocks_of, one.id)
     document["files"] = write_files(files, contents)
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
@@ -69,7 +66,7 @@ def _vocabulary(options: argparse.Namespace, scene: Scene) -> tuple[TextEncoder 
         encoder, file = scene.encoder(f"table:{options.vocabulary}"), None
     else:
         encoder, file = text_encoder(options, scene), options.vocabulary
-    return encoder, read_words(file, encoder)
+    return encoder, read_words(file, scene, encoder)
 
 
 def _lines(document: dict[str, Any]) -> Iterable[str]:

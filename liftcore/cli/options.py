@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from pydantic import BaseModel
 
-    from liftcore.query.scene import Scene
+    from liftcore import Scene
     from liftcore.text import TextEncoder
 
 BAD_INPUT = 2
@@ -171,7 +171,7 @@ def opened_lift(options: argparse.Namespace) -> Scene:
     Raises:
         InvalidLift: it is none.
     """
-    from liftcore.query.scene import Scene
+    from liftcore import Scene
 
     return Scene(options.lift, splats=options.splats, cameras=options.cameras)
 

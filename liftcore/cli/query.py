@@ -27,11 +27,7 @@ if TYPE_CHECKING:
 
     from PIL.Image import Image
 
-    from liftcore.query.question import Answer, Objects, Query
-    from liftcore.query.render import ViewMask
-    from liftcore.query.scene import Scene
-    from liftcore.query.terms import Example
-    from liftcore.text import TextEncoder
+    from liftcore import Answer, Objects, Query, Scene, TextEncoder, ViewMask
 
 
 LOCAL_SUFFIXES = (".splat", ".spz")  # of files whose positions are about the splats' origin
@@ -54,7 +50,7 @@ OUTPUTS = ("object", "coloured", "scores", "mask", "attention", "overlay")  # op
 
 def add_arguments(parser: Parser) -> None:
     """The options of the command."""
-    from liftcore.query.question import Query
+    from liftcore import Query
 
     parser.last = "text"
     add_lift(parser)
@@ -78,8 +74,6 @@ def run(options: argparse.Namespace) -> int:
     view = view_of(options, "mask", "attention", "overlay")
     files = {kind: path for kind in OUTPUTS if (path := getattr(options, kind)) is not None}
     free_outputs(files, [path for path in (options.lift, options.table, options.camera) if path])
-    from liftcore.query.export import blocks_of
-
     query = _query(options)
     scene = opened_lift(options)
     if files:
@@ -92,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
     document = _document(answer, found, seen, encoder)
     photo = None if seen is None else _picture(options.photo, seen.mask.shape[::-1])
     contents = {
-        kind: partial(blocks_of, scene, answer, kind, view=view, suffix=path.suffix.lower(), seen=seen, photo=photo)
+        kind: partial(scene.blocks_of, answer, kind, view=view, suffix=path.suffix.lower(), seen=seen, photo=photo)
         for kind, path in files.items()
     }
     document["files"] = write_files(files, contents)
@@ -103,7 +97,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _query(options: argparse.Namespace) -> Query:
-    from liftcore.query.question import Query
+    from liftcore import Query, read_example
 
     if options.text is None and not options.like and options.negatives:
         raise InvalidQuery(
@@ -114,19 +108,8 @@ def _query(options: argparse.Namespace) -> Query:
         )
     fields: dict[str, Any] = {name: getattr(options, name) for name in (*Query.deciding(), "top")}
     fields["text"] = [] if options.text is None else options.text
-    fields |= {name: examples_of(fields[name], f"--{name}") for name in ("like", "unlike")}
+    fields |= {name: [read_example(one, f"--{name}") for one in fields[name]] for name in ("like", "unlike")}
     return Query(**fields)
-
-
-def examples_of(notations: list[str], argument: str) -> list[Example]:
-    """Examples of their notations; what ends in .npy is a file of a vector."""
-    from liftcore.query.directions import read_vector
-    from liftcore.query.terms import parse_example
-
-    return [
-        read_vector(Path(notation)) if notation.endswith(".npy") else parse_example(notation, argument)
-        for notation in notations
-    ]
 
 
 def _document(

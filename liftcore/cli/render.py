@@ -14,7 +14,7 @@ from liftcore.errors import InvalidQuery
 
 def add_arguments(parser: Parser) -> None:
     """The options of the command."""
-    from liftcore.query.question import Picture
+    from liftcore import Picture
 
     add_lift(parser)
     add_view(parser)
@@ -28,10 +28,8 @@ def run(options: argparse.Namespace) -> int:
     if view is None:
         raise InvalidQuery("--view", expected="a view to see it from", got="no --view and no --camera")
     free_outputs(files, [path for path in (options.lift, options.camera) if path])
-    from liftcore.query.export import blocks_of
-
     scene = opened_lift(options)
     free_outputs(files, made_from(scene))
-    written = write_files(files, {"output": partial(blocks_of, scene, None, options.what, view=view)})
+    written = write_files(files, {"output": partial(scene.blocks_of, None, options.what, view=view)})
     reply({"what": options.what, "out": written["output"]}, as_json=options.json, lines=[written["output"]])
     return 0

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.cli.options import Parser, add_encoder, add_lift, add_view, count, opened_lift, text_encoder, view_of
-from liftcore.cli.query import examples_of, made_from, place_of, write_files
+from liftcore.cli.query import made_from, place_of, write_files
 from liftcore.cli.reply import free_outputs, reply
 from liftcore.errors import InvalidQuery
 from liftcore.runtime.progress import progress_bars
@@ -16,7 +16,7 @@ from liftcore.runtime.progress import progress_bars
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from liftcore.text import TextEncoder
+    from liftcore import Scene, TextEncoder
 
 OUTPUTS = ("labels", "picture", "coloured", "splat_labels", "labelled")  # options that name a file to write
 
@@ -46,16 +46,16 @@ def run(options: argparse.Namespace) -> int:
         files["names"] = options.labelled.with_name(f"{options.labelled.name}.json")
     given = [path for path in (options.lift, options.table, options.words, options.camera) if path]
     free_outputs(files, given)
-    from liftcore.query.export import blocks_of
+    from liftcore import read_example
 
     scene = opened_lift(options)
     if files:
         free_outputs(files, made_from(scene))
     encoder = text_encoder(options, scene)
-    words = read_words(options.words, encoder)
+    words = read_words(options.words, scene, encoder)
     document: dict[str, Any] = {"encoder": encoder.name, "words": len(words)}
     if options.what:
-        named = zip(options.what, examples_of(options.what, "--what"), strict=True)
+        named = [(notation, read_example(notation, "--what")) for notation in options.what]
         document["what"] = {
             said: [vars(word) for word in scene.what(example, words, top=options.top, encoder=encoder)]
             for said, example in named
@@ -71,18 +71,16 @@ def run(options: argparse.Namespace) -> int:
                 for value, named in enumerate(found.found, 1)
             ],
         }
-        contents = {kind: partial(blocks_of, scene, found, kind, view=view) for kind in files}
+        contents = {kind: partial(scene.blocks_of, found, kind, view=view) for kind in files}
         document["files"] = write_files(files, contents)
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
 
 
-def read_words(path: Path | None, encoder: TextEncoder) -> list[str]:
+def read_words(path: Path | None, scene: Scene, encoder: TextEncoder) -> list[str]:
     """The words of a file, one a line, or all that a table has."""
-    from liftcore.query.segment import words_of
-
     if path is None:
-        return words_of(encoder)
+        return scene.words(encoder)
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

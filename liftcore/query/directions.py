@@ -15,7 +15,7 @@ from liftcore.errors import InvalidQuery, NotFound
 from liftcore.query.question import Query
 from liftcore.query.regions import codebook_row, regions_of
 from liftcore.query.scene import Scene, as_numpy
-from liftcore.query.terms import OneSplat, Pixel, Region, Term, Vector
+from liftcore.query.terms import Example, OneSplat, Pixel, Region, Term, Vector, parse_example
 from liftcore.text import TextEncoder
 
 MINIMUM_ROW_SUM = 0.5  # below it a ray mostly misses the scene: no histogram, no mask and no example takes it
@@ -148,6 +148,16 @@ def _unit(vector: np.ndarray, name: str) -> np.ndarray:
         raise InvalidQuery(name, expected="a finite feature with a direction", got=got)
     scaled = wide / largest
     return (scaled / np.linalg.norm(scaled)).astype(np.float32)
+
+
+def read_example(notation: str, argument: str = "like") -> Example:
+    """An example by its notation, or the vector of a file that ends in .npy.
+
+    Raises:
+        InvalidQuery: it is none of them (blamed on ``argument``), or an array that is no vector.
+        InvalidFeatures: no such file, or no array of numbers in it.
+    """
+    return read_vector(Path(notation)) if notation.endswith(".npy") else parse_example(notation, argument)
 
 
 def read_vector(path: Path) -> Vector:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.catalogue import one_object_ply
+from liftcore.query.catalogue import Catalogue, one_object_ply, table_csv
 from liftcore.query.colours import NOT_SEEN_COLOUR, cluster_colours, heat_colours
 from liftcore.query.objects import MOST_SPLATS, objects
 from liftcore.query.question import Answer
@@ -30,13 +30,14 @@ FILES = {  # of what a file is made -> the files that there are of it
     "answer": ("object", "coloured", "scores", "selection", "mask", "attention", "overlay"),
     "segmentation": ("coloured", "labels", "picture", "splat_labels", "labelled", "names"),
     "object": ("object",),
+    "catalogue": ("csv",),
     "scene": ("rgb", "depth", "pca", "cluster", "confidence", "splats"),
 }
 
 
 def blocks_of(
     scene: Scene,
-    source: Answer | Segmentation | int | None,
+    source: Answer | Segmentation | Catalogue | int | None,
     what: str = "",
     *,
     view: str | Camera | None = None,
@@ -44,16 +45,9 @@ def blocks_of(
     seen: ViewMask | None = None,
     photo: Image | None = None,
 ) -> Iterable[bytes]:
-    """A file, in blocks: of an answer, of a segmentation, of one object of the lift by its id, or of the scene.
+    """Make a file, in blocks: of an answer, a segmentation, an object of the lift by its id, or the scene.
 
-    Args:
-        what: which file, by its name in FILES; empty = the first of its kind.
-        view: of pictures; None: the query's own. suffix: of its name, where there are several formats.
-        seen: the answer as the view shows it, where that is known. photo: of the view, for an overlay.
-
-    Raises:
-        InvalidQuery: there is no such file; or nothing was found that it could hold.
-        NotFound, InvalidLift: as what makes it.
+    Arguments and errors are those of `Scene.blocks_of`; ``what`` is one of FILES.
     """
     kind = "object" if isinstance(source, int) else "scene" if source is None else type(source).__name__.lower()
     what = what or FILES[kind][0]
@@ -61,6 +55,8 @@ def blocks_of(
         raise InvalidQuery("what", expected=f"one of {', '.join(FILES[kind])}", got=repr(what))
     if isinstance(source, int):
         return one_object_ply(scene, source)
+    if isinstance(source, Catalogue):
+        return [table_csv(source)]
     if isinstance(source, Answer):
         return _of_answer(scene, source, what, view, suffix, seen, photo)
     if source is not None:

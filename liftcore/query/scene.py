@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from liftcore.text.table import TableEncoder, own_words
 from liftcore.values.lift_file import read_lift
 
 if TYPE_CHECKING:  # these load torch or what comes after a scene
+    from PIL.Image import Image
     from torch import Tensor
 
     from liftcore.query.catalogue import Catalogue
@@ -36,6 +37,7 @@ if TYPE_CHECKING:  # these load torch or what comes after a scene
     from liftcore.values.lift import InputFile, Lift, LiftMetadata
     from liftcore.values.pack import Views
 
+Source: TypeAlias = "Query | str | Answer | Segmentation | Catalogue | int | None"  # of a file
 MOST_SAMPLED = 1 << 14  # splats of which a rough mean is taken
 MOST_OF_THING = 512  # splats of a thing, likewise
 MOST_PIXELS = 1 << 26  # of a picture: 67 million take a minute of one core and 2 GB
@@ -240,12 +242,12 @@ class Scene:
             words: n different ones; None: all words of the encoder, which is a table. vectors: as in `catalogue`.
         """
         from liftcore.query.presence import references_of
-        from liftcore.query.segment import segment, words_of
+        from liftcore.query.segment import segment
 
         if vectors is not None:
             return segment(self, words or (), vectors, progress)
         reader = self.encoder(encoder)
-        words = words_of(reader) if words is None else words
+        words = self.words(reader) if words is None else words
         references = references_of(reader, self.metadata.text_space)
         return segment(self, words, reader.encode(words), progress, references)
 
@@ -262,13 +264,19 @@ class Scene:
         Args:
             example: or its notation, as in `Query.like`. words: None: all words of the encoder, which is a table.
         """
-        from liftcore.query.segment import best_words, words_of
+        from liftcore.query.segment import best_words
         from liftcore.query.terms import parse_example
 
         reader = self.encoder(encoder)
-        words = words_of(reader) if words is None else words
+        words = self.words(reader) if words is None else words
         example = parse_example(example, "example") if isinstance(example, str) else example
         return best_words(self, example, words, reader.encode(words), top)
+
+    def words(self, encoder: TextEncoder | str | Path | None = None) -> list[str]:
+        """All words of an encoder that is a table, each once; another one is an InvalidQuery."""
+        from liftcore.query.segment import words_of
+
+        return words_of(self.encoder(encoder))
 
     def regions(self, view: str, x: int, y: int) -> tuple[CoveringRegion, ...]:
         """The regions of the lift's feature packs that cover a pixel of a view's photo, the smallest first."""
@@ -276,37 +284,45 @@ class Scene:
 
         return regions_at(self, view, x, y)
 
-    def export(
+    def export(self, path: Path | str, source: Source = None, what: str = "", **how: Any) -> None:
+        """Write a file, whole or not at all; arguments and errors as in `blocks_of`, which takes its suffix."""
+        from liftcore.io.files import whole_file
+
+        how = {"suffix": Path(path).suffix.lower(), **how}
+        content = self.blocks_of(source, what, **how)
+        with whole_file(Path(path)) as handle:
+            handle.writelines(content)
+
+    def blocks_of(
         self,
-        path: Path | str,
-        source: Query | str | Answer | Segmentation | int | None = None,
+        source: Source = None,
         what: str = "",
         *,
         view: str | Camera | None = None,
+        suffix: str = "",
+        seen: ViewMask | None = None,
+        photo: Image | None = None,
         encoder: TextEncoder | str | Path | None = None,
-    ) -> None:
-        """Write a file, whole or not at all (`liftcore.query.export.blocks_of`).
+    ) -> Iterable[bytes]:
+        """Make a file, in blocks.
 
         Args:
-            path: its suffix says the format where there are several.
-            source: a question or its answer, a segmentation, the id of an object of the catalogue; None: the scene.
+            source: a question or its answer, a segmentation, a catalogue, the id of an object of it; None: the scene.
             what: of an answer object, coloured, scores, selection, mask, attention or overlay; of a segmentation
-                coloured, labels, picture, splat_labels, labelled or names; of the scene what `render` draws. Empty:
-                the first of these.
-            view: of pictures, as in `look`.
+                coloured, labels, picture, splat_labels, labelled or names; of the scene what `render` draws, or
+                splats; of a catalogue csv. Empty: the first of these.
+            view: of pictures, as in `look`. suffix: of its name, where there are several formats.
+            seen: the answer as the view shows it, where that is known. photo: of the view, for an overlay.
 
         Raises:
             InvalidQuery: there is no such file of it, or nothing was found that it could hold.
             NotFound, InvalidLift, Unavailable: as the question, or as pictures.
         """
-        from liftcore.io.files import whole_file
         from liftcore.query.export import blocks_of
         from liftcore.query.question import Query
 
         source = self._answer(source, encoder) if isinstance(source, str | Query) else source
-        content = blocks_of(self, source, what, view=view, suffix=Path(path).suffix.lower())
-        with whole_file(Path(path)) as handle:
-            handle.writelines(content)
+        return blocks_of(self, source, what, view=view, suffix=suffix, seen=seen, photo=photo)
 
     def encoder(self, encoder: TextEncoder | str | Path | None = None) -> TextEncoder:
         """The encoder of a specification, opened once and with its last texts remembered; one of yours as it is.

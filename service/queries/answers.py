@@ -22,30 +22,40 @@ from typing import Any, Generic, TypeVar
 
 import torch
 
-from liftcore.errors import SplatliftError
+from liftcore import (
+    Answer,
+    Camera,
+    Catalogue,
+    Objects,
+    Query,
+    Scene,
+    Segmentation,
+    SplatliftError,
+    TextEncoder,
+    ViewMask,
+    open_encoder,
+)
 from liftcore.query.ask import Question, answers, located, question
-from liftcore.query.catalogue import Catalogue, catalogue, one_object_ply
-from liftcore.query.export import coloured_ply, layer_colours, npy, object_splats, viewer_splats
+from liftcore.query.export import layer_colours, npy
 from liftcore.query.objects import objects
-from liftcore.query.presence import references_of
-from liftcore.query.question import Answer, Found, Objects, OwnCamera, Query, Seen
-from liftcore.query.regions import region_mask, regions_at
-from liftcore.query.render import ViewMask, attention_png, mask_png, render, render_png, view_mask
-from liftcore.query.scene import Scene
+from liftcore.query.question import Found, OwnCamera, Seen
+from liftcore.query.regions import region_mask
+from liftcore.query.render import mask_png, view_mask
 from liftcore.query.scores import warm_up as warm_up_scores
-from liftcore.query.segment import Segmentation, best_words, map_png, picture_png, segment, word_map, words_of
+from liftcore.query.segment import words_of
 from liftcore.query.terms import Example, Region, Vector, parse_example
 from liftcore.raster.cpu.warm_up import warm_up
-from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Kernel
 from liftcore.scene.views import cameras_of_views
-from liftcore.text import OWN_WORDS, RememberingEncoder, TextEncoder, open_encoder
+from liftcore.text import OWN_WORDS, RememberingEncoder
 from service.child import fault_of, own_stdout
 from service.encoders import encoder_version
 from service.errors import NoSpace
 from service.queries.client import PIPE_BYTES, Frame, write_frame
 
 WARM_UP_TEXT = "something"
+WORD_FILES = {"word_labels": "splat_labels", "word_map": "labels", "word_picture": "picture"}  # of `blocks_of`
+SPLATS_FILES = {"object": "object", "scores": "coloured"}
 PRODUCT_BYTES = 128 << 20  # of the cosines that one pass over a lift's features may give
 COSINE_BYTES = 4  # of a splat and a direction
 ANSWER_BYTES = 6  # of a splat: its score, whether it was seen, whether it was selected
@@ -120,23 +130,11 @@ class Answers:
         self._operations: dict[str, Callable[[dict[str, Any]], Frame]] = {
             "query": self._query,
             "objects": self._objects,
-            "scores": self._scores,
-            "selection": self._selection,
-            "mask": self._mask,
-            "attention": self._attention,
-            "render": self._render,
-            "splats": self._splats,
-            "scene": self._viewer_splats,
-            "layer": self._layer,
             "views": self._views,
             "segment": self._segment,
-            "word_labels": self._word_labels,
-            "word_map": self._word_map,
-            "word_picture": self._word_picture,
             "what": self._what,
             "catalogue": self._catalogue,
             "regions": self._regions,
-            "region_mask": self._region_mask,
         }
 
     @property
@@ -167,7 +165,7 @@ class Answers:
         """
         if "query" in request and _key(request) not in self._cache:
             self._answer_together([request, *ahead])
-        return self._operations[request["operation"]](request)
+        return self._operations.get(request["operation"], self._file)(request)
 
     def _answer_together(self, requests: Sequence[dict[str, Any]]) -> None:
         """Answer the first question, and more to its lift as far as one pass goes; errors wait for their turn."""
@@ -250,36 +248,28 @@ class Answers:
         found = self._answer(request).model_dump(mode="json", include=set(Found.model_fields))
         return Frame(found | self._grouped(request).model_dump(mode="json"))
 
-    def _scores(self, request: dict[str, Any]) -> Frame:
-        return _file(npy(self._answer(request).scores), request)
-
-    def _selection(self, request: dict[str, Any]) -> Frame:
-        return _file(npy(self._answer(request).selected), request)
-
-    def _mask(self, request: dict[str, Any]) -> Frame:
-        return _file(mask_png(self._look(request).mask), request)
-
-    def _attention(self, request: dict[str, Any]) -> Frame:
-        return _file(attention_png(self._look(request)), request)
-
-    def _render(self, request: dict[str, Any]) -> Frame:
-        return _file(render_png(self._scene(request), view_of(request), request["what"]), request)
-
-    def _splats(self, request: dict[str, Any]) -> Frame:
-        scene = self._scene(request)
-        if "object" in request:
-            write_draft(one_object_ply(scene, request["object"]), Path(request["draft"]))
-            return Frame({})
-        make = {"object": object_splats, "scores": coloured_ply}[request["what"]]
-        write_draft(make(scene, self._answer(request)), Path(request["draft"]))
+    def _file(self, request: dict[str, Any]) -> Frame:
+        """A file of an answer, of named splats, of an object or of the scene."""
+        scene, operation, what = self._scene(request), request["operation"], request.get("what", "")
+        view = view_of(request) if "view" in request or "camera" in request else None
+        if operation == "layer":
+            blocks: Iterable[bytes] = [npy(layer_colours(scene, what))]
+        elif operation == "region_mask":
+            blocks = [mask_png(region_mask(scene, Region(request["view"], request["level"], request["region"])))]
+        elif operation in WORD_FILES:
+            blocks = scene.blocks_of(self._named(request), WORD_FILES[operation], view=view)
+        elif "query" in request:
+            seen = self._look(request) if operation in ("mask", "attention") else None
+            kind = SPLATS_FILES[what] if operation == "splats" else operation
+            blocks = scene.blocks_of(self._answer(request), kind, view=view, seen=seen)
+        else:  # one of its objects, its splats or a picture of it
+            blocks = scene.blocks_of(
+                request.get("object"), "" if operation == "splats" else what or "splats", view=view
+            )
+        if operation not in ("splats", "scene"):
+            return _small_file(b"".join(blocks), request)
+        write_draft(blocks, Path(request["draft"]))
         return Frame({})
-
-    def _viewer_splats(self, request: dict[str, Any]) -> Frame:
-        write_draft(viewer_splats(self._scene(request)), Path(request["draft"]))
-        return Frame({})
-
-    def _layer(self, request: dict[str, Any]) -> Frame:
-        return _file(npy(layer_colours(self._scene(request), request["what"])), request)
 
     def _views(self, request: dict[str, Any]) -> Frame:
         cameras = self._scene(request).cameras
@@ -300,9 +290,7 @@ class Answers:
     def _named(self, request: dict[str, Any]) -> Segmentation:
         def make() -> Segmentation:
             words, encoder = self._words(request)
-            scene = self._scene(request)
-            references = references_of(encoder, scene.metadata.text_space)
-            return segment(scene, words, encoder.encode(words), references=references)
+            return self._scene(request).segment(words, encoder=encoder)
 
         made = self._cache.get((_key(request), "words"), make)
         assert isinstance(made, Segmentation)
@@ -312,20 +300,9 @@ class Answers:
         told = describe_words(self._named(request))
         return _json(request, {name: told[name] for name in ("words", "splats", "none")}, "found", told["found"])
 
-    def _word_labels(self, request: dict[str, Any]) -> Frame:
-        return _file(npy(self._named(request).values), request)
-
-    def _word_map(self, request: dict[str, Any]) -> Frame:
-        found = self._named(request)
-        return _file(map_png(word_map(self._scene(request), found, view_of(request)), found), request)
-
-    def _word_picture(self, request: dict[str, Any]) -> Frame:
-        scene, view, found = self._scene(request), view_of(request), self._named(request)
-        return _file(picture_png(render(scene, view), word_map(scene, found, view), found), request)
-
     def _what(self, request: dict[str, Any]) -> Frame:
         (words, encoder), example = self._words(request), _example(request["example"], "example")
-        best = best_words(self._scene(request), example, words, encoder.encode(words), request["top"])
+        best = self._scene(request).what(example, words, top=request["top"], encoder=encoder)
         return Frame({"words": [word.model_dump(mode="json") for word in best]})
 
     def _catalogue(self, request: dict[str, Any]) -> Frame:
@@ -343,22 +320,16 @@ class Answers:
         return _json(request, told, "objects", things)
 
     def _regions(self, request: dict[str, Any]) -> Frame:
-        found = regions_at(self._scene(request), request["view"], request["x"], request["y"])
+        found = self._scene(request).regions(request["view"], request["x"], request["y"])
         return Frame({"regions": [one.model_dump(mode="json") for one in found]})
-
-    def _region_mask(self, request: dict[str, Any]) -> Frame:
-        example = Region(request["view"], request["level"], request["region"])
-        return _file(mask_png(region_mask(self._scene(request), example)), request)
 
     def _named_objects(self, request: dict[str, Any]) -> Catalogue:
         """The objects of a lift; all words of the table that the request names, if it does, name them."""
-        if request["encoder"] is None:
-            return catalogue(self._scene(request))
-        words, encoder = self._words(request)
-        return catalogue(self._scene(request), words, encoder.encode(words))
+        words, encoder = ([], None) if request["encoder"] is None else self._words(request)
+        return self._scene(request).catalogue(words, encoder=encoder)
 
 
-def _file(content: bytes, request: dict[str, Any]) -> Frame:
+def _small_file(content: bytes, request: dict[str, Any]) -> Frame:
     """An array or a picture: through the pipe, or in the draft."""
     if len(content) <= PIPE_BYTES:
         return Frame({}, content)
@@ -370,7 +341,7 @@ def _json(request: dict[str, Any], told: dict[str, Any], name: str, items: Itera
     """A JSON object with a list of many, whole: the HTTP process passes it on, through the pipe or in the draft."""
     dumps = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode
     head = dumps(request["head"] | told).removesuffix("}")
-    return _file(f"{head},{dumps(name)}:[{','.join(map(dumps, items))}]}}".encode(), request)
+    return _small_file(f"{head},{dumps(name)}:[{','.join(map(dumps, items))}]}}".encode(), request)
 
 
 def write_draft(blocks: Iterable[bytes], draft: Path) -> None:

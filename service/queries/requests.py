@@ -11,8 +11,7 @@ from typing import Annotated, Any
 
 from fastapi import Depends, Request, Response
 
-from liftcore import __version__
-from liftcore.query.question import Query, Seen
+from liftcore import Query, __version__
 from service import models
 from service.content import BINARY, Draft, kept, unchanged
 from service.encoders import encoder_file, encoder_spec, encoder_version
@@ -129,7 +128,7 @@ def query_request(operation: str, asked: models.Question, lift: LiftRecord, deps
     return request | {"query": asked.model_dump(mode="json", include=set(Query.deciding()))}
 
 
-def seen_from(asked: Seen) -> dict[str, Any]:
+def seen_from(asked: models.Seen) -> dict[str, Any]:
     """The camera of a picture: a view of the lift, or one of the client's own.
 
     Raises:

@@ -8,8 +8,7 @@ from urllib.parse import urlencode
 from fastapi import APIRouter, Depends, Request, Response
 from fastapi import Query as Parameter
 
-from liftcore.query.question import Query
-from liftcore.query.terms import Vector
+from liftcore import Query
 from service import models
 from service.encoders import encoder_label
 from service.queries.requests import Ask, find_lift, query_request, scene_request, seen_from, tagged_answer
@@ -143,7 +142,7 @@ def _answer_links(asked: models.Question, lift: LiftRecord, view: str | None, *,
 
 def shown(example: str | tuple[float, ...]) -> str:
     """An example as an answer names it."""
-    return example if isinstance(example, str) else str(Vector(example))
+    return example if isinstance(example, str) else f"a vector of {len(example)} channels"
 
 
 def _link(path: str, asked: models.Question, **more: str) -> str:

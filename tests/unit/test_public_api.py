@@ -1,5 +1,6 @@
 """``import liftcore as lc``: its list, what it loads, lifts of values in memory, and what a lift tells meanwhile."""
 
+import ast
 import json
 import logging
 import re
@@ -40,6 +41,24 @@ def test_public_names_are_few_load_and_are_in_the_documents():
     assert all(getattr(lc, name) is not None for name in lc.__all__)
     page = (Path(__file__).parents[2] / "docs" / "python.md").read_text(encoding="utf-8")
     assert not [name for name in lc.__all__ if not re.search(rf"\b{name}\b", page)]
+
+
+ASKING = ("liftcore/cli/query.py", "liftcore/cli/render.py", "liftcore/cli/segment.py", "liftcore/cli/objects.py",
+          "liftcore/cli/options.py", "service/routes/queries.py", "service/routes/words.py",
+          "service/queries/requests.py")  # fmt: skip
+
+
+@pytest.mark.parametrize("path", ASKING)
+def test_commands_and_routes_of_questions_ask_by_public_names(path):
+    tree = ast.parse((Path(__file__).parents[2] / path).read_text(encoding="utf-8"))
+    imported = {
+        (node.module or "", name.name)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom)
+        for name in node.names
+    }
+    assert not [module for module, _ in imported if module.startswith("liftcore.query")]
+    assert {name for module, name in imported if module == "liftcore"} <= {*lc.__all__, "__version__"}
 
 
 def test_import_loads_neither_torch_nor_numba():
