@@ -288,6 +288,13 @@ class Value(BaseModel):
     def __repr__(self) -> str:
         return one_line(self, *(f"{name}={value_text(value)}" for name, value in self))
 
+    def __eq__(self, other: object) -> bool:
+        """Compare what JSON has; a value a splat is not compared."""
+        return isinstance(other, Value) and type(self) is type(other) and dict(self) == dict(other)
+
+    def __hash__(self) -> int:
+        return hash(repr(self))
+
 
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None

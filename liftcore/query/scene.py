@@ -116,6 +116,10 @@ class Scene:
             self.lift.require_splats(splats)
             self.__dict__["splats"] = splats.cpu()
 
+    def __repr__(self) -> str:
+        objects = "" if self.object_views is None else f", {len(self.object_views)} objects"
+        return f"Scene({len(self.features)} splats, {self.channels} channels{objects})"
+
     def _hold(self, arrays: dict[str, Any]) -> None:
         self.features, self.evidence, self._has_feature = (arrays[n] for n in ("features", "evidence", "seen"))
         self.cluster, self.cluster_features = arrays.get("cluster"), arrays.get("cluster_features")

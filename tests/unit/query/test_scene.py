@@ -1,0 +1,60 @@
+"""A scene opened for questions: of a file, of values, and kept by a result."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+import liftcore as lc
+from liftcore.text.table import TableEncoder
+from tests.api.tiny_scene import CHANNELS
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from liftcore.query.scene import Scene
+
+AXES = TableEncoder("axes", ("x", "y", "z"), np.eye(3, CHANNELS, dtype=np.float32))
+
+
+def test_file_and_values_give_the_same_answer(tiny_lift: Path, scene: Scene) -> None:
+    result = lc.load_lift(tiny_lift)
+    expected = scene.ask("x", encoder=AXES)
+    for opened in (lc.Scene(result), lc.Scene(str(tiny_lift), scene.splat_file), lc.Scene(result, scene.splats)):
+        answer = opened.ask(lc.Query(text=["x"]), encoder=AXES)
+        assert answer == expected and np.array_equal(answer.selected, expected.selected)
+        assert answer.box is not None and len(answer.top) == 10
+    assert scene.ask("x", encoder=AXES, places=False).top == ()
+
+
+def test_result_keeps_its_scene_while_its_splats_are_the_same(tiny_lift: Path, scene: Scene) -> None:
+    result = lc.load_lift(tiny_lift)
+    opened = result.scene(scene.splats)
+    assert result.scene(scene.splats) is opened and result.scene() is not opened
+    assert lc.LiftResult.of(result).settings == result.settings  # which copies values, and no scene
+
+
+def test_files_are_those_of_the_answer_and_no_others(scene: Scene, tmp_path: Path) -> None:
+    answer = scene.ask("x", encoder=AXES)
+    scene.export(tmp_path / "scores.npy", answer, "scores")
+    assert np.array_equal(np.load(tmp_path / "scores.npy"), answer.scores)
+    scene.export(tmp_path / "x.ply", "x", encoder=AXES)
+    assert lc.read_splats(tmp_path / "x.ply").count == answer.count - scene.objects(answer).strays
+    scene.export(tmp_path / "mask.png", lc.Query(text=["x"], view="middle"), "mask", encoder=AXES)
+    assert (tmp_path / "mask.png").read_bytes() == b"".join(scene.blocks_of(answer, "mask", view="middle"))
+    for what, told in (("mesh", "what: expected one of object, coloured"), ("mask", "view: expected")):
+        with pytest.raises(lc.InvalidQuery, match=told):
+            scene.export(tmp_path / "none.png", answer, what)
+    assert not (tmp_path / "none.png").exists()
+
+
+def test_view_of_a_question_is_a_name_or_a_camera(scene: Scene) -> None:
+    by_name = scene.look(lc.Query(text=["x"], view="middle"), encoder=AXES)
+    camera = scene.cameras["middle"]
+    for query, view in ((lc.Query.of("x", camera=camera), None), ("x", camera), ("x", "middle")):
+        assert np.array_equal(scene.mask(query, view, encoder=AXES), by_name.mask)
+    assert np.array_equal(scene.attention("x", "middle", encoder=AXES), by_name.attention)
+    assert scene.render("middle").shape == (*by_name.mask.shape, 3)
+    assert (scene.render("middle", "depth") > 0).any()
