@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from liftcore.errors import InvalidInput
 from liftcore.io.safetensors_file import map_tensors, write_tensors
 from liftcore.io.shards import ROWS, features_file
 from liftcore.lifting.geometry import Question, question_of
@@ -144,7 +145,11 @@ def weigh(job: Job, piece: int, threads: int | None) -> None:
         numbers = [number for number in job.views_of(piece) if not job.view_file(number).exists()]
         if numbers:
             _weigh_views(job, numbers, threads)
-        _write_weights(job, piece)
+        try:
+            _write_weights(job, piece)
+        except InvalidInput:
+            if not job.weights_file(piece).exists():  # else another worker, with the same piece, was done before
+                raise
     for number in job.views_of(piece):
         _entries_file(job, number).unlink(missing_ok=True)
 
