@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from pydantic import BaseModel
+
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = ("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md")
 GUIDE, SETTINGS, PYTHON, SERVICE, METHOD, RESULTS = (
@@ -36,6 +38,15 @@ def shell_commands(name: str) -> list[str]:
     # Not the first of `run splatlift splatlift keys`, which names a service of the compose file.
     found = [re.search(r"(?:^|[ (])(?:\.venv/bin/)?splatlift (?!splatlift )([^#()]+)", line) for line in lines]
     return [match[1].strip() for match in found if match]
+
+
+def field_table(model: type[BaseModel]) -> str:
+    """The rows of a table of a model's fields, as a document has them: name, default, meaning."""
+    rows = (
+        f"| `{name}` | {'none' if field.default in (None, []) else f'`{field.default}`'} | {field.description} |"
+        for name, field in model.model_fields.items()
+    )
+    return "\n".join(rows) + "\n"
 
 
 def table_heads(name: str) -> list[str]:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from liftcore import Query
 from liftcore.cli import COMMANDS, build_parser
 from liftcore.values.settings import LiftSettings, Preset
 from service.__main__ import options
@@ -23,10 +24,12 @@ from .readme import (
     FOR_USERS,
     GUIDE,
     PAGES,
+    PYTHON,
     ROOT,
     SERVICE,
     SETTINGS,
     blocks,
+    field_table,
     inline_code,
     shell_commands,
     table_heads,
@@ -136,6 +139,10 @@ def test_every_setting_of_a_lift_is_told_with_its_default() -> None:
     for name, default in LiftSettings.of().model_dump(mode="json").items():
         shown = rows[name].split(" (")[0].strip("`")
         assert shown in (str(default), json.dumps(default)) or float(shown) == default, name
+
+
+def test_every_field_of_a_question_is_in_the_table() -> None:
+    assert field_table(Query) in text(PYTHON), f"the table of docs/python.md should be:\n{field_table(Query)}"
 
 
 def test_every_preset_is_told() -> None:
