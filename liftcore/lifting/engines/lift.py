@@ -124,6 +124,15 @@ def _folder(folder: Path | None, *, kept: bool) -> Iterator[Path]:
         yield Path(own).resolve()
 
 
+def _lack_of_disk(folder: Path, plan: Plan) -> list[str]:
+    """What to say where the folder has no room for W by views, W by splats and X: nothing, or a warning."""
+    size, free = 2 * plan.weight_bytes + plan.memory["features"], shutil.disk_usage(folder).free
+    if free >= size:
+        return []
+    there = f"blocks of about {size / 2**30:.1f} GiB go to {folder}, and there is {free / 2**30:.1f} GiB of disk"
+    return [f"{there}: give a checkpoint folder with more room"]
+
+
 @contextmanager
 def _in_words(folder: Path) -> Iterator[None]:
     """Say what to do about a folder of pieces that is full, or that workers do not see."""
@@ -213,7 +222,8 @@ class InBlocks(Steps[Job]):
         return plan_lift(self.inputs.splats, views, self.inputs.settings, device, self.threads, apart=True, look=look)
 
     def weigh(self, views: LiftViews, plan: Plan, on_plan: Callable[[Plan], None]) -> tuple[Job, WeighedViews]:
-        on_plan(plan_of_a_worker(plan))
+        own = plan_of_a_worker(plan)
+        on_plan(replace(own, warnings=(*own.warnings, *_lack_of_disk(self.folder, plan))))
         with self.timings.step("share"):
             job = self._share(views, plan)
         for done, _ in enumerate(self.engine.run(weigh, job, job.weighings), start=1):

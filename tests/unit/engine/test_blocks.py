@@ -6,6 +6,7 @@ import errno
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from liftcore.lifting.engines import blocks
 from liftcore.lifting.engines.base import LocalEngine
 from liftcore.lifting.engines.lift import steps_in_blocks
 from liftcore.lifting.inputs import LiftInputs
+from liftcore.lifting.planning.plan import Plan
 from liftcore.runtime.progress import Timings
 from liftcore.values.lift_file import ALL
 from liftcore.values.pack import write_pack
@@ -170,6 +172,17 @@ def test_folder_that_is_full_or_that_workers_do_not_see_is_named(scene: dict[str
     for engine, message in ((Full(1), "room for blocks in .*No space left"), (Elsewhere(1), "under one path.*scene")):
         with pytest.raises(lc.Unavailable, match=message):
             in_blocks(engine, scene, LiftSettings.of(preset="row-sum"), folder=tmp_path)
+
+
+def test_folder_without_room_for_the_blocks_is_told_before_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    cameras = {name: look_at(name, np.array([0, 0, -4.0]), 32, 24, 30.0) for name in ("v0", "v1", "v2")}
+    plans = list[Plan]()
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1))
+    found = lc.lift(
+        random_splats(3, 300), cameras, few_views(1), "row-sum", engine=LocalEngine(1), on_plan=plans.append
+    )
+    assert any("GiB of disk: give a checkpoint folder" in warning for warning in plans[0].warnings)
+    assert not any("of disk" in warning for warning in found.diagnostics["warnings"])  # of this machine, today
 
 
 def test_plan_in_blocks_is_of_a_worker_and_asks_this_machine_for_no_room(
