@@ -11,12 +11,27 @@ import torch
 from hypothesis import strategies as st
 
 from liftcore.errors import InvalidInput, InvalidSettings
-from liftcore.raster.base import RayRows, ViewRequest
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.raster.reference import ReferenceRaster, counted_weights, dense_view, reading_matrix, strided_rays
+from liftcore.raster.reference import ReferenceRaster, counted_weights, dense_view, reading_matrix
 from liftcore.scene.compositing import CompositingParams, Selection, Weighting
 from liftcore.scene.splats import Kernel, Splats
-from liftcore.values.region_weights import RegionWeights
+from liftcore.testing.raster import (
+    INSIDE,
+    check_adjoint,
+    check_counted_weights,
+    check_footprints,
+    check_inner_product,
+    check_iterated_views,
+    check_ray_rows,
+    check_region_weights,
+    check_render,
+    check_strongest_labels,
+    dense,
+    one_region_a_ray,
+    pixels_of,
+    random_image,
+    same_bits,
+)
 from liftcore.values.views import Regions, ViewFeatures
 from tests.backends import Backend, every_backend
 from tests.scenes import look_at, random_camera, random_grid, random_regions, random_splats, scenes
@@ -24,8 +39,6 @@ from tests.scenes import look_at, random_camera, random_grid, random_regions, ra
 if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera
 
-INSIDE = 1e-5  # absolute, on weights
-FLIPS = 1e-2  # of rays: on tiny random images one ray in a hundred; the pooled test below holds 1e-4
 UNDECIDED = 0.03  # of rays too close to call in a weighting, which no comparison sees
 GAIN = CompositingParams(opacity_logit_scale=1.2)
 WALKS = (
@@ -74,45 +87,13 @@ def seeded(footprint: str, seed: int, count: int) -> tuple[Splats, CompositingPa
     return random_splats(seed, count, kernel=kernel), CompositingParams(antialiased=antialiased)
 
 
-def dense(weights: RegionWeights, splats: int, rows: int) -> np.ndarray:
-    """W as a dense [P, M] matrix."""
-    W = np.zeros((splats, rows))
-    lengths = np.diff(weights.indptr.numpy())
-    W[np.repeat(weights.splats.numpy(), lengths), weights.region.numpy()] = weights.weight.numpy()
-    return W
-
-
-def one_a_ray(camera: Camera) -> Regions:
-    """A region a pixel, so that W^T is A' itself."""
-    rays = camera.width * camera.height
-    labels = torch.arange(rays, dtype=torch.int32).reshape(1, camera.height, camera.width)
-    return Regions(labels, torch.ones(rays, 1))
-
-
-def random_image(camera: Camera, channels: int) -> torch.Tensor:
-    values = np.random.default_rng(1).normal(0, 1, (camera.height, camera.width, channels))
-    return torch.tensor(values, dtype=torch.float32)
-
-
-def every_pixel_of(camera: Camera) -> torch.Tensor:
-    """[H * W, 2] i32 (x, y)."""
-    y, x = np.mgrid[: camera.height, : camera.width]
-    return torch.tensor(np.stack([x.ravel(), y.ravel()], axis=1), dtype=torch.int32)
-
-
 @every_footprint
 @every_backend
 def test_renders_equal_the_oracle(footprint, backend):
     @backend.holds(st.data())
     def check(data) -> None:
         splats, camera, _, walk = drawn(data, footprint, backend)
-        values = torch.tensor(np.random.default_rng(0).uniform(0, 1, (splats.count, 3)), dtype=torch.float32)
-        view = dense_view(splats, camera, walk)
-        expected = (view.A @ values.double().numpy()).reshape(camera.height, camera.width, 3)
-        image = backend.open(splats).render(camera, values, walk).numpy()
-        inside = ~view.cut.reshape(camera.height, camera.width)
-        assert np.abs(image - expected)[inside].max(initial=0) < INSIDE
-        assert (np.abs(image - expected).max(axis=2) > INSIDE).mean() <= max(FLIPS, 1 / inside.size)
+        check_render(backend.open(splats), splats, camera, walk)
 
 
 @every_footprint
@@ -121,11 +102,7 @@ def test_splats_that_a_ray_meets_have_a_footprint(footprint, backend):
     @backend.holds(st.data())
     def check(data) -> None:
         splats, camera, _, walk = drawn(data, footprint, backend)
-        areas = backend.open(splats).footprints(camera, walk).numpy()
-        view = dense_view(splats, camera, walk)
-        met = (view.A[~view.cut] > 0).any(axis=0)
-        assert (areas[met] > 0).all()
-        assert areas.dtype == np.float32 and areas.max(initial=0) <= camera.width * camera.height
+        check_footprints(backend.open(splats), splats, camera, walk)
 
 
 @every_backend
@@ -146,23 +123,7 @@ def test_region_weights_and_evidence_equal_the_oracle(footprint, backend):
     @backend.holds(st.data(), st.sampled_from(POWERS))
     def check(data, weighting) -> None:
         splats, camera, observation, walk = drawn(data, footprint, backend, strided=True)
-        walked = strided_rays(camera, walk)
-        weights = backend.open(splats).region_weights(camera, observation, walk, weighting)
-        plain = dense_view(splats, camera, replace(walk, opacity_logit_scale=1.0))
-        if plain.cut.any():
-            return  # the pooled test counts the flips
-        evidence = np.zeros(splats.count)
-        evidence[weights.evidence_splats.numpy()] = weights.evidence.numpy()
-        expected = plain.A[walked].sum(axis=0)  # whatever the gain and the power
-        assert np.abs(evidence - expected).max() < INSIDE * max(1.0, expected.max())
-        view = dense_view(splats, camera, walk)
-        if view.cut.any():
-            return
-        S, ray = reading_matrix(observation, camera.width, camera.height)
-        chosen = counted_weights(view.A, splats, camera, walk, weighting)[0]
-        expected = chosen[ray[walked[ray]]].T @ S[walked[ray]]
-        W = dense(weights, splats.count, observation.codebook.shape[0])
-        assert np.abs(W - expected).max(initial=0) < INSIDE * max(1.0, expected.max(initial=0))
+        check_region_weights(backend.open(splats), splats, camera, observation, walk, weighting)
 
 
 @every_footprint
@@ -171,13 +132,7 @@ def test_weights_that_count_equal_the_oracle_ray_by_ray(footprint, backend):
     @backend.holds(st.data(), st.sampled_from(SELECTIONS))
     def check(data, weighting) -> None:
         splats, camera, _, walk = drawn(data, footprint, backend, strided=True)
-        view = dense_view(splats, camera, walk)
-        chosen, close = counted_weights(view.A, splats, camera, walk, weighting)
-        found = backend.open(splats).region_weights(camera, one_a_ray(camera), walk, weighting)
-        W = dense(found, splats.count, camera.width * camera.height)
-        walked = strided_rays(camera, walk)
-        assert W[:, ~walked].max(initial=0) == 0
-        assert np.abs(W.T - chosen)[walked & ~view.cut & ~close].max(initial=0) < INSIDE
+        check_counted_weights(backend.open(splats), splats, camera, walk, weighting)
 
 
 @every_backend
@@ -191,7 +146,7 @@ def test_every_weighting_equals_the_oracle_and_few_rays_are_too_close_to_call(ba
         undecided = []
         for splats, camera, raster, view in views:
             chosen, close = counted_weights(view.A, splats, camera, CompositingParams(), weighting)
-            found = raster.region_weights(camera, one_a_ray(camera), CompositingParams(), weighting)
+            found = raster.region_weights(camera, one_region_a_ray(camera), CompositingParams(), weighting)
             W = dense(found, splats.count, width * height)
             assert np.abs(W.T - chosen)[~view.cut & ~close].max() < INSIDE, weighting
             undecided.append(close & ~view.cut)
@@ -204,7 +159,7 @@ def test_of_equal_weights_the_nearest_counts():
     means, scales = torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.0, 2.0]]), torch.ones(2, 3)  # the second is the nearer
 
     def on_the_axis(splats: Splats, weighting: Weighting) -> list[float]:
-        found = CpuRaster(splats).region_weights(camera, one_a_ray(camera), CompositingParams(), weighting)
+        found = CpuRaster(splats).region_weights(camera, one_region_a_ray(camera), CompositingParams(), weighting)
         return dense(found, 2, 81)[:, 4 * 9 + 4].tolist()
 
     ties = 0
@@ -227,7 +182,7 @@ def test_a_region_a_pixel_and_grids_of_any_fineness_are_weighed_as_the_oracle_we
     width, height = (18, 4) if backend.name == "gpu" and cells else (20, 18)
     camera, splats = random_camera(3, width, height), random_splats(3, 60)
     if cells is None:
-        labels = one_a_ray(camera).labels
+        labels = one_region_a_ray(camera).labels
         observation = Regions(torch.cat([labels, labels // 200]), torch.ones(width * height, 1))
     else:
         down, across = (max(1, int(n * side)) for n, side in zip(cells, (height, width), strict=True))
@@ -262,12 +217,7 @@ def test_ray_rows_are_rows_of_a(footprint, backend):
     @backend.holds(st.data())
     def check(data) -> None:
         splats, camera, _, walk = drawn(data, footprint, backend)
-        view = dense_view(splats, camera, walk)
-        some = np.arange(view.A.shape[0])[:: -(-view.A.shape[0] // backend.rays)]
-        rows = backend.open(splats).ray_rows(camera, every_pixel_of(camera)[some], walk)
-        A = np.zeros((len(some), splats.count))
-        A[np.repeat(np.arange(len(some)), np.diff(rows.indptr.numpy())), rows.splats.numpy()] = rows.weights.numpy()
-        assert np.abs(A - view.A[some])[~view.cut[some]].max(initial=0) < INSIDE
+        check_ray_rows(backend.open(splats), splats, camera, walk, backend.rays)
 
 
 @every_backend
@@ -275,13 +225,7 @@ def test_adjoints_equal_the_oracle(backend):
     @backend.holds(scenes(most=backend.splats, largest=backend.size), st.sampled_from(WALKS), CHANNELS)
     def check(scene, walk, channels) -> None:
         splats, camera, _ = scene
-        view = dense_view(splats, camera, walk)
-        Y = random_image(camera, channels)
-        Y[torch.from_numpy(view.cut.reshape(camera.height, camera.width))] = 0  # the render's test counts the flips
-        expected = view.A.T @ Y.double().numpy().reshape(-1, channels)
-        got = backend.open(splats).adjoint(camera, Y, walk).numpy()
-        assert got.shape == (splats.count, channels)
-        assert np.abs(got - expected).max(initial=0) < INSIDE * max(1.0, view.A.sum(axis=0).max(initial=0))
+        check_adjoint(backend.open(splats), splats, camera, walk, channels)
 
 
 @every_backend
@@ -289,29 +233,15 @@ def test_a_render_and_its_adjoint_agree_on_every_inner_product(backend):
     @backend.holds(scenes(most=backend.splats, largest=backend.size), st.sampled_from(WALKS))
     def check(scene, walk) -> None:
         splats, camera, _ = scene
-        raster = backend.open(splats)
-        X = torch.tensor(np.random.default_rng(2).normal(0, 1, (splats.count, 4)), dtype=torch.float32)
-        Y = random_image(camera, 4)
-        image, sums = raster.render(camera, X, walk), raster.adjoint(camera, Y, walk)
-        left, right = float((image.double() * Y).sum()), float((X * sums.double()).sum())
-        scale = float((raster.render(camera, X.abs(), walk).double() * Y.abs()).sum())  # no cancellation in it
-        assert abs(left - right) <= 1e-6 * scale + 1e-12
+        check_inner_product(backend.open(splats), splats, camera, walk)
 
 
 @every_backend
 def test_strongest_labels_are_those_of_the_one_hot_render(backend):
     for seed in range(min(6, backend.seeds)):
         splats, camera = random_splats(seed, 80), random_camera(seed, *backend.size)
-        labels = torch.tensor(np.random.default_rng(seed).integers(-1, 60, 80), dtype=torch.int32)
-        view = dense_view(splats, camera, GAIN)
-        sums = view.A @ np.eye(61)[labels.numpy() + 1]
-        ranked = np.sort(sums, axis=1)
-        clear = (ranked[:, -1] - ranked[:, -2] > 1e-4) & ~view.cut
         for raster in (backend.open(splats), ReferenceRaster(splats)):
-            shown = raster.strongest_labels(camera, labels, GAIN).numpy().ravel()
-            assert np.array_equal(shown[clear], (sums.argmax(axis=1) - 1)[clear])
-            assert (shown[view.A.sum(axis=1) == 0] == -1).all()
-        assert clear.mean() > 0.3
+            assert check_strongest_labels(raster, splats, camera, GAIN) > 0.3
 
 
 @pytest.mark.parametrize(("cap", "stop"), [(0.9, 0.1), (0.95, 0.0025), (0.999, 1e-6), (0.99, 1e-6), (0.99, 1e-4)])
@@ -325,41 +255,16 @@ def test_rays_end_at_the_same_splat_in_every_product(cap, stop):
     camera = random_camera(0, 5, 5).replace(cx=2.5, cy=2.5, fx=5.0, fy=5.0, viewmat=np.eye(4))
     raster, walk = CpuRaster(splats), CompositingParams(alpha_cap=cap, transmittance_stop=stop)
     image = raster.render(camera, torch.ones(6, 1), walk)[..., 0]
-    rows = raster.ray_rows(camera, every_pixel_of(camera), walk)
+    rows = raster.ray_rows(camera, pixels_of(camera), walk)
     sums = [float(part.sum()) for part in rows.weights.split(rows.indptr.diff().tolist())]
     assert image.ravel().tolist() == pytest.approx(sums, rel=1e-6, abs=1e-7)
-
-
-def same_bits(one: RegionWeights | RayRows, other: RegionWeights | RayRows) -> bool:
-    """Whether all tensors of the two are equal to the bit."""
-    parts = ([part for part in vars(of).values() if isinstance(part, torch.Tensor)] for of in (one, other))
-    return all(map(torch.equal, *parts))
 
 
 @every_footprint
 @every_backend
 def test_views_walked_in_a_row_are_those_walked_alone_to_the_bit(footprint, backend):
     splats, walk = seeded(footprint, 7, 12)
-    pixels = (torch.tensor([[3, 4], [10, 11]], dtype=torch.int32), torch.empty(0, 2, dtype=torch.int32))
-    looks = [
-        ViewRequest(
-            random_camera(k, 14, 13),
-            random_regions(k),
-            replace(walk, opacity_logit_scale=1.0 + k % 2 / 5),
-            Weighting(),
-            pixels[k % 2],
-        )
-        for k in range(3)
-    ]
-    walked = list(backend.open(splats).iterate_views(iter(looks)))
-    assert len(walked) == len(looks)
-    alone = backend.open(splats)
-    for look, found in zip(looks, walked, strict=True):
-        assert same_bits(found.weights, alone.region_weights(look.camera, look.observation, look.params, Weighting()))
-        if len(look.pixels):
-            assert same_bits(found.rows, alone.ray_rows(look.camera, look.pixels, look.params))
-        else:
-            assert found.rows.indptr.tolist() == [0]
+    check_iterated_views(backend.open(splats), backend.open(splats), walk)
 
 
 @every_footprint
@@ -411,7 +316,7 @@ def test_the_oracle_is_a_backend_that_gives_the_same_products():
     assert torch.allclose(fast.row_sums(camera, GAIN), plain.row_sums(camera, GAIN), atol=INSIDE)
     image = random_image(camera, 2)
     assert torch.allclose(fast.adjoint(camera, image, GAIN), plain.adjoint(camera, image, GAIN), atol=1e-4)
-    some = every_pixel_of(camera)[::50]
+    some = pixels_of(camera)[::50]
     assert torch.equal(fast.ray_rows(camera, some, GAIN).indptr, plain.ray_rows(camera, some, GAIN).indptr)
 
 
