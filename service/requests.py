@@ -20,7 +20,7 @@ from pydantic.json_schema import JsonSchemaMode, models_json_schema
 from starlette.exceptions import HTTPException
 
 from liftcore.runtime.fields import NAME_CHARACTERS, one_of
-from service import limits, models
+from service import limits
 from service.content import TAGGED
 from service.errors import InvalidRequest, UnreadableBody
 from service.problems import CLOSE
@@ -29,6 +29,7 @@ M = TypeVar("M", bound=BaseModel)
 F = TypeVar("F", bound=Callable[..., Any])
 SCHEMAS = "#/components/schemas/"
 BODY = "in the body of the request"
+_BODIES: dict[str, type[BaseModel]] = {}  # by their names, which the documents refer to
 LET_GO = 16  # times the limit of a body: an upload sent to the wrong route ends there
 
 
@@ -200,6 +201,7 @@ def _is_json(media: str | None) -> bool:
 
 def described_body(model: type[BaseModel]) -> dict[str, Any]:
     """What OpenAPI tells of a route with a `json_body`."""
+    _BODIES[model.__name__] = model
     schema = {"$ref": f"{SCHEMAS}{model.__name__}"}
     return {"requestBody": {"required": True, "content": {"application/json": {"schema": schema}}}}
 
@@ -208,7 +210,6 @@ def with_bodies(document: dict[str, Any]) -> dict[str, Any]:
     """An OpenAPI document with the schemas of the bodies that it refers to (`described_body`)."""
     components = document["components"]
     missing = set(re.findall(f"{SCHEMAS}(\\w+)", json.dumps(document))) - components["schemas"].keys()
-    named: list[type[BaseModel]] = [getattr(models, name) for name in sorted(missing)]
-    bodies: list[tuple[type[BaseModel], JsonSchemaMode]] = [(model, "validation") for model in named]
+    bodies: list[tuple[type[BaseModel], JsonSchemaMode]] = [(_BODIES[name], "validation") for name in sorted(missing)]
     _, found = models_json_schema(bodies, ref_template=SCHEMAS + "{model}")
     return {**document, "components": {**components, "schemas": found["$defs"] | components["schemas"]}}

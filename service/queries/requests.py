@@ -16,6 +16,7 @@ from service import models
 from service.content import BINARY, Draft, kept, unchanged
 from service.encoders import encoder_file, encoder_spec, encoder_version
 from service.errors import InvalidRequest
+from service.queries import questions
 from service.queries.client import PIPE_BYTES, Asker, Frame
 from service.requests import BodyBytes
 from service.state import AppState, Deps
@@ -119,7 +120,7 @@ def scene_request(operation: str, lift: LiftRecord, deps: AppState) -> dict[str,
     }
 
 
-def query_request(operation: str, asked: models.Question, lift: LiftRecord, deps: AppState) -> dict[str, Any]:
+def query_request(operation: str, asked: questions.Question, lift: LiftRecord, deps: AppState) -> dict[str, Any]:
     """The same with a query; texts bring their encoder, and examples of regions the lift's feature packs."""
     request: dict[str, Any] = scene_request(operation, lift, deps)
     request = with_encoder(request, asked, lift, deps) if asked.texts else {**request, **NO_ENCODER}
@@ -128,7 +129,7 @@ def query_request(operation: str, asked: models.Question, lift: LiftRecord, deps
     return request | {"query": asked.model_dump(mode="json", include=set(Query.deciding()))}
 
 
-def seen_from(asked: models.Seen) -> dict[str, Any]:
+def seen_from(asked: questions.Seen) -> dict[str, Any]:
     """The camera of a picture: a view of the lift, or one of the client's own.
 
     Raises:
@@ -157,7 +158,7 @@ def with_packs(request: dict[str, Any], lift: LiftRecord, deps: AppState, argume
 
 def with_encoder(
     request: dict[str, Any],
-    asked: models.LiftQuestion | models.AskedForSceneObjects,
+    asked: questions.LiftQuestion | questions.AskedForSceneObjects,
     lift: LiftRecord,
     deps: AppState,
 ) -> dict[str, Any]:

@@ -9,8 +9,8 @@ from fastapi import APIRouter, Depends, Request, Response
 from fastapi import Query as Parameter
 
 from liftcore import Query
-from service import models
 from service.encoders import encoder_label
+from service.queries import questions
 from service.queries.requests import Ask, find_lift, query_request, scene_request, seen_from, tagged_answer
 from service.requests import Asked, both
 from service.state import AppState, Deps
@@ -25,16 +25,16 @@ def bytes_of(media_type: str) -> dict[int | str, dict[str, Any]]:
 
 
 PNG, NPY, PLY = bytes_of("image/png"), bytes_of("application/x-npy"), bytes_of("application/octet-stream")
-TERMS = (*models.LiftQuestion.model_fields, *Query.deciding())
-ASKED, WHERE = Asked(models.Question, TERMS), Asked(models.Question, (*TERMS, "view", "top"))
-IN_VIEW = Asked(models.Question, (*TERMS, "view"), needs=("view",))
-PICTURE = Asked(models.AskedToRender, ("lift", "view", "what"), needs=("view",))
-Question = Annotated[models.Question, Depends(ASKED)]
-InView = Annotated[models.Question, Depends(IN_VIEW)]
+TERMS = (*questions.LiftQuestion.model_fields, *Query.deciding())
+ASKED, WHERE = Asked(questions.Question, TERMS), Asked(questions.Question, (*TERMS, "view", "top"))
+IN_VIEW = Asked(questions.Question, (*TERMS, "view"), needs=("view",))
+PICTURE = Asked(questions.AskedToRender, ("lift", "view", "what"), needs=("view",))
+Question = Annotated[questions.Question, Depends(ASKED)]
+InView = Annotated[questions.Question, Depends(IN_VIEW)]
 
 
-@both(router, "/query", WHERE, response_model=models.QueryAnswer)
-def query(asked: Annotated[models.Question, Depends(WHERE)], deps: Deps, ask: Ask) -> dict[str, Any]:
+@both(router, "/query", WHERE, response_model=questions.QueryAnswer)
+def query(asked: Annotated[questions.Question, Depends(WHERE)], deps: Deps, ask: Ask) -> dict[str, Any]:
     """Where it is: scores in numbers, the best splats, a box, and links to objects, splats and pictures.
 
     In a body examples may be vectors; POST the same body to the links of those.
@@ -53,7 +53,7 @@ def query(asked: Annotated[models.Question, Depends(WHERE)], deps: Deps, ask: As
     }
 
 
-@both(router, "/query/objects", ASKED, response_model=models.ObjectsAnswer)
+@both(router, "/query/objects", ASKED, response_model=questions.ObjectsAnswer)
 def objects(asked: Question, deps: Deps, ask: Ask) -> dict[str, Any]:
     """The things that were found, splats that touch one another: where each lies, and how large it is."""
     lift = find_lift(asked.lift, deps)
@@ -96,7 +96,7 @@ def splats(asked: Question, request: Request, deps: Deps, ask: Ask, what: Splats
 
 @both(router, "/render", PICTURE, responses=PNG, response_class=Response)
 def render(
-    asked: Annotated[models.AskedToRender, Depends(PICTURE)], request: Request, deps: Deps, ask: Ask
+    asked: Annotated[questions.AskedToRender, Depends(PICTURE)], request: Request, deps: Deps, ask: Ask
 ) -> Response:
     """The splats from a view, in their colours or in those of their features or clusters, or their depth: a PNG.
 
@@ -112,7 +112,7 @@ def render(
 
 def _entity(
     operation: str,
-    asked: models.Question,
+    asked: questions.Question,
     request: Request,
     deps: AppState,
     ask: Ask,
@@ -123,7 +123,7 @@ def _entity(
     return tagged_answer(request, deps, query_request(operation, asked, lift, deps) | (more or {}), lift, ask)
 
 
-def _answer_links(asked: models.Question, lift: LiftRecord, view: str | None, *, found: bool) -> dict[str, str]:
+def _answer_links(asked: questions.Question, lift: LiftRecord, view: str | None, *, found: bool) -> dict[str, str]:
     """The URLs of other looks at the same query; vectors do not fit in one, and are sent there again.
 
     Where nothing was ``found`` there are no objects.
@@ -145,13 +145,13 @@ def shown(example: str | tuple[float, ...]) -> str:
     return example if isinstance(example, str) else f"a vector of {len(example)} channels"
 
 
-def _link(path: str, asked: models.Question, **more: str) -> str:
+def _link(path: str, asked: questions.Question, **more: str) -> str:
     """A route with the fields that are not as they are without being asked for, and always the threshold."""
     if not all(isinstance(example, str) for example in (*asked.like, *asked.unlike)):
         return path
     pairs: list[tuple[str, str]] = []
     for name in (*Query.deciding(), "encoder", "table"):
         value = getattr(asked, name)
-        if name == "threshold" or value != models.Question.model_fields[name].default:
+        if name == "threshold" or value != questions.Question.model_fields[name].default:
             pairs += [(name, str(one)) for one in (value if isinstance(value, list) else [value])]
     return f"{path}{'&' if '?' in path else '?'}{urlencode(pairs + list(more.items()))}"

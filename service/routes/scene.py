@@ -13,6 +13,7 @@ from service import limits, models
 from service.content import TAGGED, Limit, kept, unchanged
 from service.encoders import encoder_label
 from service.photos import in_camera_orientation
+from service.queries import questions
 from service.queries.requests import NO_ENCODER, Ask, made, scene_request, tagged_answer, with_encoder, with_packs
 from service.routes.queries import NPY, PLY, PNG
 from service.state import AppState, Deps
@@ -93,12 +94,12 @@ def views(lift: str, deps: Deps, ask: Ask, limit: Limit = limits.PAGE, cursor: V
     return models.Views(views=told, next=cursor + limit if answer["more"] else None)
 
 
-@router.get("/regions", response_model=models.CoveringRegions)
-def regions(lift: str, view: View, x: Pixel, y: Pixel, deps: Deps, ask: Ask) -> models.CoveringRegions:
+@router.get("/regions", response_model=questions.CoveringRegions)
+def regions(lift: str, view: View, x: Pixel, y: Pixel, deps: Deps, ask: Ask) -> questions.CoveringRegions:
     """The regions of the lift's feature packs that cover a pixel of a view's photo: each is an example to ask by."""
     found = deps.store.lifts.get(deps.owner, lift)
     wanted = with_packs(scene_request("regions", found, deps), found, deps, "lift") | {"view": view, "x": x, "y": y}
-    return models.CoveringRegions(lift=found.id, view=view, **ask(wanted).header)
+    return questions.CoveringRegions(lift=found.id, view=view, **ask(wanted).header)
 
 
 @router.get("/regions/mask", responses=PNG | TAGGED, response_class=Response)
@@ -112,9 +113,9 @@ def region_mask(
     return tagged_answer(request, deps, wanted, found, ask)
 
 
-@router.get("/objects", response_model=models.SceneObjects)
+@router.get("/objects", response_model=questions.SceneObjects)
 def scene_objects(
-    lift: str, deps: Deps, ask: Ask, asked: Annotated[models.AskedForSceneObjects, Query()]
+    lift: str, deps: Deps, ask: Ask, asked: Annotated[questions.AskedForSceneObjects, Query()]
 ) -> Response:
     """The things in the scene, found by masks alone when it was lifted; a vocabulary names them."""
     found = deps.store.lifts.get(deps.owner, lift)

@@ -6,8 +6,8 @@ from typing import Any
 
 from fastapi import APIRouter, Response
 
-from service import models
 from service.encoders import encoder_label
+from service.queries import questions
 from service.queries.requests import Ask, find_lift, made, scene_request, seen_from, with_encoder
 from service.requests import described_body, json_body
 from service.routes.queries import NPY, PNG, shown
@@ -16,12 +16,12 @@ from service.store.lifts import LiftRecord
 
 router = APIRouter(prefix="/query", tags=["queries"])
 
-SEGMENT_BODY, WHAT_BODY = json_body(models.AskedToSegment), json_body(models.AskedWhat)
-SEGMENT, WHAT = described_body(models.AskedToSegment), described_body(models.AskedWhat)
+SEGMENT_BODY, WHAT_BODY = json_body(questions.AskedToSegment), json_body(questions.AskedWhat)
+SEGMENT, WHAT = described_body(questions.AskedToSegment), described_body(questions.AskedWhat)
 
 
-@router.post("/segment", response_model=models.SegmentAnswer, openapi_extra=SEGMENT)
-def segment(deps: Deps, ask: Ask, asked: models.AskedToSegment = SEGMENT_BODY) -> Response:
+@router.post("/segment", response_model=questions.SegmentAnswer, openapi_extra=SEGMENT)
+def segment(deps: Deps, ask: Ask, asked: questions.AskedToSegment = SEGMENT_BODY) -> Response:
     """Which of many words are there, and where: to every splat the word that it is most like, or none."""
     lift = find_lift(asked.lift, deps)
     wanted = _wanted("segment", asked, lift, deps)
@@ -30,37 +30,37 @@ def segment(deps: Deps, ask: Ask, asked: models.AskedToSegment = SEGMENT_BODY) -
 
 
 @router.post("/segment/labels", responses=NPY, response_class=Response, openapi_extra=SEGMENT)
-def labels(deps: Deps, ask: Ask, asked: models.AskedToSegment = SEGMENT_BODY) -> Response:
+def labels(deps: Deps, ask: Ask, asked: questions.AskedToSegment = SEGMENT_BODY) -> Response:
     """The value of every splat's word, 0 for none: .npy, int32 [P]."""
     lift = find_lift(asked.lift, deps)
     return made(deps, _wanted("word_labels", asked, lift, deps), lift, ask, {})
 
 
 @router.post("/segment/map", responses=PNG, response_class=Response, openapi_extra=SEGMENT)
-def word_map(deps: Deps, ask: Ask, asked: models.AskedToSegment = SEGMENT_BODY) -> Response:
+def word_map(deps: Deps, ask: Ask, asked: questions.AskedToSegment = SEGMENT_BODY) -> Response:
     """The values of a view's pixels in colours, with a palette: a PNG whose text `legend` has the words by value."""
     lift = find_lift(asked.lift, deps)
     return made(deps, _wanted("word_map", asked, lift, deps) | seen_from(asked), lift, ask, {})
 
 
 @router.post("/segment/picture", responses=PNG, response_class=Response, openapi_extra=SEGMENT)
-def picture(deps: Deps, ask: Ask, asked: models.AskedToSegment = SEGMENT_BODY) -> Response:
+def picture(deps: Deps, ask: Ask, asked: questions.AskedToSegment = SEGMENT_BODY) -> Response:
     """A view tinted with the colours of its words, beside a drawn legend: a PNG."""
     lift = find_lift(asked.lift, deps)
     return made(deps, _wanted("word_picture", asked, lift, deps) | seen_from(asked), lift, ask, {})
 
 
-@router.post("/what", response_model=models.WhatAnswer, openapi_extra=WHAT)
-def what(deps: Deps, ask: Ask, asked: models.AskedWhat = WHAT_BODY) -> models.WhatAnswer:
+@router.post("/what", response_model=questions.WhatAnswer, openapi_extra=WHAT)
+def what(deps: Deps, ask: Ask, asked: questions.AskedWhat = WHAT_BODY) -> questions.WhatAnswer:
     """What is this? The words that a pixel, a splat, a region or a vector is most like."""
     lift = find_lift(asked.lift, deps)
     wanted = _wanted("what", asked, lift, deps) | {"example": asked.example, "top": asked.top}
-    return models.WhatAnswer(
+    return questions.WhatAnswer(
         lift=lift.id, encoder=encoder_label(wanted["encoder"]), example=shown(asked.example), **ask(wanted).header
     )
 
 
-def _wanted(operation: str, asked: models.Words, lift: LiftRecord, deps: AppState) -> dict[str, Any]:
+def _wanted(operation: str, asked: questions.Words, lift: LiftRecord, deps: AppState) -> dict[str, Any]:
     request = with_encoder(scene_request(operation, lift, deps), asked, lift, deps)
     packs = [deps.store.assets.get(deps.owner, asset) for asset in lift.features]
     names = request["names"] | {str(pack.path): f"features {pack.id}" for pack in packs}

@@ -31,9 +31,10 @@ from service.errand import ErrandLimits
 from service.errors import Busy, NoSpace
 from service.jobs.supervisor import Supervisor
 from service.limits import BODY_BRACKETS, BODY_COMMAS, PACKS, SETTINGS
-from service.models import AskedInBody, AssetKind
+from service.models import AssetKind
 from service.observe import SAME_A_MINUTE, JsonLines, Sparing, TextLines, working_for
 from service.queries.client import Frame
+from service.queries.questions import Question
 from service.state import Stopping
 from service.store.assets import SHOWN_CHARACTERS
 from service.store.database import Database
@@ -459,7 +460,7 @@ def test_settings_are_bounded_before_they_are_looked_at(client: TestClient, uplo
 )
 def test_body_is_refused_for_the_first_thing_that_is_wrong_and_not_for_all(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValidationError) as told:
-        AskedInBody.model_validate({"text": ["apple"], **wrong})
+        Question.model_validate({"text": ["apple"], **wrong})
     assert told.value.error_count() == 1
 
 

@@ -23,10 +23,9 @@ from liftcore.query.objects import objects
 from liftcore.query.presence import NOT_IN_WORDS
 from liftcore.query.question import Answer, Query, Threshold
 from liftcore.query.terms import Vector
-from service import models
 from service.auth import EVERYBODY
 from service.errors import Busy, ClientLeft, TimedOut, TooMany
-from service.queries import answers, client
+from service.queries import answers, client, questions
 from service.queries.answers import Answers, Kept, bytes_of, reply_to
 from service.queries.client import Asker, Frame, QueryClient, QueryLimits
 from service.routes.queries import query_request
@@ -258,7 +257,7 @@ def request_of(client: TestClient, lift: dict[str, Any]) -> Callable[..., dict[s
     record = here.store.lifts.get(here.owner, lift["id"])
 
     def make(operation: str = "scores", **asked: Any) -> dict[str, Any]:
-        body = models.Question.model_validate({"lift": lift["id"], **asked})
+        body = questions.Question.model_validate({"lift": lift["id"], **asked})
         return query_request(operation, body, record, here) | {"view": "left", "top": 3}
 
     return make

@@ -35,6 +35,7 @@ from liftcore.io.splats import read_splats, write_splats
 from liftcore.text.table import TableEncoder
 from liftcore.values.pack import read_features, write_pack
 from service import models
+from service.queries import questions
 from service.routes import assets, jobs, operations, queries, results, scene, words
 from service.scopes import OPEN
 from tests.api.tiny_scene import HEIGHT, WIDTH, WORDS, cameras_document, codebook, colmap_zip, labels, make_scene
@@ -46,8 +47,8 @@ ROUTES: tuple[ModuleType, ...] = (operations, assets, jobs, results, scene, quer
 SHAPES: dict[str, type[BaseModel]] = {  # a field that no other answer has -> the answer
     "counts": models.Asset,
     "attempt": models.Job,
-    "statistics": models.QueryAnswer,
-    "strays": models.ObjectsAnswer,
+    "statistics": questions.QueryAnswer,
+    "strays": questions.ObjectsAnswer,
     "detail": models.Problem,
 }
 
