@@ -3,14 +3,17 @@
 Torch is imported only where tensors are written, so that processes without it can look at files.
 """
 
+import ctypes
 import json
 import math
 import mmap
+import os
 import struct
+import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -40,6 +43,8 @@ TYPES = {
     "torch.bool": "BOOL",
 }
 COPIED_BYTES = 1 << 20
+NO_RESERVE = 0x4000 if sys.platform == "linux" else 0  # flags of mmap, which Python does not name
+FIXED = 0x10
 MAX_HEADER_BYTES = 32 * 1024 * 1024
 _START = 9  # bytes: the header's length, and the brace that it begins with
 
@@ -158,8 +163,39 @@ def map_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     with path.open("rb") as file:
         start = 8 + int.from_bytes(file.read(8), "little")
         header = json.loads(file.read(start - 8))
-        mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+        mapped = map_file(file)
     return {name: _array(mapped, start, told) for name, told in header.items() if name != "__metadata__"}, metadata
+
+
+def map_file(file: IO[bytes]) -> mmap.mmap:
+    """Map a whole file privately. It is not kept open, as Python's own maps keep theirs: there may be thousands."""
+    if sys.platform == "win32":
+        return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+    size = os.fstat(file.fileno()).st_size
+    place, address = pages(size)
+    map_over(address, file, 0, size)
+    return place
+
+
+def pages(size: int) -> tuple[mmap.mmap, int]:
+    """Addresses for so many bytes, for `map_over` to fill, and the first of them."""
+    place = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | NO_RESERVE)
+    return place, ctypes.addressof(ctypes.c_char.from_buffer(place))
+
+
+def map_over(address: int, file: IO[bytes], begin: int, size: int) -> None:
+    """Map bytes of a file, from a page on, over addresses of `pages`; what is written there stays in memory.
+
+    Raises:
+        OSError: they cannot be mapped.
+    """
+    system = ctypes.CDLL(None, use_errno=True)
+    system.mmap.restype = ctypes.c_void_p
+    system.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_long]
+    flags = mmap.MAP_PRIVATE | FIXED | NO_RESERVE
+    if system.mmap(address, size, mmap.PROT_READ | mmap.PROT_WRITE, flags, file.fileno(), begin) != address:
+        code = ctypes.get_errno()
+        raise OSError(code, os.strerror(code), file.name)
 
 
 def _array(mapped: mmap.mmap, start: int, told: dict) -> np.ndarray:

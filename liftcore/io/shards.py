@@ -8,11 +8,8 @@ array [P, F], as of one file, and nothing is gathered in memory.
 
 from __future__ import annotations
 
-import ctypes
 import json
-import mmap
 import os
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -20,7 +17,15 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from liftcore.io.files import open_regular, whole_file
-from liftcore.io.safetensors_file import DTYPES, map_tensors, safetensors_header, tensor_bytes, write_tensors
+from liftcore.io.safetensors_file import (
+    DTYPES,
+    map_over,
+    map_tensors,
+    pages,
+    safetensors_header,
+    tensor_bytes,
+    write_tensors,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -31,8 +36,6 @@ COLUMNS = "columns.safetensors"
 MAX_INDEX_BYTES = 64 << 20
 ROWS = 1 << 17  # splats of a shard: with 512 channels of float16, 128 MiB
 PAGE = 1 << 16  # bytes: the largest page of the machines that run this
-NO_RESERVE = 0x4000 if sys.platform == "linux" else 0  # flags of mmap, which Python does not name
-FIXED = 0x10
 
 
 class Shard(NamedTuple):
@@ -149,18 +152,10 @@ def map_rows(shards: Sequence[Shard]) -> np.ndarray:
         raise ValueError("shards of different channels or types")
     if any(size % PAGE for size in sizes[:-1]):
         raise ValueError("a shard that ends within a page, before the last")
-    place = mmap.mmap(-1, sum(sizes), flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | NO_RESERVE)
-    address = ctypes.addressof(ctypes.c_char.from_buffer(place))
-    system = ctypes.CDLL(None, use_errno=True)
-    system.mmap.restype = ctypes.c_void_p
-    system.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_long]
+    place, address = pages(sum(sizes))
     for shard, size in zip(shards, sizes, strict=True):
         with shard.path.open("rb") as handle:
-            flags = mmap.MAP_PRIVATE | FIXED | NO_RESERVE
-            got = system.mmap(address, size, mmap.PROT_READ | mmap.PROT_WRITE, flags, handle.fileno(), shard.begin)
-        if got != address:
-            code = ctypes.get_errno()
-            raise OSError(code, os.strerror(code), str(shard.path))
+            map_over(address, handle, shard.begin, size)
         address += size
     rows = sum(shard.shape[0] for shard in shards)
     return np.frombuffer(place, first.dtype).reshape(rows, first.shape[1])

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -65,6 +68,17 @@ def test_a_saved_file_is_mapped_as_it_was(tmp_path):
     for path in (tmp_path / "w.safetensors", tmp_path / "none.safetensors"):
         with pytest.raises(InvalidInput, match="weights"):
             RegionWeights.load(path)
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="open files are counted as Linux tells them")
+def test_mapped_files_are_not_kept_open(tmp_path):
+    views()[0].save(tmp_path / "w.safetensors")
+    before = len(os.listdir("/proc/self/fd"))
+    mapped = [RegionWeights.load(tmp_path / "w.safetensors") for _ in range(50)]  # a lift has as many as views
+    assert len(os.listdir("/proc/self/fd")) == before
+    mapped[0].weight[:] = 7.0  # stays in memory
+    assert not torch.equal(mapped[0].weight, mapped[1].weight)
+    assert_same(RegionWeights.load(tmp_path / "w.safetensors"), views()[0])
 
 
 def test_more_regions_than_four_bytes_number_are_refused():
