@@ -103,7 +103,7 @@ def agreement_facts(levels: np.ndarray, reliability: float | None, confidence: T
 
 
 def reweighted(W: RegionWeights, factors: Tensor) -> RegionWeights:
-    """W with each entry times its factor [nnz] f32."""
+    """W with each entry times its factor [nnz] f32, whose memory its weights take over."""
     return replace(W, weight=torch.mul(W.weight, factors, out=factors))
 
 

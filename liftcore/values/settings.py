@@ -292,7 +292,7 @@ class LiftSettings(BaseModel):
             raise InvalidSettings("consensus", expected=expected, got=NO_MASKS, hint="leave it at auto")
         return masks and bool(self.consensus)
 
-    def check_blocks(self, masks: bool = True) -> None:
+    def check_blocks(self, masks: bool) -> None:
         """Refuse what no engine can work on in blocks of views and splats.
 
         Args:

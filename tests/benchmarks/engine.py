@@ -132,7 +132,7 @@ def large(splats: int, channels: int, views: int, preset: str) -> Cost:
         seconds = time.perf_counter() - begun
         result.save(Path(folder, "lift"))
         entries, shown = result.diagnostics["weights_entries"], result.diagnostics["plan"]["splats_a_view"]
-        blocks = sum(path.stat().st_size for path in work.glob("weights-*"))
+        blocks = sum(path.stat().st_size for path in work.rglob("weights-*"))
     seen = float(result.seen.float().mean())
     return Cost(seconds, result.metadata.timings, held[0], before, entries, blocks, shown, seen)
 

@@ -31,7 +31,7 @@ class Engine(Protocol):
         """Do ``work(job, piece, threads)`` for all pieces below that number; give each when it is done, in any order.
 
         Raises:
-            SplatliftError: what a piece raised. Unavailable: there is nobody who can do a piece.
+            SplatliftError, OSError: what a piece raised. Unavailable: there is nobody who can do a piece.
         """
         ...
 
