@@ -13,7 +13,7 @@ import re
 import secrets
 import shutil
 import tempfile
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -154,7 +154,7 @@ def _missing(error: FileNotFoundError, folder: Path) -> str:
     return Path(error.filename).name if error.filename else str(error).replace(f"{folder}/", "")
 
 
-def _packs(given: Views, unpaired: Collection[str], folder: Path) -> list[Path]:
+def _packs(given: Views, unpaired: set[str], folder: Path) -> list[Path]:
     """Views that lie in no pack, written into some: whoever works on a view reads it there, and pairs it anew."""
     names = [name for name in given if name not in unpaired]
     packs = []
@@ -249,7 +249,7 @@ class InBlocks(Steps[Job]):
         job = replace(job, folder=_open_pieces(self.folder, _identity(job, splats)))
         if not (job.folder / SCENE).exists():
             write_scene(splats, job.folder / SCENE)
-        return job if packs else replace(job, packs=tuple(_packs(given, views.unpaired, job.folder)))
+        return job if packs else replace(job, packs=tuple(_packs(given, set(views.unpaired), job.folder)))
 
     def _gather(self, job: Job) -> None:
         """W by blocks of splats, and what places of the curve mean."""
