@@ -16,10 +16,8 @@ What is listed here is the public interface. It is loaded when it is asked for: 
 torch nor numba.
 """
 
-import re
 from functools import cache
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 from liftcore.runtime.version import __version__ as __version__
@@ -28,6 +26,9 @@ from liftcore.runtime.version import __version__ as __version__
 @cache
 def _public() -> dict[str, str]:
     """The public names, each with the module that defines it, as ``__init__.pyi`` lists them."""
+    import re  # with pathlib four milliseconds, which an import alone does without
+    from pathlib import Path
+
     stub = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
     return {name: module for module, name in re.findall(r"^from (\S+) import (\w+)", stub, re.MULTILINE)}
 
