@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import liftcore as lc
-from liftcore.evaluate.tradeoff import RunSpec, Scene, measured
+from liftcore.evaluate.tradeoff import RunSpec, SceneFiles, measured
 from liftcore.values import region_weights as weights
 from liftcore.values.settings import Preset
 from tests import paper_card
@@ -126,7 +126,7 @@ def test_weights_that_no_card_can_stack_are_stacked_here(paths: list[Path], monk
 
 
 def test_a_run_of_a_tradeoff_is_judged_off_the_card(paths: list[Path], tmp_path: Path) -> None:
-    scene, judged = Scene(paths[0], paths[1], (paths[2],)), []
+    scene, judged = SceneFiles(paths[0], paths[1], (paths[2],)), []
     for device in ("cpu", "cuda"):
         settings = FEW | {"preset": "row-sum", "device": device}
         run = RunSpec(scene, settings, ("left", "right"), ("middle",), (), 1, tmp_path, exact=True)
