@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from liftcore.scene.compositing import MAX_LOG_SCALE
+from liftcore.scene.neighbours import map_nearest
 from liftcore.scene.quaternions import rotation_matrices
 
 if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
 
-NEIGHBOURS = 16  # that each splat looks at, the nearest by their centres
 REACH = 2.0  # standard deviations to which a splat touches
-_PIECE = 1 << 12  # splats whose neighbours are looked at at once: what is made of them stays in the cache
-_TOLD_APART = 1e-12  # of the farthest coordinate
 
 
 def touching(splats: Splats, rows: np.ndarray, threads: int | None = None) -> np.ndarray:
@@ -36,28 +32,18 @@ def touching(splats: Splats, rows: np.ndarray, threads: int | None = None) -> np
     """
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import KDTree
 
     count = len(rows)
     if count < 2:
         return np.zeros(count, np.int32)
     means = splats.means.cpu().numpy()[rows].astype(np.float64)
     shapes = np.concatenate([means, _covariances(splats, rows)], axis=1)
-    # Points at one place make a leaf that no search can divide: told apart by less than float32 can, they are.
-    extent = float(np.abs(means).max()) or 1.0
-    places = means + _TOLD_APART * extent * np.random.default_rng(0).random(means.shape)
-    tree = KDTree(places)
-    # Leaf by leaf: splats that are looked at one after the other have the same neighbours.
-    order = tree.indices.astype(np.int32)
 
-    def look(first: int) -> tuple[np.ndarray, np.ndarray]:
-        own = order[first : first + _PIECE]
-        near = np.asarray(tree.query(places[own], min(NEIGHBOURS + 1, count))[1], np.int32)  # itself among them
+    def look(own: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         touch = _touch(shapes[own], shapes[near])
         return np.repeat(own, touch.sum(axis=1)), near[touch]
 
-    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
-        looks = list(pool.map(look, range(0, count, _PIECE)))
+    looks = map_nearest(means, look, threads)
     pairs = tuple(np.concatenate(parts) for parts in zip(*looks, strict=True))
     graph = csr_array((np.ones(len(pairs[0]), np.int8), pairs), shape=(count, count))
     return connected_components(graph, directed=True, connection="weak")[1]

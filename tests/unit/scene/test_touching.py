@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from liftcore.scene.neighbours import NEIGHBOURS
 from liftcore.scene.splats import Kernel, Splats
-from liftcore.scene.touching import NEIGHBOURS, REACH, touching
+from liftcore.scene.touching import REACH, touching
 from tests.scenes import random_splats
 
 FEW = NEIGHBOURS + 1  # of so many splats, each looks at all others

@@ -1,0 +1,129 @@
+"""The nearest splats of each splat, and how alike they are in place and colour: the graph of a scene."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self, TypeVar
+
+import numpy as np
+
+from liftcore.scene.harmonics import SH_C0
+
+if TYPE_CHECKING:
+    from liftcore.scene.splats import Splats
+
+NEIGHBOURS = 16  # of each splat, the nearest by their centres
+COLOUR_WIDTH = 0.1  # standard deviation of colours in 0..1, over all three channels
+LEAST_AFFINITY = 1e-6  # of pairs in the graph: weaker ones move nothing
+_PIECE = 1 << 12  # points whose neighbours are worked on at once: what is made of them stays in the cache
+_TOLD_APART = 1e-12  # of the farthest coordinate
+
+T = TypeVar("T")
+
+
+def map_nearest(
+    means: np.ndarray, work: Callable[[np.ndarray, np.ndarray], T], threads: int | None = None
+) -> list[T]:
+    """Call ``work(own, near)`` for all points in pieces, with the NEIGHBOURS nearest others of each.
+
+    Args:
+        means: [n, 3] f64, n at least one.
+        work: takes ``own`` [m] i32, the numbers of points that lie near one another, and ``near`` [m, k] i32 with
+            ``k = min(NEIGHBOURS + 1, n)``, the nearest first: each point is among its own.
+        threads: None takes the cores that this process may use. The number changes no bit.
+
+    Returns:
+        What ``work`` returned, in an order that depends on the points alone.
+    """
+    from scipy.spatial import KDTree
+
+    # Points at one place make a leaf that no search can divide: told apart by less than float32 can, they are.
+    extent = float(np.abs(means).max()) or 1.0
+    places = means + _TOLD_APART * extent * np.random.default_rng(0).random(means.shape)
+    tree = KDTree(places)
+    # Leaf by leaf: points that are worked on one after the other have the same neighbours.
+    order, most = tree.indices.astype(np.int32), min(NEIGHBOURS + 1, len(means))
+
+    def work_piece(first: int) -> T:
+        own = order[first : first + _PIECE]
+        near = np.asarray(tree.query(places[own], [*range(1, most + 1)])[1], np.int32)
+        return work(own, near)
+
+    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
+        return list(pool.map(work_piece, range(0, len(means), _PIECE)))
+
+
+@dataclass(frozen=True)
+class SplatGraph:
+    """The affinities of neighbouring splats, symmetric and without loops, in rows that are near in space.
+
+    With d_jk the distance of centres and m_j the median of d_jk over the 16 nearest k of j::
+
+        a_jk = exp(-(d_jk / m_j)^2 / 2) exp(-(|rgb_j - rgb_k| / 0.1)^2 / 2),  then the mean of a_jk and a_kj
+
+    where a_jk is zero if k is not among the nearest of j. Colours are those of degree 0, the same from everywhere, in
+    0..1; splats without colours have the first factor alone. Distances have no unit of their own.
+    """
+
+    order: np.ndarray  # [P] i32, the splat of each row
+    starts: np.ndarray  # [P + 1] i64, of the rows' entries
+    neighbours: np.ndarray  # [E] i32, rows, ascending within a row
+    affinities: np.ndarray  # [E] f32, above LEAST_AFFINITY / 2, at most 1
+    coloured: bool  # whether the splats have colours
+
+    @classmethod
+    def of(cls, splats: Splats, threads: int | None = None) -> Self:
+        """Find the neighbours of all splats.
+
+        Args:
+            threads: None takes the cores that this process may use. The number changes no bit.
+        """
+        from scipy.sparse import csr_array
+
+        means, colours = splats.means.cpu().numpy().astype(np.float64), base_colours(splats)
+
+        def weigh(own: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            near = near[:, 1:]  # the first is itself
+            distances = np.linalg.norm(means[near] - means[own][:, None], axis=2)
+            exponents = (distances / _scales(distances)[:, None]) ** 2
+            if colours is not None:
+                exponents += (((colours[near] - colours[own][:, None]) / COLOUR_WIDTH) ** 2).sum(axis=2)
+            affinities = np.exp(-0.5 * exponents).astype(np.float32)
+            affinities[affinities < LEAST_AFFINITY] = 0.0
+            return own, near, affinities
+
+        parts = map_nearest(means, weigh, threads)
+        order, near, affinities = (np.concatenate(part) for part in zip(*parts, strict=True))
+        del parts
+        count, width = near.shape
+        rank = np.empty(count, np.int32)
+        rank[order] = np.arange(count, dtype=np.int32)
+        columns = rank[near].ravel()
+        columns = columns.astype(np.int64) if columns.size > np.iinfo(np.int32).max // 2 else columns
+        starts = np.arange(count + 1, dtype=columns.dtype) * width
+        directed = csr_array((affinities.ravel() * np.float32(0.5), columns, starts), shape=(count, count))
+        del near, affinities
+        graph = csr_array(directed + directed.T)
+        graph.setdiag(0.0) if graph.diagonal().any() else None
+        graph.eliminate_zeros()
+        graph.sort_indices()
+        indices = graph.indices.astype(np.int32, copy=False)
+        return cls(order, graph.indptr.astype(np.int64), indices, graph.data, colours is not None)
+
+
+def base_colours(splats: Splats) -> np.ndarray | None:
+    """[P, 3] f32 in 0..1, the colours of degree 0; None where the splats have none."""
+    if splats.sh is None:
+        return None
+    return (0.5 + SH_C0 * splats.sh[:, 0].float()).clamp(0.0, 1.0).cpu().numpy()
+
+
+def _scales(distances: np.ndarray) -> np.ndarray:
+    """[m] f64 above zero: the median of the distances [m, k], else the largest, where points share a place."""
+    if not distances.shape[1]:
+        return np.ones(len(distances))
+    medians, largest = np.median(distances, axis=1), distances.max(axis=1)
+    return np.where(medians > 0, medians, np.where(largest > 0, largest, 1.0))
