@@ -24,6 +24,7 @@ COMMANDS = {
     "store": "mend the HTTP service's data directory",
     "check": "do splats, cameras, photos and features belong together",
     "lift": "lift features onto splats",
+    "refine": "a finished lift with smooth features",
     "plan": "what a lift would do and need",
     "query": "find words and examples in a lift",
     "segment": "name every splat of a lift by the best of many words",
@@ -71,7 +72,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def bring(options: argparse.Namespace) -> None:
-    """Put paths of this machine in the place of inputs that lie elsewhere."""
+    """Put paths of this machine in the place of inputs that lie elsewhere, whose options ``elsewhere`` names."""
+    options.elsewhere = [name for name, value in vars(options).items() if isinstance(value, Elsewhere)]
     for name, value in vars(options).items():
         if name == "output":
             continue

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.cli.options import Parser, add_settings, add_sources, add_verbose, count
-from liftcore.cli.reply import JSON, LIFT, free_output, reply, shown, writing
+from liftcore.cli.reply import free_lift, reply, shown, writing
 from liftcore.errors import InvalidInput, InvalidSettings
-from liftcore.io.remote import is_remote, place, require_storage
+from liftcore.io.remote import place
 from liftcore.lifting.engines import ENGINES, engine_named
 from liftcore.runtime.nearest import nearest
 from liftcore.runtime.progress import one_step, progress_bars
@@ -46,17 +46,12 @@ def run(options: argparse.Namespace) -> int:
     """Lift, write the lift whole or not at all, and say what came of it."""
     settings = settings_of(options)
     from liftcore.io.cameras import camera_source
-    from liftcore.io.shards import INDEX, SUFFIX
     from liftcore.lifting.files import lift_files
     from liftcore.values.lift_file import save_lift
 
     views = camera_source(options.cameras).files
     inputs = [options.splats, *views, *options.features]
-    out = options.output
-    if is_remote(out):
-        require_storage(str(out))
-    else:
-        out = free_output(out / INDEX, inputs, JSON) if out.suffix == SUFFIX else free_output(out, inputs, LIFT)
+    out = free_lift(options.output, inputs)
     engine = engine_named(options.engine, options.address, options.threads)
     checkpoint = checkpoint_in(options.checkpoint) if options.checkpoint else None
 
@@ -217,9 +212,11 @@ def _lines(document: dict[str, Any], cameras: Path, verbose: bool) -> Iterable[s
     yield from _verdict(document, cameras)
     if not verbose:
         return
+    from liftcore.solve.smooth import smoothing_line
+
     for key, value in document["certificate"].items():
         if key not in ("plan", "warnings"):  # the plan in full is what --explain prints
-            yield f"  {key}: {shown(value)}"
+            yield f"  {key}: {smoothing_line(value) if key == 'smoothing' else shown(value)}"
     yield "timings:"
     yield from (f"  {stage}: {seconds:.3f} s" for stage, seconds in document["timings"].items())
 

@@ -159,10 +159,15 @@ def add_encoder(parser: argparse.ArgumentParser) -> None:
 def add_lift(parser: argparse.ArgumentParser) -> None:
     """A lift, and where its splats and cameras are now."""
     parser.add_argument("lift", type=place, help="a lift (.safetensors)")
-    parser.add_argument("--splats", type=place, metavar="FILE", help="its splats; else where they were, or beside it")
+    add_splats(parser)
     parser.add_argument(
         "--cameras", type=place, metavar="PATH", help="its cameras, likewise; more of them may be there"
     )
+
+
+def add_splats(parser: argparse.ArgumentParser) -> None:
+    """Where the splats of a lift are now."""
+    parser.add_argument("--splats", type=place, metavar="FILE", help="its splats; else where they were, or beside it")
 
 
 def opened_lift(options: argparse.Namespace) -> Scene:

@@ -78,6 +78,22 @@ def free_output(path: Path, inputs: Sequence[Path], written: OutputType) -> Path
     return path
 
 
+def free_lift(path: Path | str, inputs: Sequence[Path]) -> Path | str:
+    """The file that a lift's output begins with: itself, the index of a folder of shards, or a place elsewhere.
+
+    Raises:
+        InvalidInput: it is no `free_output`, or lies where nothing can be sent to.
+    """
+    from liftcore.io.remote import is_remote, require_storage
+    from liftcore.io.shards import INDEX, SUFFIX
+
+    if is_remote(path):
+        require_storage(str(path))
+        return path
+    file = Path(path)
+    return free_output(file / INDEX, inputs, JSON) if file.suffix == SUFFIX else free_output(file, inputs, LIFT)
+
+
 def free_outputs(files: Mapping[str, Path], inputs: Sequence[Path]) -> None:
     """Several outputs, by the options that name them.
 

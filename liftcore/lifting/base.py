@@ -85,6 +85,10 @@ class Steps(Protocol[Weights]):
         """X after the least squares of the settings, for the splats seen [P] bool; and what is known of it."""
         ...
 
+    def smooth(self, W: Weights, X: Tensor, support: Support) -> tuple[Tensor, dict[str, Any]]:
+        """X after the smoothness of the settings, for all splats; and what is known of it."""
+        ...
+
     def aggregate(self, W: Weights, X: Tensor, clusters: RegionObjects | None) -> tuple[Tensor, Aggregation]:
         """X with the features of clusters; those of features where no masks make them."""
         ...

@@ -68,12 +68,17 @@ def lift_files(
 def open_files(
     splats: Path, cameras: Path, features: Sequence[Path | str], settings: LiftSettings
 ) -> tuple[Splats, Cameras, Views]:
-    """What a lift with these settings takes: splats without their colours, cameras, and packs whose headers are read.
+    """What a lift with these settings takes: splats, cameras, and packs whose headers are read.
+
+    The splats come without their colours; with ``smoothness`` they have those of degree 0.
 
     Raises:
         InvalidInput: a file is malformed.
     """
-    scene = read_splats(splats, settings.kernel, colour=False)
+    scene = read_splats(splats, settings.kernel, colour=bool(settings.smoothness))
+    if scene.sh is not None:
+        base = {"sh": scene.sh[:, :1].clone(), "sb_params": None, "extras": {}, "layout": (), "header": ()}
+        scene = replace(scene, **base)
     settings.for_splats(scene)  # refuses what does not suit them before gigabytes are read
     packs = read_features(*_checked(features))
     return scene, read_cameras(cameras, views=packs.views), packs

@@ -30,6 +30,7 @@ from liftcore.solve.least_squares import AllRays, reference, refine
 from liftcore.solve.loss import huber_factors
 from liftcore.solve.objects import RegionObjects, region_objects
 from liftcore.solve.reweight import Agreement, agreement_factors, reweighted, whole_regions
+from liftcore.solve.smooth import smooth
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import LiftSettings
@@ -153,6 +154,13 @@ class InMemory(Steps[SceneWeights]):
             with self.timings.stage("reference"):
                 facts["reference"] = reference(rays, X, seen, W.geometry.samples, books, settings, progress)
         return X, facts
+
+    def smooth(self, W: SceneWeights, X: Tensor, support: Support) -> tuple[Tensor, dict[str, Any]]:
+        seen = torch.from_numpy(support.sums > 0)
+        return smooth(
+            X, self.splats, support.evidence, support.confidence, seen, self.settings.smoothness,
+            self.timings.progress, self.threads,
+        )  # fmt: skip
 
     def aggregate(self, W: SceneWeights, X: Tensor, clusters: RegionObjects | None) -> tuple[Tensor, Aggregation]:
         settings, agreement, judged = self.settings, W.agreement, None

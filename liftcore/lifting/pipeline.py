@@ -135,6 +135,9 @@ def _run(
         with timings.stage("rays"):
             X, least_squares = steps.refine(W, X, support.sums > 0)
         facts |= least_squares
+    if settings.smoothness:
+        with timings.stage("smooth"):
+            X, facts["smoothing"] = steps.smooth(W, X, support)
     if settings.aggregation:
         with timings.stage("aggregate"):
             X, aggregation = steps.aggregate(W, X, clusters)

@@ -15,6 +15,7 @@ from liftcore.solve.directions import RegionDirections
 from liftcore.solve.loss import huber_factors
 from liftcore.solve.objects import region_objects
 from liftcore.solve.reweight import agreement_factors
+from liftcore.solve.smooth import warm_up_smoothing
 from liftcore.values.region_weights import one_view
 
 if TYPE_CHECKING:
@@ -37,5 +38,7 @@ def warm_up_lift(kernel: Kernel, device: Device, settings: LiftSettings) -> None
         agreement_factors(W, book, 1, threads=1, reliability=torch.ones(1, dtype=torch.bool))
     if settings.loss == "huber":
         huber_factors(W, book, threads=1)
+    if settings.smoothness:
+        warm_up_smoothing()
     if settings.aggregation:
         explained_by(W, RegionDirections.of_weights(W, book), first, one[None], 1)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from liftcore.query.catalogue import Catalogue
     from liftcore.query.scene import Scene
     from liftcore.query.segment import Segmentation
+    from liftcore.runtime.progress import Progress
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
     from liftcore.text import TextEncoder
@@ -128,6 +129,31 @@ class LiftResult(Lift):
             Unavailable: the encoder's weights are not on this machine.
         """
         return self.scene(splats).catalogue(words, vectors, encoder=encoder)
+
+    def refined(
+        self,
+        splats: Splats,
+        *,
+        smoothness: float,
+        progress: Progress | bool | None = None,
+        threads: int | None = None,
+    ) -> LiftResult:
+        """The lift with smooth features, as the setting ``smoothness`` makes them, without lifting again.
+
+        Args:
+            splats: that were lifted, with their colours where they have any. smoothness: lambda, above zero.
+            progress, threads: as `liftcore.lift` has them.
+
+        Raises:
+            InvalidSplats: other splats than were lifted.
+            InvalidSettings: smoothness is zero or out of range.
+            InvalidLift: it was smoothed before, or its splats have the features of clusters.
+        """
+        from liftcore.query.refine import refine
+        from liftcore.runtime.progress import shown_progress
+
+        with shown_progress(progress) as reporter:
+            return refine(self, splats, smoothness, reporter, threads)
 
     def save(self, path: Path | str) -> None:
         """Write a lift file (`liftcore.values.lift_file`), whole or not at all."""

@@ -49,7 +49,7 @@ def map_nearest(
 
     def work_piece(first: int) -> T:
         own = order[first : first + _PIECE]
-        near = np.asarray(tree.query(places[own], [*range(1, most + 1)])[1], np.int32)
+        near = np.asarray(tree.query(places[own], most)[1], np.int32).reshape(len(own), most)
         return work(own, near)
 
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:

@@ -180,7 +180,7 @@ def quantiles(values: np.ndarray) -> dict[str, float | None]:
 
 MOSTLY = 0.5  # of the splats, or of the views; below it, what was not seen is most of the answer
 FAINT = 1e-30  # of a sum of weights: its terms come near the smallest numbers of float32
-UNSEEN = "splats were reached by no labelled ray; their features are zero"
+UNSEEN = "splats were reached by no labelled ray; they have no features of their own"
 NAMES = 3  # that a sentence shows
 POSES = "poses are world to camera, with x right, y down and z forward"
 SAMPLE = 10_000  # splats whose depths are looked at, evenly over the file

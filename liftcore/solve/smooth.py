@@ -6,8 +6,8 @@ After the closed form, X0, with evidence D, confidence c and affinities a_jk (`l
     w_j = D_j max(c_j, 0.02)
 
 Conjugate gradients from X0 on, with the diagonal as preconditioner, in blocks of channels: float32 with sums in
-float64. A channel stops by itself, and every sum has a fixed order, so that neither the number of threads nor the size
-of a block changes a bit. The solution is a mean of X0's rows, so no channel of it leaves the range of X0's; nor does
+float64. A channel stops by itself, and every sum has a fixed order, so that neither the number of threads nor the
+size of a block changes a bit. The solution is a mean of X0's rows, so no channel of it leaves the range of X0's; nor does
 what is delivered.
 
 A splat without evidence has no term of its own. It takes the limit of the solution for w_j towards zero, the mean of
@@ -137,6 +137,13 @@ def smoothing_line(facts: Mapping[str, Any]) -> str:
         f"{facts['filled']} splats without evidence took their neighbours' "
         f"({facts['steps']} steps, {facts['residual']:.1g} of the gradient left)"
     )
+
+
+def warm_up_smoothing() -> None:
+    """Compile the kernels, or load them from the disk cache."""
+    splats = Splats(torch.eye(3), torch.zeros(3, 4), torch.zeros(3, 3), torch.zeros(3))
+    ones = torch.ones(3)
+    smooth(torch.eye(3), splats, ones, None, ones > 0, 1.0, threads=1)
 
 
 def _weights(evidence: Tensor, confidence: Tensor | None, seen: Tensor) -> np.ndarray:

@@ -48,6 +48,7 @@ class LiftOptions(TypedDict, total=False):
     aggregation_channels: int
     certificate_rays: int
     seed: int
+    smoothness: float
     cg_steps: int
     damping: float
     cg_basis: int

@@ -180,6 +180,12 @@ class LiftSettings(BaseModel):
         json_schema_extra={"maximum": MOST_CERTIFICATE_RAYS},  # of a new lift
     )
     seed: int = Field(0, ge=0, lt=2**31, description="of samples, random projections and strides")
+    smoothness: float = Field(
+        0.0,
+        ge=0,
+        le=1e6,
+        description="lambda of the term that draws splats near in place and colour together, 0 = off",
+    )
     cg_steps: int = Field(0, ge=0, le=10_000, description="least-squares steps from the closed form on, 0 = none")
     damping: float = Field(1.0, ge=0, le=1e6, description="mu, pulls least squares towards the closed form")
     cg_basis: int = Field(0, ge=0, le=65_536, description="principal feature directions refined, 0 = all channels")
@@ -218,6 +224,9 @@ class LiftSettings(BaseModel):
         if self.aggregation_resolve and self.aggregation_clusters == "graph":
             told = "aggregation_clusters=hdbscan beside aggregation_resolve: masks that make clusters are all kept"
             raise PydanticCustomError("whole_regions", "{expected}", {"expected": told})
+        if self.aggregation_resolve and self.smoothness:
+            expected = "smoothness=0 beside aggregation_resolve, whose features know no neighbours"
+            raise PydanticCustomError("whole_regions", "{expected}", {"expected": expected})
         if self.loss == "huber" and self.cg_steps:
             told = "cg_steps=0 beside loss=huber: such steps go towards the least squares"
             raise PydanticCustomError("one_loss", "{expected}", {"expected": told})
@@ -299,9 +308,9 @@ class LiftSettings(BaseModel):
             masks: whether any view has masks, which make clusters in blocks.
 
         Raises:
-            InvalidSettings: least squares, or an aggregation by HDBSCAN.
+            InvalidSettings: least squares, smoothness, or an aggregation by HDBSCAN.
         """
-        asked = [name for name in ("cg_steps", "reference_channels") if getattr(self, name)]
+        asked = [name for name in ("cg_steps", "reference_channels", "smoothness") if getattr(self, name)]
         if self.aggregation and not self.clusters_by_masks:
             asked += [name for name in ("aggregation_clusters", "aggregation_resolve") if getattr(self, name)]
         whole = [f"{name}={getattr(self, name)}" for name in asked]
@@ -310,11 +319,12 @@ class LiftSettings(BaseModel):
         if whole:
             raise InvalidSettings(
                 "engine",
-                expected="settings that work on blocks of splats: least squares need all rays, and clusters by "
-                "HDBSCAN all features in one place",
+                expected="settings that work on blocks of splats: least squares need all rays, smoothness and "
+                "clusters by HDBSCAN all features in one place",
                 got=", ".join(whole),
-                hint="set cg_steps=0 and reference_channels=0, aggregation_clusters=graph where views have masks, or "
-                "aggregation=false; or lift without an engine",
+                hint="set cg_steps=0 and reference_channels=0, smoothness=0 (splatlift refine smooths the finished "
+                "lift), aggregation_clusters=graph where views have masks, or aggregation=false; or lift without an "
+                "engine",
             )
 
     def _compositing(self, opacity_logit_scale: float) -> CompositingParams:

@@ -139,7 +139,7 @@ def test_lift_is_described(tmp_path: Path) -> None:
     found = inspected(tmp_path / "l")
     assert (found["kind"], found["splats"], found["channels"]) == ("lift", count, len(WORDS))
     assert found["seen_share"] == pytest.approx(1 - unseen / count) and found["settings"]["preset"] == "row-sum"
-    told = f"{unseen} of {count} splats were reached by no labelled ray; their features are zero"
+    told = f"{unseen} of {count} splats were reached by no labelled ray; they have no features of their own"
     assert found["warnings"][0] == told and "no longer at" in found["warnings"][1]
 
 

@@ -324,6 +324,10 @@ class InBlocks(Steps[Job]):
         """See the protocol: `LiftSettings.check_blocks` has refused what asks for it."""
         raise AssertionError("least squares need all rays in one place")
 
+    def smooth(self, W: Job, X: Tensor, support: Support) -> NoReturn:
+        """See the protocol: `LiftSettings.check_blocks` has refused what asks for it."""
+        raise AssertionError("the graph of neighbours crosses blocks")
+
     def aggregate(self, W: Job, X: Tensor, clusters: RegionObjects | None) -> tuple[Tensor, Aggregation]:
         """See the protocol: the features of clusters that masks make."""
         assert clusters is not None, "check_blocks refuses those of features"

@@ -58,6 +58,7 @@ BLOCK_BYTES = 9  # of an entry that lies by region
 CG_VECTORS, CG_CHANNELS = 14, 32  # [P, 32] f32 of conjugate gradients, with the images of a view
 CLUSTERING = 80_000_000  # of hdbscan and what it stands on
 TOUCHING_BYTES = 1_000  # of a splat, where those that touch are told
+SMOOTHING_BYTES = 1_000  # of a splat: the graph as it is made, or with a block of channels
 SPARE = 0.9  # of the free memory: 10 % are left to other processes
 CARD_SPARE = 0.8  # of a card's free memory: what is freed does not lie in one piece
 CARD_SPLAT_BYTES = 400  # of a splat on a card, walked in the smallest pieces
@@ -347,6 +348,8 @@ def memory_parts(
             parts["reweighting"] += int(CONSENSUS_BYTES * entries + BLOCK_BYTES * min(entries, BLOCK_ENTRIES))
     if settings.cg_steps or settings.reference_channels:
         parts["refinement"] = 4 * (splats.count * (CG_VECTORS * CG_CHANNELS) + 3 * largest * CG_CHANNELS)
+    if settings.smoothness:
+        parts["smoothing"] = SMOOTHING_BYTES * splats.count
     if settings.aggregation:
         parts["aggregation"] = CLUSTERING + 24 * channels * min(splats.count, settings.aggregation_sample)
         if settings.aggregation_clusters in ("auto", "touching"):  # afterwards, and of one cluster at a time

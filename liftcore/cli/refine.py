@@ -1,0 +1,58 @@
+"""``splatlift refine``: a finished lift with smooth features, without lifting again."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from liftcore.cli.options import Parser, add_splats, count
+from liftcore.cli.reply import free_lift, reply, writing
+from liftcore.errors import InvalidInput
+from liftcore.io.remote import place
+from liftcore.runtime.progress import one_step, progress_bars
+
+
+def add_arguments(parser: Parser) -> None:
+    """The options of the command."""
+    parser.add_argument("lift", type=place, help="a lift (.safetensors or .shards)")
+    strength = "lambda of the term that draws splats near in place and colour together, above 0; try 1"
+    parser.add_argument("--smoothness", type=float, required=True, metavar="L", help=strength)
+    named = "the lift to write; else the name of LIFT with .smooth before its suffix"
+    parser.add_argument("-o", "--output", type=place, metavar="OUT", help=named)
+    add_splats(parser)
+    parser.add_argument("--threads", type=count, metavar="N", help="else as many as there are cores")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Smooth the lift's features, write it whole or not at all, and say how much they moved."""
+    out = options.output
+    if out is None:
+        if "lift" in options.elsewhere:
+            raise InvalidInput("output", expected="-o OUT", got="none, of a lift that lies elsewhere")
+        out = options.lift.with_name(f"{options.lift.stem}.smooth{options.lift.suffix}")
+    from liftcore.query.result import load_lift
+    from liftcore.query.scene import Scene
+    from liftcore.solve.smooth import smoothing_line
+    from liftcore.values.lift_file import save_lift
+
+    scene = Scene(options.lift, splats=options.splats)
+    file = free_lift(out, [options.lift, scene.splat_file])
+    with progress_bars() as progress:
+        result = load_lift(options.lift).refined(
+            scene.splats, smoothness=options.smoothness, threads=options.threads, progress=progress
+        )
+        with writing(file), one_step(progress, "save"):
+            save_lift(result, out)
+    facts = result.diagnostics["smoothing"]
+    document: dict[str, Any] = {
+        "out": str(out),
+        "splats": len(result),
+        "channels": result.features.shape[1],
+        "smoothing": facts,
+        "seconds": result.metadata.timings["smooth"],
+        "warnings": [facts["warning"]] if "warning" in facts else [],
+    }
+    lines = [f"{out}: {smoothing_line(facts)}, in {document['seconds']:.1f} s"]
+    lines += [f"warning: {warning}" for warning in document["warnings"]]
+    reply(document, as_json=options.json, lines=lines)
+    return 0

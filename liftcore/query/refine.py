@@ -1,0 +1,73 @@
+"""A finished lift after the smoothness step, without its views: nobody lifts twice."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from liftcore.errors import InvalidLift, InvalidSettings
+from liftcore.runtime.memory import free_memory, zeros
+from liftcore.runtime.progress import Progress, silent
+from liftcore.runtime.torch_modes import usual_modes
+from liftcore.solve.smooth import smooth
+from liftcore.values.settings import LiftSettings
+
+if TYPE_CHECKING:
+    from liftcore.scene.splats import Splats
+    from liftcore.values.lift import Lift
+
+    AnyLift = TypeVar("AnyLift", bound=Lift)
+
+OF_FEATURES = ("residual", "surrogate", "beta", "bound")  # of the certificate: sampled rays against the features
+ROOM = 0.5  # of the free memory, that features may take before they lie in a mapped file
+
+
+@usual_modes()
+def refine(
+    lift: AnyLift, splats: Splats, smoothness: float, progress: Progress = silent, threads: int | None = None
+) -> AnyLift:
+    """Smooth the features of a lift, as `LiftSettings.smoothness` does it in a lift: the same bits.
+
+    Args:
+        lift: of any engine; it stays as it is. splats: that were lifted. smoothness: lambda, above zero.
+        threads: None takes the cores that this process may use. The number changes no bit.
+
+    Returns:
+        The lift with other features, on the device of the lift. Settings and diagnostics have the step; measures of
+        rays against features are None, as no ray is walked.
+
+    Raises:
+        InvalidSplats: other splats than were lifted.
+        InvalidSettings: smoothness is zero or out of range.
+        InvalidLift: it was smoothed before, or its splats have the features of clusters.
+    """
+    smoothness = LiftSettings.of(smoothness=smoothness).smoothness
+    if not smoothness:
+        raise InvalidSettings("smoothness", expected="a number above 0", got="0", hint="1 is a good first try")
+    lift.require_splats(splats)
+    settings = lift.settings
+    if settings.smoothness:
+        got = f"one of smoothness={settings.smoothness:g}"
+        raise InvalidLift("lift", expected="a lift without smoothness", got=got, hint="refine the lift it came from")
+    if settings.aggregation:
+        hint = f"lift again with smoothness={smoothness:g} beside aggregation: clusters are made of smooth features"
+        raise InvalidLift("lift", expected="each splat's own features", got="a lift with aggregation", hint=hint)
+    start, place = time.perf_counter(), lift.features.device
+    lift = lift.cpu()
+    free = free_memory()
+    in_file = free is not None and lift.features.nbytes > ROOM * free
+    X = zeros(tuple(lift.features.shape), lift.features.dtype, name="features", in_file=in_file).copy_(lift.features)
+    X, facts = smooth(X, splats, lift.evidence, lift.confidence, lift.seen, smoothness, progress, threads)
+    certificate: dict[str, Any] = lift.diagnostics | {"smoothing": facts}
+    certificate |= {name: None for name in OF_FEATURES if name in certificate}
+    if "beta" in certificate:
+        certificate["beta"] = {"median": None, "p99": None, "max": None}
+    if "warning" in facts:
+        certificate["warnings"] = [*certificate.get("warnings", ()), facts["warning"]]
+    changes = {
+        "settings": settings.model_copy(update={"smoothness": smoothness}),
+        "certificate": certificate,
+        "timings": lift.metadata.timings | {"smooth": time.perf_counter() - start},
+    }
+    return replace(lift, features=X, metadata=lift.metadata.model_copy(update=changes)).to(place)
