@@ -7,8 +7,8 @@ After the closed form, X0, with evidence D, confidence c and affinities a_jk (`l
 
 Conjugate gradients from X0 on, with the diagonal as preconditioner, in blocks of channels: float32 with sums in
 float64. A channel stops by itself, and every sum has a fixed order, so that neither the number of threads nor the
-size of a block changes a bit. The solution is a mean of X0's rows, so no channel of it leaves the range of X0's; nor does
-what is delivered.
+size of a block changes a bit. The solution is a mean of X0's rows, so no channel of it leaves the range of X0's; nor
+does what is delivered.
 
 A splat without evidence has no term of its own. It takes the limit of the solution for w_j towards zero, the mean of
 its neighbours by ``a_jk sqrt(w_k)``, and those behind it the mean of these, ring by ring.
@@ -35,7 +35,8 @@ LEAST_CONFIDENCE = 0.02  # that a splat counts by: one view alone says something
 LEAST_WEIGHT = 1e-30  # of the largest; a splat below it has no evidence
 BLOCK = 32  # channels solved at a time: four [P, 32] f32
 ROWS = 1 << 12  # splats of one piece of work
-TOLERANCE = 1e-3  # of each channel's gradient, relative to that at X0: half of float16's step of what moves
+TOLERANCE = 1e-3  # of each channel's gradient, relative to that at X0, over sqrt(1 + lambda): what varies slowly
+# over the scene has little of the gradient, the less the larger lambda
 STEPS = 200  # of conjugate gradients at most; with lambda 4 about 20 are taken
 
 
@@ -47,6 +48,7 @@ class _System:
     weights: np.ndarray  # [P] f32, w over its largest value; zero without evidence
     couplings: np.ndarray  # [E] f32, lambda a_jk sqrt(w_j w_k)
     inverse: np.ndarray  # [P] f32, of the diagonal; zero without evidence
+    tolerance: float  # of the gradient, relative to that at X0
 
     @classmethod
     def of(cls, graph: SplatGraph, weights: np.ndarray, smoothness: float) -> _System:
@@ -58,7 +60,8 @@ class _System:
         rows = np.repeat(np.arange(len(weights), dtype=np.int32), counts)
         diagonal = weights + np.bincount(rows, couplings, minlength=len(weights))
         inverse = np.divide(1.0, diagonal, out=np.zeros_like(diagonal), where=weights > 0)
-        return cls(graph, weights.astype(np.float32), couplings, inverse.astype(np.float32))
+        tolerance = TOLERANCE / (1.0 + smoothness) ** 0.5
+        return cls(graph, weights.astype(np.float32), couplings, inverse.astype(np.float32), tolerance)
 
 
 @one_thread()
@@ -120,7 +123,7 @@ def smooth(
         "filled": sum(len(rows) for rows, _ in rings),
         "colours": graph.coloured,
     }
-    if residual > TOLERANCE:
+    if residual > system.tolerance:
         facts["warning"] = (
             f"smoothness={smoothness:g} ended after {steps} steps with {residual:.1g} of the gradient left: features "
             "are less smooth than asked for"
@@ -221,7 +224,7 @@ def _solve(system: _System, start: np.ndarray, threads: int | None) -> tuple[np.
         new = run(advance_rows, system.inverse, length, direction, image, length, X, rest)
         turn = np.divide(new, slope, out=np.zeros(channels), where=active).astype(np.float32)
         slope, steps = new, steps + 1
-        active &= slope > TOLERANCE**2 * first
+        active &= slope > system.tolerance**2 * first
         run(turn_rows, system.inverse, turn, rest, direction)
     left = np.divide(slope, first, out=np.zeros(channels), where=np.isfinite(first) & (first > 0))
     return X, steps, float(np.sqrt(left.max(initial=0.0)))

@@ -1,0 +1,76 @@
+"""The graph of neighbouring splats, against its formula pair by pair."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from liftcore.scene.neighbours import COLOUR_WIDTH, LEAST_AFFINITY, NEIGHBOURS, SplatGraph
+from liftcore.scene.splats import Splats
+from tests.scenes import random_splats
+
+SEEDS = st.integers(0, 2**16)
+
+
+def dense(graph: SplatGraph) -> np.ndarray:
+    """[P, P] f64, the affinities in the splats' order."""
+    count = len(graph.order)
+    matrix = np.zeros((count, count))
+    rows = np.repeat(np.arange(count), np.diff(graph.starts))
+    matrix[graph.order[rows], graph.order[graph.neighbours]] = graph.affinities
+    return matrix
+
+
+def by_formula(splats: Splats) -> np.ndarray:
+    """[P, P] f64, of splats of which no two share a place."""
+    means = splats.means.double().numpy()
+    distances = np.linalg.norm(means[:, None] - means[None], axis=2)
+    matrix = np.zeros_like(distances)
+    for j, row in enumerate(distances):
+        near = np.argsort(row)[1 : NEIGHBOURS + 1]
+        matrix[j, near] = np.exp(-((row[near] / np.median(row[near])) ** 2) / 2)
+    if splats.sh is not None:
+        colours = (0.5 + splats.sh[:, 0].double().numpy() / np.sqrt(4 * np.pi)).clip(0, 1)
+        apart = ((colours[:, None] - colours[None]) ** 2).sum(axis=2)
+        matrix *= np.exp(-apart / COLOUR_WIDTH**2 / 2)
+    matrix[matrix < LEAST_AFFINITY] = 0
+    return (matrix + matrix.T) / 2
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=SEEDS, count=st.integers(2, 80), coloured=st.booleans())
+def test_affinities_are_those_of_the_formula(seed: int, count: int, coloured: bool) -> None:
+    splats = random_splats(seed, count)
+    splats = replace(splats, sh=0.2 * splats.sh if coloured else None)
+    graph = SplatGraph.of(splats)
+    assert graph.coloured == coloured
+    assert sorted(graph.order) == list(range(count))
+    np.testing.assert_allclose(dense(graph), by_formula(splats), rtol=1e-4, atol=2 * LEAST_AFFINITY)
+
+
+@pytest.mark.parametrize("power", [-10, 10])
+def test_affinities_know_no_unit_of_length(power: int) -> None:
+    splats = random_splats(0, 100)
+    scaled = replace(splats, means=2.0**power * splats.means)
+    np.testing.assert_allclose(dense(SplatGraph.of(scaled)), dense(SplatGraph.of(splats)), rtol=1e-5)
+
+
+@pytest.mark.parametrize("together", [5, 12, 60])
+def test_splats_at_one_place_are_neighbours(together: int) -> None:
+    splats = replace(random_splats(0, 60), sh=None)
+    splats.means[:together] = splats.means[0]
+    matrix = dense(SplatGraph.of(splats))
+    assert np.array_equal(matrix, matrix.T)
+    assert not matrix.diagonal().any()
+    inside = matrix[:together, :together]
+    assert (inside.sum(axis=1) >= min(together - 1, NEIGHBOURS) / 2).all()
+    assert (inside[inside > 0] >= 0.5).all()
+
+
+def test_graph_is_the_same_for_any_number_of_threads() -> None:
+    splats = random_splats(0, 9_000)
+    one, three = (SplatGraph.of(splats, threads) for threads in (1, 3))
+    for name in ("order", "starts", "neighbours", "affinities"):
+        assert np.array_equal(getattr(one, name), getattr(three, name))

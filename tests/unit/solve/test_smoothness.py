@@ -1,0 +1,183 @@
+"""The smoothness of features: its minimum, its bits, and a finished lift refined by it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+import liftcore as lc
+from liftcore.lifting.files import lift_files
+from liftcore.scene.neighbours import SplatGraph
+from liftcore.scene.splats import Splats
+from liftcore.solve.smooth import STEPS, smooth, smoothing_line
+from liftcore.values.settings import LiftSettings
+from tests.scenes import random_splats, write_scene
+from tests.unit.command_line import run
+from tests.unit.scene.test_neighbours import dense
+
+SEEDS = st.integers(0, 2**16)
+
+
+class Scene:
+    """Splats of similar colours with random features and support; some of them were seen by no ray."""
+
+    def __init__(self, seed: int, count: int, channels: int = 5, unseen: float = 0.2) -> None:
+        rng = np.random.default_rng(seed)
+        splats = random_splats(seed, count)
+        self.splats: Splats = replace(splats, sh=0.1 * splats.sh)
+        self.seen: Tensor = torch.from_numpy(rng.random(count) >= unseen)
+        self.X: Tensor = torch.from_numpy(rng.normal(size=(count, channels)).astype(np.float32)) * self.seen[:, None]
+        self.evidence: Tensor = torch.from_numpy(10 ** rng.uniform(-4, 3, count)).float()
+        self.confidence: Tensor = torch.from_numpy(rng.random(count)).float()
+
+    def smooth(self, smoothness: float, **how: int) -> Tensor:
+        given = self.splats, self.evidence, self.confidence, self.seen, smoothness
+        return smooth(self.X.clone(), *given, **how)[0]
+
+    def minimum(self, smoothness: float) -> tuple[np.ndarray, np.ndarray]:
+        """The features [P, F] of the splats that were seen by a dense solver, and their weights [P], both f64."""
+        weights = self.evidence.double() * self.confidence.double().clamp_min(0.02) * self.seen
+        weights, affinities = weights.numpy(), dense(SplatGraph.of(self.splats))
+        couplings = smoothness * affinities * np.sqrt(np.outer(weights, weights))
+        K = np.diag(weights + couplings.sum(axis=1)) - couplings
+        rows = np.flatnonzero(weights)
+        X = np.zeros(self.X.shape)
+        X[rows] = np.linalg.solve(K[np.ix_(rows, rows)], (weights[:, None] * self.X.double().numpy())[rows])
+        return X, weights
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=SEEDS, count=st.integers(1, 120), smoothness=st.sampled_from([0.01, 0.3, 1.0, 4.0, 100.0]))
+def test_features_are_those_of_the_least_sum(seed: int, count: int, smoothness: float) -> None:
+    scene = Scene(seed, count)
+    X, weights = scene.minimum(smoothness)
+    apart = np.sqrt(weights[:, None]) * (scene.smooth(smoothness).double().numpy() - X)
+    moved = np.sqrt(weights[:, None]) * (scene.X.double().numpy() - X)
+    assert np.linalg.norm(apart) <= 1e-2 * np.linalg.norm(moved) + 1e-6 * np.sqrt(weights.sum())
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=SEEDS, unseen=st.floats(0.05, 0.99))
+def test_splats_without_evidence_take_the_mean_of_their_neighbours(seed: int, unseen: float) -> None:
+    scene = Scene(seed, 120, unseen=unseen)
+    X, weights = scene.smooth(1.0).double().numpy(), scene.minimum(1.0)[1]
+    affinities, roots = dense(SplatGraph.of(scene.splats)), np.sqrt(weights)
+    filled = weights > 0
+    while True:
+        shares = affinities * roots
+        ring = ~filled & (shares.sum(axis=1) > 0)
+        if not ring.any():
+            break
+        means = shares[ring] @ X / shares[ring].sum(axis=1, keepdims=True)
+        np.testing.assert_allclose(X[ring], means, rtol=1e-3, atol=1e-4)
+        roots, filled = ring.astype(float), filled | ring
+    assert not X[~filled].any()
+
+
+def test_neither_threads_nor_blocks_of_channels_change_a_bit() -> None:
+    scene = Scene(0, 9_000, channels=5)
+    usual = scene.smooth(1.0)
+    assert not torch.equal(usual, scene.X)
+    for how in ({"threads": 1}, {"threads": 3}, {"block": 1}, {"block": 2}, {"block": 3, "threads": 2}):
+        assert torch.equal(scene.smooth(1.0, **how), usual), how
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32])
+@pytest.mark.parametrize("longest", [6e4, 1e-6])
+def test_no_channel_leaves_the_range_of_the_features(dtype: torch.dtype, longest: float) -> None:
+    scene = Scene(1, 300)
+    X = (scene.X / scene.X.abs().max() * longest).to(dtype)
+    low, high = X[scene.seen].aminmax(dim=0)
+    smoothed, facts = smooth(X.clone(), scene.splats, scene.evidence, None, scene.seen, 1e6)
+    assert smoothed.dtype == dtype
+    assert ((smoothed >= low.clamp_max(0)) & (smoothed <= high.clamp_min(0))).all()
+    assert ("warning" in facts) == (facts["steps"] >= STEPS)
+
+
+def test_features_that_are_one_stay_as_they_are() -> None:
+    scene = Scene(2, 200, unseen=0.0)
+    X = torch.ones(200, 3)
+    smoothed, facts = smooth(X.clone(), scene.splats, scene.evidence, scene.confidence, scene.seen, 4.0)
+    assert torch.equal(smoothed, X)
+    assert facts["moved"] == facts["steps"] == facts["filled"] == 0
+    nothing, facts = smooth(0 * X, scene.splats, scene.evidence, scene.confidence, ~scene.seen, 4.0)
+    assert not nothing.any()
+    assert facts["moved"] is None
+    assert "not at all" in smoothing_line(facts)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
+    return write_scene(tmp_path_factory.mktemp("scene"), 3)
+
+
+@pytest.fixture(scope="module")
+def plain(files: tuple[Path, Path, Path]) -> lc.LiftResult:
+    return lift_files(files[0], files[1], files[2:], LiftSettings())
+
+
+@pytest.mark.parametrize("dtype", ["float16", "float32"])
+def test_refined_lift_is_the_lift_with_that_smoothness(files: tuple[Path, Path, Path], dtype: str) -> None:
+    own = {"dtype": dtype, "preset": "default"}
+    plain, smoothed = (
+        lift_files(files[0], files[1], files[2:], LiftSettings(smoothness=strength, **own)) for strength in (0, 1.5)
+    )
+    before = plain.features.clone()
+    refined = plain.refined(lc.read_splats(files[0]), smoothness=1.5)
+    assert torch.equal(plain.features, before)
+    assert not torch.equal(smoothed.features, before)
+    for name in ("features", "evidence", "agreement", "confidence", "seen"):
+        assert torch.equal(getattr(refined, name), getattr(smoothed, name)), name
+    assert refined.settings == smoothed.settings
+    assert refined.diagnostics["smoothing"] == smoothed.diagnostics["smoothing"]
+    assert refined.diagnostics["smoothing"]["colours"]
+    assert refined.diagnostics["residual"] is None
+    assert smoothed.diagnostics["residual"] > plain.diagnostics["residual"] * 0.5
+    assert "smooth" in refined.metadata.timings
+
+
+def test_refinement_that_cannot_be_is_refused_in_words(files: tuple[Path, Path, Path], plain: lc.LiftResult) -> None:
+    splats = lc.read_splats(files[0])
+    with pytest.raises(lc.InvalidSettings, match="smoothness: expected a number above 0"):
+        plain.refined(splats, smoothness=0)
+    with pytest.raises(lc.InvalidSettings, match="smoothness"):
+        plain.refined(splats, smoothness=float("nan"))
+    with pytest.raises(lc.InvalidSplats, match="splats"):
+        plain.refined(splats[:10], smoothness=1)
+    with pytest.raises(lc.InvalidLift, match="without smoothness"):
+        plain.refined(splats, smoothness=1).refined(splats, smoothness=1)
+    clustered = lift_files(files[0], files[1], files[2:], LiftSettings(aggregation=True))
+    with pytest.raises(lc.InvalidLift, match="aggregation"):
+        clustered.refined(splats, smoothness=1)
+    with pytest.raises(lc.InvalidSettings, match="smoothness=0"):
+        LiftSettings.of(smoothness=1, aggregation=True, aggregation_resolve=True, aggregation_clusters="hdbscan")
+    with pytest.raises(lc.InvalidSettings, match=r"engine: .*got smoothness=2.0; set .*smoothness=0"):
+        LiftSettings(smoothness=2).check_blocks()
+
+
+def test_command_refines_a_lift_that_is_there(
+    plain: lc.LiftResult, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "scene.lift.safetensors"
+    plain.save(path)
+    status, out, err = run(capsys, "refine", path, "--smoothness", "1")
+    assert (status, err) == (0, "")
+    assert "smoothness 1: features moved by" in out
+    refined = lc.load_lift(tmp_path / "scene.lift.smooth.safetensors")
+    assert refined.settings.smoothness == 1
+    assert torch.equal(lc.load_lift(path).features, plain.features)
+    assert run(capsys, "refine", tmp_path / "scene.lift.smooth.safetensors", "--smoothness", "1")[0] == 2
+    assert run(capsys, "refine", path, "--smoothness", "1", "-o", path)[0] == 2
+
+
+def test_http_takes_smoothness_as_any_setting() -> None:
+    field = LiftSettings.model_json_schema()["properties"]["smoothness"]
+    assert field["default"] == 0
+    assert field["description"]
