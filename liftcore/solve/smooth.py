@@ -16,7 +16,9 @@ its neighbours by ``a_jk sqrt(w_k)``, and those behind it the mean of these, rin
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+from collections.abc import Callable, Mapping
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,12 +31,11 @@ from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, silent
 from liftcore.scene.neighbours import SplatGraph
 from liftcore.scene.splats import Splats
-from liftcore.values.region_weights import run_each
 
 LEAST_CONFIDENCE = 0.02  # that a splat counts by: one view alone says something, too
 LEAST_WEIGHT = 1e-30  # of the largest; a splat below it has no evidence
 BLOCK = 32  # channels solved at a time: four [P, 32] f32
-ROWS = 1 << 12  # splats of one piece of work
+ROWS = 1 << 13  # splats of one piece of work
 TOLERANCE = 1e-3  # of each channel's gradient, relative to that at X0, over sqrt(1 + lambda): what varies slowly
 # over the scene has little of the gradient, the less the larger lambda
 STEPS = 200  # of conjugate gradients at most; with lambda 4 about 20 are taken
@@ -98,22 +99,26 @@ def smooth(
     weights = _weights(evidence, confidence, seen)[graph.order]
     rings = _rings(graph, weights)
     system = _System.of(graph, weights, smoothness)
-    order, known = torch.from_numpy(graph.order).long(), torch.from_numpy(weights > 0)
-    squares, steps, residual, channels = np.zeros((2, X.shape[1])), 0, 0.0, X.shape[1]
-    for begin in range(0, channels, block):
-        own = slice(begin, min(begin + block, channels))
-        values = X[:, own].index_select(0, order).float()
-        values[~known] = 0.0
-        if bool(known.any()):
-            low, high = values[known].aminmax(dim=0)
-            solution, taken, rest = _solve(system, values.numpy(), threads)
+    known, written = weights > 0, weights > 0
+    for rows, _ in rings:
+        written[rows] = True
+    order, rows_written = torch.from_numpy(graph.order).long(), np.flatnonzero(written)
+    places, channels = order[torch.from_numpy(rows_written)], X.shape[1]
+    squares, steps, residual = np.zeros((2, channels)), 0, 0.0
+    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
+        for begin in range(0, channels if known.any() else 0, block):
+            own = slice(begin, min(begin + block, channels))
+            values = X[:, own].index_select(0, order).float().numpy()
+            values[~known] = 0.0
+            low, high = values[known].min(axis=0), values[known].max(axis=0)
+            solution, taken, rest = _solve(system, values, pool)
             steps, residual = max(steps, taken), max(residual, rest)
-            smoothed = torch.from_numpy(solution).clamp_(low, high)
-            squares[:, own] = _movement(system.weights, values.numpy(), solution, threads)
+            np.clip(solution, low, high, out=solution)
+            squares[:, own] = _movement(system.weights, values, solution, pool)
             for rows, shares in rings:
                 solution[rows] = shares @ solution
-            X[:, own].index_copy_(0, order, smoothed.to(X.dtype))
-        progress("smooth", own.stop, channels, "channels")
+            X[:, own].index_copy_(0, places, torch.from_numpy(solution[rows_written]).to(X.dtype))
+            progress("smooth", own.stop, channels, "channels")
     moved, whole = squares.sum(axis=1).tolist()
     facts: dict[str, Any] = {
         "smoothness": smoothness,
@@ -192,22 +197,14 @@ def _rings(graph: SplatGraph, weights: np.ndarray) -> list[tuple[np.ndarray, Any
     return rings
 
 
-def _solve(system: _System, start: np.ndarray, threads: int | None) -> tuple[np.ndarray, int, float]:
+def _solve(system: _System, start: np.ndarray, pool: Executor) -> tuple[np.ndarray, int, float]:
     """The minimum [P, C] f32 from X0 [P, C] f32 on, the steps taken, and the largest relative gradient left."""
-    graph, channels = system.graph, start.shape[1]
-    pieces = [(first, min(first + ROWS, len(start))) for first in range(0, len(start), ROWS)]
-    dots = np.zeros((len(pieces), channels))
+    graph, (count, channels) = system.graph, start.shape
     X, rest, direction = start.copy(), np.zeros_like(start), start.copy()
     image = np.empty_like(start)
 
-    def run(work: Any, *arguments: Any) -> np.ndarray:
-        """[C] f64, the sums over pieces of what the work adds up, in their order."""
-        dots[:] = 0.0
-        run_each(work, [(*piece, *arguments, dots[k]) for k, piece in enumerate(pieces)], threads)
-        total = np.zeros(channels)
-        for part in dots:
-            total += part
-        return total
+    def run(work: Callable[..., Any], *arguments: Any) -> np.ndarray:
+        return _row_sums(work, arguments, (channels,), count, pool)
 
     def multiply(weights: np.ndarray) -> np.ndarray:
         return run(multiply_rows, graph.starts, graph.neighbours, system.couplings, weights, direction, image)
@@ -264,14 +261,20 @@ def turn_rows(first, last, inverse, turn, rest, direction, dots):
             direction[j, c] = inverse[j] * rest[j, c] + turn[c] * direction[j, c]
 
 
-def _movement(weights: np.ndarray, before: np.ndarray, after: np.ndarray, threads: int | None) -> np.ndarray:
+def _movement(weights: np.ndarray, before: np.ndarray, after: np.ndarray, pool: Executor) -> np.ndarray:
     """[2, C] f64: ``sum_j w_j (x_j - x0_j)^2`` and ``sum_j w_j x0_j^2`` of each channel."""
-    pieces = [(first, min(first + ROWS, len(before))) for first in range(0, len(before), ROWS)]
-    sums = np.zeros((len(pieces), 2, before.shape[1]))
-    given = weights, before, after
-    run_each(add_movement, [(*piece, *given, sums[k]) for k, piece in enumerate(pieces)], threads)
-    total = np.zeros(sums.shape[1:])
-    for part in sums:
+    return _row_sums(add_movement, (weights, before, after), (2, before.shape[1]), len(before), pool)
+
+
+def _row_sums(
+    work: Callable[..., Any], arguments: tuple[Any, ...], shape: tuple[int, ...], count: int, pool: Executor
+) -> np.ndarray:
+    """What ``work(first, last, *arguments, sums)`` adds up over pieces of ``count`` rows: f64 of the shape."""
+    starts = range(0, count, ROWS)
+    parts = np.zeros((len(starts), *shape))
+    list(pool.map(lambda first, part: work(first, min(first + ROWS, count), *arguments, part), starts, parts))
+    total = np.zeros(shape)
+    for part in parts:
         total += part
     return total
 

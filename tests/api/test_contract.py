@@ -13,6 +13,8 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
+from liftcore.values.settings import LiftSettings
+
 from .contract import conformance, served
 
 
@@ -40,6 +42,13 @@ def test_document_refers_to_what_is_in_it(client: TestClient) -> None:
         for part in reference.removeprefix("#/").split("/"):
             assert part in found, reference
             found = found[part]
+
+
+def test_document_has_every_setting_of_a_lift_with_its_meaning(client: TestClient) -> None:
+    schemas = client.get("/openapi.json").json()["components"]["schemas"]
+    fields = schemas["LiftRequest"]["properties"]["settings"]["properties"]
+    assert fields.keys() == LiftSettings.model_fields.keys()
+    assert fields["smoothness"]["description"]
 
 
 def test_answers_are_as_the_document_says_and_what_is_deleted_is_gone(copied: Path, table: Path) -> None:

@@ -101,6 +101,18 @@ def test_no_channel_leaves_the_range_of_the_features(dtype: torch.dtype, longest
     assert ("warning" in facts) == (facts["steps"] >= STEPS)
 
 
+def test_splats_that_no_neighbour_reaches_stay_as_they_are() -> None:
+    scene = Scene(4, 60, unseen=0.0)
+    far = scene.splats.means.clone()
+    far[40:] += 1e4
+    splats, seen = replace(scene.splats, means=far), torch.arange(60) < 40
+    X = (scene.X.abs() + 1) * seen[:, None]
+    smoothed, facts = smooth(X.clone(), splats, scene.evidence, None, seen, 1.0)
+    assert facts["filled"] == 0
+    assert not smoothed[40:].any()
+    assert (smoothed[:40] >= 1).all()
+
+
 def test_features_that_are_one_stay_as_they_are() -> None:
     scene = Scene(2, 200, unseen=0.0)
     X = torch.ones(200, 3)
@@ -175,9 +187,3 @@ def test_command_refines_a_lift_that_is_there(
     assert torch.equal(lc.load_lift(path).features, plain.features)
     assert run(capsys, "refine", tmp_path / "scene.lift.smooth.safetensors", "--smoothness", "1")[0] == 2
     assert run(capsys, "refine", path, "--smoothness", "1", "-o", path)[0] == 2
-
-
-def test_http_takes_smoothness_as_any_setting() -> None:
-    field = LiftSettings.model_json_schema()["properties"]["smoothness"]
-    assert field["default"] == 0
-    assert field["description"]
