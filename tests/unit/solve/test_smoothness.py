@@ -137,9 +137,9 @@ def plain(files: tuple[Path, Path, Path]) -> lc.LiftResult:
 
 @pytest.mark.parametrize("dtype", ["float16", "float32"])
 def test_refined_lift_is_the_lift_with_that_smoothness(files: tuple[Path, Path, Path], dtype: str) -> None:
-    own = {"dtype": dtype, "preset": "default"}
     plain, smoothed = (
-        lift_files(files[0], files[1], files[2:], LiftSettings(smoothness=strength, **own)) for strength in (0, 1.5)
+        lift_files(files[0], files[1], files[2:], LiftSettings.of(smoothness=strength, dtype=dtype))
+        for strength in (0, 1.5)
     )
     before = plain.features.clone()
     refined = plain.refined(lc.read_splats(files[0]), smoothness=1.5)
@@ -165,13 +165,13 @@ def test_refinement_that_cannot_be_is_refused_in_words(files: tuple[Path, Path, 
         plain.refined(splats[:10], smoothness=1)
     with pytest.raises(lc.InvalidLift, match="without smoothness"):
         plain.refined(splats, smoothness=1).refined(splats, smoothness=1)
-    clustered = lift_files(files[0], files[1], files[2:], LiftSettings(aggregation=True))
+    clustered = lift_files(files[0], files[1], files[2:], LiftSettings.of(aggregation=True))
     with pytest.raises(lc.InvalidLift, match="aggregation"):
         clustered.refined(splats, smoothness=1)
     with pytest.raises(lc.InvalidSettings, match="smoothness=0"):
         LiftSettings.of(smoothness=1, aggregation=True, aggregation_resolve=True, aggregation_clusters="hdbscan")
     with pytest.raises(lc.InvalidSettings, match=r"engine: .*got smoothness=2.0; set .*smoothness=0"):
-        LiftSettings(smoothness=2).check_blocks()
+        LiftSettings.of(smoothness=2).check_blocks(masks=True)
 
 
 def test_command_refines_a_lift_that_is_there(
