@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,7 +38,7 @@ class Scene:
         self.evidence: Tensor = torch.from_numpy(10 ** rng.uniform(-4, 3, count)).float()
         self.confidence: Tensor = torch.from_numpy(rng.random(count)).float()
 
-    def smooth(self, smoothness: float, **how: int) -> Tensor:
+    def smooth(self, smoothness: float, **how: Any) -> Tensor:
         given = self.splats, self.evidence, self.confidence, self.seen, smoothness
         return smooth(self.X.clone(), *given, **how)[0]
 
@@ -132,7 +133,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
 
 @pytest.fixture(scope="module")
 def plain(files: tuple[Path, Path, Path]) -> lc.LiftResult:
-    return lift_files(files[0], files[1], files[2:], LiftSettings())
+    return lift_files(files[0], files[1], files[2:], LiftSettings.of())
 
 
 @pytest.mark.parametrize("dtype", ["float16", "float32"])
