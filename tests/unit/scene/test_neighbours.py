@@ -43,6 +43,7 @@ def by_formula(splats: Splats) -> np.ndarray:
 @given(seed=SEEDS, count=st.integers(2, 80), coloured=st.booleans())
 def test_affinities_are_those_of_the_formula(seed: int, count: int, coloured: bool) -> None:
     splats = random_splats(seed, count)
+    assert splats.sh is not None
     splats = replace(splats, sh=0.2 * splats.sh if coloured else None)
     graph = SplatGraph.of(splats)
     assert graph.coloured == coloured

@@ -32,6 +32,7 @@ class Scene:
     def __init__(self, seed: int, count: int, channels: int = 5, unseen: float = 0.2) -> None:
         rng = np.random.default_rng(seed)
         splats = random_splats(seed, count)
+        assert splats.sh is not None
         self.splats: Splats = replace(splats, sh=0.1 * splats.sh)
         self.seen: Tensor = torch.from_numpy(rng.random(count) >= unseen)
         self.X: Tensor = torch.from_numpy(rng.normal(size=(count, channels)).astype(np.float32)) * self.seen[:, None]
