@@ -38,7 +38,7 @@ BLOCK = 32  # channels solved at a time: four [P, 32] f32
 ROWS = 1 << 13  # splats of one piece of work
 TOLERANCE = 1e-3  # of each channel's gradient, relative to that at X0, over sqrt(1 + lambda): what varies slowly
 # over the scene has little of the gradient, the less the larger lambda
-STEPS = 200  # of conjugate gradients at most; with lambda 4 about 20 are taken
+STEPS = 200  # of conjugate gradients at most; with lambda 4 about 20 are enough
 
 
 @dataclass(frozen=True)
@@ -99,25 +99,25 @@ def smooth(
     weights = _weights(evidence, confidence, seen)[graph.order]
     rings = _rings(graph, weights)
     system = _System.of(graph, weights, smoothness)
-    known, written = weights > 0, weights > 0
+    has_evidence, has_feature = weights > 0, weights > 0
     for rows, _ in rings:
-        written[rows] = True
-    order, rows_written = torch.from_numpy(graph.order).long(), np.flatnonzero(written)
-    places, channels = order[torch.from_numpy(rows_written)], X.shape[1]
+        has_feature[rows] = True
+    order, rows_with_feature = torch.from_numpy(graph.order).long(), np.flatnonzero(has_feature)
+    places, channels = order[torch.from_numpy(rows_with_feature)], X.shape[1]
     squares, steps, residual = np.zeros((2, channels)), 0, 0.0
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
-        for begin in range(0, channels if known.any() else 0, block):
+        for begin in range(0, channels if has_evidence.any() else 0, block):
             own = slice(begin, min(begin + block, channels))
             values = X[:, own].index_select(0, order).float().numpy()
-            values[~known] = 0.0
-            low, high = values[known].min(axis=0), values[known].max(axis=0)
-            solution, taken, rest = _solve(system, values, pool)
-            steps, residual = max(steps, taken), max(residual, rest)
+            values[~has_evidence] = 0.0
+            low, high = values[has_evidence].min(axis=0), values[has_evidence].max(axis=0)
+            solution, count, gradient = _solve(system, values, pool)
+            steps, residual = max(steps, count), max(residual, gradient)
             np.clip(solution, low, high, out=solution)
             squares[:, own] = _movement(system.weights, values, solution, pool)
             for rows, shares in rings:
                 solution[rows] = shares @ solution
-            X[:, own].index_copy_(0, places, torch.from_numpy(solution[rows_written]).to(X.dtype))
+            X[:, own].index_copy_(0, places, torch.from_numpy(solution[rows_with_feature]).to(X.dtype))
             progress("smooth", own.stop, channels, "channels")
     moved, whole = squares.sum(axis=1).tolist()
     facts: dict[str, Any] = {
