@@ -34,7 +34,6 @@ from liftcore.lifting.planning.contradictions import (
     unseen,
 )
 from liftcore.lifting.planning.views import visibility
-from liftcore.query.render import in_photo
 from liftcore.query.splat_colours import seen_colours
 from liftcore.raster import open_raster
 from liftcore.raster.base import Raster
@@ -42,6 +41,7 @@ from liftcore.runtime.device import CPU
 from liftcore.runtime.progress import Progress, silent
 from liftcore.scene.cameras import Camera, Cameras, photo_size
 from liftcore.scene.compositing import CompositingParams
+from liftcore.scene.drawing import in_photo
 from liftcore.scene.panorama import with_panoramas
 from liftcore.scene.render_mode import rendering_reason, rendering_warnings
 from liftcore.scene.splats import Splats

@@ -24,6 +24,7 @@ from torch import Tensor
 from liftcore.query.ask import ask
 from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.objects import Objects, objects
+from liftcore.query.opened import OpenedLift
 from liftcore.query.question import Answer, Query
 from liftcore.query.render import view_mask
 from liftcore.query.scene import Scene
@@ -210,7 +211,7 @@ class OwnMasks(Segmenter):
         return {text: self._look(text, view) for text in self._answers}
 
     def _look(self, text: str, view: str) -> Prediction:
-        def group(scene: Scene, answer: Answer) -> Objects:
+        def group(scene: OpenedLift, answer: Answer) -> Objects:
             if text not in self._objects:
                 self._objects[text] = objects(scene, answer)
             return self._objects[text]

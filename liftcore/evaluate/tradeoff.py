@@ -35,13 +35,14 @@ from liftcore.lifting.warm_up import warm_up_lift
 from liftcore.query.ask import ask
 from liftcore.query.objects import objects
 from liftcore.query.question import Query
-from liftcore.query.render import in_photo, view_mask
+from liftcore.query.render import view_mask
 from liftcore.query.result import LiftResult
 from liftcore.query.scene import Scene
 from liftcore.raster import open_raster
 from liftcore.runtime.device import CPU, choose_device
 from liftcore.runtime.progress import Progress
 from liftcore.scene.cameras import Cameras
+from liftcore.scene.drawing import in_photo
 from liftcore.scene.splats import Splats
 from liftcore.scene.views import cameras_of_views
 from liftcore.text.table import TableEncoder

@@ -16,6 +16,7 @@ from liftcore.errors import InvalidQuery
 from liftcore.io.json_file import finite
 from liftcore.query.directions import directions
 from liftcore.query.objects import objects
+from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.presence import (
     NOT_IN_WORDS,
     References,
@@ -26,7 +27,6 @@ from liftcore.query.presence import (
     together,
 )
 from liftcore.query.question import Answer, Box, Objects, Point, Presence, Query, Threshold, TopSplat
-from liftcore.query.scene import Scene, as_numpy
 from liftcore.query.scores import LEAST_LIKENESS, LOWEST_COSINE, combine, cosines, cosines_about
 from liftcore.query.selection import LEAST_FIRST, Rivals, contest, nearer_than_rivals, whole_things
 from liftcore.query.terms import Vector
@@ -79,7 +79,7 @@ class VectorAnswer:
         return f"VectorAnswer({found}, present={self.present}, clear={self.clear})"
 
 
-def ask(scene: Scene, query: Query | str, encoder: TextEncoder | None = None) -> Answer:
+def ask(scene: OpenedLift, query: Query | str, encoder: TextEncoder | None = None) -> Answer:
     """Score every splat for a query and choose those that answer it.
 
     A splat counts in the histogram by its evidence: what hardly a ray met scores by the chance of a few pixels. It is
@@ -106,7 +106,7 @@ def ask(scene: Scene, query: Query | str, encoder: TextEncoder | None = None) ->
 
 
 def query_vectors(
-    scene: Scene,
+    scene: OpenedLift,
     positives: Any,
     negatives: Any = (),
     *,
@@ -166,7 +166,7 @@ def _terms(values: Any) -> tuple[str | Vector, ...]:
     return tuple(Vector(tuple(row.tolist())) for row in np.atleast_2d(rows)) if rows.size else ()
 
 
-def question(scene: Scene, query: Query, encoder: TextEncoder | None, names: Sequence[str] = ()) -> Question:
+def question(scene: OpenedLift, query: Query, encoder: TextEncoder | None, names: Sequence[str] = ()) -> Question:
     """A query with the directions of its terms; what can be wrong with a query is found here (see `ask`).
 
     Args:
@@ -181,7 +181,7 @@ def question(scene: Scene, query: Query, encoder: TextEncoder | None, names: Seq
     return Question(query, rows, words, references_of(encoder, scene.metadata.text_space), pack_of(encoder))
 
 
-def answers(scene: Scene, questions: Sequence[Question]) -> list[Answer]:
+def answers(scene: OpenedLift, questions: Sequence[Question]) -> list[Answer]:
     """Answer several queries in one pass over the features; each to the same bits as alone."""
     similarities = _similarities(scene, questions)
     if len(questions) == 1:
@@ -190,7 +190,7 @@ def answers(scene: Scene, questions: Sequence[Question]) -> list[Answer]:
         return list(pool.map(lambda asked, similar: _answer(scene, asked, similar), questions, similarities))
 
 
-def located(scene: Scene, answer: Answer, count: int | None = None) -> Answer:
+def located(scene: OpenedLift, answer: Answer, count: int | None = None) -> Answer:
     """An answer with its best splats, and the box around all selected ones.
 
     A single outlier stretches the box; ``objects`` tells outliers from things.
@@ -216,7 +216,7 @@ def located(scene: Scene, answer: Answer, count: int | None = None) -> Answer:
     return answer.model_copy(update={"top": top, "box": Box(*map(_point, ends)) if ends else None})
 
 
-def _similarities(scene: Scene, questions: Sequence[Question]) -> list[np.ndarray]:
+def _similarities(scene: OpenedLift, questions: Sequence[Question]) -> list[np.ndarray]:
     """For each query [P, n] f32, how like each of its terms every splat is."""
     features, norms = scene.features, scene.norms
     of_words = np.concatenate([asked.rows[asked.plain] for asked in questions])
@@ -233,7 +233,7 @@ def _similarities(scene: Scene, questions: Sequence[Question]) -> list[np.ndarra
     return found
 
 
-def _answer(scene: Scene, asked: Question, similarities: np.ndarray) -> Answer:
+def _answer(scene: OpenedLift, asked: Question, similarities: np.ndarray) -> Answer:
     query, seen = asked.query, scene.seen
     presence, kept = _presence(scene, asked, similarities)
     scores = combine(similarities if kept.all() else similarities[:, kept], int(kept[: len(query.positives)].sum()))
@@ -254,7 +254,7 @@ def _answer(scene: Scene, asked: Question, similarities: np.ndarray) -> Answer:
 
 
 def _selected(
-    scene: Scene, asked: Question, kept: np.ndarray, scores: np.ndarray, weights: np.ndarray
+    scene: OpenedLift, asked: Question, kept: np.ndarray, scores: np.ndarray, weights: np.ndarray
 ) -> tuple[Threshold, np.ndarray]:
     """The threshold of a question and what it selects, [P] bool.
 
@@ -308,7 +308,7 @@ def _rivals(asked: Question, directions: np.ndarray) -> list[Rivals]:
     return [some for some in rivals if len(some.vectors)]
 
 
-def _presence(scene: Scene, asked: Question, similarities: np.ndarray) -> tuple[Presence, np.ndarray]:
+def _presence(scene: OpenedLift, asked: Question, similarities: np.ndarray) -> tuple[Presence, np.ndarray]:
     """Whether any of the positives is there; and the terms that count, [n] bool: all, or without absent words."""
     kept, positives = np.ones(len(asked.rows), np.bool_), len(asked.query.positives)
     words = np.flatnonzero(asked.plain[:positives]).tolist()

@@ -17,8 +17,8 @@ import numpy as np
 
 from liftcore.errors import InvalidQuery, NotFound
 from liftcore.query.objects import largest_box
+from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.question import SceneObject
-from liftcore.query.scene import Scene, as_numpy
 from liftcore.query.scores import cosines, norms_of
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.origin import MAP_REACH
@@ -48,7 +48,7 @@ class Catalogue:
         return one_line(self, f"{len(self.objects)} objects", f"features={list(self.features.shape)}", some or "none")
 
 
-def catalogue(scene: Scene, words: Sequence[str] = (), vectors: Any = None) -> Catalogue:
+def catalogue(scene: OpenedLift, words: Sequence[str] = (), vectors: Any = None) -> Catalogue:
     """The objects of a lift, named by the nearest of some words.
 
     Args:
@@ -89,7 +89,7 @@ def catalogue(scene: Scene, words: Sequence[str] = (), vectors: Any = None) -> C
     return Catalogue(tuple(found), told, features)
 
 
-def object_features(scene: Scene) -> np.ndarray:
+def object_features(scene: OpenedLift) -> np.ndarray:
     """[N, F] f32: the unit mean of each object's unit features, by evidence; zeros where none has a feature."""
     from scipy.sparse import csr_array
 
@@ -147,7 +147,7 @@ def table_csv(found: Catalogue) -> bytes:
     return content.getvalue().encode()
 
 
-def one_object_ply(scene: Scene, number: int) -> Iterable[bytes]:
+def one_object_ply(scene: OpenedLift, number: int) -> Iterable[bytes]:
     """The splats of one object, as a file in blocks; every property of theirs to the byte.
 
     Raises:

@@ -12,16 +12,16 @@ from pathlib import Path
 import numpy as np
 
 from liftcore.errors import InvalidQuery, NotFound
+from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.question import Query
 from liftcore.query.regions import codebook_row, regions_of
-from liftcore.query.scene import Scene, as_numpy
 from liftcore.query.terms import Example, OneSplat, Pixel, Region, Term, Vector, parse_example
 from liftcore.text import TextEncoder
 
 MINIMUM_ROW_SUM = 0.5  # below it a ray mostly misses the scene: no histogram, no mask and no example takes it
 
 
-def directions(scene: Scene, query: Query, encoder: TextEncoder | None, names: Sequence[str] = ()) -> np.ndarray:
+def directions(scene: OpenedLift, query: Query, encoder: TextEncoder | None, names: Sequence[str] = ()) -> np.ndarray:
     """The unit vector of every term, [n, F] f32.
 
     Args:
@@ -61,7 +61,7 @@ class _Names:
             raise type(error)(self.names[place], expected=error.expected, got=got, hint=error.hint) from None
 
 
-def _encode(scene: Scene, query: Query, encoder: TextEncoder | None, named: _Names) -> dict[int, np.ndarray]:
+def _encode(scene: OpenedLift, query: Query, encoder: TextEncoder | None, named: _Names) -> dict[int, np.ndarray]:
     """The unit vector of each text, by its place among the terms."""
     texts = {place: term for place, term in enumerate(query.terms) if isinstance(term, str)}
     if not texts:
@@ -87,7 +87,7 @@ def _encode(scene: Scene, query: Query, encoder: TextEncoder | None, named: _Nam
     return {place: _unit(row, text) for row, (place, text) in zip(as_numpy(rows), texts.items(), strict=True)}
 
 
-def _regions(scene: Scene, query: Query, named: _Names) -> dict[int, np.ndarray]:
+def _regions(scene: OpenedLift, query: Query, named: _Names) -> dict[int, np.ndarray]:
     """The unit row of each region, by its place among the terms; a view is read once for all that are of it."""
     asked = [(term.view, place, term) for place, term in enumerate(query.terms) if isinstance(term, Region)]
     rows: dict[int, np.ndarray] = {}
@@ -100,7 +100,7 @@ def _regions(scene: Scene, query: Query, named: _Names) -> dict[int, np.ndarray]
     return rows
 
 
-def _feature(scene: Scene, example: Pixel | OneSplat | Vector) -> np.ndarray:
+def _feature(scene: OpenedLift, example: Pixel | OneSplat | Vector) -> np.ndarray:
     if isinstance(example, Pixel):
         return _rendered(scene, example)
     if isinstance(example, Vector):
@@ -113,7 +113,7 @@ def _feature(scene: Scene, example: Pixel | OneSplat | Vector) -> np.ndarray:
     return scene.features[example.splat]
 
 
-def _rendered(scene: Scene, pixel: Pixel) -> np.ndarray:
+def _rendered(scene: OpenedLift, pixel: Pixel) -> np.ndarray:
     """``sum_j A_ij x_j`` of the pixel's ray, [F] f64, as scores are rendered."""
     import torch
 

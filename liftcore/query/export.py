@@ -16,8 +16,8 @@ from liftcore.errors import InvalidQuery
 from liftcore.query.catalogue import Catalogue, one_object_ply, table_csv
 from liftcore.query.colours import NOT_SEEN_COLOUR, cluster_colours, heat_colours
 from liftcore.query.objects import MOST_SPLATS, objects
+from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.question import Answer
-from liftcore.query.scene import Scene, as_numpy
 
 if TYPE_CHECKING:  # these load torch
     from PIL.Image import Image
@@ -36,7 +36,7 @@ FILES = {  # of what a file is made -> the files that there are of it
 
 
 def blocks_of(
-    scene: Scene,
+    scene: OpenedLift,
     source: Answer | Segmentation | Catalogue | int | None,
     what: str = "",
     *,
@@ -69,7 +69,7 @@ def blocks_of(
 
 
 def _of_answer(
-    scene: Scene,
+    scene: OpenedLift,
     answer: Answer,
     what: str,
     view: str | Camera | None,
@@ -93,7 +93,7 @@ def _of_answer(
     return [mask_png(seen.mask) if what == "mask" else attention_png(seen)]
 
 
-def _of_words(scene: Scene, found: Segmentation, what: str, view: str | Camera | None) -> Iterable[bytes]:
+def _of_words(scene: OpenedLift, found: Segmentation, what: str, view: str | Camera | None) -> Iterable[bytes]:
     from liftcore.query.labels import document_bytes, labelled_ply, labels
     from liftcore.query.segment import map_png, named_ply, picture_png, word_map
 
@@ -120,7 +120,7 @@ def _needed(view: str | Camera | None) -> str | Camera:
     return view
 
 
-def object_splats(scene: Scene, answer: Answer, suffix: str = ".ply") -> Iterable[bytes]:
+def object_splats(scene: OpenedLift, answer: Answer, suffix: str = ".ply") -> Iterable[bytes]:
     """The splats of an answer's objects, as a file in blocks: a PLY with every property to the byte, .splat or .spz.
 
     They are those that `objects` and masks show, without strays; of more than are grouped, all that were selected.
@@ -146,7 +146,7 @@ def object_splats(scene: Scene, answer: Answer, suffix: str = ".ply") -> Iterabl
     return some_rows(scene.splat_file, answer.selected if whole else objects(scene, answer).numbers >= 0, suffix)
 
 
-def coloured_ply(scene: Scene, answer: Answer) -> Iterable[bytes]:
+def coloured_ply(scene: OpenedLift, answer: Answer) -> Iterable[bytes]:
     """All splats in the colours of their scores, as a file in blocks.
 
     The colour map spans the scores of the seen splats as a picture of the attention spans its pixels. Splats without
@@ -171,7 +171,7 @@ def npy(values: np.ndarray) -> bytes:
     return content.getvalue()
 
 
-def viewer_splats(scene: Scene) -> Iterator[bytes]:
+def viewer_splats(scene: OpenedLift) -> Iterator[bytes]:
     """The scene in the ``.splat`` format of web viewers, in the lift's order, in blocks.
 
     Raises:
@@ -182,7 +182,7 @@ def viewer_splats(scene: Scene) -> Iterator[bytes]:
     return splat_blocks(scene.splats)
 
 
-def layer_colours(scene: Scene, what: str) -> np.ndarray:
+def layer_colours(scene: OpenedLift, what: str) -> np.ndarray:
     """Colours of all splats, [P, 3] u8 sRGB.
 
     ``pca`` are three principal components of the features, ``cluster`` a colour a cluster; ``evidence`` (by its

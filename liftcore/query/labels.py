@@ -13,7 +13,7 @@ import numpy as np
 
 from liftcore.errors import InvalidLift
 from liftcore.query.objects import LEAST_EVIDENCE, trimmed_box
-from liftcore.query.scene import Scene, as_numpy
+from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.runtime.version import __version__
 from liftcore.scene.touching import touching
 
@@ -35,7 +35,7 @@ class Labels:
     document: dict[str, Any]
 
 
-def labels(scene: Scene, segmentation: Segmentation) -> Labels:
+def labels(scene: OpenedLift, segmentation: Segmentation) -> Labels:
     """The labels of a segmentation.
 
     ``class_id`` is the value of a splat's word (`Segmentation.values`), ``instance_id`` counts groups of splats of
@@ -90,7 +90,7 @@ def labels(scene: Scene, segmentation: Segmentation) -> Labels:
     return Labels(columns, document)
 
 
-def labelled_ply(scene: Scene, made: Labels) -> Iterator[bytes]:
+def labelled_ply(scene: OpenedLift, made: Labels) -> Iterator[bytes]:
     """All splats with the columns, as a file in blocks; every other property to the byte.
 
     Raises:
@@ -127,7 +127,7 @@ def _boxes(means: np.ndarray, weights: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _frame(scene: Scene) -> str:
+def _frame(scene: OpenedLift) -> str:
     """Whose frame boxes and splats are in, as far as the lift's files tell."""
     from liftcore.io.cameras import camera_source
 

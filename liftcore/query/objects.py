@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from liftcore.errors import InvalidQuery
+from liftcore.query.opened import OpenedLift
 from liftcore.query.question import Answer, Box, FoundObject, Objects, Point
-from liftcore.query.scene import Scene
 from liftcore.scene.touching import touching
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ MOST_SPLATS = 1 << 20  # that are grouped: a million take seven seconds of two c
 _TAIL = 1e-3  # of an object's evidence that its box leaves out at each end of each axis
 
 
-def objects(scene: Scene, answer: Answer) -> Objects:
+def objects(scene: OpenedLift, answer: Answer) -> Objects:
     """Group the selected splats of an answer into the things that they make up.
 
     Things are splats that touch (`touching`). What has less than a twentieth of the evidence of the largest is no

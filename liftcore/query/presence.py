@@ -36,8 +36,8 @@ from typing import Any, Self
 import numpy as np
 
 from liftcore.errors import InvalidQuery, InvalidTable, Unavailable
+from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.question import Presence
-from liftcore.query.scene import Scene, as_numpy
 from liftcore.query.scores import cosines
 from liftcore.query.threshold import LEAST_SHARE
 from liftcore.text import LVIS_TABLE, RememberingEncoder, TextEncoder
@@ -101,7 +101,9 @@ class References:
         return np.flatnonzero(similar < max(RELATED * nearest, np.finfo(np.float32).eps)), allowed
 
 
-def judge(scene: Scene, name: str, direction: np.ndarray, scores: np.ndarray, references: References) -> Presence:
+def judge(
+    scene: OpenedLift, name: str, direction: np.ndarray, scores: np.ndarray, references: References
+) -> Presence:
     """Say whether a word is there.
 
     Args:
@@ -180,7 +182,7 @@ def together(words: Sequence[Presence]) -> Presence:
     return Presence(present=first.present, presence=first.presence, why=" ".join(one.why for one in words))
 
 
-def best_splats(scene: Scene, scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def best_splats(scene: OpenedLift, scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The splats of the highest scores [P] that have LEAST_SHARE of the evidence, and how much each counts.
 
     Returns:

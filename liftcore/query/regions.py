@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from liftcore.errors import InvalidFeatures, InvalidQuery, NotFound
+from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.question import CoveringRegion
-from liftcore.query.scene import Scene, as_numpy
 from liftcore.query.terms import Region
 
 if TYPE_CHECKING:
     from liftcore.values.views import Regions
 
 
-def regions_of(scene: Scene, view: str, argument: str) -> Regions:
+def regions_of(scene: OpenedLift, view: str, argument: str) -> Regions:
     """The regions that the packs have of a view, which may be named as the pack or as its camera is.
 
     Raises:
@@ -50,7 +50,7 @@ def codebook_row(regions: Regions, example: Region) -> np.ndarray:
     return as_numpy(regions.codebook[example.region])
 
 
-def regions_at(scene: Scene, view: str, x: int, y: int) -> tuple[CoveringRegion, ...]:
+def regions_at(scene: OpenedLift, view: str, x: int, y: int) -> tuple[CoveringRegion, ...]:
     """The regions that cover pixel (x, y) of a view's photo, one a level at most, the smallest first.
 
     Raises:
@@ -70,7 +70,7 @@ def regions_at(scene: Scene, view: str, x: int, y: int) -> tuple[CoveringRegion,
     return tuple(sorted(found, key=lambda one: one.share))
 
 
-def region_mask(scene: Scene, example: Region) -> np.ndarray:
+def region_mask(scene: OpenedLift, example: Region) -> np.ndarray:
     """[H, W] bool, the pixels of the view's photo that a region covers.
 
     Raises:
@@ -93,7 +93,7 @@ def _labelled(regions: Regions, example: Region) -> np.ndarray:
     return inside
 
 
-def _map_places(scene: Scene, view: str, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _map_places(scene: OpenedLift, view: str, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """[H] and [W], the row and column of the label map [L, h, w] that each row and column of the photo reads."""
     from liftcore.scene.cameras import photo_size
 

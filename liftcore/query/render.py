@@ -8,22 +8,19 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
 from PIL.PngImagePlugin import PngInfo
-from torch import Tensor
 
 from liftcore.errors import InvalidQuery
 from liftcore.query.colours import cluster_colours, heat_colours, map_colours
 from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.objects import objects
+from liftcore.query.opened import OpenedLift
 from liftcore.query.question import Answer, Objects
-from liftcore.query.scene import Scene
 from liftcore.query.splat_colours import seen_colours
-from liftcore.scene.cameras import Camera, drawn_by
+from liftcore.scene.cameras import Camera
 from liftcore.scene.compositing import CompositingParams
-from liftcore.scene.distortion import photo_places
 
 LEAST_SHARE = 0.5  # of a ray's weight, that what was found must have in a mask
 MOST_GROUPED = 1 << 17  # selected splats whose strays a mask leaves out: they take .4 s of two cores
-BAND_PIXELS = 1 << 20  # of a distorted photo, carried at a time
 _SHOWN = (0.01, 0.99)  # quantiles of the covered pixels' depths: a floater before the lens dims no picture
 _LEVELS = 254  # between the farthest covered pixel, at 1, and the nearest, at 255; 0 is for what no splat covers
 _DIM = 0.35  # brightness that an overlay leaves to what was not found
@@ -60,7 +57,7 @@ class ShownDepth:
 
 
 def view_mask(
-    scene: Scene, answer: Answer, view: str | Camera, group: Callable[[Scene, Answer], Objects] = objects
+    scene: OpenedLift, answer: Answer, view: str | Camera, group: Callable[[OpenedLift, Answer], Objects] = objects
 ) -> ViewMask:
     """See an answer from a camera: attention, and a mask of the objects that were found.
 
@@ -104,7 +101,7 @@ def attention_png(seen: ViewMask) -> bytes:
     return _png(heat_colours(seen.attention, seen.row_sums > 0))
 
 
-def render_png(scene: Scene, view: str | Camera, what: str = "rgb") -> bytes:
+def render_png(scene: OpenedLift, view: str | Camera, what: str = "rgb") -> bytes:
     """The scene as a camera sees it, RGB [H, W, 3] on black: its colours, features (``pca``) or clusters.
 
     Its ``depth`` is one 8-bit channel [H, W], near bright, whose PNG tells its range as text (`ShownDepth`).
@@ -118,7 +115,7 @@ def render_png(scene: Scene, view: str | Camera, what: str = "rgb") -> bytes:
     return _png(render(scene, view, what))
 
 
-def render(scene: Scene, view: str | Camera, what: str = "rgb") -> np.ndarray:
+def render(scene: OpenedLift, view: str | Camera, what: str = "rgb") -> np.ndarray:
     """The colours of a view, [H, W, 3] u8 sRGB on black, with the opacities as trained.
 
     ``rgb`` takes the splats' own colours, ``pca`` the first three principal components of their features, and
@@ -143,7 +140,7 @@ def render(scene: Scene, view: str | Camera, what: str = "rgb") -> np.ndarray:
     return np.round(levels, out=levels).astype(np.uint8)
 
 
-def _render_clusters(scene: Scene, view: str | Camera) -> np.ndarray:
+def _render_clusters(scene: OpenedLift, view: str | Camera) -> np.ndarray:
     if scene.cluster is None or scene.cluster_features is None:
         hint = "lift again with the setting aggregation=true"
         raise InvalidQuery("what", expected="a lift with clusters", got="a lift without aggregation", hint=hint)
@@ -155,7 +152,7 @@ def _render_clusters(scene: Scene, view: str | Camera) -> np.ndarray:
     return picture
 
 
-def _render_confidence(scene: Scene, view: str | Camera) -> np.ndarray:
+def _render_confidence(scene: OpenedLift, view: str | Camera) -> np.ndarray:
     if scene.confidence is None:
         hint = "lift again with the preset default, or with robust_steps"
         raise InvalidQuery("what", expected="a lift with confidence", got="a lift that was not reweighted", hint=hint)
@@ -166,7 +163,7 @@ def _render_confidence(scene: Scene, view: str | Camera) -> np.ndarray:
     return map_colours(means, sums >= MINIMUM_ROW_SUM)
 
 
-def expected_depth(scene: Scene, view: str | Camera) -> tuple[np.ndarray, np.ndarray]:
+def expected_depth(scene: OpenedLift, view: str | Camera) -> tuple[np.ndarray, np.ndarray]:
     """The expected depth of the rays of a view, ``sum_j w_j z_j / sum_j w_j``.
 
     z_j is the depth of a splat's centre along the camera's axis, not along the ray. Opacities are as trained.
@@ -185,7 +182,7 @@ def expected_depth(scene: Scene, view: str | Camera) -> tuple[np.ndarray, np.nda
     return torch.where(covered, image[..., 0] / image[..., 1], 0.0).numpy(), covered.numpy()
 
 
-def shown_depth(scene: Scene, view: str | Camera) -> ShownDepth:
+def shown_depth(scene: OpenedLift, view: str | Camera) -> ShownDepth:
     """The expected depths of a view, near bright, from the 1st to the 99th percentile of the covered pixels.
 
     Raises:
@@ -201,52 +198,12 @@ def shown_depth(scene: Scene, view: str | Camera) -> ShownDepth:
     return ShownDepth(levels, (near, far))
 
 
-def _as_trained(scene: Scene) -> CompositingParams:
+def _as_trained(scene: OpenedLift) -> CompositingParams:
     return CompositingParams(antialiased=scene.compositing.antialiased)
 
 
-def in_photo(camera: Camera, draw: Callable[[Camera], Tensor]) -> Tensor:
-    """A picture in the pixels of a camera's photo: what a pinhole drew, seen through the lens.
-
-    Args:
-        camera: of the photo. draw: makes a picture [H, W, ..] of a pinhole.
-
-    Returns:
-        [H, W, ..] of the photo. Where there is no lens it is as drawn; else floats are interpolated between four
-        pixels, and others are the nearest one's. Zero at the rim of a fisheye's photo that no pinhole sees.
-    """
-    image = draw(drawn_by(camera))
-    if camera.lens is None:
-        return image
-    width, height, places = camera.lens.width, camera.lens.height, photo_places(camera.lens)
-    picture = torch.zeros((height, width, *image.shape[2:]), dtype=image.dtype)
-    rows = max(1, BAND_PIXELS // width)
-    for first in range(0, height, rows):
-        u, v = (torch.from_numpy(axis[first : first + rows]) for axis in places)
-        picture[first : first + rows] = _read(image, u, v)
-    return picture
-
-
-def _read(image: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """[h, w, ..], an image at places [h, w] in its pixels; zero where these lie outside."""
-    height, width = image.shape[:2]
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    u, v = torch.where(inside, u, 0.0), torch.where(inside, v, 0.0)
-    shape = (*inside.shape, *(1 for _ in image.shape[2:]))
-    if not image.is_floating_point():
-        return image[v.long(), u.long()] * inside.reshape(shape)
-    found = torch.zeros((*inside.shape, *image.shape[2:]), dtype=image.dtype)
-    left, top = (u - 0.5).floor(), (v - 0.5).floor()
-    for row in (top, top + 1):
-        for column in (left, left + 1):
-            share = (1 - (u - 0.5 - column).abs()) * (1 - (v - 0.5 - row).abs()) * inside
-            taken = image[row.clamp(0, height - 1).long(), column.clamp(0, width - 1).long()]
-            found += taken * share.to(image.dtype).reshape(shape)
-    return found
-
-
 def overlay_png(
-    scene: Scene, seen: ViewMask, view: str | Camera, name: str, photo: Image.Image | None = None
+    scene: OpenedLift, seen: ViewMask, view: str | Camera, name: str, photo: Image.Image | None = None
 ) -> bytes:
     """What was found, in the photo of its view or else a render, with a caption that says its share of the picture.
 

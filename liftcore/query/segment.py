@@ -22,9 +22,9 @@ from liftcore.errors import InvalidQuery
 from liftcore.query.colours import cluster_colours
 from liftcore.query.directions import MINIMUM_ROW_SUM, directions
 from liftcore.query.objects import trimmed_box
+from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.presence import LEAST_WORDS, References, judge, references_beside
 from liftcore.query.question import BestWord, NamedSplats, Query
-from liftcore.query.scene import Scene, as_numpy
 from liftcore.query.scores import cosines, norms_of
 from liftcore.query.terms import Example
 from liftcore.query.threshold import find_threshold
@@ -90,7 +90,7 @@ def words_of(encoder: TextEncoder) -> list[str]:
 
 
 def segment(
-    scene: Scene,
+    scene: OpenedLift,
     words: Sequence[str],
     vectors: Any,
     progress: Progress = silent,
@@ -178,7 +178,7 @@ class _Nearest:
         self.row[nearer] = row
 
 
-def _scores(scene: Scene, vectors: np.ndarray, rows: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+def _scores(scene: OpenedLift, vectors: np.ndarray, rows: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
     """Each of the rows with the cosines [P] f32 of its vector; some rows in one pass over the features."""
     for first in range(0, len(rows), AT_ONCE):
         some = rows[first : first + AT_ONCE]
@@ -186,7 +186,7 @@ def _scores(scene: Scene, vectors: np.ndarray, rows: Sequence[int]) -> Iterator[
 
 
 def best_words(
-    scene: Scene, example: Example, words: Sequence[str], vectors: Any, count: int = 5
+    scene: OpenedLift, example: Example, words: Sequence[str], vectors: Any, count: int = 5
 ) -> tuple[BestWord, ...]:
     """What is this? The words that a pixel, a region, a splat or a vector is most like, the nearest first.
 
@@ -203,7 +203,7 @@ def best_words(
     return tuple(BestWord(word=words[row], score=float(scores[row])) for row in nearest)
 
 
-def named_ply(scene: Scene, segmentation: Segmentation) -> Iterable[bytes]:
+def named_ply(scene: OpenedLift, segmentation: Segmentation) -> Iterable[bytes]:
     """All splats in the colours of their words, grey where they have none, as a file in blocks.
 
     Raises:
@@ -215,7 +215,7 @@ def named_ply(scene: Scene, segmentation: Segmentation) -> Iterable[bytes]:
     return recoloured(scene.splat_file, segmentation.colours[segmentation.values])
 
 
-def word_map(scene: Scene, segmentation: Segmentation, view: str | Camera) -> np.ndarray:
+def word_map(scene: OpenedLift, segmentation: Segmentation, view: str | Camera) -> np.ndarray:
     """[H, W] i32, the value of the word (`Segmentation.values`) that has the most weight on each ray.
 
     Raises:

@@ -26,7 +26,7 @@ from liftcore.query.presence import References, nearer_counts, products
 from liftcore.query.threshold import LEAST_SHARE
 
 if TYPE_CHECKING:
-    from liftcore.query.scene import Scene
+    from liftcore.query.opened import OpenedLift
 
 NEAR = 0.9  # of the selected evidence, at which the word must be among the nearest; with .5 two things pass for one
 SAMPLED = 256  # splats of each octave of the ranking that are looked at: a million splats have twelve octaves
@@ -61,11 +61,11 @@ class Rivals:
         same = (rivals.vectors @ directions.T >= SAME_WORD).any(axis=1)
         return cls(directions, rivals.vectors[~same], 0)
 
-    def ahead(self, scene: Scene, rows: np.ndarray) -> np.ndarray:
+    def ahead(self, scene: OpenedLift, rows: np.ndarray) -> np.ndarray:
         """[n] i64, how many of them are nearer to these splats [n] than the query's words (`nearer_counts`)."""
         return np.minimum(*nearer_counts(scene.features[rows], scene.norms[rows], scene.rough_mean, *self._pair))
 
-    def ahead_of_means(self, scene: Scene, means: np.ndarray) -> np.ndarray:
+    def ahead_of_means(self, scene: OpenedLift, means: np.ndarray) -> np.ndarray:
         """The same for unit features [n, F]."""
         ones = np.ones(len(means), np.float32)
         return np.minimum(*nearer_counts(means, ones, scene.rough_mean, *self._pair))
@@ -83,7 +83,7 @@ class Contest:
     first: float  # share, of the evidence at which the word is the nearest of all, at or above a threshold
 
 
-def contest(scene: Scene, scores: np.ndarray, weights: np.ndarray, threshold: float, rivals: Rivals) -> Contest:
+def contest(scene: OpenedLift, scores: np.ndarray, weights: np.ndarray, threshold: float, rivals: Rivals) -> Contest:
     """Compare the splats of a ranking with rivals, from the best down.
 
     A sample is looked at, denser where scores are higher: `SAMPLED` of each octave of the ranking, evenly. Where the
@@ -115,7 +115,7 @@ def contest(scene: Scene, scores: np.ndarray, weights: np.ndarray, threshold: fl
     return Contest(float(lowest), share)
 
 
-def nearer_than_rivals(scene: Scene, selected: np.ndarray, rivals: Rivals) -> np.ndarray:
+def nearer_than_rivals(scene: OpenedLift, selected: np.ndarray, rivals: Rivals) -> np.ndarray:
     """[P] bool: the selected splats [P] bool to which no rival is nearer than the query's words."""
     kept = np.zeros_like(selected)
     rows = np.flatnonzero(selected)
@@ -126,7 +126,7 @@ def nearer_than_rivals(scene: Scene, selected: np.ndarray, rivals: Rivals) -> np
     return kept
 
 
-def whole_things(scene: Scene, selected: np.ndarray, weights: np.ndarray, rivals: Rivals) -> list[int]:
+def whole_things(scene: OpenedLift, selected: np.ndarray, weights: np.ndarray, rivals: Rivals) -> list[int]:
     """The things of the region graph that a selection [P] bool covers mostly and that it may take whole.
 
     Args:
@@ -159,7 +159,7 @@ def whole_things(scene: Scene, selected: np.ndarray, weights: np.ndarray, rivals
     return taken
 
 
-def _about(scene: Scene, means: np.ndarray, mean: np.ndarray) -> np.ndarray:
+def _about(scene: OpenedLift, means: np.ndarray, mean: np.ndarray) -> np.ndarray:
     """[n] f32, the cosines of unit features [n, F] and [F] about the scene's mean."""
     offsets, offset = means - scene.rough_mean, mean - scene.rough_mean
     lengths = np.linalg.norm(offsets, axis=1) * np.linalg.norm(offset)

@@ -12,8 +12,8 @@ from PIL import Image
 
 from liftcore.errors import InvalidQuery, NotFound
 from liftcore.query import objects as grouping
+from liftcore.query import opened as scenes
 from liftcore.query import render as module
-from liftcore.query import scene as scenes
 from liftcore.query.ask import ask
 from liftcore.query.colours import NO_CLUSTER_COLOUR, cluster_colours
 from liftcore.query.objects import objects
@@ -21,7 +21,6 @@ from liftcore.query.question import Answer, Query
 from liftcore.query.render import (
     attention_png,
     expected_depth,
-    in_photo,
     mask_png,
     overlay,
     render,
@@ -36,6 +35,7 @@ from liftcore.raster.reference import ReferenceRaster
 from liftcore.scene.cameras import Camera, Cameras, behind_lens, drawn_by
 from liftcore.scene.compositing import CompositingParams
 from liftcore.scene.distortion import Brown, Distortion, Fisheye, photo_places
+from liftcore.scene.drawing import in_photo
 from liftcore.scene.harmonics import SH_C0
 from liftcore.scene.splats import Kernel, Splats
 from tests.api.tiny_scene import HEIGHT, SPLATS_A_CLUSTER, WIDTH
