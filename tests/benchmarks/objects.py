@@ -16,7 +16,6 @@ there should be with table and curtain; and what they cost, ``seconds`` of the l
 
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any
@@ -58,7 +57,8 @@ def measure_lift(scene: Scene, answers: dict[int, Answer], owners: np.ndarray) -
 def _are_two(scene: Scene, answers: dict[int, Answer], owners: np.ndarray) -> bool:
     """Whether the splats of two answers make exactly two objects, most of one's splats of each thing."""
     first, second = answers.values()
-    both = objects(scene, replace(first, selected=first.selected | second.selected))
+    either, told = first.selected | second.selected, first.model_dump(exclude={"text", "like", "count", "top", "box"})
+    both = objects(scene, Answer.of(first.query, first.scores, first.seen, either, **told))
     most = {int(np.bincount(owners[both.numbers == number]).argmax()) for number in range(len(both.found))}
     return len(both.found) == 2 and most == set(answers)
 
