@@ -89,15 +89,16 @@ setup: $(READY)
 
 # torch and torchvision first, from one index: each build of the one loads beside its own build of the other alone,
 # and the lock has digests of PyPI's. What they need has digests in the lock, but for the libraries of a CUDA build,
-# which come last.
+# which come last. Modules are compiled as they are imported: most of them never are, and to compile all takes half a
+# minute.
 $(READY): requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "splatlift needs Python 3.11 or later")'
 	@echo "making .venv: a few minutes, once"
 	[ -x $(BIN)/python ] || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --no-deps $(TORCH_PIP) $(TORCH)
+	$(BIN)/python -m pip install --quiet --no-compile --no-deps $(TORCH_PIP) $(TORCH)
 	awk '/^[a-z]/ { kept = !/^(torch|torchvision)==/ } kept' requirements.lock \
-	| $(BIN)/python -m pip install --quiet --no-deps --require-hashes -r /dev/stdin
-	$(BIN)/python -m pip install --quiet $(TORCH_PIP) $(TORCH)
+	| $(BIN)/python -m pip install --quiet --no-compile --no-deps --require-hashes -r /dev/stdin
+	$(BIN)/python -m pip install --quiet --no-compile $(TORCH_PIP) $(TORCH)
 	$(BIN)/python -m pip install --quiet --no-deps -e .
 	@$(BIN)/python -c "import torchvision" 2>/dev/null || echo "torchvision does not load beside this torch: scripts that" \
 	"import open_clip or segment-anything need both of one index (TORCH_PIP='--index-url ...'); splatlift does without"
