@@ -231,7 +231,10 @@ def prompt_views(
         )
     rows = {phrase: row for row, phrase in enumerate(order)}
     vectors = np.eye(len(order) + 1, dtype=np.float16)
-    read_view = lambda name: _regions(name, told[name], rows, vectors)  # noqa: E731
+
+    def read_view(name: str) -> Regions:
+        return _regions(name, told[name], rows, vectors)
+
     views = ViewFolder({name: one.file for name, one in told.items()}, read_view, files)
     table = TableEncoder("phrases", [index.phrases[phrase] for phrase in order], vectors[:-1])
     counts = {said: seen_in[phrase] for phrase, said in sorted(index.phrases.items())}

@@ -34,23 +34,9 @@ MOST_PIXELS = 1 << 26  # of a picture: 67 million take a minute of one core and 
 
 
 class OpenedLift:
-    """A lift, with the splats and cameras of its scene; `liftcore.query.scene.Scene` asks it.
+    """A lift, with the splats and cameras of its scene: what `liftcore.query.scene.Scene` asks.
 
-    What questions share is made once and kept: norms, mean, axes, encoders. Scores need the lift alone, and no torch.
-    Splats, cameras and packs that are not given are found where the lift remembers them, are checked against their
-    digests when first used, and are loaded once.
-
-    Args:
-        source: the lift, or the path of its file, which is mapped and not read.
-        splats: that were lifted, or where they lie now, if they moved since the lift. cameras: of the scene, or where
-            they lie.
-        packs: that were lifted.
-        device: that draws: cpu, cuda or auto. Scores are computed on the CPU.
-
-    Raises:
-        InvalidLift: the file is missing, is not a lift, or has other rows than the file of ``splats``, where these
-            are counted without reading them.
-        InvalidSplats: other splats than were lifted (`Lift.require_splats`).
+    Arguments and errors are those of `Scene`. Norms, mean, axes and encoders are made once and kept.
     """
 
     features: np.ndarray

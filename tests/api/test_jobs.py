@@ -361,8 +361,11 @@ def test_look_that_fails_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     Devices().require("cuda")
 
 
+JOB_FOLDER = "/folder/of/a/job"
+
+
 def told(job: dict[str, Any]) -> dict[str, Any]:
-    return child.run({"kind": "lift", "names": {}, "work": "/data/work/1"} | job, Reporter(io.BytesIO()))["fault"]
+    return child.run({"kind": "lift", "names": {}, "work": JOB_FOLDER} | job, Reporter(io.BytesIO()))["fault"]
 
 
 def test_fault_of_a_job_names_what_is_missing_and_no_folder_of_the_server(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -377,7 +380,7 @@ def test_fault_of_a_job_names_what_is_missing_and_no_folder_of_the_server(monkey
     assert told({})["kind"] == "no-space" and "delete" in told({})["hint"]
     error = Unavailable("features", expected=f"disk in {tempfile.gettempdir()}", got="none")
     assert told({})["expected"] == "disk in the server's temporary folder"
-    error = Unavailable("checkpoint", expected="room for blocks in /data/work/1", got="none")
+    error = Unavailable("checkpoint", expected=f"room for blocks in {JOB_FOLDER}", got="none")
     assert told({})["expected"] == "room for blocks in the job's folder"
     error.__cause__ = OSError(errno.ENOSPC, "No space left on device")
     assert told({})["kind"] == "no-space"
