@@ -374,7 +374,11 @@ def test_question_counts_with_its_answer() -> None:
     assert short >= 1024 and long >= short + 1000 and vector >= 65_536 * 24  # an entry is never free
 
 
-def test_calls_of_a_worker_that_dies_are_answered_by_the_next(client: TestClient, lift: dict[str, Any]) -> None:
+def test_calls_of_a_worker_that_dies_are_answered_by_the_next(
+    client: TestClient, lift: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # a process that is seen stopped is replaced before it is asked
+    monkeypatch.setattr("service.queries.client.is_stopped", lambda pid: False)
     worker = parts_of(client).queries
     process = worker._process
     assert process is not None
