@@ -271,7 +271,7 @@ def _selected(
     in_words = (asked.plain & kept)[:positives]
     least = -math.inf if in_words.any() else LEAST_LIKENESS
     counted = "evidence" if query.weigh == "evidence" else "evidence times confidence"
-    alone = scene.seen_alone(weights)
+    alone = scene.weights if query.weigh == "evidence" else scene.seen_alone(weights)
     found = find_threshold(known, query.threshold, alone, least, counted)
     selected = scene.seen & (scores >= np.float32(found.value))
     rivals = _rivals(asked, asked.rows[:positives][in_words])

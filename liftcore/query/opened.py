@@ -210,8 +210,8 @@ class OpenedLift:
 
     def seen_alone(self, weights: np.ndarray) -> np.ndarray | None:
         """Weights [P] of the seen splats; None when none is above zero, so that they count alike."""
-        weights = weights[self.seen]
-        return weights if bool((weights > 0).any()) else None
+        weights = weights if self.all_seen else weights[self.seen]
+        return weights if weights.max(initial=0.0) > 0 else None
 
     @cached_property
     def mean(self) -> np.ndarray:

@@ -199,7 +199,7 @@ def combine(similarities: np.ndarray, positives: int) -> np.ndarray:
     Returns:
         [P] f32 in -1..1.
     """
-    nearest = similarities[:, :positives].max(axis=1)
+    nearest = similarities[:, 0] if positives == 1 else similarities[:, :positives].max(axis=1)
     return nearest if similarities.shape[1] == positives else nearest * relevancy(similarities, positives)
 
 

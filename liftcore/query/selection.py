@@ -93,9 +93,7 @@ def contest(scene: OpenedLift, scores: np.ndarray, weights: np.ndarray, threshol
     Args:
         scene: an opened lift. scores, weights: [P] f32, how much each splat counts. threshold: on the scores.
     """
-    order = np.flatnonzero(scene.seen)
-    order = order[np.argsort(-scores[order], kind="stable")]
-    rows, widths = _octaves(order)
+    rows, widths = _octaves(_from_the_best(scores, np.flatnonzero(scene.seen)))
     counts = weights[rows] * widths
     if not counts.any():
         counts = widths
@@ -164,6 +162,18 @@ def _about(scene: OpenedLift, means: np.ndarray, mean: np.ndarray) -> np.ndarray
     offsets, offset = means - scene.rough_mean, mean - scene.rough_mean
     lengths = np.linalg.norm(offsets, axis=1) * np.linalg.norm(offset)
     return (offsets @ offset) / np.maximum(lengths, np.float32(1e-12))
+
+
+def _from_the_best(scores: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Rows [n] by their scores [P] f32, the highest first and equal ones in order.
+
+    A score and its row are sorted as one integer, which takes a quarter of what a sort of indices does.
+    """
+    bits = (-scores[rows] + np.float32(0.0)).view(np.int32)  # no zero is negative, so that all zeros are equal
+    keys = (bits ^ ((bits >> 31) & np.int32(0x7FFFFFFF))).astype(np.int64)  # in the order of the floats
+    keys = (keys << 32) | rows
+    keys.sort()
+    return keys & 0xFFFFFFFF
 
 
 def _octaves(order: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
