@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import fcntl
 import json
 import re
 import sqlite3
@@ -50,28 +49,18 @@ def opened(data: Path, *, make: bool) -> Iterator[KeyStore]:
     Raises:
         NotFound: there is no database, and none is to be made.
         StaleDatabase: it is gone, or older than the files.
-        Misconfigured: a server of an older release holds it, or a later one wrote it.
+        Misconfigured: a release with another schema wrote it.
     """
     path = data / DATABASE
     if make:
         data.mkdir(parents=True, exist_ok=True)
     elif not path.exists():
         raise NotFound("data", expected="the data directory of a service", got=str(data), hint="name it with --data")
-    database = Database(path, migrate=not _held(data))
+    database = Database(path)
     try:
         yield KeyStore(database, data)
     finally:
         database.close()
-
-
-def _held(data: Path) -> bool:
-    """Whether a server runs over a data directory."""
-    with (data / "lock").open("a") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except OSError:
-            return True
-        return False
 
 
 def _create(keys: KeyStore, given: argparse.Namespace) -> None:

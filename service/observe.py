@@ -36,7 +36,7 @@ from liftcore import __version__
 from service import models
 from service.models import JobState
 from service.queries.client import QueryClient
-from service.store.schema import MIGRATIONS
+from service.store.schema import VERSION
 from service.store.store import Store
 from service.streams import EventStreams
 
@@ -207,7 +207,7 @@ def versions(commit: str | None) -> models.Version:
     return models.Version(
         version=__version__,
         api=API,
-        database=len(MIGRATIONS),
+        database=VERSION,
         commit=commit,
         python=platform.python_version(),
         packages={name: known for name, known in found.items() if known is not None},

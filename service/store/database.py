@@ -19,7 +19,7 @@ from typing import Any, Generic, TypeVar, cast
 from liftcore.io.files import whole_file
 from service.errors import InvalidRequest, Misconfigured, StaleDatabase
 from service.store.files import remove, sync_directory
-from service.store.schema import MIGRATIONS
+from service.store.schema import MIGRATING_RELEASE, SCHEMA, VERSION
 
 DATABASE = "service.sqlite"  # in the data directory, beside two files that know an empty or older one from it:
 GENERATION = "generation"  # the number that the newest counted transaction had
@@ -41,15 +41,14 @@ class Database:
 
     Args:
         path: the file; made when it is not there.
-        migrate: whether the schema may be changed.
         rebuilding: whether it may be gone or older than the files beside it.
 
     Raises:
         StaleDatabase: it is, and may not; then it is left as it was.
-        Misconfigured: a later release wrote it, or it needs a migration that may not be.
+        Misconfigured: a release with another schema wrote it.
     """
 
-    def __init__(self, path: Path, *, migrate: bool = True, rebuilding: bool = False) -> None:
+    def __init__(self, path: Path, *, rebuilding: bool = False) -> None:
         self._path = path
         self._rebuilding = rebuilding  # until `catch_up`, and so long nothing counts
         # Looked at before the database is: a server that runs may count on meanwhile, there first.
@@ -63,7 +62,7 @@ class Database:
         self._writer = self._connect("rwc")
         self._identity = _identity(path)
         try:
-            self._migrate(migrate, least)
+            self._require_schema(least)
         except BaseException:
             self._writer.close()
             raise
@@ -80,30 +79,22 @@ class Database:
         connection.execute("PRAGMA foreign_keys = ON")
         return connection
 
-    def _migrate(self, allowed: bool, least: int | None) -> None:
-        with self.write() as connection:  # all steps or none
+    def _require_schema(self, least: int | None) -> None:
+        """See that the schema is this release's, and make it in an empty database."""
+        with self.write() as connection:
             version = connection.execute("PRAGMA user_version").fetchone()[0]
             if version == 0 and least is not None:
                 raise StaleDatabase(self._path.parent, "an empty one")
-            if version > len(MIGRATIONS):
-                raise Misconfigured(
-                    "data", expected=f"a database of schema version {len(MIGRATIONS)} or less", got=f"{version}",
-                    hint="use the release that wrote it, or another data directory",
-                )  # fmt: skip
-            if version == len(MIGRATIONS):
-                self._require_generation(least)
-                return  # nothing to write, which a full disk would refuse
-            if not allowed:
-                raise Misconfigured(
-                    "data", expected=f"a database of schema version {len(MIGRATIONS)}", got=f"{version}",
-                    hint="an older server runs over it: start it again with this release first",
-                )  # fmt: skip
-            if version > 0:
-                copy_database(self._path, self._path.with_name(f"{self._path.name}.schema-{version}"))
-            for step in MIGRATIONS[version:]:
-                for statement in _statements(step):
+            if version not in (0, VERSION):
+                hint = "use the release that wrote it, or another data directory"
+                if version < VERSION:
+                    hint = f"start a service of release {MIGRATING_RELEASE} over it once, which migrates it"
+                expected = f"a database of schema version {VERSION}"
+                raise Misconfigured("data", expected=expected, got=f"{version}", hint=hint)
+            if version == 0:
+                for statement in SCHEMA.split(";\n"):  # `executescript` would commit before it begins
                     connection.execute(statement)
-            connection.execute(f"PRAGMA user_version = {len(MIGRATIONS)}")
+                connection.execute(f"PRAGMA user_version = {VERSION}")
             self._require_generation(least)
 
     def _require_generation(self, least: int | None) -> None:
@@ -421,13 +412,3 @@ def page_of(rows: Sequence[sqlite3.Row], limit: int, record: Callable[[sqlite3.R
     last = rows[limit - 1] if len(rows) > limit else None
     cursor = None if last is None else f"{last['created']!r}~{last['id']}"
     return Page([record(row) for row in rows[:limit]], cursor)
-
-
-def _statements(script: str) -> Iterator[str]:
-    """The statements of a script, one by one: `executescript` would commit before it begins."""
-    statement = ""
-    for line in script.splitlines(keepends=True):
-        statement += line
-        if sqlite3.complete_statement(statement):
-            yield statement
-            statement = ""

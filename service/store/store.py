@@ -48,8 +48,8 @@ class Store:
 
         Raises:
             StaleDatabase: it is so, and neither was asked for.
-            Misconfigured: another server holds it, a later release wrote it, its database is none, or it is to begin
-                anew and is the right one.
+            Misconfigured: another server holds it, a release of another schema wrote it, its database is none, or it
+                is to begin anew and is the right one.
         """
         files = DataDirectory(root, floor_bytes=floor_bytes)
         try:

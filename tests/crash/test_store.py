@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import sqlite3
@@ -25,7 +24,7 @@ from service.store.database import DATABASE
 from service.store.files import DataDirectory
 from service.store.keys import Quota
 from service.store.owners import SERVICE, Owner
-from service.store.schema import MIGRATIONS
+from service.store.schema import SCHEMA
 from service.store.store import Store
 
 from .conftest import Supervising, asset_of, ended, often, order, until
@@ -90,15 +89,7 @@ def older(data: Path) -> None:
     (data / "backup").replace(data / DATABASE)
 
 
-def of_an_older_release(data: Path) -> None:
-    """One that has no generation yet."""
-    gone(data)
-    database = sqlite3.connect(data / DATABASE)
-    database.executescript("".join(MIGRATIONS[:7]) + "PRAGMA user_version = 7;")
-    database.close()
-
-
-LOSSES = [gone, gone_under_a_release_without_markers, empty, without_its_wal, older, of_an_older_release]
+LOSSES = [gone, gone_under_a_release_without_markers, empty, without_its_wal, older]
 
 
 @pytest.mark.parametrize("lose", LOSSES)
@@ -260,67 +251,47 @@ def test_marker_that_holds_no_number_is_one_line(data: Path, capsys: pytest.Capt
 # Of another release
 
 
-def test_database_of_a_later_release_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("version", "hint"), [(99, "the release that wrote it"), (12, "release 0.4.0")])
+def test_database_of_another_schema_is_refused_with_a_way_on(tmp_path: Path, version: int, hint: str) -> None:
     store = Store.open(tmp_path)
     with store.database.read() as connection:
-        connection.execute("PRAGMA user_version = 99")
+        connection.execute(f"PRAGMA user_version = {version}")
     store.close()
-    with pytest.raises(Misconfigured, match="99"):
+    with pytest.raises(Misconfigured, match=f"{version}.*{hint}"):
         Store.open(tmp_path)
+    assert sqlite3.connect(tmp_path / DATABASE).execute("PRAGMA user_version").fetchone() == (version,)
 
 
-def test_database_of_the_first_schema_is_taken_over(tmp_path: Path) -> None:
+def test_database_of_release_0_4_opens_with_all_that_it_holds(tmp_path: Path) -> None:
     (tmp_path / "data").mkdir()
-    old = sqlite3.connect(tmp_path / "data" / "service.sqlite")
-    old.executescript(f"BEGIN; {MIGRATIONS[0]} PRAGMA user_version = 1; COMMIT;")
-    old.executemany(
-        "INSERT INTO assets VALUES (?, ?, 1, 'blobs/x', '{}', '[]', 0)",
-        [("s", "splats"), ("c", "cameras"), ("f", "features"), ("t", "table")],
-    )
-    for asset, counts in (("c", {"views": 2, "names": ["w", "v"]}), ("t", {"words": ["apple"], "channels": 1})):
-        old.execute("UPDATE assets SET counts = ? WHERE id = ?", (json.dumps(counts), asset))
-    old.execute("INSERT INTO lifts VALUES ('c', 1, 'd', 'lifts/c', 1, 1, ?, 0)", (json.dumps({"views": ["v"]}),))
-    problem = json.dumps({"kind": "crashed", "argument": "job", "expected": "a", "got": "b", "hint": ""})
-    for job, state, told in (("a", "running", None), ("b", "queued", None), ("c", "failed", problem)):
-        old.execute(
-            "INSERT INTO jobs (id, state, attempt, splats, cameras, settings, problem, created)"
-            " VALUES (?, ?, 1, 's', 'c', '{}', ?, 0)",
-            (job, state, told),
-        )
-        old.execute("INSERT INTO job_features VALUES (?, 0, 'f')", (job,))
-    old.commit()
+    old = sqlite3.connect(tmp_path / "data" / DATABASE)
+    old.executescript(Path(__file__).with_name("database_of_0_4.sql").read_text())
     old.close()
     store = Store.open(tmp_path / "data")
-    kept = sqlite3.connect(tmp_path / "data" / f"{DATABASE}.schema-1")  # a copy, made before the migration
-    assert kept.execute("PRAGMA user_version").fetchone()[0] == 1
-    assert kept.execute("SELECT count(*) FROM assets").fetchone()[0] == 4
-    kept.close()
     assert {job.kind for job in store.jobs.all(SERVICE)} == {JobKind.LIFT}
     assert store.jobs.get(SERVICE, "a").features == ("f",) and store.jobs.get(SERVICE, "a").plan is None
     assert store.assets.get(SERVICE, "c").counts == {"views": 2}
     assert store.assets.get(SERVICE, "c", most=ALL).counts == {"views": 2, "names": ["w", "v"]}
     assert store.assets.get(SERVICE, "t", most=ALL).counts == {"channels": 1, "words": ["apple"]}
     assert store.assets.names(SERVICE, "c", 1, 9) == ["v"]
-    assert store.lifts.lifted(SERVICE, "c", ["w", "v"]) == {"v"}
-    assert store.lifts.get(SERVICE, "c").metadata == {"views": ["v"]}
+    assert store.lifts.lifted(SERVICE, "d", ["w", "v"]) == {"v"}
+    lift = store.lifts.get(SERVICE, "d")
+    assert (lift.name, lift.metadata) == ("the desk", {"views": ["v"]})
+    assert [key.name for key in store.keys.all()] == ["anna"] and store.keys.required()
     store.jobs.release_all("the server died")
-    assert [store.jobs.get(SERVICE, job).state for job in "abc"] == [
-        JobState.QUEUED,
-        JobState.QUEUED,
-        JobState.FAILED,
-    ]
+    states = {job.id: job.state for job in store.jobs.all(SERVICE)}
+    queued, failed, succeeded = JobState.QUEUED, JobState.FAILED, JobState.SUCCEEDED
+    assert states == {"a": queued, "b": queued, "c": failed, "d": succeeded}
     (last,) = store.jobs.events(SERVICE, "c", 0)
-    assert last.data == {"state": "failed", "attempt": 1, "problem": json.loads(problem)}
-    with store.database.read() as connection:
-        assert connection.execute("PRAGMA user_version").fetchone()[0] == len(MIGRATIONS)
+    assert last.data["problem"]["kind"] == "crashed"
+    asset_of(store, AssetKind.SPLATS, {})
     store.close()
-    Store.open(tmp_path / "data").close()  # and once is enough
+    assert (tmp_path / "data" / markers.GENERATION).read_text() == "8\n"
+    Store.open(tmp_path / "data").close()
 
 
-def test_migration_that_breaks_off_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "service.store.database.MIGRATIONS", (*MIGRATIONS, "CREATE TABLE x (a);\nCREATE TABLE x (a);")
-    )
+def test_schema_that_breaks_off_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.store.database.SCHEMA", f"{SCHEMA};\nCREATE TABLE keys (a);\n")
     with pytest.raises(Misconfigured, match="already exists"):
         Store.open(tmp_path / "data")
     monkeypatch.undo()
