@@ -358,7 +358,7 @@ def test_bad_commands_about_keys_are_one_line(
     assert not (tmp_path / "nowhere").exists()
 
 
-def test_keys_are_not_made_under_a_server_of_an_older_release(
+def test_keys_are_not_made_in_a_database_of_an_older_release(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     store = Store.open(tmp_path)
@@ -366,7 +366,7 @@ def test_keys_are_not_made_under_a_server_of_an_older_release(
         with store.database.write() as connection:
             connection.execute("PRAGMA user_version = 1")
         assert main(["create", "--name", "x", "--scopes", "read", "--data", str(tmp_path)]) == 2
-        assert "older server" in capsys.readouterr().err
+        assert "release 0.4.0" in capsys.readouterr().err
     finally:
         store.close()
 
