@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator
-from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+from pydantic import Field, ValidationError, field_validator
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict, SettingsError
+
+from service.errors import Misconfigured
 
 MiB = 1 << 20
 GiB = 1 << 30
@@ -155,3 +159,32 @@ def variables() -> Iterator[tuple[str, str, str]]:
         if name.endswith("bytes") and default and default % size == 0:
             shown = f"{default} ({default // size} {unit})"
         yield f"SPLATLIFT_{name.upper()}", shown, field.description or ""
+
+
+def read_settings(**given: Any) -> ServiceSettings:
+    """Settings as a command line gives them, else of the environment, else their defaults.
+
+    Args:
+        given: field -> value; None is not set.
+
+    Raises:
+        Misconfigured: a value that a setting does not take.
+    """
+    try:
+        return ServiceSettings(**{name: value for name, value in given.items() if value is not None})
+    except SettingsError as error:  # of a variable that is to hold JSON, and does not
+        raise _no_json(error) from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(str(part) for part in first["loc"])
+        raise Misconfigured(name, expected=first["msg"].lower(), got=repr(first["input"])) from None
+
+
+def _no_json(error: SettingsError) -> Misconfigured:
+    field = next((name for name in ServiceSettings.model_fields if f'"{name}"' in str(error)), "settings")
+    variable = f"SPLATLIFT_{field.upper()}"
+    example = json.dumps({"NAME": "table:FILE"})
+    return Misconfigured(
+        variable, expected="JSON", got=repr(os.environ.get(variable, "something else"))[:120],
+        hint=f"a JSON object looks like '{example}'",
+    )  # fmt: skip

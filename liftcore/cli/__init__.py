@@ -1,4 +1,4 @@
-"""``splatlift``: the command line. Each command is a file: ``add_arguments`` and ``run``.
+"""``splatlift``: the command line. Each command is a file, here or in another package: ``add_arguments`` and ``run``.
 
 Exit status: 0; 2 for input that is the user's to mend, with one line on stderr that says what; 1 for our own
 fault. With ``--json`` stdout holds one JSON object and nothing else.
@@ -10,18 +10,15 @@ import sys
 from collections.abc import Sequence
 from functools import partial
 from importlib import import_module
+from typing import Any
 
 from liftcore.cli.options import BAD_INPUT, Parser, misplaced, shared_options
 from liftcore.errors import SplatliftError
 from liftcore.io.remote import Elsewhere, local_path
+from liftcore.runtime.plugins import load_plugin
 from liftcore.runtime.version import __version__
 
 COMMANDS = {
-    "demo": "the whole job, through the real service",
-    "serve": "run the HTTP service",
-    "view": "one lift on the service's page, until Ctrl-C",
-    "keys": "who may use the HTTP service",
-    "store": "mend the HTTP service's data directory",
     "check": "do splats, cameras, photos and features belong together",
     "lift": "lift features onto splats",
     "refine": "a finished lift with smooth features",
@@ -37,6 +34,13 @@ COMMANDS = {
     "bench": "how fast this machine lifts",
     "tradeoff": "speed against accuracy on your scene",
 }
+SERVICE_COMMANDS = {  # files of another package, which are entry points in splatlift.commands
+    "demo": "the whole job, through the real service",
+    "serve": "run the HTTP service",
+    "view": "one lift on the service's page, until Ctrl-C",
+    "keys": "who may use the HTTP service",
+    "store": "mend the HTTP service's data directory",
+}
 WITH_ACTIONS = ("keys", "pack", "store")  # whose actions take the shared options
 OUR_FAULT = 1
 INTERRUPTED = 130
@@ -50,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return end.code if isinstance(end.code, int) else 0
     try:
         bring(options)
-        status = import_module(f"liftcore.cli.{options.command}").run(options)
+        status = _module(options.command).run(options)
         sys.stdout.flush()
         return status
     except SplatliftError as error:
@@ -89,11 +93,25 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"splatlift {__version__}")
     shared = shared_options()
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
-    for name, said in COMMANDS.items():
+    for name, said in (SERVICE_COMMANDS | COMMANDS).items():
         own = commands.add_parser(name, parents=[] if name in WITH_ACTIONS else [shared], help=said)
         own.fill = partial(_add_options, name, own, [shared] if name in WITH_ACTIONS else [])
     return parser
 
 
 def _add_options(name: str, parser: Parser, shared: list[Parser]) -> None:
-    import_module(f"liftcore.cli.{name}").add_arguments(parser, *shared)
+    try:
+        _module(name).add_arguments(parser, *shared)
+    except SplatliftError as error:  # its package is not installed
+        parser.exit(BAD_INPUT, f"splatlift: {error}\n")
+
+
+def _module(name: str) -> Any:
+    """The file of a command.
+
+    Raises:
+        Unavailable: its package is not installed.
+    """
+    if name in COMMANDS:
+        return import_module(f"liftcore.cli.{name}")
+    return load_plugin("splatlift.commands", name)

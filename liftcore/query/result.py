@@ -176,11 +176,11 @@ class LiftResult(Lift):
 
         Raises:
             InvalidInput: splats or cameras that it needs are not given, or not those of the lift.
-            Unavailable: the package ``service`` is not installed.
+            Unavailable: no package with the page is installed.
         """
-        from liftcore.query.page import show
+        from liftcore.runtime.plugins import load_plugin
 
-        show(self, splats, cameras, port=port, browser=browser)
+        load_plugin("splatlift.viewers", "page")(self, splats, cameras, port=port, browser=browser)
 
 
 def load_lift(path: Path | str) -> LiftResult:

@@ -1,4 +1,4 @@
-"""Formats and encoders of other packages, which announce them as entry points of their distribution.
+"""Formats, encoders and commands of other packages, announced as entry points of their distribution.
 
     [project.entry-points."splatlift.text_encoders"]
     mine = "my_package:open_encoder"
@@ -10,17 +10,26 @@ asked for, never before.
 from __future__ import annotations
 
 import logging
+import tomllib
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from liftcore.errors import SplatliftError, Unavailable
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Iterator
 
-Group = Literal["splatlift.splat_formats", "splatlift.text_encoders", "splatlift.image_encoders"]
+Group = Literal[
+    "splatlift.splat_formats",
+    "splatlift.text_encoders",
+    "splatlift.image_encoders",
+    "splatlift.commands",
+    "splatlift.viewers",
+]
 log = logging.getLogger(__name__)
 
 
@@ -45,19 +54,47 @@ class Plugin:
         Raises:
             Unavailable: it does not import, fails with an error that is none of splatlift's, or gives something else.
         """
-        try:
+        with self._errors():
             made = self.entry.load()(*arguments)
+        missing = [name for name in needs if not hasattr(made, name)]
+        if missing:
+            got = f"{type(made).__name__} without {', '.join(missing)}"
+            raise Unavailable(f"plugin {self.value}", expected=f"a value with {', '.join(needs)}", got=got)
+        return made
+
+    def load(self) -> Any:
+        """Import the object that it announces.
+
+        Raises:
+            Unavailable: it does not import.
+        """
+        with self._errors():
+            return self.entry.load()
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        try:
+            yield
         except SplatliftError:
             raise
         except Exception as error:  # of code that is not ours
             got = f"{type(error).__name__}: {error}"[:160]
             hint = f"see whether {self.entry.value} imports and runs alone, or remove the package"
             raise Unavailable(f"plugin {self.value}", expected="one that works", got=got, hint=hint) from error
-        missing = [name for name in needs if not hasattr(made, name)]
-        if missing:
-            got = f"{type(made).__name__} without {', '.join(missing)}"
-            raise Unavailable(f"plugin {self.value}", expected=f"a value with {', '.join(needs)}", got=got)
-        return made
+
+
+def load_plugin(group: Group, name: str) -> Any:
+    """Import what a package announces under that name, for what splatlift does not do itself.
+
+    Raises:
+        Unavailable: none does, two do, or it does not import.
+    """
+    plugin = find_plugin(group, name)
+    if plugin is None:
+        expected = f"a package with an entry point of that name in {group}"
+        hint = "splatlift's package 'service' has it: pip install splatlift, or make setup in a checkout"
+        raise Unavailable(repr(name), expected=expected, got="none installed", hint=hint)
+    return plugin.load()
 
 
 def find_plugin(group: Group, name: str, built_in: Collection[str] = ()) -> Plugin | None:
@@ -85,8 +122,19 @@ def plugin_names(group: Group) -> list[str]:
 
 
 def _entries(group: Group) -> tuple[EntryPoint, ...]:
-    found = entry_points(group=group)
+    found = [*entry_points(group=group)]
+    names = {(entry.name, entry.value) for entry in found}
+    found += [entry for entry in _of_checkout() if entry.group == group and (entry.name, entry.value) not in names]
     return tuple(sorted(found, key=lambda entry: (entry.name, entry.dist.name if entry.dist else "")))
+
+
+@cache
+def _of_checkout() -> tuple[EntryPoint, ...]:
+    """Entry points of the checkout that this file lies in, whose installation may be older, or not there."""
+    path = Path(__file__).parents[2] / "pyproject.toml"
+    project = tomllib.loads(path.read_text(encoding="utf-8")).get("project", {}) if path.is_file() else {}
+    groups = project.get("entry-points", {}) if project.get("name") == "splatlift" else {}
+    return tuple(EntryPoint(name, value, group) for group in groups for name, value in groups[group].items())
 
 
 @cache

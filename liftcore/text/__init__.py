@@ -21,7 +21,7 @@ ENCODER_SPECS = (
 )
 # Encoders that need no file of the user's, and the text space of each: what answers when nobody chose an encoder.
 BUILT_IN = {"lvis": "open_clip:ViT-B-32/openai", "minilm": "minilm"}
-LVIS_TABLE = Path(__file__).with_name("lvis_clip_vit_b_32.safetensors")  # its licences: liftcore/demo/tabletop
+LVIS_TABLE = Path(__file__).with_name("lvis_clip_vit_b_32.safetensors")  # its licences: service/commands/tabletop
 PLUGINS = "splatlift.text_encoders"  # the entry points of other packages' encoders
 TEMPLATES = (1, 7, 80)  # sentences that open_clip's encoders put a word into: the word alone, or CLIP's for ImageNet
 NO_WORDS = "none"  # the text space of features that no text encoder shares

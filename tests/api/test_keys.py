@@ -20,11 +20,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from starlette.datastructures import Headers
 
+from liftcore.cli import main
 from liftcore.errors import SplatliftError
-from service.__main__ import require_keys
 from service.auth import CALLER, Gate, Hosts, host_name, is_loopback
+from service.commands.serve import require_keys
 from service.errors import Busy, ForeignOrigin, Misdirected, TooMany
-from service.keys import main
 from service.models import JobState
 from service.scopes import OPEN, Scope, needed
 from service.settings import ServiceSettings
@@ -197,7 +197,7 @@ def test_open_until_the_first_key_and_never_again(tmp_path: Path, capsys: pytest
         assert len(house.ask(None, "GET", "/lifts").json()["lifts"]) == 1
         assert "security" not in str(house.ask(None, "GET", "/openapi.json").json()["paths"])
         where = ["--data", str(tmp_path / "data")]
-        assert main(["create", "--name", "first", "--scopes", "read", *where]) == 0  # while the server runs
+        assert main(["keys", "create", "--name", "first", "--scopes", "read", *where]) == 0  # while the server runs
         secret = capsys.readouterr().out.strip()
         assert house.ask(None, "GET", "/jobs").status_code == 401
         require_keys(ServiceSettings.model_validate({"data": tmp_path / "data", "host": "0.0.0.0"}))
@@ -205,10 +205,10 @@ def test_open_until_the_first_key_and_never_again(tmp_path: Path, capsys: pytest
         assert mine.status_code == 200 and mine.json()["jobs"] == []  # what was before keys is of admins
         _, admin = make_key(house.store, "admin")
         assert len(house.client.get("/jobs", headers=bearer(admin)).json()["jobs"]) == 3
-        assert main(["list", *where]) == 0
+        assert main(["keys", "list", *where]) == 0
         line = capsys.readouterr().out.splitlines()[0].split()
         assert secret not in " ".join(line) and "valid" in line
-        assert main(["revoke", line[0], *where]) == 0
+        assert main(["keys", "revoke", line[0], *where]) == 0
         assert "revoked" in capsys.readouterr().out
         gone = house.client.get("/jobs", headers=bearer(secret))
         assert gone.status_code == 401 and 'error="invalid_token"' in gone.headers["www-authenticate"]
@@ -223,7 +223,7 @@ def test_rotated_key_has_a_new_secret_and_keeps_what_is_its_own(
     grace: str | None, house: Guarded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     old, where = house.secrets["alice"], ["--data", str(tmp_path / "data")]
-    assert main(["rotate", house.ids["alice"], *([] if grace is None else ["--grace", grace]), *where]) == 0
+    assert main(["keys", "rotate", house.ids["alice"], *([] if grace is None else ["--grace", grace]), *where]) == 0
     new = capsys.readouterr().out.strip()
     assert house.client.get(f"/jobs/{house.done}", headers=bearer(new)).status_code == 200
     assert house.client.get("/jobs", headers=bearer(old)).status_code == (401 if grace is None else 200)
@@ -237,11 +237,11 @@ def test_rotated_key_has_a_new_secret_and_keeps_what_is_its_own(
 def test_key_is_rotated_by_its_name_where_one_has_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     where = ["--data", str(tmp_path)]
     for name in ("anna", "bob", "bob"):
-        assert main(["create", "--name", name, "--scopes", "read", *where]) == 0
-    assert main(["rotate", "anna", *where]) == 0
+        assert main(["keys", "create", "--name", name, "--scopes", "read", *where]) == 0
+    assert main(["keys", "rotate", "anna", *where]) == 0
     capsys.readouterr()
     for name, told in (("bob", "name one of"), ("nobody", "valid key")):
-        assert main(["rotate", name, *where]) == 2
+        assert main(["keys", "rotate", name, *where]) == 2
         assert told in capsys.readouterr().err
 
 
@@ -314,7 +314,7 @@ def test_keys_speak_json_and_say_until_when_they_are_valid(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def told(*arguments: str) -> Any:
-        assert main([*arguments, "--json", "--data", str(tmp_path / "new" / "data")]) == 0
+        assert main(["keys", *arguments, "--json", "--data", str(tmp_path / "new" / "data")]) == 0
         return json.loads(capsys.readouterr().out)
 
     made = told("create", "--name", "x", "--scopes", "write,read", "--max-bytes", "5", "--max-uploads", "2")
@@ -329,7 +329,7 @@ def test_keys_speak_json_and_say_until_when_they_are_valid(
         expires = told("create", "--name", "y", "--scopes", "read", "--expires", text)["expires"]
         wanted = datetime(2999, 12, 31, tzinfo=UTC).timestamp() if seconds is None else begun + seconds
         assert wanted <= expires <= wanted + (time.time() - begun if seconds else 0)
-    assert main(["list", "--data", str(tmp_path / "new" / "data")]) == 0
+    assert main(["keys", "list", "--data", str(tmp_path / "new" / "data")]) == 0
     assert capsys.readouterr().out.count("valid until") == 3
 
 
@@ -351,10 +351,10 @@ def test_bad_commands_about_keys_are_one_line(
     arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Store.open(tmp_path).close()
-    assert main([*arguments, "--data", str(tmp_path)]) == 2
+    assert main(["keys", *arguments, "--data", str(tmp_path)]) == 2
     err = capsys.readouterr().err
     assert err.startswith("splatlift: ") and err.count("\n") == 1
-    assert main(["list", "--data", str(tmp_path / "nowhere")]) == 2
+    assert main(["keys", "list", "--data", str(tmp_path / "nowhere")]) == 2
     assert not (tmp_path / "nowhere").exists()
 
 
@@ -365,7 +365,7 @@ def test_keys_are_not_made_in_a_database_of_an_older_release(
     try:
         with store.database.write() as connection:
             connection.execute("PRAGMA user_version = 1")
-        assert main(["create", "--name", "x", "--scopes", "read", "--data", str(tmp_path)]) == 2
+        assert main(["keys", "create", "--name", "x", "--scopes", "read", "--data", str(tmp_path)]) == 2
         assert "release 0.4.0" in capsys.readouterr().err
     finally:
         store.close()

@@ -17,12 +17,12 @@ from PIL import Image, ImageOps
 from safetensors import safe_open
 from safetensors.numpy import load, save
 
+from liftcore.cli import main
 from liftcore.io.splat import ROW
 from liftcore.lifting.files import lift_files
 from liftcore.query.scene import Scene
 from liftcore.values.settings import LiftSettings
 from service.photos import PhotoIndexes
-from service.store.__main__ import main
 from service.store.database import DATABASE
 
 from .conftest import serving
@@ -183,7 +183,7 @@ def test_lift_of_a_folder_of_cameras_takes_a_zip_of_them(
         assert made.status_code == 201 and made.json()["cameras"] == same
         assert client.get("/query/mask", params={"text": "lamp", "view": "left"}).status_code == 200
     (data / DATABASE).unlink()
-    assert main(["rebuild", "--data", str(data), "--json"]) == 0
+    assert main(["store", "rebuild", "--data", str(data), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["lifts"] == 1
     with serving(data, table) as client:
         assert client.get("/lifts").json()["lifts"][0]["cameras"] == same

@@ -26,7 +26,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from pydantic import ValidationError
 
 from service import errand, middleware
-from service.__main__ import AnnouncingServer
+from service.commands.serve import AnnouncingServer
 from service.errand import ErrandLimits
 from service.errors import Busy, NoSpace
 from service.jobs.supervisor import Supervisor

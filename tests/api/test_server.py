@@ -22,16 +22,15 @@ import numpy as np
 import pytest
 from safetensors.numpy import save
 
+from liftcore.cli import build_parser, main
 from liftcore.lifting.files import lift_files
 from liftcore.values.lift_file import save_lift
 from liftcore.values.settings import LiftSettings
-from service.__main__ import main, parse
+from service.commands.serve import settings_of
 from service.encoders import encoder_label, encoder_spec
 from service.errors import InvalidRequest
-from service.keys import main as keys
 from service.routes.operations import WEB
 from service.settings import ServiceSettings
-from service.view import main as view
 from tests.crash.conftest import until
 
 from .conftest import Uploaded
@@ -116,7 +115,7 @@ def test_server_that_speaks_json_says_one_object_when_it_is_ready_and_nothing_af
 
 def test_http_process_loads_neither_torch_nor_numba_nor_hdbscan() -> None:
     code = (
-        "import sys, service.app, service.__main__\n"
+        "import sys, service.app, service.commands.serve, service.commands.view\n"
         "print(sorted({'torch', 'numba', 'hdbscan', 'plyfile', 'open_clip'} & set(sys.modules)))"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
@@ -137,7 +136,7 @@ def test_http_process_loads_neither_torch_nor_numba_nor_hdbscan() -> None:
 def test_setting_that_cannot_be_is_one_line_at_the_start(
     arguments: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([*arguments, "--data", str(tmp_path / "data")]) == 2
+    assert main(["serve", *arguments, "--data", str(tmp_path / "data")]) == 2
     said = capsys.readouterr().err
     assert said.startswith("splatlift: ") and told in said and said.count("\n") == 1
     assert not (tmp_path / "data").exists()
@@ -161,7 +160,7 @@ def test_text_table_that_is_none_is_told_at_the_start(
     table = tmp_path / "words.safetensors"
     if content is not None:
         table.write_bytes(content)
-    assert main(["--encoder", f"table:{table}", "--data", str(tmp_path / "data")]) == 2
+    assert main(["serve", "--encoder", f"table:{table}", "--data", str(tmp_path / "data")]) == 2
     said = capsys.readouterr().err
     assert said.startswith("splatlift: encoder: expected ") and told in said and str(table) in said
     assert said.count("\n") == 1 and not (tmp_path / "data").exists()
@@ -170,7 +169,7 @@ def test_text_table_that_is_none_is_told_at_the_start(
 def test_taken_port_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        assert main(["--port", str(port), "--data", str(tmp_path / "data")]) == 2
+        assert main(["serve", "--port", str(port), "--data", str(tmp_path / "data")]) == 2
     assert "free port" in capsys.readouterr().err
 
 
@@ -178,8 +177,8 @@ def test_variable_that_is_no_json_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("SPLATLIFT_TEXT_SPACES", "{bad")
-    for program, arguments in ((main, []), (keys, ["list"])):
-        assert program([*arguments, "--data", str(tmp_path)]) == 2
+    for command in (["serve"], ["keys", "list"]):
+        assert main([*command, "--data", str(tmp_path)]) == 2
         said = capsys.readouterr().err
         assert "SPLATLIFT_TEXT_SPACES: expected JSON, got '{bad'" in said and said.count("\n") == 1
 
@@ -187,15 +186,18 @@ def test_variable_that_is_no_json_is_one_line(
 def test_settings_come_from_the_environment_and_the_command_line_wins(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    def serve(*arguments: str) -> ServiceSettings:
+        return settings_of(build_parser().parse_args(["serve", *arguments]))
+
     monkeypatch.setenv("SPLATLIFT_PORT", "1234")
     monkeypatch.setenv("SPLATLIFT_QUERY_SECONDS", "7")
     monkeypatch.setenv("SPLATLIFT_TEXT_SPACES", '{"a": "minilm"}')
-    assert (parse([]).port, parse([]).query_seconds) == (1234, 7)
-    assert parse([]).text_spaces == {"a": "minilm"}
-    assert parse(["--port", "1", "--text-space", "a=table:x=y"]).text_spaces == {"a": "table:x=y"}
+    assert (serve().port, serve().query_seconds) == (1234, 7)
+    assert serve().text_spaces == {"a": "minilm"}
+    assert serve("--port", "1", "--text-space", "a=table:x=y").text_spaces == {"a": "table:x=y"}
     for name in ("COMMIT", "PORT", "ALLOWED_HOSTS", "TEXT_SPACES"):  # empty, it is as if it were not set
         monkeypatch.setenv(f"SPLATLIFT_{name}", "")
-    assert (parse([]).commit, parse([]).port, parse([]).allowed_hosts) == (None, 8787, ())
+    assert (serve().commit, serve().port, serve().allowed_hosts) == (None, 8787, ())
 
 
 def test_encoder_is_chosen_by_text_space_and_never_by_the_client(tmp_path: Path) -> None:
@@ -354,8 +356,8 @@ def test_lift_in_memory_is_shown_until_it_is_interrupted_or_killed(folder: Path)
 
 def test_lift_whose_files_moved_is_told(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "s.ply").unlink()
-    for lift, told in (("l.safetensors", "its splats at"), ("f.safetensors", "a lift file")):
-        assert view([str(folder / lift), "--no-browser"]) == 2
+    for lift, told in (("l.safetensors", "its splats at"), ("f.safetensors", "expected lift as LIFT, got features")):
+        assert main(["view", str(folder / lift), "--no-browser"]) == 2
         assert told in capsys.readouterr().err
 
 

@@ -10,17 +10,15 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from liftcore import cli
-from service.__main__ import require_keys
+from liftcore.cli import INTERRUPTED, main
+from service.commands.serve import require_keys
 from service.errors import Misconfigured, StaleDatabase
 from service.scopes import needed
 from service.settings import ServiceSettings
-from service.store.__main__ import main
 from service.store.collect import collect
 from service.store.database import DATABASE
 from service.store.owners import SERVICE
 from service.store.store import Store
-from tests.unit.command_line import programs_become
 
 from .conftest import Uploaded, app_of, serving
 from .following import ended
@@ -72,7 +70,7 @@ def test_rebuild_makes_the_database_of_the_files(
     broken.write_bytes(b"half of a file")
     strange = data / "lifts" / f"{'0' * 32}.safetensors"
     strange.write_bytes(b"no lift")
-    assert main(["rebuild", "--data", str(data), "--json"]) == 0
+    assert main(["store", "rebuild", "--data", str(data), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["lifts"], found["assets"]) == (
         1, {"splats": 1, "cameras": 2, "features": 1, "masks": 1, "table": 1}
@@ -97,7 +95,7 @@ def test_rebuild_brings_an_older_database_up_to_its_files(filled: tuple[Path, di
     store.close()
     with pytest.raises(StaleDatabase, match=r"an older one \(generation 3"):
         Store.open(data)
-    assert main(["rebuild", "--data", str(data)]) == 0
+    assert main(["store", "rebuild", "--data", str(data)]) == 0
     store = Store.open(data)
     assert store.jobs.get(SERVICE, lift).state == "succeeded" and store.jobs.claim() is None
     with store.database.read() as connection:
@@ -118,12 +116,11 @@ def test_rebuild_that_was_cut_off_does_not_let_the_server_start(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("service.store.rebuild._add_lift", cut_off)
-    with pytest.raises(KeyboardInterrupt):
-        main(["rebuild", "--data", str(data)])
+    assert main(["store", "rebuild", "--data", str(data)]) == INTERRUPTED
     monkeypatch.undo()
     with pytest.raises(StaleDatabase):
         Store.open(data)
-    assert main(["rebuild", "--data", str(data)]) == 0
+    assert main(["store", "rebuild", "--data", str(data)]) == 0
     assert "0 assets" in capsys.readouterr().out
     Store.open(data).close()
 
@@ -135,27 +132,20 @@ def test_lift_whose_splats_are_gone_is_left_out(
     (data / DATABASE).unlink()
     (splats,) = data.glob("blobs/*/*.ply")
     splats.unlink()
-    assert main(["rebuild", "--data", str(data)]) == 0
+    assert main(["store", "rebuild", "--data", str(data)]) == 0
     said = capsys.readouterr().out
     assert "0 lifts" in said and "left out" in said and splats.stem in said
 
 
 def test_rebuild_beside_a_server_or_nowhere_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     store = Store.open(tmp_path)
-    assert main(["rebuild", "--data", str(tmp_path)]) == 2
+    assert main(["store", "rebuild", "--data", str(tmp_path)]) == 2
     store.close()
     assert not (tmp_path / "generation").exists()
-    assert main(["rebuild", "--data", str(tmp_path / "nowhere")]) == 2
+    assert main(["store", "rebuild", "--data", str(tmp_path / "nowhere")]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2 and all(line.startswith("splatlift: data: expected") for line in lines)
     assert not (tmp_path / "nowhere").exists()
-
-
-def test_store_and_new_reach_the_programs_of_the_service(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = programs_become(monkeypatch)
-    cli.main(["store", "rebuild", "--data=-d", "--json"])
-    cli.main(["serve", "--new"])
-    assert calls == [["-m", "service.store", "rebuild", "--data=-d", "--json"], ["-m", "service", "--new"]]
 
 
 def without_keys(house: Guarded) -> None:

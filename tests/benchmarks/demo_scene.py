@@ -23,8 +23,8 @@ from safetensors.numpy import load_file, save
 import liftcore as lc
 from liftcore.text import BUILT_IN, LVIS_TABLE, open_encoder
 from liftcore.values.pack import write_pack
+from service.commands.scene_folder import SHIPPED
 
-SHIPPED = Path(lc.__file__).parent / "demo" / "tabletop"
 EVERY = 3  # of the views with features
 PACK = "features_hard"
 ASKED = ("penguin", "pizza", "teapot", "cat", "sofa")  # the last is not there

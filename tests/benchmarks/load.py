@@ -32,9 +32,8 @@ import numpy as np
 import torch
 from safetensors.torch import save_file
 
-from liftcore.cli.demo import serving
-from liftcore.demo.run import Client
 from liftcore.raster.cpu.warm_up import warm_up
+from service.commands.demo import Client, serving
 from tests.benchmarks.base import machine
 from tests.benchmarks.scenes import Room, write_bench_room
 

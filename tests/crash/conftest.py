@@ -17,7 +17,7 @@ import pytest
 import uvicorn
 from fastapi import FastAPI
 
-from service.__main__ import server_of
+from service.commands.serve import server_of
 from service.jobs.process import JobLimits
 from service.jobs.supervisor import Clock, Supervisor
 from service.models import ENDED, AssetKind

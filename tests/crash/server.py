@@ -16,8 +16,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from service.__main__ import keep_pauses_short, server_of
 from service.app import create_app, job_limits
+from service.commands.serve import keep_pauses_short, server_of
 from service.jobs.process import JobProcess
 from service.jobs.supervisor import CHILD, Supervisor
 from service.queries.client import Frame, QueryClient

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from liftcore.cli import main
 from service.errors import Misconfigured
 from service.models import AssetKind, JobState
 from service.scopes import Scope
 from service.store import backup
-from service.store.__main__ import main as store_command
 from service.store.backup import back_up, restore, verify
 from service.store.database import KEYS_REQUIRED
 from service.store.keys import Quota
@@ -152,14 +152,14 @@ def test_commands_back_up_verify_and_restore(
     filled: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data, copy, again = (str(tmp_path / name) for name in ("data", "backup", "again"))
-    assert store_command(["backup", copy, "--data", data]) == 0
-    assert store_command(["verify", "--data", data]) == 0
-    assert store_command(["restore", copy, "--data", again]) == 0
-    assert store_command(["restore", copy, "--data", again]) == 2  # it replaces nothing
+    assert main(["store", "backup", copy, "--data", data]) == 0
+    assert main(["store", "verify", "--data", data]) == 0
+    assert main(["store", "restore", copy, "--data", again]) == 0
+    assert main(["store", "restore", copy, "--data", again]) == 2  # it replaces nothing
     said = capsys.readouterr()
     assert "4 files" in said.out and "every file is as it was stored" in said.out and "move it away" in said.err
     (lift,) = (tmp_path / "again" / "lifts").iterdir()
     flip(lift)
-    assert store_command(["verify", "--data", again, "--json"]) == 1
+    assert main(["store", "verify", "--data", again, "--json"]) == 1
     (damage,) = json.loads(capsys.readouterr().out)["damage"]
     assert damage.startswith("lifts/")

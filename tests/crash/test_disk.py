@@ -18,7 +18,8 @@ from unittest.mock import Mock
 import pytest
 from fastapi.testclient import TestClient
 
-from service import __main__ as server
+from liftcore.cli import main
+from service.commands import serve
 from service.errors import Misconfigured
 from service.store import database as databases
 from service.store.collect import collect
@@ -119,8 +120,8 @@ def test_start_on_a_full_or_read_only_disk_is_one_line(
         fill(small_disk)
     else:
         subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
-    monkeypatch.setattr(server, "server_of", lambda *given: pytest.fail("the server started"))
-    assert server.main(["--data", str(small_disk / "data"), "--port", "0"]) == 2
+    monkeypatch.setattr(serve, "server_of", lambda *given: pytest.fail("the server started"))
+    assert main(["serve", "--data", str(small_disk / "data"), "--port", "0"]) == 2
     said = capsys.readouterr().err
     assert said.startswith("splatlift: data: expected") and said.count("\n") == 1
 
@@ -235,7 +236,7 @@ def test_file_that_is_no_database_is_a_misconfiguration(tmp_path: Path, capsys: 
         with pytest.raises(Misconfigured, match="expected a database of this service"):
             look()
     for host in ("127.0.0.1", "0.0.0.0"):
-        assert server.main(["--data", str(tmp_path), "--host", host, "--port", "0"]) == 2
+        assert main(["serve", "--data", str(tmp_path), "--host", host, "--port", "0"]) == 2
         said = capsys.readouterr().err
         assert said.startswith("splatlift: data: expected a database") and said.count("\n") <= 2
 
@@ -256,8 +257,8 @@ def test_directory_has_one_server_and_a_look_at_its_lock_keeps_none_from_startin
 def test_too_few_files_for_the_connections_are_told_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(server.resource, "getrlimit", lambda which: (256, 256))
-    assert server.main(["--data", str(tmp_path / "data"), "--port", "0"]) == 2
+    monkeypatch.setattr(serve.resource, "getrlimit", lambda which: (256, 256))
+    assert main(["serve", "--data", str(tmp_path / "data"), "--port", "0"]) == 2
     said = capsys.readouterr().err
     assert "max_connections: expected at most 64" in said and "ulimit -n" in said and said.count("\n") == 1
     assert not (tmp_path / "data").exists()

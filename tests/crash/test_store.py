@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from service import __main__ as server
+from liftcore.cli import main
+from service.commands import serve
 from service.errors import Misconfigured, StaleDatabase
-from service.keys import main as keys
 from service.models import AssetKind, JobKind, JobState
 from service.scopes import Scope
 from service.store import database as markers
@@ -39,7 +39,7 @@ def no_server(monkeypatch: pytest.MonkeyPatch) -> None:
     def started(*given: object) -> None:
         raise AssertionError("the server started")
 
-    monkeypatch.setattr(server, "server_of", started)
+    monkeypatch.setattr(serve, "server_of", started)
 
 
 @pytest.fixture
@@ -100,18 +100,20 @@ def test_start_over_files_without_their_database_is_refused_in_one_line(
     before = blobs(data)
     assert before
     for _ in range(2):  # a refused start makes nothing that the next would take for a database
-        assert server.main(["--data", str(data), "--port", "0"]) == 2
+        assert main(["serve", "--data", str(data), "--port", "0"]) == 2
         said = capsys.readouterr().err
         assert said.startswith("splatlift: data: expected the database that the files beside it were stored with")
         assert "splatlift store rebuild" in said and "serve --new" in said and said.count("\n") == 1
-    assert keys(["create", "--name", "a", "--scopes", "read", "--data", str(data)]) == 2  # makes no database either
+    assert (
+        main(["keys", "create", "--name", "a", "--scopes", "read", "--data", str(data)]) == 2
+    )  # makes no database either
     assert "splatlift store rebuild" in capsys.readouterr().err
     assert blobs(data) == before
 
 
 def test_missing_database_is_told_beyond_loopback_too(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     gone(data)
-    assert server.main(["--data", str(data), "--host", "0.0.0.0", "--port", "0"]) == 2
+    assert main(["serve", "--data", str(data), "--host", "0.0.0.0", "--port", "0"]) == 2
     assert "splatlift store rebuild" in capsys.readouterr().err
 
 
@@ -243,7 +245,7 @@ def test_marker_never_goes_back(data: Path) -> None:
 
 def test_marker_that_holds_no_number_is_one_line(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (data / markers.GENERATION).write_text("")
-    assert server.main(["--data", str(data), "--port", "0"]) == 2
+    assert main(["serve", "--data", str(data), "--port", "0"]) == 2
     said = capsys.readouterr().err
     assert "expected a whole number in the file 'generation'" in said and said.count("\n") == 1
 

@@ -26,7 +26,6 @@ from scipy.spatial.transform import Rotation
 
 import liftcore as lc
 from liftcore.cli import main
-from liftcore.demo.scene_folder import find_scene
 from liftcore.features.encoders import Pixels
 from liftcore.features.encoders.crops import CropEncoder
 from liftcore.io.cameras import read_cameras
@@ -35,6 +34,7 @@ from liftcore.io.splats import read_splats, write_splats
 from liftcore.text.table import TableEncoder
 from liftcore.values.pack import read_features, write_pack
 from service import models
+from service.commands.scene_folder import find_scene
 from service.queries import questions
 from service.routes import assets, jobs, operations, queries, results, scene, words
 from service.scopes import OPEN

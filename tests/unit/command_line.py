@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import re
-import sys
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,7 +21,6 @@ if TYPE_CHECKING:
 
     import pytest
 
-
 PROGRESS = re.compile(r"^\w+: \d+ of \d+ \w+\n", re.MULTILINE)  # what a slow machine tells every ten seconds
 
 
@@ -32,19 +29,6 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, st
     status = cli.main([str(argument) for argument in arguments])
     captured = capsys.readouterr()
     return status, captured.out, PROGRESS.sub("", captured.err)
-
-
-def programs_become(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
-    """Where commands that become another Python program leave its arguments, in place of becoming it."""
-    calls: list[list[str]] = []
-
-    def execv(program: str, arguments: list[str]) -> None:
-        assert program == sys.executable
-        calls.append(arguments[1:])
-        raise KeyboardInterrupt  # the real one does not return either
-
-    monkeypatch.setattr(os, "execv", execv)
-    return calls
 
 
 def assert_one_line(err: str) -> None:

@@ -17,16 +17,17 @@ from safetensors.torch import save_file
 from liftcore import cli
 from liftcore.cli import reply
 from liftcore.cli.lift import pairs_of
-from liftcore.errors import InvalidFeatures, InvalidSettings, SplatliftError
+from liftcore.errors import InvalidFeatures, InvalidSettings, SplatliftError, Unavailable
 from liftcore.lifting.files import lift_files
 from liftcore.query.result import load_lift
 from liftcore.query.threshold import METHODS
+from liftcore.runtime import plugins
 from liftcore.runtime.progress import progress_bars
 from liftcore.values.pack import write_pack
 from liftcore.values.settings import LiftSettings, Preset
 from liftcore.values.views import FeatureGrid
 
-from .command_line import assert_one_line, lift_arguments, programs_become, run, write_toy_scene
+from .command_line import assert_one_line, lift_arguments, run, write_toy_scene
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -287,29 +288,18 @@ def test_what_the_plan_warned_of_is_said_once(scene: Path, capsys: pytest.Captur
     assert sum("maps of another aspect" in warning for warning in document["warnings"]) == 1
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["serve", "--port", "0", "--data", "d", "--encoder", "minilm"],
-        ["serve", "--json"],
-        ["keys", "create", "--name=-a b", "--scopes", "read,write", "--max-bytes", "0", "--max-uploads", "3"],
-        ["keys", "create", "--name", "a", "--scopes", "admin", "--max-queued", "2", "--data", "a b", "--json"],
-        ["keys", "list", "--data=-d"],
-        ["keys", "revoke", "--json", "--", "-0123"],
-    ],
-)
-def test_commands_of_the_service_become_its_programs(
-    arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_commands_and_the_page_of_a_missing_service_say_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, scene: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    calls = programs_become(monkeypatch)
-    assert run(capsys, *arguments)[0] == cli.INTERRUPTED
-    [(dash_m, program, *given)] = calls
-    assert (dash_m, program) == ("-m", "service" if arguments[0] == "serve" else "service.keys")
-    if program == "service":
-        assert given == arguments[1:]
-    else:  # every option as it was given
-        parse = cli.build_parser().parse_args
-        assert vars(parse(["keys", *given])) == vars(parse(arguments))
+    assert run(capsys, *lift_arguments(scene))[0] == 0
+    monkeypatch.setattr(plugins, "_entries", lambda group: ())
+    for command in (["serve"], ["keys", "list"]):
+        status, out, err = run(capsys, *command)
+        assert (status, out) == (2, "") and "pip install splatlift" in err
+        assert_one_line(err)
+    with pytest.raises(Unavailable, match="pip install splatlift"):
+        load_lift(scene / "lift.safetensors").show()
+    assert "run the HTTP service" in run(capsys, "--help")[1]
 
 
 def test_a_second_lift_of_a_checkpoint_gives_the_same_bits(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:

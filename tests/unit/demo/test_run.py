@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from liftcore.cli import demo
-from liftcore.demo.scene_folder import SHIPPED
 from liftcore.errors import Unavailable
 from liftcore.query.result import load_lift
 from liftcore.text import LVIS_TABLE
+from service.commands import demo
+from service.commands.scene_folder import SHIPPED
 
 pytestmark = pytest.mark.slow
 

@@ -1,44 +1,63 @@
-"""``python -m service.keys``: make, list, rotate and revoke keys, beside a server that runs or without one."""
+"""``splatlift keys``: make, list, rotate and revoke keys, beside a server that runs or without one."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import re
-import sqlite3
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from liftcore.cli import build_parser
-from liftcore.errors import NotFound, SplatliftError
-from service.__main__ import parse
+from liftcore.cli.options import Parser, whole
+from liftcore.errors import NotFound
+from service.commands.serve import data_directory_errors
 from service.errors import InvalidRequest
 from service.scopes import parse_scopes
+from service.settings import read_settings
 from service.store.database import DATABASE, Database
 from service.store.keys import KeyRecord, KeyStore, Quota
 
 MAX_NAME = 100
+QUOTAS = {
+    "max_bytes": "most bytes stored, of its assets and lifts",
+    "max_queued": "most jobs in line",
+    "max_uploads": "most uploads at once",
+}
 UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Do what the command line says; the exit status."""
-    given = build_parser().parse_args(["keys", *(sys.argv[1:] if arguments is None else arguments)])
-    try:
-        data = parse([] if given.data is None else ["--data", str(given.data)]).data
-        with opened(data, make=given.action == "create") as keys:
-            {"create": _create, "list": _list, "rotate": _rotate, "revoke": _revoke}[given.action](keys, given)
-    except SplatliftError as error:
-        print(f"splatlift: {error}", file=sys.stderr)
-        return 2
-    except (OSError, sqlite3.Error) as error:
-        print(f"splatlift: data: expected a directory to write to, got {error}", file=sys.stderr)
-        return 2
+def add_arguments(parser: Parser, shared: Parser) -> None:
+    """The options of the command."""
+    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=Parser)
+    create = actions.add_parser("create", parents=[shared], help="make a key and show it, once")
+    create.add_argument("--name", required=True, metavar="NAME", help="whose it is, or what for")
+    create.add_argument("--scopes", required=True, metavar="SCOPES", help="read,write,metrics,admin: what it may do")
+    create.add_argument("--expires", metavar="WHEN", help="after 30d, 12h or 90m, or at a date (UTC); else never")
+    for name, limit in QUOTAS.items():
+        option = f"--{name.replace('_', '-')}"
+        create.add_argument(option, type=whole, metavar="N", help=f"{limit}; else as the server is set")
+    listing = actions.add_parser("list", parents=[shared], help="all keys, without their secrets")
+    rotate = actions.add_parser("rotate", parents=[shared], help="give a key another secret and show it, once")
+    rotate.add_argument("key", metavar="NAME", help="its name, or its id as keys list shows it")
+    rotate.add_argument(
+        "--grace", metavar="TIME", help="how long the secret before counts, such as 24h; else not at all"
+    )
+    revoke = actions.add_parser("revoke", parents=[shared], help="end a key; what it made stays, for admins")
+    revoke.add_argument("key", metavar="ID", help="as keys list shows it")
+    for action in (create, listing, rotate, revoke):
+        action.add_argument("--data", type=Path, metavar="DIR", help="the service's directory")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Do what the command line says."""
+    action = {"create": _create, "list": _list, "rotate": _rotate, "revoke": _revoke}[options.action]
+    with data_directory_errors(), opened(read_settings(data=options.data).data, make=action is _create) as keys:
+        action(keys, options)
     return 0
 
 
@@ -161,7 +180,3 @@ def _limits(key: KeyRecord) -> str:
 
 def _when(seconds: float) -> str:
     return time.strftime("%Y-%m-%d %H:%M", time.gmtime(seconds)) + "Z"
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Commands of ``splatlift`` that entry points announce: each file is one, as those of `liftcore.cli` are."""

@@ -1,0 +1,239 @@
+"""``splatlift serve``, which is ``python -m service``: the service on this machine."""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import logging
+import math
+import resource
+import signal
+import socket
+import sqlite3
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from textwrap import fill
+from types import FrameType
+
+import uvicorn
+from fastapi import FastAPI
+
+from liftcore.cli.options import Parser
+from service.app import assemble
+from service.auth import is_loopback
+from service.connection import Pace, watched
+from service.encoders import require_encoder_files
+from service.errors import Misconfigured
+from service.observe import logging_to_stderr
+from service.settings import ServiceSettings, read_settings, variables
+from service.state import Stopping
+from service.store.database import DATABASE, keys_were_made, require_database
+from service.store.keys import any_key
+from service.store.store import Store
+
+FILES_A_CONNECTION = 2  # itself, and what it is sent
+SWITCH_SECONDS = 0.0005  # that a thread may compute on while the event loop waits; Python's own is ten times that
+MARGIN = " " * 6  # of what --help says of a variable
+FILES_BESIDE = 128  # of the database, checks, jobs and the query worker
+
+log = logging.getLogger(__name__)
+
+
+class AnnouncingServer(uvicorn.Server):
+    """Says on stdout where it listens, once it does, and stops in order: what it is told to stop by is no failure."""
+
+    def __init__(self, config: uvicorn.Config, stopping: Stopping, announce: Callable[[str], None]) -> None:
+        super().__init__(config)
+        self._stopping = stopping
+        self._announce = announce
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """Stop at the first signal; at a second SIGINT at once. uvicorn would die of the signal after the stop."""
+        self.force_exit = self.force_exit or (self.should_exit and sig == signal.SIGINT)
+        self.should_exit = True
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Refuse work and put back what runs while the port still answers, then close it."""
+        await self._stopping.begin(lambda: self.force_exit)
+        await super().shutdown(sockets)
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start, then say so."""
+        await super().startup(sockets)
+        if self.started and sockets:
+            host, port = sockets[0].getsockname()[:2]
+            shown = f"[{host}]" if ":" in host else host
+            self._announce(f"http://{shown}:{port}")
+
+
+def say(address: str) -> None:
+    """Tell people where the server listens."""
+    print(f"listening on {address}", flush=True)
+
+
+def say_in_json(address: str, data: Path) -> None:
+    """Tell programs, and where everything lies."""
+    print(json.dumps({"address": address, "data": str(data.absolute())}), flush=True)
+
+
+def add_arguments(parser: Parser) -> None:
+    """The options of the command; the end of its help lists all settings."""
+    parser.formatter_class, parser.epilog = argparse.RawDescriptionHelpFormatter, told_variables()
+    parser.add_argument("--host", help="the address to bind; beyond loopback only with keys")
+    parser.add_argument("--port", type=int, help="the port to bind; 0 picks a free one")
+    parser.add_argument("--data", type=Path, metavar="DIR", help="the directory for the database and all files")
+    parser.add_argument("--encoder", metavar="SPEC", help="the default text encoder: lvis, table:FILE, ...")
+    of_space = "the text encoder of a text space; may be given several times"
+    parser.add_argument("--text-space", action="append", dest="text_spaces", metavar="NAME=SPEC", help=of_space)
+    anew = "where the database is gone or older than the files, begin an empty one; the files go to quarantine"
+    parser.add_argument("--new", action="store_true", help=anew)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the service until it is stopped."""
+    settings = settings_of(options)
+    with data_directory_errors():
+        if not options.new:
+            require_database(settings.data / DATABASE)
+        require_keys(settings)
+        require_encoder_files(settings)
+        require_files(settings)
+        listener = bind(settings.host, settings.port)
+        try:
+            store = Store.open(settings.data, floor_bytes=settings.disk_floor_bytes, new=options.new)
+        except BaseException:
+            listener.close()
+            raise
+    with logging_to_stderr(settings.log_format):
+        if settings.keys == "none" and keys_were_made(settings.data):
+            log.warning("SPLATLIFT_KEYS is none: nobody needs a key, though keys were made for %s", settings.data)
+        try:
+            app = assemble(settings, store)
+            app.state.documents.get(keys=False)  # for whoever comes first, and for all who come at once
+            keep_pauses_short()
+            announce = partial(say_in_json, data=settings.data) if options.json else say
+            server_of(app, settings, announce).run(sockets=[listener])
+        finally:
+            store.close()
+            listener.close()
+    return 0
+
+
+def settings_of(options: argparse.Namespace) -> ServiceSettings:
+    """Settings from the command line, else from the environment, else their defaults.
+
+    Raises:
+        Misconfigured: a value that a setting does not take.
+    """
+    pairs = [text.partition("=") for text in options.text_spaces or ()]
+    for name, _, spec in pairs:
+        if not (name and spec):
+            raise Misconfigured("--text-space", expected="NAME=SPEC", got=repr(f"{name}={spec}"))
+    given = {name: getattr(options, name) for name in ("host", "port", "data", "encoder")}
+    return read_settings(**given, text_spaces={name: spec for name, _, spec in pairs} or None)
+
+
+@contextmanager
+def data_directory_errors() -> Iterator[None]:
+    """Tell in one line of a disk that is full, may only be read or fails, and of a database that does.
+
+    Raises:
+        Misconfigured: in place of OSError and sqlite3.Error.
+    """
+    try:
+        yield
+    except (OSError, sqlite3.Error) as error:
+        raise Misconfigured("data", expected="a directory to read and write", got=str(error)) from error
+
+
+def told_variables() -> str:
+    """All settings, as ``--help`` tells them."""
+    rows = (
+        f"  {name}, default {default}\n{fill(said, 78, initial_indent=MARGIN, subsequent_indent=MARGIN)}"
+        for name, default, said in variables()
+    )
+    return "\n".join(("environment variables; options win, and an empty variable is not set:", *rows))
+
+
+def require_keys(settings: ServiceSettings) -> None:
+    """See that nobody beyond this machine comes in without a key.
+
+    Raises:
+        Misconfigured: the address is not loopback, and there is no key.
+    """
+    if is_loopback(settings.host) or settings.keys == "required":
+        return
+    if settings.keys == "none":
+        raise Misconfigured(
+            "host", expected="a loopback address such as 127.0.0.1, as SPLATLIFT_KEYS is none", got=settings.host
+        )
+    if not any_key(settings.data / DATABASE):
+        raise Misconfigured(
+            "host", expected="a loopback address such as 127.0.0.1, as there are no keys", got=settings.host,
+            hint=f"make one first: splatlift keys create --name NAME --scopes read,write --data {settings.data}",
+        )  # fmt: skip
+
+
+def require_files(settings: ServiceSettings) -> None:
+    """See that every connection can have its files, as far as the machine lets us raise what we may have.
+
+    Raises:
+        Misconfigured: there would be too few of them.
+    """
+    needed = FILES_A_CONNECTION * settings.max_connections + FILES_BESIDE
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if 0 <= soft < needed:
+        if 0 <= hard < needed:
+            raise Misconfigured(
+                "max_connections", expected=f"at most {max(0, (hard - FILES_BESIDE) // FILES_A_CONNECTION)}, as a"
+                f" process may open {hard} files here", got=f"{settings.max_connections}", hint="or raise ulimit -n",
+            )  # fmt: skip
+        resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
+
+
+def bind(host: str, port: int) -> socket.socket:
+    """A listening socket.
+
+    Raises:
+        Misconfigured: the address is not of this machine, or it is taken.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+    except OSError as error:
+        listener.close()
+        got = f"{host} port {port}: {error.strerror}"
+        raise Misconfigured("host", expected="an address of this machine, with a free port", got=got) from None
+    return listener
+
+
+def pace_of(settings: ServiceSettings) -> Pace:
+    """What the settings ask of clients."""
+    return Pace(
+        settings.min_bytes_per_second, settings.slow_grace_seconds, settings.header_seconds, settings.max_connections
+    )
+
+
+def server_of(app: FastAPI, settings: ServiceSettings, announce: Callable[[str], None] = say) -> AnnouncingServer:
+    """The server of an application, which announces the address at which it listens."""
+    proxies = settings.forwarded_allow
+    config = uvicorn.Config(
+        app, http=watched(pace_of(settings)), log_config=None, log_level="warning", access_log=False,
+        server_header=False, ws="none", timeout_graceful_shutdown=math.ceil(settings.stop_seconds),
+        proxy_headers=bool(proxies), forwarded_allow_ips=proxies,
+    )  # fmt: skip
+    return AnnouncingServer(config, app.state.stopping, announce)
+
+
+def keep_pauses_short() -> None:
+    """Let no thread, and no collection of cycles, hold up the event loop for long."""
+    sys.setswitchinterval(SWITCH_SECONDS)
+    gc.set_threshold(700, 10, 10)  # Python's own: other commands collect less often
+    gc.collect()
+    gc.freeze()  # modules and routes are most of what there ever is: looking through them took 20 to 40 ms

@@ -1,0 +1,77 @@
+"""``splatlift store``: rebuild, back up, restore and verify a data directory."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from liftcore.cli.options import Parser
+from liftcore.errors import NotFound
+from service.commands.serve import data_directory_errors
+from service.settings import ServiceSettings, read_settings
+from service.store.backup import back_up, restore, verify
+from service.store.database import DATABASE
+from service.store.rebuild import rebuild
+from service.store.store import Store
+
+LOST = (
+    "what the database alone held is not made again: keys, owners (what was added is of admins alone), trade-offs,"
+    " jobs without a lift, histories of jobs"
+)
+
+
+def add_arguments(parser: Parser, shared: Parser) -> None:
+    """The options of the command."""
+    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=Parser)
+    rebuild = actions.add_parser("rebuild", parents=[shared], help="rows for files that the database does not know")
+    backup = actions.add_parser("backup", parents=[shared], help="copy a data directory, beside a server that runs")
+    backup.add_argument("directory", type=Path, metavar="DIR", help="the backup, which is not there yet")
+    restore = actions.add_parser("restore", parents=[shared], help="make a data directory of a backup")
+    restore.add_argument("directory", type=Path, metavar="DIR", help="the backup")
+    verify = actions.add_parser("verify", parents=[shared], help="compare every file with its digest")
+    for action in (rebuild, backup, restore, verify):
+        action.add_argument("--data", type=Path, metavar="DIR", help="the service's directory")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Do what the command line says; the exit status: 1 where `verify` finds damage."""
+    with data_directory_errors():
+        settings = read_settings(data=options.data)
+        if options.action == "restore":
+            found = {"files": restore(options.directory, settings.data)}
+            return _told(options, found, f"restored to {settings.data}")
+        _require_directory(settings.data)
+        if options.action == "backup":
+            found = {"files": back_up(settings.data, options.directory)}
+            return _told(options, found, f"{DATABASE} and {found['files']} files are in {options.directory}")
+        if options.action == "verify":
+            damage = verify(settings.data)
+            _told(options, {"damage": damage}, "\n".join(damage) or "every file is as it was stored")
+            return 1 if damage else 0
+        return _rebuild(options, settings)
+
+
+def _require_directory(data: Path) -> None:
+    if not data.is_dir():
+        raise NotFound("data", expected="the data directory of a service", got=str(data), hint="name it with --data")
+
+
+def _rebuild(given: argparse.Namespace, settings: ServiceSettings) -> int:
+    store = Store.open(settings.data, rebuilding=True)
+    try:
+        found = rebuild(store, settings)
+    finally:
+        store.close()
+    added = [f"{count} of kind {kind}" for kind, count in sorted(found["assets"].items())]
+    kinds = f" ({', '.join(added)})" if added else ""
+    lines = [f"added to {DATABASE}: {sum(found['assets'].values())} assets{kinds}, {found['lifts']} lifts"]
+    for left in found["left"]:
+        lines.append(f"left out, and to be moved to quarantine by the server: {left['file']}: {left['why']}")
+    return _told(given, {**found, "lost": LOST}, "\n".join([*lines, LOST]))
+
+
+def _told(given: argparse.Namespace, found: dict[str, Any], text: str) -> int:
+    print(json.dumps(found) if given.json else text)
+    return 0

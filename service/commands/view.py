@@ -1,0 +1,246 @@
+"""``splatlift view`` and ``result.show()``: one lift on the service's page, on a local port, until Ctrl-C.
+
+A temporary data directory holds links to the lift and to the files that it was made of: nothing is copied, and what
+is deleted on the page is a link. What a lift of Python has in memory alone is written to another one beside it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import secrets
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import webbrowser
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from liftcore.cli.options import Parser
+from liftcore.errors import InvalidInput, InvalidLift, Unavailable
+from liftcore.io.remote import place
+from liftcore.text import BUILT_IN, NO_WORDS, OWN_WORDS
+from service.app import assemble
+from service.commands.serve import bind, server_of
+from service.encoders import require_encoder_files
+from service.errand import ErrandLimits
+from service.errors import Misconfigured
+from service.models import AssetKind
+from service.observe import logging_to_stderr
+from service.settings import ServiceSettings
+from service.store.assets import CheckedUpload
+from service.store.lifts import FinishedLift, order_of
+from service.store.owners import SERVICE
+from service.store.rebuild import header_of
+from service.store.store import Store
+from service.uploads.intake import check
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from liftcore.scene.cameras import Camera
+    from liftcore.scene.splats import Splats
+    from liftcore.values.lift import InputFile, Lift, LiftMetadata
+
+LAST_PORT = 65_535
+ENDING_SECONDS = 10.0  # for a server that was interrupted
+
+
+def add_arguments(parser: Parser) -> None:
+    """The options of the command."""
+    parser.add_argument(
+        "lift", type=place, help="a lift (.safetensors), whose splats and cameras are where they were"
+    )
+    parser.add_argument("--port", type=int, default=0, help="the port of this machine; 0 picks a free one")
+    parser.add_argument("--no-browser", action="store_true", help="print the address, and open nothing")
+    parser.add_argument("--lent", type=Path, help=argparse.SUPPRESS)  # by `show`
+
+
+def run(options: argparse.Namespace) -> int:
+    """Show the lift until Ctrl-C; a folder that is lent goes with whoever holds the other end of stdin."""
+    if options.lent is None:
+        _serve(options.lift, options.port, browser=not options.no_browser)
+        return 0
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # in order, until the server takes signals itself
+    threading.Thread(target=stop_when_stdin_closes, daemon=True).start()
+    try:
+        _serve(options.lift, options.port, browser=not options.no_browser)
+    finally:
+        shutil.rmtree(options.lent, ignore_errors=True)
+    return 0
+
+
+def show(
+    lift: Lift, splats: Splats | None, cameras: Mapping[str, Camera] | None, *, port: int, browser: bool
+) -> None:
+    """Serve a lift until Ctrl-C: `LiftResult.show`."""
+    if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port <= LAST_PORT:
+        expected = f"a whole number in 0..{LAST_PORT}, 0 for a free one"
+        raise InvalidInput("port", expected=expected, got=repr(port)[:80])
+    from liftcore.values.lift_file import save_lift
+
+    with tempfile.TemporaryDirectory(prefix="splatlift-show-", ignore_cleanup_errors=True) as folder:
+        inputs = {
+            "splats": _splats_file(lift, splats, Path(folder)),
+            "cameras": _cameras_file(lift.metadata, cameras, Path(folder)),
+        }
+        path = Path(folder, "lift.safetensors")
+        save_lift(replace(lift.cpu(), metadata=lift.metadata.model_copy(update=inputs)), path)
+        command = [sys.executable, "-m", "liftcore.cli", "view", str(path), "--port", str(port)]
+        command += ["--lent", folder, *["--no-browser"] * (not browser)]  # a notebook's kernel may be killed
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
+            assert server.stdout is not None
+            try:
+                for line in server.stdout:
+                    print(line, end="", flush=True)  # into a notebook's cell, too
+            except KeyboardInterrupt:  # which the server heard as well, or will now
+                server.terminate()
+                with suppress(subprocess.TimeoutExpired):
+                    server.wait(ENDING_SECONDS)
+                server.kill()
+                return
+        if server.returncode:
+            got = f"one that ended with status {server.returncode}; what it said stands above"
+            raise Unavailable("the page", expected="a server that starts", got=got)
+
+
+def _splats_file(lift: Lift, splats: Splats | None, folder: Path) -> InputFile:
+    if splats is None:
+        return _remembered("splats", lift.metadata)
+    from liftcore.io.splats import write_splats
+    from liftcore.values.lift_file import input_file
+
+    lift.require_splats(splats)
+    write_splats(folder / "splats.ply", splats)
+    return input_file(folder / "splats.ply")
+
+
+def _cameras_file(metadata: LiftMetadata, cameras: Mapping[str, Camera] | None, folder: Path) -> InputFile:
+    from liftcore.io.transforms import transforms_of
+    from liftcore.values.lift_file import camera_input, found_input
+
+    there = found_input("cameras", metadata.cameras, metadata, None) if metadata.cameras.path else None
+    if cameras is None or there is not None:  # a file knows lenses and panoramas, too
+        return _remembered("cameras", metadata)
+    (folder / "cameras.json").write_text(json.dumps(transforms_of(cameras)), encoding="utf-8")
+    return camera_input(folder / "cameras.json")
+
+
+def _remembered(role: str, metadata: LiftMetadata) -> InputFile:
+    from liftcore.values.lift_file import found_input
+
+    remembered: InputFile = getattr(metadata, role)
+    found = found_input(role, remembered, metadata, None) if remembered.path else None
+    if found is None:
+        got = f"nothing, and they are not at {remembered.path}" if remembered.path else "nothing, of a lift in memory"
+        raise InvalidInput(role, expected=f"the {role} of the lift", got=got, hint=f"give show({role}=...)")
+    return remembered
+
+
+def adopt(store: Store, settings: ServiceSettings, path: Path) -> str:
+    """Give a store a lift and what it was made of, by links; the lift's id there.
+
+    Packs that moved are left out: only examples of regions need them.
+
+    Raises:
+        InvalidLift: it is no lift, or its splats or cameras are not where it remembers them.
+        InvalidInput: one of its files is malformed, or of a format that may hold code.
+    """
+    told, shape = metadata_of(path)
+    order = order_of(told)
+    packs = list(zip(told["features"], order.features, strict=True))
+    kept = [(pack, asset) for pack, asset in packs if Path(pack["path"]).is_file()]
+    _link(store, settings, AssetKind.SPLATS, told["splats"], path)
+    _link(store, settings, AssetKind.CAMERAS, told["cameras"], path)
+    for pack, _ in kept:
+        _link(store, settings, AssetKind.FEATURES, pack, path)
+    lift = secrets.token_hex(16)
+    store.files.lift(lift).symlink_to(path.resolve())
+    with path.open("rb") as handle:
+        digest = hashlib.file_digest(handle, "sha256").hexdigest()
+    made = FinishedLift(store.files.lift(lift), digest, shape[0], shape[1], told)
+    store.lifts.adopt(SERVICE, lift, replace(order, features=tuple(asset for _, asset in kept)), made)
+    return lift
+
+
+def metadata_of(path: Path) -> tuple[dict[str, Any], list[int]]:
+    """What a lift file tells of itself, and the shape of its features.
+
+    Raises:
+        InvalidLift: it is none.
+    """
+    _, metadata, shape = header_of(path)
+    if "splatlift" not in metadata or len(shape) != 2:
+        raise InvalidLift(str(path), expected="a lift file", got="a file without a lift's metadata")
+    return json.loads(metadata["splatlift"]), shape
+
+
+def _link(store: Store, settings: ServiceSettings, kind: AssetKind, file: dict[str, str], lift: Path) -> None:
+    source = Path(file["path"])
+    if not file["path"] or not source.exists():
+        got = "nothing there" if file["path"] else "a lift of values in memory"
+        raise InvalidLift(str(lift), expected=f"its {kind} at {file['path'] or 'a path'}", got=got)
+    with store.files.scratch() as scratch:
+        limits = ErrandLimits(settings.check_seconds, settings.check_memory_bytes, threading.Event())
+        report = check(kind, source, scratch, limits)
+    path = store.files.blob(file["sha256"], report.suffix)
+    path.parent.mkdir(exist_ok=True)
+    path.symlink_to(source.resolve() if source.is_file() else source)
+    store.assets.add(
+        SERVICE, CheckedUpload(path, kind, file["sha256"], report.suffix, report.counts, report.warnings)
+    )
+
+
+def settings_of(folder: Path, port: int, text_space: str) -> ServiceSettings:
+    """Settings of a server for this machine alone, with the encoder of the lift's text space, if it is here.
+
+    Spaces of encoders that ship, and those that the environment names, are answered as by any server.
+    """
+    own: dict[str, Any] = {"data": folder, "host": "127.0.0.1", "port": port}
+    settings = ServiceSettings(**own)
+    if text_space in ("", NO_WORDS, OWN_WORDS, *BUILT_IN.values(), *settings.text_spaces):
+        return settings
+    known = settings.model_copy(update={"text_spaces": {**settings.text_spaces, text_space: text_space}})
+    try:
+        require_encoder_files(known)
+    except Misconfigured:
+        return settings
+    return known
+
+
+def _serve(path: Path, port: int, *, browser: bool) -> None:
+    """Show the lift at a port, over a data directory that goes with the server."""
+    with tempfile.TemporaryDirectory(prefix="splatlift-view-") as folder:
+        settings = settings_of(Path(folder), port, metadata_of(path)[0].get("text_space", ""))
+        listener = bind(settings.host, settings.port)
+        store = Store.open(settings.data, floor_bytes=0)
+        try:
+            announced = partial(announce, lift=adopt(store, settings, path), browser=browser)
+            with logging_to_stderr(settings.log_format):
+                server_of(assemble(settings, store), settings, announced).run(sockets=[listener])
+        finally:
+            store.close()
+            listener.close()
+
+
+def stop_when_stdin_closes() -> None:
+    """Stop this process in order once nobody holds the other end of the pipe, however that one ended."""
+    while os.read(0, 1 << 16):  # not by sys.stdin, whose lock a thread that waits would keep beyond the end
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def announce(address: str, *, lift: str, browser: bool) -> None:
+    """Tell where the page is, and open it."""
+    page = f"{address}/?lift={lift}"
+    print(f"{page} (Ctrl-C ends it)", flush=True)
+    if browser:
+        threading.Thread(target=webbrowser.open, args=(page,), daemon=True).start()
