@@ -3,7 +3,7 @@
 SplatliftError
 └── ServiceError
     ├── Unauthorized, MissingScope, ForeignOrigin, Misdirected      who may ask
-    ├── InvalidRequest, UnreadableBody, DigestMismatch, InvalidEncoding, UnsupportedEncoding, TooLarge,
+    ├── InvalidRequest, UnreadableBody, DigestMismatch, UnsupportedEncoding, TooLarge,
     │   RangeNotSatisfiable, KeyReused
     ├── InUse, Conflict                                             what the state of things does not allow
     ├── OverQuota, OverLimit, NoSpace                               what there is no room for
@@ -81,14 +81,8 @@ class DigestMismatch(ServiceError):
     kind = "digest-mismatch"
 
 
-class InvalidEncoding(ServiceError):
-    """A compressed body that does not decompress."""
-
-    kind = "invalid-encoding"
-
-
 class UnsupportedEncoding(ServiceError):
-    """A Content-Encoding that the service does not read."""
+    """A body that is compressed."""
 
     kind = "unsupported-encoding"
 

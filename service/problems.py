@@ -67,7 +67,6 @@ TABLE: dict[type[SplatliftError], tuple[int, str]] = {
     errors.InvalidRequest: (422, MALFORMED),
     errors.UnreadableBody: (400, MALFORMED),
     errors.DigestMismatch: (422, "The body is not what its digest promised"),
-    errors.InvalidEncoding: (422, "The body does not decompress"),
     errors.UnsupportedEncoding: (415, "The content encoding is not supported"),
     errors.TooLarge: (413, "The body is too large"),
     errors.RangeNotSatisfiable: (416, "The range is beyond the end"),

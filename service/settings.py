@@ -56,15 +56,13 @@ class ServiceSettings(BaseSettings):
     )
     stop_seconds: float = Field(10, gt=0, le=600, description="time that open requests have to end in a stop")
 
-    max_splats_bytes: int = Field(4 * GiB, gt=0, description="the largest splat file, compressed or not")
-    max_cameras_bytes: int = Field(
-        256 * MiB, gt=0, description="the largest camera file, compressed or not; at most 100,000 views"
-    )
-    max_features_bytes: int = Field(16 * GiB, gt=0, description="the largest feature pack, compressed or not")
-    max_masks_bytes: int = Field(256 * MiB, gt=0, description="the largest file of masks, compressed or not")
-    max_table_bytes: int = Field(64 * MiB, gt=0, description="the largest text table, compressed or not")
-    max_photos_bytes: int = Field(4 * GiB, gt=0, description="the largest zip of photos, compressed or not")
-    max_lift_bytes: int = Field(16 * GiB, gt=0, description="the largest lift file, compressed or not")
+    max_splats_bytes: int = Field(4 * GiB, gt=0, description="the largest splat file")
+    max_cameras_bytes: int = Field(256 * MiB, gt=0, description="the largest camera file; at most 100,000 views")
+    max_features_bytes: int = Field(16 * GiB, gt=0, description="the largest feature pack")
+    max_masks_bytes: int = Field(256 * MiB, gt=0, description="the largest file of masks")
+    max_table_bytes: int = Field(64 * MiB, gt=0, description="the largest text table")
+    max_photos_bytes: int = Field(4 * GiB, gt=0, description="the largest zip of photos")
+    max_lift_bytes: int = Field(16 * GiB, gt=0, description="the largest lift file")
     max_body_bytes: int = Field(MiB, gt=0, description="the largest body of any request that is not an upload")
 
     min_bytes_per_second: int = Field(

@@ -140,7 +140,7 @@ _MAGIC: tuple[tuple[int, bytes, FileKind], ...] = (
     (0, LFS_POINTER, FileKind(None, "a Git LFS pointer, which stands for the file", LFS_HINT)),
     (0, b"/annex/objects/", FileKind(None, "a git-annex pointer, which stands for the file", "run 'git annex get'")),
     (0, b"\x1f\x8b", FileKind(
-        None, "a gzip file", f"{UNPACK} (gunzip), or upload it with the header 'Content-Encoding: gzip'")),
+        None, "a gzip file", f"{UNPACK} (gunzip)")),
     (0, b"7z\xbc\xaf\x27\x1c", FileKind(None, "a 7z archive", UNPACK)),
     (0, b"Rar!\x1a\x07", FileKind(None, "a RAR archive", UNPACK)),
     (0, b"\xfd7zXZ\x00", FileKind(None, "an xz file", UNPACK)),

@@ -17,7 +17,7 @@ from service.errors import Crashed
 from service.requests import described_body, json_body
 from service.state import AppState, Deps
 from service.store.assets import SHOWN_CHARACTERS, AssetRecord
-from service.uploads.intake import AssetIntake, Intake, Taken, coding_of, require_size
+from service.uploads.intake import AssetIntake, Intake, Taken, require_plain, require_size
 
 T = TypeVar("T")
 BATCH = 1 << 20  # bytes gathered before a thread writes them
@@ -30,14 +30,14 @@ AssetKind = Annotated[models.AssetKind, Path(alias="asset", description="what it
 AssetId = Annotated[str, Path(description="sha256: and the digest of the bytes, in hex")]
 Sha256 = Annotated[
     str | None,
-    Query(pattern="^[0-9a-fA-F]{64}$", description="of the content after decompression; checked if given"),
+    Query(pattern="^[0-9a-fA-F]{64}$", description="of the content; checked if given"),
 ]
 CHANGE_BODY = json_body(models.PackChange)
 NamesCursor = Annotated[int, Query(ge=0, le=10**9, description="the `next` of the page before")]
 RAW_BODY = {
     "requestBody": {
         "required": True,
-        "description": "the file itself, with Content-Encoding: gzip or zstd if it is compressed",
+        "description": "the file itself",
         "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
     }
 }
@@ -62,10 +62,10 @@ async def taken(
     into: Callable[..., Intake[Taken]], kind: models.UploadKind, request: Request, deps: AppState, sha256: str | None
 ) -> tuple[Taken, bool]:
     """Take the body of an upload in, check it whole and keep it; whether its owner did not have it before."""
-    coding = coding_of(", ".join(request.headers.getlist("content-encoding")))
+    require_plain(", ".join(request.headers.getlist("content-encoding")))
     limit = deps.settings.max_upload_bytes(kind)
     require_size(kind, _announced(request), limit)  # before a byte of it is asked for with 100 Continue
-    intake = into(deps.store, deps.owner, kind, limit, coding)
+    intake = into(deps.store, deps.owner, kind, limit)
 
     async def write(step: Callable[..., T], *given: Any) -> T:
         return await anyio.to_thread.run_sync(step, *given, limiter=deps.writing)
@@ -145,7 +145,7 @@ def _retagged(asset: str, change: models.PackChange, deps: AppState) -> tuple[As
     found = deps.store.assets.get(deps.owner, asset, models.AssetKind.FEATURES)
     allowed = ErrandLimits(deps.settings.check_seconds, deps.settings.check_memory_bytes, deps.ending)
     limit = deps.settings.max_upload_bytes(models.AssetKind.FEATURES)
-    intake = AssetIntake(deps.store, deps.owner, models.AssetKind.FEATURES, limit, None)
+    intake = AssetIntake(deps.store, deps.owner, models.AssetKind.FEATURES, limit)
     try:
         intake.open()
         with deps.store.files.scratch() as scratch, found.path.open("rb") as pack:

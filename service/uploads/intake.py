@@ -1,30 +1,20 @@
-"""A body on its way to a checked file: decompressed, counted and digested as it comes, then read in a child process.
-
-No bomb ever lies in memory. What a decoder gives at once is bounded by what it is given: deflate makes at most 1,032
-bytes of one, and a zstd block of four bytes at most 128 KiB. So each coding has a size of piece of which 16 MiB come
-out at most.
-"""
+"""A body on its way to a checked file: counted and digested as it comes, then read in a child process."""
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
 import logging
-import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Generic, TypeVar
-
-import zstandard
 
 from liftcore.errors import InvalidLift, NotFound
 from liftcore.scene.views import require_pairs
 from service.child import error_of
 from service.errand import ErrandLimits, run_errand
-from service.errors import Busy, Crashed, DigestMismatch, InvalidEncoding, TooLarge, UnsupportedEncoding
+from service.errors import Busy, Crashed, DigestMismatch, TooLarge, UnsupportedEncoding
 from service.models import AssetKind, UploadKind
 from service.store.assets import ALL, SHOWN_CHARACTERS, AssetRecord, CheckedUpload
 from service.store.files import is_whole
@@ -33,9 +23,6 @@ from service.store.owners import Owner
 from service.store.store import Store
 from service.uploads import INVALID
 
-GZIP_WINDOW = 31  # zlib's name for "a gzip header and a 32 KiB window"
-ZSTD_WINDOW_BYTES = 8 << 20  # the largest that RFC 9659 lets a Content-Encoding ask for
-MAX_MEMBERS = 1_000_000  # of a concatenated body; bgzip makes one of each 64 KiB
 STEP = 4 << 20  # bytes of content between two looks at what may still be stored
 CHECK_BASE_BYTES, CHECK_FACTOR = 1 << 30, 16  # private memory of a check: a reader holds several copies of a file
 TRACE_CHARACTERS = 4000  # of a check that died, in the log
@@ -44,80 +31,17 @@ HINTS: dict[UploadKind, str] = {AssetKind.FEATURES: "several feature packs may m
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Coding:
-    """A way to compress a body, of one or more members (gzip members, zstd frames) one after the other."""
-
-    name: str
-    piece: int  # bytes that one step takes
-    begin: Callable[[], Callable[[], Any]]  # for a body: what makes a decoder for each of its members
-
-
-GZIP = Coding("gzip", 16 << 10, lambda: partial(zlib.decompressobj, GZIP_WINDOW))
-# The tables of zstd are made once a body, and not once a frame.
-ZSTD = Coding("zstd", 512, lambda: zstandard.ZstdDecompressor(max_window_size=ZSTD_WINDOW_BYTES).decompressobj)
-CODINGS = {"": None, "identity": None, "gzip": GZIP, "x-gzip": GZIP, "zstd": ZSTD}
-
-
-def coding_of(content_encoding: str) -> Coding | None:
-    """The coding that a Content-Encoding names, None for none.
+def require_plain(content_encoding: str) -> None:
+    """See that a body comes as it is.
 
     Raises:
-        UnsupportedEncoding: it names another, or several.
+        UnsupportedEncoding: its Content-Encoding says that it is compressed.
     """
-    name = content_encoding.strip().lower()
-    if name not in CODINGS:
-        raise UnsupportedEncoding("Content-Encoding", expected="gzip, zstd, or none", got=name[:40])
-    return CODINGS[name]
-
-
-class Decoding:
-    """Undoes a coding."""
-
-    def __init__(self, coding: Coding) -> None:
-        self._coding = coding
-        self._member = coding.begin()
-        self._decoder = self._member()
-        self._members = 1
-
-    def feed(self, chunk: bytes) -> Iterator[bytes]:
-        """What the next bytes of the body stand for, 16 MiB at most at a time.
-
-        Raises:
-            InvalidEncoding: they are not in the coding, ask for too large a window, or are too many members.
-        """
-        for first in range(0, len(chunk), self._coding.piece):
-            rest = chunk[first : first + self._coding.piece]
-            while rest:
-                if self._decoder.eof:
-                    self._next_member()
-                yield self._decompress(rest)
-                rest = self._decoder.unused_data if self._decoder.eof else b""
-
-    def finish(self) -> None:
-        """See that the body has ended.
-
-        Raises:
-            InvalidEncoding: its last member is cut short.
-        """
-        if not self._decoder.eof:
-            raise self._refuse(f"a whole {self._coding.name} stream", "one that ends early")
-
-    def _next_member(self) -> None:
-        self._members += 1
-        if self._members > MAX_MEMBERS:
-            raise self._refuse(f"at most {MAX_MEMBERS} {self._coding.name} streams in a row", "more")
-        self._decoder = self._member()
-
-    def _decompress(self, piece: bytes) -> bytes:
-        try:
-            return self._decoder.decompress(piece)
-        except (zlib.error, zstandard.ZstdError) as error:
-            hint = f"a window of at most {ZSTD_WINDOW_BYTES >> 20} MiB" if "memory" in str(error) else ""
-            raise self._refuse(f"{self._coding.name}, as Content-Encoding says", str(error), hint) from None
-
-    def _refuse(self, expected: str, got: str, hint: str = "") -> InvalidEncoding:
-        return InvalidEncoding("body", expected=expected, got=got, hint=hint)
+    if content_encoding.strip().lower() not in ("", "identity"):
+        raise UnsupportedEncoding(
+            "Content-Encoding", expected="a body that is not compressed", got=content_encoding[:40],
+            hint="send the file as it is; .spz and .sog are compressed already",
+        )  # fmt: skip
 
 
 def require_size(kind: UploadKind, count: int, limit: int) -> None:
@@ -127,9 +51,7 @@ def require_size(kind: UploadKind, count: int, limit: int) -> None:
         TooLarge: it may not.
     """
     if count > limit:
-        raise TooLarge(
-            "body", expected=f"at most {limit} bytes, compressed or not", got="more", hint=HINTS.get(kind, "")
-        )
+        raise TooLarge("body", expected=f"at most {limit} bytes", got="more", hint=HINTS.get(kind, ""))
 
 
 Taken = TypeVar("Taken", AssetRecord, LiftRecord)
@@ -141,17 +63,15 @@ class Intake(ABC, Generic[Taken]):
     Args:
         store: that takes it.
         owner: for whom.
-        limit: bytes that may come, and come out after decompression.
-        coding: how the body is compressed.
+        limit: bytes that may come.
     """
 
-    def __init__(self, store: Store, owner: Owner, kind: UploadKind, limit: int, coding: Coding | None) -> None:
+    def __init__(self, store: Store, owner: Owner, kind: UploadKind, limit: int) -> None:
         self._store = store
         self._owner = owner
         self._kind: UploadKind = kind
         self._limit = limit
-        self._decoding = None if coding is None else Decoding(coding)
-        self._received = self._written = self._permitted = 0
+        self._received = self._permitted = 0
         self._digest = hashlib.sha256()
         self._open = contextlib.ExitStack()
         self._draft: Path | None = None
@@ -176,25 +96,18 @@ class Intake(ABC, Generic[Taken]):
         """Take the next bytes of the body.
 
         Raises:
-            TooLarge: there are more than may come, or come out.
-            InvalidEncoding: they do not decompress.
+            TooLarge: there are more than may come.
             NoSpace, OverQuota: they may not be stored.
         """
+        assert self._file is not None
         self._received += len(chunk)
         require_size(self._kind, self._received, self._limit)
-        for content in (chunk,) if self._decoding is None else self._decoding.feed(chunk):
-            self._write(content)
-
-    def _write(self, content: bytes) -> None:
-        assert self._file is not None
-        self._written += len(content)
-        require_size(self._kind, self._written, self._limit)
-        if self._written > self._permitted:  # compressed, a body's end is not known before
-            self._store.files.require_room(len(content))
-            self._store.assets.require_quota(self._owner, self._written)
-            self._permitted = self._written + STEP
-        self._digest.update(content)
-        self._file.write(content)
+        if self._received > self._permitted:  # a body may come without its length
+            self._store.files.require_room(len(chunk))
+            self._store.assets.require_quota(self._owner, self._received)
+            self._permitted = self._received + STEP
+        self._digest.update(chunk)
+        self._file.write(chunk)
 
     def finish(self, promised: str | None) -> Taken | None:
         """Call once after the last byte.
@@ -206,12 +119,9 @@ class Intake(ABC, Generic[Taken]):
             What there is, when its owner has these very bytes already.
 
         Raises:
-            InvalidEncoding: a compressed body ended early.
             DigestMismatch: the bytes are others.
         """
         assert self._file is not None
-        if self._decoding is not None:
-            self._decoding.finish()
         self._file.flush()
         digest = self._digest.hexdigest()
         if promised is not None and digest != promised.lower():

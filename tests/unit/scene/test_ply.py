@@ -195,7 +195,7 @@ MALFORMED = {
     "scaffold": (ply_bytes([*INRIA, "f_offset_0"]), "anchors of Scaffold-GS"),
     "git lfs": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "git lfs pull"),
     "web page": (b"<!DOCTYPE html>\n<html>", "a web page"),
-    "gzip": (b"\x1f\x8b\x08", "a gzip file.*Content-Encoding"),
+    "gzip": (b"\x1f\x8b\x08", "a gzip file.*gunzip"),
     "NumPy": (b"\x93NUMPY\x01", "a NumPy array"),
     "odd number of f_rest": (ply_bytes([*INRIA, "f_rest_0"]), r"0, 9, 24, 45, 72 properties f_rest"),
     "gap in f_rest": (ply_bytes([*INRIA, "f_rest_1"]), r"'f_rest_0'.*'f_rest_1' without it"),
