@@ -31,14 +31,13 @@ if TYPE_CHECKING:
 
 
 LOCAL_SUFFIXES = (".splat", ".spz")  # of files whose positions are about the splats' origin
-EXAMPLES = "VIEW:x,y (a pixel), region:VIEW:LEVEL:ID, splat:J or a vector FILE.npy; may be given several times"
 OWN: dict[str, dict[str, Any]] = {  # what the command line says of fields beside what they say themselves
     "text": {
         "flag": "text", "nargs": "?", "action": "store", "default": None, "metavar": "text",
         "help": "what to look for, in quotes; may be left out beside --like",
     },
-    "like": {"metavar": "EXAMPLE", "help": f"more of this: {EXAMPLES}"},
-    "unlike": {"metavar": "EXAMPLE", "help": "less of that, likewise"},
+    "like": {"metavar": "EXAMPLE|FILE.npy"},
+    "unlike": {"metavar": "EXAMPLE|FILE.npy"},
     "negatives": {
         "flag": "--negative", "nargs": "+", "action": "extend", "metavar": "WORD",
         "help": "texts to compete with: all up to the next option, so TEXT goes before it; may be given again",

@@ -26,8 +26,8 @@ def add_arguments(parser: Parser) -> None:
     add_lift(parser)
     parser.add_argument("--words", type=Path, metavar="FILE", help="the words, one a line; else all of the table's")
     add_encoder(parser)
-    what = "what is this? VIEW:x,y (a pixel), region:VIEW:LEVEL:ID, splat:J or a vector FILE.npy"
-    parser.add_argument("--what", action="append", default=[], metavar="EXAMPLE", help=f"{what}; repeatable")
+    what = "what is this? an example as 'query --like' takes it; may be given several times"
+    parser.add_argument("--what", action="append", default=[], metavar="EXAMPLE", help=what)
     parser.add_argument("--top", type=count, default=5, metavar="N", help="words for each --what; 5")
     add_view(parser)
     parser.add_argument("--labels", type=Path, metavar="PNG", help="write the words of the view's pixels, as numbers")

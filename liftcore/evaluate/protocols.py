@@ -21,8 +21,8 @@ import torch
 from scipy.ndimage import uniform_filter
 from torch import Tensor
 
+from liftcore.query.areas import MINIMUM_ROW_SUM
 from liftcore.query.ask import ask
-from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.objects import Objects, objects
 from liftcore.query.opened import OpenedLift
 from liftcore.query.question import Answer, Query

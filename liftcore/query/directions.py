@@ -12,13 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from liftcore.errors import InvalidQuery, NotFound
+from liftcore.query.areas import feature_shown
 from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.question import Query
 from liftcore.query.regions import codebook_row, regions_of
-from liftcore.query.terms import Example, OneSplat, Pixel, Region, Term, Vector, parse_example
+from liftcore.query.terms import Area, Example, OneSplat, Region, Term, Vector, parse_example
 from liftcore.text import TextEncoder
-
-MINIMUM_ROW_SUM = 0.5  # below it a ray mostly misses the scene: no histogram, no mask and no example takes it
 
 
 def directions(scene: OpenedLift, query: Query, encoder: TextEncoder | None, names: Sequence[str] = ()) -> np.ndarray:
@@ -36,7 +35,7 @@ def directions(scene: OpenedLift, query: Query, encoder: TextEncoder | None, nam
     named = _Names(query.terms, names)
     rows = _encode(scene, query, encoder, named) | _regions(scene, query, named)
     for place, term in enumerate(query.terms):
-        if isinstance(term, Pixel | OneSplat | Vector):
+        if not isinstance(term, str | Region):
             with named(place):
                 rows[place] = _unit(_feature(scene, term), "vector" if isinstance(term, Vector) else str(term))
     return np.stack([rows[place] for place in range(len(query.terms))])
@@ -100,9 +99,9 @@ def _regions(scene: OpenedLift, query: Query, named: _Names) -> dict[int, np.nda
     return rows
 
 
-def _feature(scene: OpenedLift, example: Pixel | OneSplat | Vector) -> np.ndarray:
-    if isinstance(example, Pixel):
-        return _rendered(scene, example)
+def _feature(scene: OpenedLift, example: Area | OneSplat | Vector) -> np.ndarray:
+    if isinstance(example, Area):
+        return feature_shown(scene, example)
     if isinstance(example, Vector):
         if len(example.values) != scene.channels:
             raise InvalidQuery("vector", expected=f"{scene.channels} channels, as the lift has", got=str(example))
@@ -111,32 +110,6 @@ def _feature(scene: OpenedLift, example: Pixel | OneSplat | Vector) -> np.ndarra
     if example.splat >= count:
         raise InvalidQuery(str(example), expected=f"a splat in 0..{count - 1}", got=str(example.splat))
     return scene.features[example.splat]
-
-
-def _rendered(scene: OpenedLift, pixel: Pixel) -> np.ndarray:
-    """``sum_j A_ij x_j`` of the pixel's ray, [F] f64, as scores are rendered."""
-    import torch
-
-    from liftcore.scene.cameras import drawn_by, photo_size, pixel_of
-
-    camera = scene.cameras[pixel.view]
-    width, height = photo_size(camera)
-    if not (0 <= pixel.x < width and 0 <= pixel.y < height):
-        expected = f"x in 0..{width - 1} and y in 0..{height - 1}"
-        raise InvalidQuery(str(pixel), expected=expected, got=f"{pixel.x},{pixel.y}")
-    drawn = pixel_of(camera, pixel.x, pixel.y)
-    if drawn is None:
-        hint = "pick a pixel nearer to the middle"
-        got = "one at the rim of a wide lens"
-        raise InvalidQuery(str(pixel), expected="a pixel that a pinhole sees", got=got, hint=hint)
-    row = scene.raster.ray_rows(drawn_by(camera), torch.tensor([drawn], dtype=torch.int32), scene.compositing)
-    weights, splats = as_numpy(row.weights), as_numpy(row.splats)
-    met = float(weights.sum())
-    if met < MINIMUM_ROW_SUM:
-        got = f"a ray that splats fill by {met:.1%}"
-        hint = "pick a pixel on a surface"
-        raise InvalidQuery(str(pixel), expected="a pixel that shows the scene", got=got, hint=hint)
-    return weights.astype(np.float64) @ scene.features[splats].astype(np.float64)
 
 
 def _unit(vector: np.ndarray, name: str) -> np.ndarray:

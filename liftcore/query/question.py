@@ -25,7 +25,7 @@ from pydantic import (
 from pydantic_core import CoreSchema, core_schema
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.terms import NOTATIONS, Example, OneSplat, Pixel, Region, Term, Vector, parse_example
+from liftcore.query.terms import NOTATIONS, Example, Term, Vector, parse_example
 from liftcore.runtime.fields import Body, NoBoolean, takes
 from liftcore.runtime.one_line import one_line, value_text
 from liftcore.scene.compositing import MAX_SIDE
@@ -57,7 +57,7 @@ def _examples(given: Any) -> Any:
 def _plain(example: Any) -> Any:
     if isinstance(example, Vector):
         return example.values
-    return str(example) if isinstance(example, Pixel | Region | OneSplat) else example
+    return str(example) if isinstance(example, Example) else example
 
 
 def _camera(given: Any) -> Any:
@@ -164,7 +164,10 @@ class Query(Seen):
     error_type: ClassVar = InvalidQuery
 
     text: Texts = Field(default=[], description="what to look for; may be given several times")
-    like: Examples = Field(default=[], description="an example of it, or a vector; may be given several times")
+    like: Examples = Field(
+        default=[],
+        description=f"an example of it: {NOTATIONS}, or a vector; may be given several times",
+    )
     negatives: Texts = Field(default=[], description="what it is not; may be given several times")
     unlike: Examples = Field(default=[], description="an example of what it is not, likewise")
     threshold: Cut = Field(

@@ -10,8 +10,8 @@ from PIL import Image, ImageDraw, ImageFont
 from PIL.PngImagePlugin import PngInfo
 
 from liftcore.errors import InvalidQuery
+from liftcore.query.areas import MINIMUM_ROW_SUM
 from liftcore.query.colours import cluster_colours, heat_colours, map_colours
-from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.objects import objects
 from liftcore.query.opened import OpenedLift
 from liftcore.query.question import Answer, Objects

@@ -19,8 +19,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liftcore.errors import InvalidQuery
+from liftcore.query.areas import MINIMUM_ROW_SUM
 from liftcore.query.colours import cluster_colours
-from liftcore.query.directions import MINIMUM_ROW_SUM, directions
+from liftcore.query.directions import directions
 from liftcore.query.objects import trimmed_box
 from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.presence import LEAST_WORDS, References, judge, references_beside

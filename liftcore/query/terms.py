@@ -5,10 +5,13 @@ Examples stand in place of words, "more of this":
 | notation | the feature |
 |---|---|
 | `VIEW:x,y` | what the lift shows at a pixel of a camera, ``sum_j A_ij x_j``; any camera, lifted or not |
+| `VIEW:box:x0,y0,x1,y1` | what most pixels of a box show and few around it: columns from x0 up to x1, without it |
+| `VIEW:stroke:x0,y0,x1,y1,...` | what most pixels show on the line through these, two or more |
 | `region:VIEW:LEVEL:ID` | the codebook row of a region, as the lift's feature packs hold it |
 | `splat:J` | the feature of a splat, by its row in the splat file |
 
-A vector has no notation. Names of views may hold colons and commas: the notation is read from its end.
+How boxes and strokes are read: `liftcore.query.areas`. A vector has no notation. Names of views may hold colons and
+commas: the notation is read from its end.
 """
 
 import re
@@ -16,8 +19,10 @@ from dataclasses import dataclass
 
 from liftcore.errors import InvalidQuery
 
-NOTATIONS = "VIEW:x,y, region:VIEW:LEVEL:ID or splat:J"
+NOTATIONS = "VIEW:x,y, VIEW:box:x0,y0,x1,y1, VIEW:stroke:x0,y0,x1,y1,..., region:VIEW:LEVEL:ID or splat:J"
 _PIXEL = re.compile(r"(.+):\s*(-?\d{1,9})\s*,\s*(-?\d{1,9})\s*", re.ASCII | re.DOTALL)
+_AREA = re.compile(r"(.+):(box|stroke):([^:]*)", re.ASCII | re.DOTALL)
+_WHOLE = re.compile(r"\s*-?\d{1,9}\s*", re.ASCII)
 _REGION = re.compile(r"region:(.+):(\d{1,9}):(\d{1,9})", re.ASCII | re.DOTALL)
 _SPLAT = re.compile(r"splat:(\d{1,18})", re.ASCII)
 
@@ -32,6 +37,31 @@ class Pixel:
 
     def __str__(self) -> str:
         return f"{self.view}:{self.x},{self.y}"
+
+
+@dataclass(frozen=True)
+class PixelBox:
+    """What a camera sees in a box of its image, and not around it."""
+
+    view: str  # the name of a camera
+    x0: int  # its first column, from the left
+    y0: int  # its first row, from the top
+    x1: int  # the column after its last one
+    y1: int  # the row after its last one
+
+    def __str__(self) -> str:
+        return f"{self.view}:box:{self.x0},{self.y0},{self.x1},{self.y1}"
+
+
+@dataclass(frozen=True)
+class Stroke:
+    """What a camera sees along a line that is drawn on its image."""
+
+    view: str  # the name of a camera
+    pixels: tuple[tuple[int, int], ...]  # column and row of its corners, two or more
+
+    def __str__(self) -> str:
+        return f"{self.view}:stroke:{','.join(f'{x},{y}' for x, y in self.pixels)}"
 
 
 @dataclass(frozen=True)
@@ -66,7 +96,8 @@ class Vector:
         return f"a vector of {len(self.values)} channels"
 
 
-Example = Pixel | Region | OneSplat | Vector
+Area = Pixel | PixelBox | Stroke  # of a camera's image
+Example = Area | Region | OneSplat | Vector
 Term = str | Example  # a text, or an example
 
 
@@ -88,4 +119,21 @@ def parse_example(notation: str, argument: str = "like") -> Example:
         return Region(region[1], int(region[2]), int(region[3]))
     if splat := _SPLAT.fullmatch(notation):
         return OneSplat(int(splat[1]))
+    if area := _AREA.fullmatch(notation):
+        return _area(notation, area, argument)
     raise InvalidQuery(argument, expected=NOTATIONS, got=repr(notation[:120]))
+
+
+def _area(notation: str, parts: re.Match[str], argument: str) -> PixelBox | Stroke:
+    view, kind, listed = parts.groups()
+    numbers = [int(one) for one in listed.split(",") if _WHOLE.fullmatch(one)]
+    corners = tuple(zip(numbers[::2], numbers[1::2], strict=False))
+    if (
+        len(numbers) < listed.count(",") + 1
+        or len(numbers) % 2
+        or len(corners) < 2
+        or (kind == "box" and len(corners) > 2)
+    ):
+        expected = f"{kind}:x0,y0,x1,y1{'' if kind == 'box' else ',...'}, whole numbers of pixels"
+        raise InvalidQuery(argument, expected=expected, got=repr(notation[:120]))
+    return PixelBox(view, *corners[0], *corners[1]) if kind == "box" else Stroke(view, corners)

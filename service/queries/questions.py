@@ -20,6 +20,7 @@ from liftcore.query.question import (
     SceneObject,
     Seen,
 )
+from liftcore.query.terms import NOTATIONS
 from liftcore.runtime.fields import Body, NoBoolean, takes
 from service import limits
 from service.models import AssetId, JobId, Text
@@ -47,7 +48,7 @@ Numbers = Annotated[
 ]
 AnExample = Annotated[
     Notation | Numbers,
-    takes(f"VIEW:x,y, region:VIEW:LEVEL:ID, splat:J, or a vector of 1 to {limits.VECTOR} finite numbers"),
+    takes(f"{NOTATIONS}, or a vector of 1 to {limits.VECTOR} finite numbers"),
 ]
 Examples = Annotated[list[AnExample], Field(max_length=limits.ASKED, fail_fast=True)]
 

@@ -20,7 +20,10 @@ from service.store.owners import SERVICE
 from .conftest import parts_of
 from .tiny_scene import HEIGHT, WORDS
 
-EXAMPLES = ("middle:6,12", f"middle:26,{HEIGHT // 2}", "splat:0", "splat:47", "region:left:0:1", "splat:60", "none")
+EXAMPLES = (
+    "middle:6,12", f"middle:26,{HEIGHT // 2}", "splat:0", "splat:47", "region:left:0:1", "middle:box:3,4,10,20",
+    "middle:stroke:26,5,26,12,27,19", "splat:60", "middle:box:9,9,3,3", "none",
+)  # the last three are refused  # fmt: skip
 FLAGS = {"negatives": "--negative"}
 
 

@@ -14,6 +14,7 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
 from liftcore.errors import SplatliftError
+from liftcore.query.terms import NOTATIONS
 from liftcore.values.settings import LiftSettings
 from service import problems
 from service.child import error_of, fault_of
@@ -127,7 +128,7 @@ def test_every_error_has_a_row_and_crosses_processes() -> None:
 
 JSON = {"Content-Type": "application/json"}
 THRESHOLD = "auto, valley, paper, otsu, stability, or a number from -1 to 1"
-EXAMPLE = "VIEW:x,y, region:VIEW:LEVEL:ID, splat:J, or a vector of 1 to 65536 finite numbers"
+EXAMPLE = f"{NOTATIONS}, or a vector of 1 to 65536 finite numbers"
 
 
 @pytest.mark.parametrize("media", [None, "application/x-www-form-urlencoded", "text/plain"])

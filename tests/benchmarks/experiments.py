@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn.functional import cosine_similarity, normalize
 
 import liftcore as lc
-from liftcore.query.directions import MINIMUM_ROW_SUM
+from liftcore.query.areas import MINIMUM_ROW_SUM
 from liftcore.query.threshold import find_threshold
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.splats import Kernel

@@ -42,8 +42,8 @@ from torch.nn import functional
 
 import liftcore as lc
 from liftcore.features.encoders.encode import find_images
+from liftcore.query.areas import MINIMUM_ROW_SUM
 from liftcore.query.ask import ask
-from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.question import Query
 from liftcore.query.render import overlay, view_mask
 from liftcore.query.scene import Scene

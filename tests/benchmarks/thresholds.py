@@ -27,8 +27,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from liftcore.query.areas import MINIMUM_ROW_SUM
 from liftcore.query.ask import ask
-from liftcore.query.directions import MINIMUM_ROW_SUM
 from liftcore.query.objects import objects
 from liftcore.query.question import Answer, Query
 from liftcore.query.render import LEAST_SHARE, MOST_GROUPED, view_mask

@@ -21,7 +21,7 @@ from liftcore.query.directions import directions, read_vector
 from liftcore.query.question import Query
 from liftcore.query.result import LiftResult, load_lift
 from liftcore.query.scene import Scene
-from liftcore.query.terms import Example, OneSplat, Pixel, Region, Vector, parse_example
+from liftcore.query.terms import Example, OneSplat, Pixel, PixelBox, Region, Stroke, Vector, parse_example
 from liftcore.query.threshold import find_threshold
 from liftcore.values.lift_file import save_lift
 from service.queries.answers import open_scene
@@ -208,8 +208,11 @@ def test_cameras_may_be_added_but_not_moved(lift_tiny: Callable[..., Path], tmp_
 @pytest.mark.parametrize("cluster", range(3))
 def test_every_kind_of_example_finds_its_cluster(scene: Scene, cluster: int) -> None:
     splats = slice(cluster * SPLATS_A_CLUSTER, (cluster + 1) * SPLATS_A_CLUSTER)
+    x = (6, 16, 26)[cluster]
     kinds: list[Example] = [
-        Pixel("middle", (6, 16, 26)[cluster], HEIGHT // 2),
+        Pixel("middle", x, HEIGHT // 2),
+        PixelBox("middle", x - 4, 2, x + 5, HEIGHT - 2),
+        Stroke("middle", ((x, 6), (x + 1, 12), (x, 18))),
         Region("left", 0, cluster),
         OneSplat(cluster * SPLATS_A_CLUSTER + 3),
         Vector(tuple(1e30 * np.eye(CHANNELS)[cluster])),
@@ -227,6 +230,28 @@ def test_pixel_is_the_feature_rendered_there(scene: Scene) -> None:
         (found,) = directions(scene, Query.of((Pixel("middle", x, y),)), None)
         expected = torch.nn.functional.normalize(image[y, x], dim=0)
         np.testing.assert_allclose(found, expected.numpy(), atol=1e-5)
+
+
+def test_box_is_what_is_in_it_and_not_around_it(scene: Scene) -> None:
+    """Half of each neighbour lies in the box, together more than the thing: so it is around a thin thing."""
+    near, thing = np.eye(2, CHANNELS)
+    rows = np.repeat([near, thing, near], SPLATS_A_CLUSTER, axis=0)
+    (boxed,) = directions(of(scene, rows), Query(like=["middle:box:5,2,28,22"]), None)
+    assert boxed @ thing > 0.9
+    (whole,) = directions(of(scene, rows), Query(like=["middle:box:0,0,32,24"]), None)  # nothing is around it
+    assert whole @ near > 0.9
+
+
+def test_stroke_may_slip_over_an_edge(scene: Scene) -> None:
+    (drawn,) = directions(scene, Query(like=["middle:stroke:16,4,16,20,26,20"]), None)
+    (middle,) = directions(scene, Query(like=["region:left:0:1"]), None)
+    assert drawn @ middle > 0.95
+
+
+def test_box_and_stroke_of_one_pixel_are_the_pixel(scene: Scene) -> None:
+    query = Query(like=["middle:6,12", "middle:box:6,12,7,13", "middle:stroke:6,12,6,12"])
+    pixel, *others = directions(scene, query, None)
+    assert all(np.allclose(other, pixel, atol=1e-6) for other in others)
 
 
 def test_threshold_of_examples_is_above_a_least_likeness(scene: Scene) -> None:
@@ -251,6 +276,14 @@ def test_threshold_of_examples_is_above_a_least_likeness(scene: Scene) -> None:
         (Pixel("middle", WIDTH, 0), InvalidQuery, rf"0\.\.{WIDTH - 1}"),
         (Pixel("middle", 0, -1), InvalidQuery, rf"0\.\.{HEIGHT - 1}"),
         (Pixel("middle", 0, 0), InvalidQuery, "a ray that splats fill by"),
+        (PixelBox("behind", 0, 0, 1, 1), NotFound, "behind"),
+        (PixelBox("middle", 0, 0, WIDTH + 1, 2), InvalidQuery, f"x1 <= {WIDTH}"),
+        (PixelBox("middle", -1, 0, 3, 2), InvalidQuery, "0 <= x0"),
+        (PixelBox("middle", 9, 9, 3, 3), InvalidQuery, "upper left corner first"),
+        (PixelBox("middle", 9, 3, 9, 9), InvalidQuery, "x0 < x1"),
+        (PixelBox("middle", 0, 0, 2, 2), InvalidQuery, "rays that splats fill by"),
+        (Stroke("middle", ((6, 12), (6, HEIGHT))), InvalidQuery, rf"0\.\.{HEIGHT - 1}, got 6,{HEIGHT}"),
+        (Stroke("middle", ((0, 0), (1, 1))), InvalidQuery, "an area that shows the scene"),
         (Region("behind", 0, 0), NotFound, "feature packs"),
         (Region("left", 1, 0), NotFound, r"0\.\.0"),
         (Region("left", 0, 3), NotFound, "label"),
@@ -274,19 +307,23 @@ def test_term_without_a_feature_says_why_under_its_name(
 
 @given(view=NAMES, x=st.integers(0, 9999), y=st.integers(0, 9999))
 def test_any_name_of_a_view_can_be_pointed_at(view: str, x: int, y: int) -> None:
-    for example in (Pixel(view, x, y), Region(view, x, y), Pixel(f"region:{view}", x, y), Pixel("splat", x, y)):
+    points = (Pixel(view, x, y), Pixel(f"region:{view}", x, y), Pixel("splat", x, y), Pixel(f"{view}:box", x, y))
+    for example in (*points, Region(view, x, y), PixelBox(view, x, y, y, x), Stroke(view, ((x, y), (y, x), (x, x)))):
         assert parse_example(str(example)) == example
 
 
 @given(st.text(max_size=40))
 def test_any_other_notation_is_refused(notation: str) -> None:
     try:
-        assert isinstance(parse_example(notation), Pixel | Region | OneSplat)
+        assert isinstance(parse_example(notation), Example)
     except InvalidQuery as error:
-        assert "VIEW:x,y" in error.expected
+        assert "x,y" in error.expected or "x0,y0" in error.expected
 
 
-@pytest.mark.parametrize("notation", ["", ":1,2", "v:1.5,2", "v:1", "splat:-1", "region:v:1", "splat:" + "9" * 5000])
+@pytest.mark.parametrize("notation", [
+    "", ":1,2", "v:1.5,2", "v:1", "splat:-1", "region:v:1", "splat:" + "9" * 5000, "v:box:1,2,3", "v:box:1,2,3,4,5,6",
+    "v:box:nan,2,3,4", "v:box:1,2,3,inf", "v:box:", "v:stroke:1,2,3", "v:stroke:1,2,3,4,", "v:stroke:1;2,3,4",
+])  # fmt: skip
 def test_what_points_nowhere_is_refused(notation: str) -> None:
     with pytest.raises(InvalidQuery, match="like"):
         parse_example(notation)
