@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
+import fcntl
 import json
 import os
 import signal
@@ -16,7 +16,6 @@ from typing import Any, BinaryIO
 from liftcore.errors import SplatliftError
 
 FIELDS = ("argument", "expected", "got", "hint")
-PR_SET_PDEATHSIG = 1  # of linux/prctl.h
 ORPHANED = 3  # the exit status of a process whose server is gone
 
 
@@ -32,29 +31,36 @@ def line_of(message: Mapping[str, Any]) -> bytes:
     return json.dumps(message, ensure_ascii=False).encode("utf-8", "surrogatepass") + b"\n"
 
 
-def end_with_parent(lifeline: int | None = None) -> None:
-    """End this process, and its group, when a pipe closes: the server's end does, however the server ended.
+def end_with_parent(lifeline: int) -> None:
+    """End this process, and the group that it leads, when the other end of a pipe closes: the server's end does,
+    however the server ended. On Linux the kernel sees to that, even within a call that no thread could interrupt.
 
     Args:
-        lifeline: the pipe's file number, which is this function's from now on. None takes a copy of stdin.
+        lifeline: the file number of a pipe that nothing is written to.
     """
-    pipe = os.fdopen(os.dup(0) if lifeline is None else lifeline, "rb", buffering=0)
+    group = os.getpgrp() == os.getpid()  # the server gave us a group of our own: all in it is our doing
+    if sys.platform == "linux":
+        fcntl.fcntl(lifeline, fcntl.F_SETOWN, -os.getpid() if group else os.getpid())
+        fcntl.fcntl(lifeline, fcntl.F_SETSIG, signal.SIGKILL)
+        fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | os.O_ASYNC)
 
-    def wait() -> None:
-        pipe.read()
-        if os.getpgrp() == os.getpid():  # the server gave us a group of our own: all in it is our doing
+    def wait() -> None:  # elsewhere; and it may have closed before
+        os.read(lifeline, 1)
+        if group:
             os.killpg(0, signal.SIGKILL)
         os._exit(ORPHANED)
 
     threading.Thread(target=wait, daemon=True).start()
 
 
-def die_with_parent() -> None:
-    """Have the kernel end this process with the thread that started it, even within a call that no thread of ours
-    could interrupt (Linux; elsewhere `end_with_parent` alone). Not for who starts processes of its own: they stay.
-    """
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+def children_of(process: int) -> list[int]:
+    """The processes that a process started and that have not been waited for, as far as Linux tells."""
+    found = list[int]()
+    with contextlib.suppress(OSError):
+        for task in Path(f"/proc/{process}/task").iterdir():  # a process is the child of the thread that began it
+            with contextlib.suppress(OSError):
+                found += map(int, (task / "children").read_text().split())
+    return found
 
 
 def memory_of(process: int | str, field: str) -> int:

@@ -111,7 +111,7 @@ def run(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
 def main() -> None:
     """Run one job."""
     out = own_stdout()
-    end_with_parent()
+    end_with_parent(sys.stdin.fileno())
     report = Reporter(out)
     threading.Thread(target=report.beat, daemon=True).start()
     os.nice(NICENESS)

@@ -1,4 +1,4 @@
-"""A child process of one job, as the thread that runs the job holds it; and those that outlived their server."""
+"""A child process of one job, as the thread that runs the job holds it."""
 
 from __future__ import annotations
 
@@ -11,19 +11,18 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Self
 
-from service.child import memory_of
+from service.child import children_of, memory_of
 from service.observe import current_id, working_for
 
 PIECE = 1 << 16
 GONE_SECONDS = 3.0  # the kernel takes a moment to end a group
 LONGEST = 8192  # bytes of a record of the log; what is longer without an end of line comes in pieces
-MARK = "SPLATLIFT_JOB_PROCESS"  # a job's processes carry its id under this name
-MOST_LOOKS = 10
+MARK = "SPLATLIFT_JOB_PROCESS"  # a job's processes carry its id under this name, for who looks at a machine
 
 log = logging.getLogger(__name__)
 
@@ -56,7 +55,7 @@ class JobProcess:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             start_new_session=True,
-            env=os.environ | dict(environment) | mark(job),
+            env=os.environ | dict(environment) | {MARK: job},
         )
         assert self._process.stdout is not None and self._process.stderr is not None
         self._printed = log_lines(self._process.stderr, job)
@@ -152,49 +151,6 @@ def log_lines(pipe: IO[bytes], job: str) -> threading.Thread:
     return thread
 
 
-def mark(job: str) -> dict[str, str]:
-    """The environment variable by which a job's processes are known; what a process starts inherits it."""
-    return {MARK: job}
-
-
-def end_orphans(jobs: Iterable[str]) -> int:
-    """End all processes of these jobs, and wait until they are gone; how many there were. Linux only, else 0."""
-    marks = {f"{MARK}={job}".encode() for job in jobs}
-    if not marks or not Path("/proc/self/environ").exists():
-        return 0
-    ended = 0
-    for _ in range(MOST_LOOKS):
-        handles = [handle for pid in _processes() if (handle := _killed(pid, marks)) is not None]
-        for handle in handles:
-            poll = select.poll()
-            poll.register(handle, select.POLLIN)
-            poll.poll(GONE_SECONDS * 1000)  # readable once the process has ended
-            os.close(handle)
-        ended += len(handles)
-        if not handles:
-            break  # and not before: one that we killed may have started another after we looked
-    return ended
-
-
-def _processes() -> list[int]:
-    return [int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdecimal()]
-
-
-def _killed(pid: int, marks: set[bytes]) -> int | None:
-    """A handle on the process when it carried a mark and was killed; with it we signal what we looked at."""
-    with contextlib.suppress(OSError):
-        handle = os.pidfd_open(pid)
-        try:
-            if marks & set(Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")):
-                signal.pidfd_send_signal(handle, signal.SIGKILL)
-                kept, handle = handle, -1
-                return kept
-        finally:
-            if handle >= 0:
-                os.close(handle)
-    return None
-
-
 def _processor_seconds(pid: int) -> float:
     with contextlib.suppress(OSError):
         behind_its_name = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
@@ -205,8 +161,5 @@ def _processor_seconds(pid: int) -> float:
 def _family(pid: int) -> Iterator[int]:
     """A process and what it started, as far as Linux tells; whoever ends meanwhile is left out."""
     yield pid
-    with contextlib.suppress(OSError):
-        for task in Path(f"/proc/{pid}/task").iterdir():  # a process is the child of the thread that began it
-            with contextlib.suppress(OSError):
-                for child in (task / "children").read_text().split():
-                    yield from _family(int(child))
+    for child in children_of(pid):
+        yield from _family(child)

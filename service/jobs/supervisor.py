@@ -19,7 +19,7 @@ from typing import Any
 from liftcore.errors import SplatliftError
 from service.child import fault_of
 from service.errors import Crashed, NoSpace, OverLimit
-from service.jobs.process import JobLimits, JobProcess, end_orphans
+from service.jobs.process import JobLimits, JobProcess
 from service.models import ENDED, JobKind, JobState
 from service.observe import working_for
 from service.store.assets import kernel_of
@@ -73,10 +73,7 @@ class Supervisor:
         ]
 
     def start(self) -> None:
-        """End what a dead server left running, then begin to take jobs."""
-        found = end_orphans(self._store.jobs.unfinished())
-        if found:
-            log.warning("ended %d processes that outlived their server", found)
+        """Begin to take jobs."""
         for thread in self._threads:
             thread.start()
 

@@ -395,12 +395,6 @@ class JobStore:
             if row is not None:
                 _release(connection, row, why)
 
-    def unfinished(self) -> list[str]:
-        """At start-up: the jobs that a dead server left in the middle of an attempt."""
-        with self._database.read() as connection:
-            rows = connection.execute("SELECT id FROM jobs WHERE state IN ('running', 'canceling')").fetchall()
-        return [row["id"] for row in rows]
-
     def release_all(self, why: str) -> None:
         """At start-up: put all of these back in line. A server's death is no job's fault."""
         with self._database.write() as connection:

@@ -25,7 +25,7 @@ from prometheus_client import REGISTRY
 from prometheus_client.parser import text_string_to_metric_families
 from pydantic import ValidationError
 
-from service import errand, middleware
+from service import middleware
 from service.commands.serve import AnnouncingServer
 from service.errand import ErrandLimits
 from service.errors import Busy, NoSpace
@@ -45,7 +45,7 @@ from service.streams import EventStreams
 from service.uploads.intake import check
 from tests.crash.conftest import order, until
 from tests.crash.server import NoQueries
-from tests.crash.service_process import ServiceProcess, processes_of
+from tests.crash.service_process import ServiceProcess, processes_of, template_of
 
 from .conftest import Uploaded, app_of, parts_of, put
 from .guarded import address, every_route, guarded
@@ -113,9 +113,7 @@ def test_readyz_names_what_fails_until_it_works_again(start: Start, tmp_path: Pa
             fails(client, "queries")
             until(lambda: client.get("/readyz").status_code == 200)
             assert counted(samples(client), "splatlift_query_worker_restarts_total") == restarts
-            template = errand._TEMPLATE._process
-            assert template is not None
-            template.send_signal(ends)
+            os.kill(template_of(os.getpid()), ends)
             fails(client, "uploads")
             until(lambda: client.get("/readyz").status_code == 200)
             assert client.put("/assets/cameras", content=b"{}").status_code == 422

@@ -121,6 +121,15 @@ def processes_of(job: str) -> list[int]:
     return found
 
 
+def template_of(server: int) -> int:
+    """The process that a server's checks are forked from."""
+    for tasks in Path(f"/proc/{server}/task").iterdir():
+        for child in map(int, (tasks / "children").read_text().split()):
+            if b"multiprocessing.forkserver" in Path(f"/proc/{child}/cmdline").read_bytes():
+                return child
+    raise AssertionError("none runs")
+
+
 def kill_processes_of(job: str) -> int:
     """SIGKILL them; how many there were."""
     found = processes_of(job)

@@ -27,10 +27,9 @@ from liftcore.io.splats import write_splats
 from liftcore.io.transforms import transforms_of
 from liftcore.values.pack import write_pack
 from service import errand
-from service.jobs import process as processes
 from service.jobs.child import Reporter
 from service.jobs.lifting import lift_as_ordered
-from service.jobs.process import LONGEST, JobProcess, mark
+from service.jobs.process import LONGEST, JobProcess
 from service.jobs.supervisor import Lease
 from service.models import AssetKind, JobState
 from service.observe import JsonLines
@@ -203,32 +202,23 @@ def test_job_interrupted_by_a_stop_goes_on_where_the_data_directory_is_next(tmp_
         assert path.is_relative_to(tmp_path / "moved") and path.exists()
 
 
-def test_what_a_dead_server_left_running_is_ended_before_its_job_runs_again(
-    store: Store, supervising: Supervising
-) -> None:
-    job = submit(store)
-    assert store.jobs.claim() is not None
-    command = [sys.executable, "-S", "-c", "import time; time.sleep(600)"]
-    left = subprocess.Popen(command, env=os.environ | mark(job), start_new_session=True)
-    bystander = subprocess.Popen(command, env=os.environ | mark("0" * 32), start_new_session=True)
-    try:
-        with supervising("answer"):
-            assert ended(store, job).attempt == 2
-            assert not alive(left.pid) and alive(bystander.pid)
-    finally:
-        bystander.kill()
-        left.wait()
-        bystander.wait()
+OCCUPATIONS = {
+    "listens": "own.wait()",
+    "is deaf": "sum(range(10**15))  # in one call of C",
+    "is stopped": "os.kill(os.getpid(), signal.SIGSTOP)",
+}
 
 
-def test_what_a_job_process_started_ends_when_its_server_does() -> None:
-    code = """if True:
-        import subprocess, sys
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a process must listen to notice it")
+@pytest.mark.parametrize("occupation", OCCUPATIONS)
+def test_job_process_and_what_it_started_end_with_their_server(occupation: str) -> None:
+    code = f"""if True:
+        import os, signal, subprocess, sys
         from service.child import end_with_parent
         own = subprocess.Popen([sys.executable, "-S", "-c", "import time; time.sleep(600)"])
+        end_with_parent(0)
         print(own.pid, flush=True)
-        end_with_parent()
-        own.wait()
+        {OCCUPATIONS[occupation]}
     """
     command = [sys.executable, "-c", code]
     child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
@@ -248,14 +238,14 @@ def run(told):
     pathlib.Path(told).write_text(str(os.getpid()))
     sum(range(10**15))  # in one call of C
 """
-TWICE = """
+OUTLIVING = """
 import os, pathlib, time
 
 def run(told):
-    first = not pathlib.Path(told).exists()
-    pathlib.Path(told).write_text(str(os.getppid()))
-    if first:
-        time.sleep(600)
+    template = os.getppid()
+    pathlib.Path(told).write_text(str(template))
+    while os.getppid() == template:
+        time.sleep(0.01)
     return {"event": "valid"}
 """
 
@@ -295,9 +285,8 @@ def test_check_that_cannot_listen_ends_when_its_server_is_killed(tmp_path: Path)
                 os.kill(check, signal.SIGKILL)
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="asks the kernel of Linux for it")
-def test_check_that_ended_with_its_template_is_run_again(tmp_path: Path) -> None:
-    with errand_of(TWICE, tmp_path) as (server, template):
+def test_check_whose_template_is_killed_goes_on_and_is_heard(tmp_path: Path) -> None:
+    with errand_of(OUTLIVING, tmp_path) as (server, template):
         os.kill(template, signal.SIGKILL)
         assert server.stdout is not None and server.stdout.read() == "valid\n"
 
@@ -316,24 +305,6 @@ def test_check_may_take_memory_by_the_size_of_its_upload(
         intake.check(
             AssetKind.SPLATS, tmp_path / "upload", tmp_path, errand.ErrandLimits(1.0, 8 << 30, threading.Event())
         )
-
-
-def environment(pid: int) -> bytes:
-    """Of a process, as the system tells it: nothing for a moment after its start."""
-    return Path(f"/proc/{pid}/environ").read_bytes()
-
-
-def test_process_that_a_leftover_started_while_it_was_looked_for_is_ended_too(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    job = "1" * 32
-    command = [sys.executable, "-S", "-c", "import time; time.sleep(600)"]
-    found = [subprocess.Popen(command, env=os.environ | mark(job)) for _ in range(2)]
-    until(lambda: all(job.encode() in environment(process.pid) for process in found))
-    looks = iter([[found[0].pid], [found[1].pid], []])
-    monkeypatch.setattr(processes, "_processes", lambda: next(looks))
-    assert processes.end_orphans([job]) == 2
-    assert [process.wait() for process in found] == [-signal.SIGKILL] * 2
 
 
 def claim(store: Store) -> str | None:

@@ -1,0 +1,8 @@
+"""Let libraries compute in one thread in a process that imports this before them.
+
+A limit on memory counts the stack and the buffers of each thread, and cores may be many.
+"""
+
+import os
+
+os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
