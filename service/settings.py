@@ -17,6 +17,12 @@ MiB = 1 << 20
 GiB = 1 << 30
 
 
+# Of releases before; a proxy bounds slow clients now.
+REMOVED_VARIABLES = frozenset(
+    {"SPLATLIFT_HEADER_SECONDS", "SPLATLIFT_MIN_BYTES_PER_SECOND", "SPLATLIFT_SLOW_GRACE_SECONDS"}
+)
+
+
 class ServiceSettings(BaseSettings):
     """Settings of the service; nothing here can be changed over HTTP."""
 
@@ -65,12 +71,7 @@ class ServiceSettings(BaseSettings):
     max_lift_bytes: int = Field(16 * GiB, gt=0, description="the largest lift file")
     max_body_bytes: int = Field(MiB, gt=0, description="the largest body of any request that is not an upload")
 
-    min_bytes_per_second: int = Field(
-        1024, ge=1, description="the least speed of a client that sends a body; slower ones get 408 and are cut off"
-    )
-    slow_grace_seconds: float = Field(10, gt=0, description="the time over which that speed is measured")
-    header_seconds: float = Field(10, gt=0, description="how long the headers of a request may take to come")
-    max_connections: int = Field(400, ge=1, description="connections that may be open; more get 503")
+    max_connections: int = Field(400, ge=1, description="connections that may be open; requests over more get 503")
 
     parallel_checks: int = Field(2, ge=1, le=64, description="uploads that are validated at the same time")
     check_seconds: float = Field(300, gt=0, description="wall time that the validation of one upload may take")

@@ -7,6 +7,7 @@ import gc
 import json
 import logging
 import math
+import os
 import resource
 import signal
 import socket
@@ -25,11 +26,10 @@ from fastapi import FastAPI
 from liftcore.cli.options import Parser
 from service.app import assemble
 from service.auth import is_loopback
-from service.connection import Pace, watched
 from service.encoders import require_encoder_files
 from service.errors import Misconfigured
 from service.observe import logging_to_stderr
-from service.settings import ServiceSettings, read_settings, variables
+from service.settings import REMOVED_VARIABLES, ServiceSettings, read_settings, variables
 from service.state import Stopping
 from service.store.database import DATABASE, keys_were_made, require_database
 from service.store.keys import any_key
@@ -109,6 +109,8 @@ def run(options: argparse.Namespace) -> int:
             listener.close()
             raise
     with logging_to_stderr(settings.log_format):
+        for name in sorted(REMOVED_VARIABLES & os.environ.keys()):
+            log.warning("%s is no setting any more and does nothing: a proxy bounds slow clients", name)
         if settings.keys == "none" and keys_were_made(settings.data):
             log.warning("SPLATLIFT_KEYS is none: nobody needs a key, though keys were made for %s", settings.data)
         try:
@@ -213,19 +215,13 @@ def bind(host: str, port: int) -> socket.socket:
     return listener
 
 
-def pace_of(settings: ServiceSettings) -> Pace:
-    """What the settings ask of clients."""
-    return Pace(
-        settings.min_bytes_per_second, settings.slow_grace_seconds, settings.header_seconds, settings.max_connections
-    )
-
-
 def server_of(app: FastAPI, settings: ServiceSettings, announce: Callable[[str], None] = say) -> AnnouncingServer:
     """The server of an application, which announces the address at which it listens."""
     proxies = settings.forwarded_allow
     config = uvicorn.Config(
-        app, http=watched(pace_of(settings)), log_config=None, log_level="warning", access_log=False,
-        server_header=False, ws="none", timeout_graceful_shutdown=math.ceil(settings.stop_seconds),
+        app, http="h11", ws="none", log_config=None, log_level="warning", access_log=False, server_header=False,
+        limit_concurrency=settings.max_connections + 1,  # with the one that asks
+        timeout_graceful_shutdown=math.ceil(settings.stop_seconds),
         proxy_headers=bool(proxies), forwarded_allow_ips=proxies,
     )  # fmt: skip
     return AnnouncingServer(config, app.state.stopping, announce)

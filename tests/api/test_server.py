@@ -58,8 +58,9 @@ def server(data: Path, table: Path, stderr: IO[str] | None = None) -> Iterator[s
 
 
 def test_server_process_does_the_main_job_and_its_log_holds_no_secret(
-    tmp_path: Path, scene: TinyScene, table: Path
+    tmp_path: Path, scene: TinyScene, table: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("SPLATLIFT_HEADER_SECONDS", "soon")  # a setting of release 0.4
     with (tmp_path / "log").open("w") as stderr, server(tmp_path / "data", table, stderr=stderr) as address:
         with httpx.Client(base_url=address, timeout=120) as client:
             assert client.get("/healthz").json() == {"status": "ok"}
@@ -79,6 +80,7 @@ def test_server_process_does_the_main_job_and_its_log_holds_no_secret(
             client.put("/assets/splats", content=b"the-secret")
     text = (tmp_path / "log").read_text()
     assert "the-secret" not in text
+    assert "SPLATLIFT_HEADER_SECONDS is no setting any more" in text
     told = [json.loads(line) for line in text.splitlines()]
     access = [line for line in told if line["logger"] == "service.access" and line["request_id"] == "mine"]
     assert [line["status"] for line in access] == [200, 404, 422, 422, 422]

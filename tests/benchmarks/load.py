@@ -4,8 +4,8 @@
 
 ``/healthz`` over new connections beside 200 sockets that trickle, 20 clients that hardly read and a running lift; and
 rounds of 16 different questions at the same moment to a large lift, first alone, then beside lifts of another scene.
-Half of the trickling sockets upload, every other one at twice the least speed, the rest a byte at a time; a quarter
-trickles headers and a quarter JSON bodies. Whoever is cut off comes back at once.
+Half of the trickling sockets upload, every other one at 2 kB a second, the rest a byte at a time; a quarter trickles
+headers and a quarter JSON bodies. Whoever is cut off comes back at once.
 """
 
 import argparse

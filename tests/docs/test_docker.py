@@ -51,7 +51,8 @@ def test_the_proxy_has_the_limits_of_the_service() -> None:
     assert f"max_size {gib}GiB # SPLATLIFT_MAX_FEATURES_BYTES" in caddy
     assert f"max_size {DEFAULTS.max_lift_bytes >> 30}GiB # SPLATLIFT_MAX_LIFT_BYTES" in caddy
     assert f"max_size {mib}MiB # SPLATLIFT_MAX_BODY_BYTES" in caddy
-    assert f"read_header {DEFAULTS.header_seconds:g}s" in caddy
+    assert all(f"\t{limit} " in caddy for limit in ("read_header 10s", "read_body 30m", "write 30m"))
+    assert f"request_buffers {mib}MiB" in caddy  # a body of JSON that is slow to come waits there
     assert f"splatlift:{DEFAULTS.port}" in caddy and "Host localhost" in caddy
     uploads = re.findall(r"@(\w+) \{\s+method (\w+)\s+path (\S+)\s+\}\s+request_body @\1 ", caddy)
     assert [(method, path) for _, method, path in uploads] == [("PUT", "/assets/*"), ("POST", "/lifts")]
