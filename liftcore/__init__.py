@@ -12,38 +12,12 @@ scene, ``B`` [rays x channels] the 2D features of its photos, ``X`` [splats x ch
     result = lc.lift(splats, cameras, views)
     result.save("scene.lift.safetensors")
 
-What is listed here is the public interface. It is loaded when it is asked for: ``import liftcore`` loads neither
-torch nor numba.
+What ``__init__.pyi`` lists is the public interface, with ``__all__`` of the modules `liftcore.errors`,
+`liftcore.evaluate`, `liftcore.files`, `liftcore.models`, `liftcore.testing` and `liftcore.text`; the command line and
+the service import nothing else. It is loaded when it is asked for: ``import liftcore`` loads neither torch nor numba.
 """
 
-from functools import cache
-from importlib import import_module
-from typing import Any
-
+from liftcore.runtime.lazy_names import lazy_names
 from liftcore.runtime.version import __version__ as __version__
 
-
-@cache
-def _public() -> dict[str, str]:
-    """The public names, each with the module that defines it, as ``__init__.pyi`` lists them."""
-    import re  # with pathlib four milliseconds, which an import alone does without
-    from pathlib import Path
-
-    stub = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
-    return {name: module for module, name in re.findall(r"^from (\S+) import (\w+)", stub, re.MULTILINE)}
-
-
-def __getattr__(name: str) -> Any:
-    public = _public()
-    if name == "__all__":
-        value: Any = sorted(public.keys() - {"__version__"})
-    elif name in public:
-        value = getattr(import_module(public[name]), name)
-    else:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_public()})
+__getattr__, __dir__ = lazy_names(__name__, __file__)

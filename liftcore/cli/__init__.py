@@ -12,12 +12,12 @@ from functools import partial
 from importlib import import_module
 from typing import Any
 
-from liftcore.cli.options import BAD_INPUT, Parser, misplaced, shared_options
+from liftcore import __version__, load_plugin
+from liftcore.cli.options import BAD_INPUT, Elsewhere, Parser, misplaced, place, shared_options, whole
 from liftcore.errors import SplatliftError
-from liftcore.io.remote import Elsewhere, local_path
-from liftcore.runtime.plugins import load_plugin
-from liftcore.runtime.version import __version__
+from liftcore.files import local_path
 
+__all__ = ["Parser", "build_parser", "main", "place", "whole"]  # what commands of other packages are made of
 COMMANDS = {
     "check": "do splats, cameras, photos and features belong together",
     "lift": "lift features onto splats",

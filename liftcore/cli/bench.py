@@ -29,7 +29,7 @@ def add_arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Measure, and print the figures with the hardware they were taken on."""
-    from liftcore.evaluate.bench import run_bench
+    from liftcore.evaluate import run_bench
 
     reply(run_bench(vars(options)), as_json=options.json)
     return 0

@@ -10,15 +10,13 @@ from statistics import median
 from typing import TYPE_CHECKING
 
 from liftcore.cli.lift import pairs_of
-from liftcore.cli.options import BAD_INPUT, Parser, add_verbose
-from liftcore.cli.reply import PNG, free_output, reply, writing
-from liftcore.io.remote import place
-from liftcore.runtime.progress import progress_bars
+from liftcore.cli.options import BAD_INPUT, Parser, add_verbose, place
+from liftcore.cli.reply import reply
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from liftcore.evaluate.check import CheckReport
+    from liftcore.evaluate import CheckReport
 
 
 def add_arguments(parser: Parser) -> None:
@@ -33,30 +31,17 @@ def add_arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Look, and say what is wrong; the exit status is 2 if something is."""
-    from liftcore.evaluate.check import check_scene
-    from liftcore.features.encoders.encode import find_images
-    from liftcore.io.cameras import read_cameras
-    from liftcore.io.splats import read_splats
-    from liftcore.values.pack import read_features
-    from liftcore.values.settings import LiftSettings
+    from liftcore import LiftSettings
+    from liftcore.evaluate import check_scene
+    from liftcore.files import check_output, writing
 
     settings = LiftSettings.of(**pairs_of(options.set))
     if options.worst:
-        free_output(options.worst, [options.splats], PNG)
+        check_output(options.worst, [options.splats], "png")
     packs = [path for path in options.others if path.suffix == ".safetensors"]
     photos = [path for path in options.others if path not in packs]
     begin = time.perf_counter()
-    with progress_bars() as progress:
-        features = read_features(*packs) if packs else None
-        images = find_images(photos) if photos else {}
-        found = check_scene(
-            read_splats(options.splats, settings.kernel),
-            read_cameras(options.cameras, views=features.views if features is not None else list(images)),
-            images,
-            features,
-            progress,
-            settings,
-        )
+    found = check_scene(options.splats, options.cameras, photos, packs or None, True, settings)
     document = {name: value for name, value in asdict(found).items() if name != "worst"}
     document |= {"healthy": not found.wrong, "seconds": time.perf_counter() - begin}
     if options.worst and found.worst is not None:

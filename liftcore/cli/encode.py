@@ -4,18 +4,10 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from liftcore.cli.options import Parser, count
-from liftcore.cli.reply import PACK, folders_of, free_output, reply, told_folders, writing
+from liftcore.cli.reply import reply, told_folders
 from liftcore.errors import InvalidInput
-from liftcore.runtime.progress import progress_bars
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from liftcore.features.encoders import ImageEncoder
-    from liftcore.features.encoders.encode import Encoded
 
 
 def add_arguments(parser: Parser) -> None:
@@ -43,11 +35,8 @@ def add_arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Write the pack whole or not at all, and say what is in it."""
-    from liftcore.features.encoders import open_image_encoder
-    from liftcore.features.encoders.encode import EncodeSettings, encode_images, find_images
+    from liftcore import encode_images
 
-    images = find_images(options.images)
-    out = free_output(options.output, list(images.values()), PACK)
     spec = options.encoder
     if options.weights:
         kind, _, named = spec.partition(":")
@@ -55,44 +44,10 @@ def run(options: argparse.Namespace) -> int:
             expected = "an encoder that names no weights itself, beside --weights"
             raise InvalidInput("--encoder", expected=expected, got=repr(spec), hint=f"{kind}:MODEL, or no --weights")
         spec = f"{spec}@{options.weights}"
-    encoder = open_image_encoder(spec, options.device)
-    settings = EncodeSettings(options.size, options.batch, options.normalised)
-    sizes = _camera_sizes(options.cameras, images) if options.cameras else {}
-    with progress_bars() as progress, writing(out):
-        encoded = encode_images(images, encoder, out, settings, progress, sizes)
-    document = {
-        "out": str(out),
-        "bytes": out.stat().st_size,
-        "views": encoded.views,
-        "folders": folders_of(images),
-        "channels": encoder.channels,
-        "patch": encoder.pixels.patch,
-        "size": options.size or encoder.pixels.shorter,
-        "encoder": encoder.name,
-        "text_space": encoder.text_space,
-        "normalised": options.normalised,
-        "warnings": _warnings(encoded, encoder),
-    }
-    line = f"{out}: {encoded.views} views, {encoder.channels} channels, {document['bytes']} bytes"
-    lines = [line, *told_folders(document["folders"])]
-    reply(document, as_json=options.json, lines=[*lines, *(f"warning: {text}" for text in document["warnings"])])
+    names = ("device", "cameras", "size", "batch", "normalised")
+    given = {name: getattr(options, name) for name in names}
+    document = encode_images(options.images, options.output, spec, **given, progress=True)
+    line = f"{document['out']}: {document['views']} views, {document['channels']} channels, {document['bytes']} bytes"
+    lines = [line, *told_folders(document["folders"]), *(f"warning: {text}" for text in document["warnings"])]
+    reply(document, as_json=options.json, lines=lines)
     return 0
-
-
-def _camera_sizes(path: Path, images: Mapping[str, Path]) -> dict[str, tuple[int, int]]:
-    """Image name -> width and height of its camera's photo, of those that have one."""
-    from liftcore.io.cameras import read_cameras
-    from liftcore.scene.cameras import photo_sizes
-
-    return photo_sizes(images, read_cameras(path, views=list(images)))
-
-
-def _warnings(encoded: Encoded, encoder: ImageEncoder) -> list[str]:
-    from liftcore.io.photos import orientation_warnings
-
-    found: list[Any] = orientation_warnings(encoded.readings, "their cameras")
-    if encoded.wide:
-        found.append(f"{len(encoded.wide)} views have features beyond float16 and are stored as float32")
-    if encoder.text_space == "none":
-        found.append("these features have no words: a lift of them is asked by example")
-    return found

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from liftcore.cli.options import Parser
+from liftcore.cli.options import Parser, place
 from liftcore.cli.reply import reply
-from liftcore.io.remote import place
 
 
 def add_arguments(parser: Parser) -> None:
@@ -16,7 +15,7 @@ def add_arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Describe a file of any kind."""
-    from liftcore.evaluate.inspect import inspect_file
+    from liftcore.evaluate import inspect_file
 
     document = {"file": str(options.file), **inspect_file(options.file)}
     unnamed = {name: "not named" for name in ("encoder", "text_space") if document.get(name) == ""}

@@ -8,23 +8,16 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import Parser, add_settings, add_sources, add_verbose, count
-from liftcore.cli.reply import free_lift, reply, shown, writing
+from liftcore.cli.options import Parser, add_settings, add_sources, add_verbose, count, place
+from liftcore.cli.reply import reply, shown, smoothing_line
 from liftcore.errors import InvalidInput, InvalidSettings
-from liftcore.io.remote import place
-from liftcore.lifting.engines import ENGINES, engine_named
-from liftcore.runtime.nearest import nearest
-from liftcore.runtime.progress import one_step, progress_bars
 
 FILLED = 0.9  # of a ray, in a scene that was trained with its background
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from liftcore.lifting.checkpoint import Checkpoint
-    from liftcore.lifting.planning.plan import Plan
-    from liftcore.query.result import LiftResult
-    from liftcore.values.settings import LiftSettings
+    from liftcore import LiftResult, LiftSettings, Plan
 
 
 def add_arguments(parser: Parser) -> None:
@@ -38,22 +31,21 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--checkpoint", type=Path, metavar="DIR", help=f"keep walked views there: {goes_on}")
     parser.add_argument("--threads", type=count, metavar="N", help="else as many as there are cores")
     blocks = "lift in blocks, whose memory is bounded: in this process, or by the workers of a Ray cluster"
-    parser.add_argument("--engine", choices=ENGINES, help=f"{blocks}; X.shards as LIFT is a folder of shards")
+    shards = "X.shards as LIFT is a folder of shards"
+    parser.add_argument("--engine", choices=("local", "ray"), help=f"{blocks}; {shards}")
     parser.add_argument("--address", metavar="HOST:PORT", help="of the Ray cluster, or auto; else of this machine")
 
 
 def run(options: argparse.Namespace) -> int:
     """Lift, write the lift whole or not at all, and say what came of it."""
     settings = settings_of(options)
-    from liftcore.io.cameras import camera_source
-    from liftcore.lifting.files import lift_files
-    from liftcore.values.lift_file import save_lift
+    from liftcore import lift_files, open_engine
+    from liftcore.files import check_output, writing
 
-    views = camera_source(options.cameras).files
-    inputs = [options.splats, *views, *options.features]
-    out = free_lift(options.output, inputs)
-    engine = engine_named(options.engine, options.address, options.threads)
-    checkpoint = checkpoint_in(options.checkpoint) if options.checkpoint else None
+    out = check_output(options.output, [options.splats, options.cameras, *options.features], "lift")
+    engine = open_engine(options.engine, options.address, options.threads)
+    if options.checkpoint:
+        require_folder(options.checkpoint)
 
     plans: list[Plan] = []
 
@@ -62,20 +54,19 @@ def run(options: argparse.Namespace) -> int:
         if not options.json:
             print(*(plan.lines() if options.explain else in_short(plan)), sep="\n", flush=True)
 
-    with progress_bars() as progress:
-        result = lift_files(
-            options.splats,
-            options.cameras,
-            options.features,
-            settings,
-            threads=options.threads,
-            progress=progress,
-            on_plan=take,
-            checkpoint=checkpoint,
-            engine=engine,
-        )
-        with writing(out), one_step(progress, "save"):
-            save_lift(result, options.output)
+    result = lift_files(
+        options.splats,
+        options.cameras,
+        options.features,
+        settings,
+        threads=options.threads,
+        progress=True,
+        on_plan=take,
+        checkpoint=options.checkpoint or None,
+        engine=engine,
+    )
+    with writing(out):
+        result.save(options.output, progress=True)
     (plan,) = plans
     warnings = result.metadata.certificate["warnings"]
     document = {"out": str(options.output), **_summary(result), "warnings": [*plan.warnings, *warnings]}
@@ -88,25 +79,22 @@ def run(options: argparse.Namespace) -> int:
 
 def example_in(views: Sequence[str], cameras: Path) -> str:
     """The pixel in the middle of the first of the lifted views, as an example of what to look for."""
-    from liftcore.io.cameras import read_cameras
-    from liftcore.scene.cameras import photo_size
+    from liftcore import read_cameras
 
-    width, height = photo_size(read_cameras(cameras, choosing=False, views=views)[views[0]])
+    width, height = read_cameras(cameras, choosing=False, views=views)[views[0]].photo_size
     return f"{views[0]}:{width // 2},{height // 2}"
 
 
-def checkpoint_in(folder: Path) -> Checkpoint:
-    """A checkpoint in that folder, which is made if need be: a lift itself would go on without one.
+def require_folder(folder: Path) -> None:
+    """See that a checkpoint can be kept in a folder, which is made if need be: a lift itself would go on without one.
 
     Raises:
         InvalidInput: it is no folder, or nothing can be written there.
     """
-    from liftcore.lifting.checkpoint import Checkpoint
-
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
-            return Checkpoint(folder)
+            pass
     except OSError as error:
         got = f"{folder} ({error.strerror or error})"
         raise InvalidInput("checkpoint", expected="a folder that can be written", got=got) from None
@@ -118,7 +106,7 @@ def settings_of(options: argparse.Namespace) -> LiftSettings:
     Raises:
         InvalidSettings: a pair without ``=``, an unknown name, one with two values or a value out of range.
     """
-    from liftcore.values.settings import LiftSettings
+    from liftcore import LiftSettings
 
     named = {"preset": options.preset, "speed": options.speed, "device": options.device}
     values = pairs_of(options.set)
@@ -134,7 +122,7 @@ def pairs_of(pairs: Sequence[str]) -> dict[str, Any]:
     Raises:
         InvalidSettings: a pair without ``=``, an unknown name or one with two values.
     """
-    from liftcore.values.settings import LiftSettings
+    from liftcore import LiftSettings
 
     values: dict[str, Any] = {}
     for pair in pairs:
@@ -142,7 +130,7 @@ def pairs_of(pairs: Sequence[str]) -> dict[str, Any]:
         if not equals or not key:
             raise InvalidSettings("--set", expected="key=value", got=repr(pair))
         if key not in LiftSettings.model_fields:
-            hint = nearest(key.replace("-", "_"), LiftSettings.model_fields, 3)
+            hint = LiftSettings.hint_of_name(key)
             raise InvalidSettings("--set", expected="a setting of a lift", got=f"the unknown {key[:80]!r}", hint=hint)
         value = _value(text)
         if key in values and values[key] != value:
@@ -161,16 +149,6 @@ def _value(text: str) -> Any:
 def _contradiction(name: str, one: str, other: str) -> InvalidSettings:
     hint = "leave one of them out"
     return InvalidSettings(name, expected="one value", got=f"{one} and {other}"[:200], hint=hint)
-
-
-def plan_of(options: argparse.Namespace, settings: LiftSettings) -> Plan:
-    """The plan of the lift that the options describe."""
-    from liftcore.lifting.files import open_files
-    from liftcore.lifting.pipeline import plan
-
-    return plan(
-        *open_files(options.splats, options.cameras, options.features, settings), settings, threads=options.threads
-    )
 
 
 def in_short(plan: Plan) -> Iterable[str]:
@@ -212,8 +190,6 @@ def _lines(document: dict[str, Any], cameras: Path, verbose: bool) -> Iterable[s
     yield from _verdict(document, cameras)
     if not verbose:
         return
-    from liftcore.solve.smooth import smoothing_line
-
     for key, value in document["certificate"].items():
         if key not in ("plan", "warnings"):  # the plan in full is what --explain prints
             yield f"  {key}: {smoothing_line(value) if key == 'smoothing' else shown(value)}"

@@ -7,11 +7,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import Parser, add_encoder, text_encoder
-from liftcore.cli.query import made_from, place_of, write_files
-from liftcore.cli.reply import PLY, free_output, free_outputs, reply
+from liftcore.cli.options import Parser, add_encoder, place, text_encoder
+from liftcore.cli.query import made_from
+from liftcore.cli.reply import free_outputs, place_of, reply, write_files
 from liftcore.cli.segment import read_words
-from liftcore.io.remote import place
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -47,13 +46,15 @@ def run(options: argparse.Namespace) -> int:
         things = [one | {"feature": row.tolist()} for one, row in zip(things, found.features, strict=True)]
     document: dict[str, Any] = {"encoder": None if encoder is None else encoder.name}
     document |= {"explanation": found.explanation, "objects": things}
-    contents: dict[str, Any] = {"csv": partial(scene.blocks_of, found)}
+    exports: dict[str, Any] = {"csv": partial(scene.export, source=found)}
     if options.splats:
+        from liftcore.files import check_output
+
         for one in found.objects:
             name = f"object-{one.id}"
-            files[name] = free_output(options.splats / f"{name}.ply", [*given, *made_from(scene)], PLY)
-            contents[name] = partial(scene.blocks_of, one.id)
-    document["files"] = write_files(files, contents)
+            files[name] = check_output(options.splats / f"{name}.ply", [*given, *made_from(scene)], "ply")
+            exports[name] = partial(scene.export, source=one.id)
+    document["files"] = write_files(files, exports)
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
 

@@ -8,15 +8,14 @@ from types import UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, Self, Union, get_args, get_origin
 
 from liftcore.errors import InvalidInput, InvalidQuery
-from liftcore.io.remote import place
+from liftcore.files import is_remote
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
     from pydantic import BaseModel
 
-    from liftcore import Scene
-    from liftcore.text import TextEncoder
+    from liftcore import Scene, TextEncoder
 
 BAD_INPUT = 2
 ROLES = {  # of arguments that name files: what belongs there
@@ -25,6 +24,15 @@ ROLES = {  # of arguments that name files: what belongs there
 ORDER = ("splats", "cameras", "features")
 ORDERED = ("lift", "plan", "check", "tradeoff")  # commands that take splats, cameras and features
 PRESETS = "default, row-sum, tikhonov, argmax, top-k, front-mass, centre or mean"
+
+
+class Elsewhere(str):
+    """The text of an argument that names a protocol."""
+
+
+def place(text: str) -> Path | Elsewhere:
+    """An argument: a path, or where a file lies elsewhere."""
+    return Elsewhere(text) if is_remote(text) else Path(text)
 
 
 class Parser(argparse.ArgumentParser):
@@ -68,7 +76,7 @@ def misplaced(options: argparse.Namespace) -> InvalidInput | None:
 
     That the order is wrong is said only where what belongs there was given elsewhere.
     """
-    from liftcore.io.kinds import kind_of, wrong_kind
+    from liftcore.files import identify, wrong_kind
 
     given = {name: _paths(getattr(options, name, None)) for name in ROLES}
     for name, wanted in ROLES.items():
@@ -76,8 +84,8 @@ def misplaced(options: argparse.Namespace) -> InvalidInput | None:
             error = wrong_kind(path, wanted, InvalidInput, expected=f"{wanted} as {name.upper()}")
             if error is None:
                 continue
-            others = (path for other in ORDER if other != name for path in given[other])
-            if options.command in ORDERED and name in ORDER and any(kind_of(other) == wanted for other in others):
+            others = (identify(path).kind for other in ORDER if other != name for path in given[other])
+            if options.command in ORDERED and name in ORDER and wanted in others:
                 hint = "the order is SPLATS CAMERAS FEATURES"
                 error = InvalidInput(error.argument, expected=error.expected, got=error.got, hint=hint)
             return error
@@ -208,7 +216,7 @@ def view_of(options: argparse.Namespace, *pictures: str) -> Any:
         if options.view is None and any(getattr(options, name) for name in pictures):
             raise InvalidQuery(named, expected="a view to see them from", got="no --view and no --camera")
         return options.view
-    from liftcore.io.cameras import read_cameras
+    from liftcore import read_cameras
 
     cameras = read_cameras(options.camera)
     if options.view is None and len(cameras) > 1:
@@ -236,18 +244,10 @@ def text_encoder(options: argparse.Namespace, scene: Scene, hint: str = "", *, s
     """The encoder that ``--table`` or ``--encoder`` names, else the lift's own words, else that of its text space.
 
     Args:
-        hint: what else the command can do. stand_in: as `encoder_of_space` has it.
+        hint: what else the command can do. stand_in: as `Scene.encoder` has it.
 
     Raises:
-        InvalidQuery, Unavailable: as `encoder_of_space` has it.
+        InvalidQuery, Unavailable: as `Scene.encoder` has it.
     """
-    from liftcore.text import encoder_of_space, open_encoder
-
-    if options.table:
-        return open_encoder(f"table:{options.table}")
-    if options.encoder:
-        return open_encoder(options.encoder)
-    if scene.table is not None:
-        return scene.table
-    told = f"--table FILE or --encoder NAME; {hint}".rstrip("; ")
-    return encoder_of_space(scene.metadata.text_space, told, stand_in=stand_in)
+    named = f"table:{options.table}" if options.table else options.encoder or None
+    return scene.encoder(named, hint=f"--table FILE or --encoder NAME; {hint}".rstrip("; "), stand_in=stand_in)

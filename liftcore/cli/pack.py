@@ -7,19 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.cli.options import Parser
-from liftcore.cli.reply import PACK, folders_of, free_output, reply, shown, told_folders, writing
-from liftcore.errors import InvalidInput
-from liftcore.runtime.progress import progress_bars
+from liftcore.cli.reply import reply, shown, told_folders
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from liftcore.features.folders import ViewFolder
-    from liftcore.runtime.progress import Progress
-    from liftcore.text.table import TableEncoder
-    from liftcore.values.views import Regions
-
-
+GIVEN = (
+    "layout", "unlabelled", "encoder", "photos", "device", "names", "folders", "unannotated", "encoder_name",
+    "text_space", "normalised",
+)  # options that `pack_folder` takes  # fmt: skip
 LARGEST_GREY = 65_535  # of a picture of 16 bits
 
 
@@ -88,31 +84,23 @@ def _grey(text: str) -> int:
 
 def run(options: argparse.Namespace) -> int:
     """Write the pack whole or not at all, and say what is in it."""
-    from liftcore.evaluate.inspect import describe_packs
-    from liftcore.values.pack import read_features, write_pack
-
     if options.format == "retag":
         return _retag(options)
-    with progress_bars() as progress:
-        views, table, warnings = _views(options, progress)
-        out = free_output(options.output, views.inputs, PACK)
-        with writing(out):
-            write_pack(out, views, _metadata(options), progress, table)
-    packs = read_features(out)
-    described = describe_packs(packs)
+    from liftcore import pack_folder
+    from liftcore.evaluate import inspect_file
+
+    given = {name: value for name, value in vars(options).items() if name in GIVEN}
+    made = pack_folder(options.folder, options.output, options.format, **given, progress=True)
+    described = inspect_file(options.output, "features")
+    names = ("bytes", "views", "channels", "encoder", "text_space", "normalised")
     document = {
-        "out": str(out),
-        "bytes": out.stat().st_size,
-        "views": len(packs.views),
-        "channels": packs.channels,
-        "encoder": packs.encoder,
-        "text_space": packs.text_space,
-        "normalised": packs.normalised,
-        "folders": folders_of(views),
+        "out": str(options.output),
+        **{name: described[name] for name in names},
+        "folders": made["folders"],
         "sizes": described["sizes"],
-        "renamed": _renamed(views, options),
-        "words": list(table.words) if table else [],
-        "warnings": [*warnings, *described["warnings"]],
+        "renamed": made["renamed"],
+        "words": made["words"],
+        "warnings": [*made["warnings"], *described["warnings"]],
     }
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
@@ -120,33 +108,15 @@ def run(options: argparse.Namespace) -> int:
 
 def _retag(options: argparse.Namespace) -> int:
     """Write the pack under its new names, and say them."""
-    from liftcore.io.files import whole_file
-    from liftcore.io.safetensors_file import with_metadata
-    from liftcore.values.pack import read_features
+    from liftcore import read_features, retag_pack
 
     given = {"encoder": options.encoder_name, "text_space": options.text_space}
-    names = {name: value for name, value in given.items() if value}
-    if not names:
-        raise InvalidInput("retag", expected="--text-space NAME or --encoder-name NAME", got="neither")
-    out = free_output(options.output, [options.pack], PACK)
-    read_features(options.pack)  # what is no pack leaves no file
-    with writing(out), whole_file(out) as handle:
-        handle.writelines(with_metadata(options.pack, names))
-    packs = read_features(out)
-    document = {"out": str(out), "encoder": packs.encoder, "text_space": packs.text_space}
-    said = f"{out}: encoder {packs.encoder or 'not named'}, text space {packs.text_space or 'not named'}"
+    retag_pack(options.pack, options.output, {name: value for name, value in given.items() if value})
+    packs = read_features(options.output)
+    document = {"out": str(options.output), "encoder": packs.encoder, "text_space": packs.text_space}
+    said = f"{options.output}: encoder {packs.encoder or 'not named'}, text space {packs.text_space or 'not named'}"
     reply(document, as_json=options.json, lines=[said])
     return 0
-
-
-def _renamed(views: ViewFolder, options: argparse.Namespace) -> dict[str, str]:
-    """The views that lost the suffix of an image, by their files of vectors."""
-    from liftcore.scene.views import IMAGE_SUFFIXES
-
-    if options.format in ("langsplat", "prompts") or getattr(options, "encoder", None):
-        return {}
-    files = {path.relative_to(options.folder).as_posix(): view for view, path in views.files.items()}
-    return {name: view for name, view in files.items() if Path(name).with_suffix("").suffix.lower() in IMAGE_SUFFIXES}
 
 
 def _lines(document: dict[str, Any]) -> Iterator[str]:
@@ -158,80 +128,3 @@ def _lines(document: dict[str, Any]) -> Iterator[str]:
     for name, view in list(document["renamed"].items())[:1]:
         yield f"  views are named without the suffix of their images, as cameras are: {name} is {view!r}"
     yield from (f"warning: {warning}" for warning in document["warnings"])
-
-
-def _encoded_masks(options: argparse.Namespace, progress: Progress) -> tuple[ViewFolder[Regions], list[str]]:
-    """Masks with vectors of their crops, and warnings.
-
-    What the encoder tells of itself is noted where the caller names nothing.
-    """
-    from liftcore.features.encoders import device_named
-    from liftcore.features.encoders.crops import CropEncoder, crop_vectors
-    from liftcore.features.encoders.encode import find_images
-    from liftcore.features.masks import mask_files, mask_views
-    from liftcore.io.photos import orientation_warnings
-
-    if options.normalised is False:
-        raise InvalidInput("--no-normalised", expected="unit vectors, which --encoder makes", got="--no-normalised")
-    if not options.photos:
-        raise InvalidInput("--photos", expected="the photos that the masks are of, for --encoder", got="none")
-    files, photos = mask_files(options.folder), find_images(options.photos)
-    free_output(options.output, [*files.values(), *photos.values()], PACK)  # told before the work
-    encoder = CropEncoder.open(options.encoder, device_named(options.device))
-    vectors, readings = crop_vectors(files, photos, encoder, options.unlabelled, progress)
-    options.encoder_name = options.encoder_name or f"crops of masks, {encoder.name}"
-    options.text_space = options.text_space or encoder.text_space
-    options.normalised = True
-    return mask_views(options.folder, options.unlabelled, vectors), orientation_warnings(
-        readings, "masks and cameras"
-    )
-
-
-def _views(options: argparse.Namespace, progress: Progress) -> tuple[ViewFolder, TableEncoder | None, list[str]]:
-    """The views, words that they bring, and warnings."""
-    from liftcore.features import folders
-
-    if options.format == "langsplat":
-        return folders.langsplat_views(options.folder), None, []
-    if options.format == "npy":
-        return folders.array_views(options.folder, options.layout), None, []
-    if options.format == "masks":
-        from liftcore.features.masks import mask_views
-
-        if options.encoder is not None:
-            found, warnings = _encoded_masks(options, progress)
-            return found, None, warnings
-        if options.photos:
-            raise InvalidInput("--encoder", expected="what makes vectors of the masks in --photos", got="none")
-        return mask_views(options.folder, options.unlabelled), None, []
-    from liftcore.features.prompts import prompt_views
-
-    found = prompt_views(
-        options.folder,
-        options.names,
-        options.folders,
-        unlabelled=options.unlabelled,
-        unannotated=options.unannotated,
-    )
-    empty = [phrase for phrase, views in found.counts.items() if not views]
-    left_out = [f"no view has a mask of {shown(empty)}: left out"] if empty else []
-    return found.views, found.table, [*found.warnings, *left_out]
-
-
-def _metadata(options: argparse.Namespace) -> dict[str, str]:
-    from liftcore.text import OWN_WORDS
-
-    told = {"source": options.format}
-    if options.format == "prompts":
-        return told | {
-            "encoder": options.encoder_name or "masks by prompt",
-            "text_space": OWN_WORDS,
-            "normalised": "true",
-        }
-    if options.encoder_name:
-        told["encoder"] = options.encoder_name
-    if options.text_space:
-        told["text_space"] = options.text_space
-    if options.normalised is not None:
-        told["normalised"] = "true" if options.normalised else "false"
-    return told

@@ -5,13 +5,12 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from liftcore.cli.lift import in_short, plan_of, settings_of
+from liftcore.cli.lift import in_short, settings_of
 from liftcore.cli.options import Parser, add_settings, add_sources, add_verbose, count
 from liftcore.cli.reply import reply
-from liftcore.runtime.progress import progress_bars
 
 if TYPE_CHECKING:
-    from liftcore.values.settings import LiftSettings
+    from liftcore import LiftSettings
 
 
 def add_arguments(parser: Parser) -> None:
@@ -24,10 +23,12 @@ def add_arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Print the plan."""
+    from liftcore import plan_files
+
     settings = settings_of(options)
     if not options.features:
         return _photos(options, settings)
-    plan = plan_of(options, settings)
+    plan = plan_files(options.splats, options.cameras, options.features, settings, threads=options.threads)
     views = {"lifted": list(plan.views), "left_out": list(plan.left_out)}
     device = {"kind": plan.device.kind, "name": plan.device.name}
     document = {
@@ -43,14 +44,9 @@ def run(options: argparse.Namespace) -> int:
 
 def _photos(options: argparse.Namespace, settings: LiftSettings) -> int:
     """Print which photos to encode first."""
-    from liftcore.io.cameras import read_cameras
-    from liftcore.io.splats import read_splats
-    from liftcore.lifting.planning.photos import plan_photos
+    from liftcore import plan_photos, read_cameras, read_splats
 
     splats = read_splats(options.splats, settings.kernel, colour=False)
-    with progress_bars() as progress:
-        plan = plan_photos(
-            splats, read_cameras(options.cameras), settings, threads=options.threads, progress=progress
-        )
+    plan = plan_photos(splats, read_cameras(options.cameras), settings, threads=options.threads, progress=True)
     reply(plan.facts(), as_json=options.json, lines=plan.lines(verbose=options.verbose))
     return 0

@@ -18,12 +18,11 @@ from liftcore.cli.options import (
     text_encoder,
     view_of,
 )
-from liftcore.cli.reply import free_outputs, reply, writing
+from liftcore.cli.reply import free_outputs, place_of, reply, write_files
 from liftcore.errors import InvalidQuery
-from liftcore.io.files import whole_file
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Iterable
 
     from PIL.Image import Image
 
@@ -84,11 +83,8 @@ def run(options: argparse.Namespace) -> int:
     found = scene.objects(answer) if options.objects else None
     document = _document(answer, found, seen, encoder)
     photo = None if seen is None else _picture(options.photo, seen.mask.shape[::-1])
-    contents = {
-        kind: partial(scene.blocks_of, answer, kind, view=view, suffix=path.suffix.lower(), seen=seen, photo=photo)
-        for kind, path in files.items()
-    }
-    document["files"] = write_files(files, contents)
+    export = partial(scene.export, source=answer, view=view, seen=seen, photo=photo)
+    document["files"] = write_files(files, {kind: partial(export, what=kind) for kind in files})
     if options.object is not None and options.object.suffix.lower() in LOCAL_SUFFIXES and any(scene.splats.origin):
         document["origin"] = scene.splats.origin
     reply(document, as_json=options.json, lines=_lines(document))
@@ -145,7 +141,7 @@ def _keys_of_before(answer: Answer, found: Objects | None) -> dict[str, Any]:
 
 
 def _picture(photo: Path | None, size: tuple[int, int]) -> Image | None:
-    from liftcore.features.encoders.encode import read_image
+    from liftcore.files import read_image
 
     return None if photo is None else read_image(photo, size)[0]
 
@@ -153,16 +149,6 @@ def _picture(photo: Path | None, size: tuple[int, int]) -> Image | None:
 def made_from(scene: Scene) -> list[Path]:
     """The files that a lift remembers."""
     return [Path(file.path) for file in (scene.metadata.splats, scene.metadata.cameras, *scene.metadata.features)]
-
-
-def write_files(files: Mapping[str, Path], contents: Mapping[str, Callable[[], Iterable[bytes]]]) -> dict[str, str]:
-    """Write each file, in their order: what cannot be made leaves no file, and none after it."""
-    for kind, path in files.items():
-        with writing(path):
-            content = contents[kind]()  # before there is a draft, or a folder for it: nothing found is no file
-            with whole_file(path) as handle:
-                handle.writelines(content)
-    return {kind: str(path) for kind, path in files.items()}
 
 
 def _lines(document: dict[str, Any]) -> Iterable[str]:
@@ -191,12 +177,3 @@ def _lines(document: dict[str, Any]) -> Iterable[str]:
     yield from (f"  {kind}: {path}" for kind, path in document["files"].items())
     if "origin" in document:
         yield f"  positions in its format are less the origin of map coordinates, {place_of(document['origin'])}"
-
-
-def place_of(point: tuple[float, ...]) -> str:
-    """A point for people, with four digits; of map coordinates, which all begin alike, with about three decimals."""
-    from liftcore.scene.origin import MAP_REACH
-
-    reach = max(map(abs, point))
-    digits = 4 if reach < MAP_REACH else 4 + int(math.log10(reach))
-    return f"({', '.join(f'{value:.{digits}g}' for value in point)})"

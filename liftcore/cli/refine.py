@@ -5,11 +5,9 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from liftcore.cli.options import Parser, add_splats, count
-from liftcore.cli.reply import free_lift, reply, writing
+from liftcore.cli.options import Parser, add_splats, count, place
+from liftcore.cli.reply import reply, smoothing_line
 from liftcore.errors import InvalidInput
-from liftcore.io.remote import place
-from liftcore.runtime.progress import one_step, progress_bars
 
 
 def add_arguments(parser: Parser) -> None:
@@ -30,19 +28,16 @@ def run(options: argparse.Namespace) -> int:
         if "lift" in options.elsewhere:
             raise InvalidInput("output", expected="-o OUT", got="none, of a lift that lies elsewhere")
         out = options.lift.with_name(f"{options.lift.stem}.smooth{options.lift.suffix}")
-    from liftcore.query.result import load_lift
-    from liftcore.query.scene import Scene
-    from liftcore.solve.smooth import smoothing_line
-    from liftcore.values.lift_file import save_lift
+    from liftcore import Scene, load_lift
+    from liftcore.files import check_output, writing
 
     scene = Scene(options.lift, splats=options.splats)
-    file = free_lift(out, [options.lift, scene.splat_file])
-    with progress_bars() as progress:
-        result = load_lift(options.lift).refined(
-            scene.splats, smoothness=options.smoothness, threads=options.threads, progress=progress
-        )
-        with writing(file), one_step(progress, "save"):
-            save_lift(result, out)
+    file = check_output(out, [options.lift, scene.splat_file], "lift")
+    result = load_lift(options.lift).refined(
+        scene.splats, smoothness=options.smoothness, threads=options.threads, progress=True
+    )
+    with writing(file):
+        result.save(out, progress=True)
     facts = result.diagnostics["smoothing"]
     document: dict[str, Any] = {
         "out": str(out),

@@ -7,8 +7,8 @@ from functools import partial
 from pathlib import Path
 
 from liftcore.cli.options import Parser, add_fields, add_lift, add_view, opened_lift, view_of
-from liftcore.cli.query import made_from, write_files
-from liftcore.cli.reply import free_outputs, reply
+from liftcore.cli.query import made_from
+from liftcore.cli.reply import free_outputs, reply, write_files
 from liftcore.errors import InvalidQuery
 
 
@@ -30,6 +30,6 @@ def run(options: argparse.Namespace) -> int:
     free_outputs(files, [path for path in (options.lift, options.camera) if path])
     scene = opened_lift(options)
     free_outputs(files, made_from(scene))
-    written = write_files(files, {"output": partial(scene.blocks_of, None, options.what, view=view)})
+    written = write_files(files, {"output": partial(scene.export, what=options.what, view=view)})
     reply({"what": options.what, "out": written["output"]}, as_json=options.json, lines=[written["output"]])
     return 0

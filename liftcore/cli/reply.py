@@ -2,10 +2,7 @@
 
 import json
 import math
-import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +12,13 @@ SHOWN_ITEMS = 6  # of a list, for people
 SHOWN_FOLDERS = 8
 LARGE = 1e5  # from here on numbers show about three decimals: places in map coordinates begin alike
 MOST_DIGITS = 15
+MAP_REACH = 1e4  # scene units from the origin: so far, positions need more digits than elsewhere
 
 
 def reply(document: Mapping[str, Any], *, as_json: bool, lines: Iterable[str] | None = None) -> None:
     """Print one JSON object, or else ``lines``, or else the document's entries, a line each."""
     if as_json:
-        from liftcore.io.json_file import finite  # loads numpy
+        from liftcore.files import finite
 
         print(json.dumps(finite(document), allow_nan=False))
         return
@@ -28,122 +26,35 @@ def reply(document: Mapping[str, Any], *, as_json: bool, lines: Iterable[str] | 
         print(line)
 
 
-@dataclass(frozen=True)
-class OutputType:
-    """What an option writes."""
-
-    name: str  # as errors have it
-    suffixes: tuple[str, ...]
-    kind: str | None  # of `liftcore.io.kinds`, that a file may have which is replaced
-    told: str = ""  # of a file without a kind, what the name of its kind begins with; empty: of a text
-
-
-SPLATS = OutputType("splats", (".ply", ".splat", ".spz"), "splats")
-PLY = OutputType("a PLY", (".ply",), "splats")
-PNG = OutputType("a picture", (".png",), None, "a picture")
-NPY = OutputType("an array", (".npy",), None, "a NumPy array")
-LIFT = OutputType("a lift", (".safetensors", ".shards"), "lift")
-PACK = OutputType("a feature pack", (".safetensors",), "features")
-CSV = OutputType("a table", (".csv",), None)
-JSON = OutputType("JSON", (".json",), None)
 OUTPUTS = {
-    "object": SPLATS, "coloured": PLY, "labelled": PLY, "names": JSON, "scores": NPY, "splat_labels": NPY, "csv": CSV,
-    **dict.fromkeys(("mask", "attention", "overlay", "labels", "picture", "output", "worst"), PNG),
-}  # by the options that name files  # fmt: skip
-CONVERTED = (".sog", ".glb", ".html", ".csv", ".compressed.ply", ".splat", ".spz")  # which splat-transform writes
-
-
-def free_output(path: Path, inputs: Sequence[Path], written: OutputType) -> Path:
-    """An output path that can be written, and is no folder, none of the inputs and no file of another kind.
-
-    Checked before the work, so that an hour of it is not lost over a misspelt name. A file of the kind that is
-    written is replaced.
-
-    Args:
-        path: as the user gave it. inputs: of the command. written: what goes there.
-
-    Raises:
-        InvalidInput: it is one of these, its suffix is not written, or no file can be made there.
-    """
-    with writing(path):
-        if path.is_dir():
-            raise InvalidInput("output", expected="a file to write", got=f"the folder {path}")
-        if any(path.exists() and source.exists() and path.samefile(source) for source in inputs):
-            raise InvalidInput("output", expected="another file than the inputs", got=str(path))
-        _require_suffix(path, written)
-        _require_same_kind(path, written)
-        folder = next(parent for parent in path.absolute().parents if os.path.lexists(parent))
-        if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
-            raise InvalidInput("output", expected="a folder that can be written", got=str(folder))
-    return path
-
-
-def free_lift(path: Path | str, inputs: Sequence[Path]) -> Path | str:
-    """The file that a lift's output begins with: itself, the index of a folder of shards, or a place elsewhere.
-
-    Raises:
-        InvalidInput: it is no `free_output`, or lies where nothing can be sent to.
-    """
-    from liftcore.io.remote import is_remote, require_storage
-    from liftcore.io.shards import INDEX, SUFFIX
-
-    if is_remote(path):
-        require_storage(str(path))
-        return path
-    file = Path(path)
-    return free_output(file / INDEX, inputs, JSON) if file.suffix == SUFFIX else free_output(file, inputs, LIFT)
+    "object": "splats", "coloured": "ply", "labelled": "ply", "names": "json", "scores": "npy", "splat_labels": "npy",
+    "csv": "csv", **dict.fromkeys(("mask", "attention", "overlay", "labels", "picture", "output"), "png"),
+}  # what options that name files write  # fmt: skip
 
 
 def free_outputs(files: Mapping[str, Path], inputs: Sequence[Path]) -> None:
     """Several outputs, by the options that name them.
 
     Raises:
-        InvalidInput: one of them is no `free_output`, or two are one file.
+        InvalidInput: one of them cannot be written (`check_output`), or two are one file.
     """
+    from liftcore.files import check_output
+
     if len({path.absolute() for path in files.values()}) < len(files):
         named = " and ".join(f"--{name.replace('_', '-')}" for name in files)
         raise InvalidInput(named, expected="a file each", got="the same file twice")
     for name, path in files.items():
-        free_output(path, inputs, OUTPUTS[name])
+        check_output(path, inputs, OUTPUTS[name])
 
 
-def _require_suffix(path: Path, written: OutputType) -> None:
-    name = path.name.lower()
-    if name.endswith(written.suffixes) and not name.endswith(".compressed.ply"):
-        return
-    hint = ""
-    if ".ply" in written.suffixes and name.endswith(CONVERTED):
-        stem = path.name[: -len(next(suffix for suffix in CONVERTED if name.endswith(suffix)))]
-        hint = f"write {stem}.ply, and convert it: npx @playcanvas/splat-transform {stem}.ply {path.name}"
-    ends = " or ".join(written.suffixes)
-    raise InvalidInput("output", expected=f"a name of {written.name}, ending in {ends}", got=str(path), hint=hint)
+def write_files(files: Mapping[str, Path], exports: Mapping[str, Callable[[Path], None]]) -> dict[str, str]:
+    """Write each file, in their order: what cannot be made leaves no file, and none after it."""
+    from liftcore.files import writing
 
-
-def _require_same_kind(path: Path, written: OutputType) -> None:
-    from liftcore.io.kinds import identify
-
-    if not path.is_file() or path.stat().st_size == 0:
-        return
-    found = identify(path)
-    fits = found.kind == written.kind if written.kind else found.kind is None and found.name.startswith(written.told)
-    if not fits:
-        expected = f"a new file, or one of {written.name} to replace"
-        hint = "name another file, or remove that one first"
-        raise InvalidInput("output", expected=expected, got=f"{path}, which is {found.name}", hint=hint)
-
-
-@contextmanager
-def writing(path: Path | str) -> Iterator[None]:
-    """Say which output failed, and why, when the disk is full or the folder is not for us to write.
-
-    Raises:
-        InvalidInput: the operating system refused.
-    """
-    try:
-        yield
-    except OSError as error:
-        got = f"{path} ({error.strerror or error})"
-        raise InvalidInput("output", expected="a file that can be written", got=got) from None
+    for kind, path in files.items():
+        with writing(path):
+            exports[kind](path)
+    return {kind: str(path) for kind, path in files.items()}
 
 
 def _entries(document: Mapping[str, Any]) -> Iterable[str]:
@@ -172,9 +83,22 @@ def _nested(value: Any) -> str:
     return f"({shown(value)})" if isinstance(value, Mapping | list | tuple) else shown(value)
 
 
-def folders_of(views: Iterable[str]) -> list[str]:
-    """The folders that are part of names like ``camA/000``, sorted."""
-    return sorted({view.rpartition("/")[0] for view in views if "/" in view})
+def place_of(point: tuple[float, ...]) -> str:
+    """A point for people, with four digits; of map coordinates, which all begin alike, with about three decimals."""
+    reach = max(map(abs, point))
+    digits = 4 if reach < MAP_REACH else 4 + int(math.log10(reach))
+    return f"({', '.join(f'{value:.{digits}g}' for value in point)})"
+
+
+def smoothing_line(facts: Mapping[str, Any]) -> str:
+    """What smoothing did (``diagnostics["smoothing"]``), as a sentence for people."""
+    moved = "not at all" if facts["moved"] is None else f"by {facts['moved']:.1%} of their length"
+    by = "place and colour" if facts["colours"] else "place alone, as the splats have no colours"
+    return (
+        f"smoothness {facts['smoothness']:g}: features moved {moved} towards their neighbours' in {by}; "
+        f"{facts['filled']} splats without evidence took their neighbours' "
+        f"({facts['steps']} steps, {facts['residual']:.1g} of the gradient left)"
+    )
 
 
 def told_folders(folders: Sequence[str]) -> list[str]:

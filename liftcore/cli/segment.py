@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.cli.options import Parser, add_encoder, add_lift, add_view, count, opened_lift, text_encoder, view_of
-from liftcore.cli.query import made_from, place_of, write_files
-from liftcore.cli.reply import free_outputs, reply
+from liftcore.cli.query import made_from
+from liftcore.cli.reply import free_outputs, place_of, reply, write_files
 from liftcore.errors import InvalidQuery
-from liftcore.runtime.progress import progress_bars
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -61,8 +60,7 @@ def run(options: argparse.Namespace) -> int:
             for said, example in named
         }
     if files or not options.what:
-        with progress_bars() as progress:
-            found = scene.segment(words, encoder=encoder, progress=progress)
+        found = scene.segment(words, encoder=encoder, progress=True)
         document |= {
             "splats": len(found.labels),
             "none": int((found.labels < 0).sum()),
@@ -71,8 +69,8 @@ def run(options: argparse.Namespace) -> int:
                 for value, named in enumerate(found.found, 1)
             ],
         }
-        contents = {kind: partial(scene.blocks_of, found, kind, view=view) for kind in files}
-        document["files"] = write_files(files, contents)
+        exports = {kind: partial(scene.export, source=found, what=kind, view=view) for kind in files}
+        document["files"] = write_files(files, exports)
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
 

@@ -8,9 +8,8 @@ from pathlib import Path
 
 from liftcore.cli.lift import pairs_of
 from liftcore.cli.options import Parser, add_sources, count
-from liftcore.cli.reply import JSON, free_output, reply, writing
+from liftcore.cli.reply import reply
 from liftcore.errors import InvalidSettings
-from liftcore.runtime.progress import progress_bars
 
 
 def add_arguments(parser: Parser) -> None:
@@ -39,36 +38,30 @@ def _seconds(text: str) -> float:
 
 def run(options: argparse.Namespace) -> int:
     """Compare, write the chart, the table and the JSON, and say what to take."""
-    from liftcore.values.settings import LiftSettings
+    from liftcore import LiftSettings
 
     settings = pairs_of(options.set)
     LiftSettings.of(**settings)
     if "speed" in settings:
         raise InvalidSettings("--set", expected="settings that are the same in all runs", got="speed")
-    from liftcore.evaluate.tradeoff import SceneFiles, compare
-    from liftcore.evaluate.tradeoff_report import page_of, save
+    from liftcore.evaluate import SceneFiles, compare_speeds
+    from liftcore.files import check_output, writing
 
-    free_output(options.out / "tradeoff.json", [], JSON)
-    scene = SceneFiles(
-        options.splats,
-        options.cameras,
-        tuple(options.features),
-        options.labels,
-        options.table,
-        tuple(options.classes),
+    check_output(options.out / "tradeoff.json", [], "json")
+    sources = options.splats, options.cameras, tuple(options.features)
+    found = compare_speeds(
+        SceneFiles(*sources, options.labels, options.table, tuple(options.classes)),
+        budget=options.budget,
+        settings=settings,
+        threads=options.threads,
+        progress=True,
+        scene=options.splats.resolve().parent.name,
+        command=_command(options),
     )
-    with progress_bars() as progress:
-        found = compare(scene, options.budget, settings, options.threads, progress)
-    document = {
-        "title": "Speed against accuracy",
-        "scene": options.splats.resolve().parent.name,
-        "command": _command(options),
-        **found,
-    }
     with writing(options.out):
-        files = save(document, options.out)
-    document["files"] = [str(file) for file in files]
-    reply(document, as_json=options.json, lines=[*page_of(document), "", *document["files"]])
+        files = found.save(options.out)
+    document = found.document | {"files": [str(file) for file in files]}
+    reply(document, as_json=options.json, lines=[*found.lines(), "", *document["files"]])
     return 0
 
 

@@ -20,9 +20,11 @@ import numpy as np
 import torch
 from PIL import Image
 
-from liftcore.features.encoders.encode import TURNS, read_image, readings_of
+from liftcore.features.encoders.encode import TURNS, find_images, read_image, readings_of
 from liftcore.features.smoothness import smoothness, unlike_maps
+from liftcore.io.cameras import read_cameras
 from liftcore.io.photos import PhotoHeader, orientation_warnings, read_header
+from liftcore.io.splats import read_splats
 from liftcore.lifting.planning.contradictions import (
     FAR_SCALES,
     LEAST_IN_VIEW,
@@ -38,8 +40,8 @@ from liftcore.query.splat_colours import seen_colours
 from liftcore.raster import open_raster
 from liftcore.raster.base import Raster
 from liftcore.runtime.device import CPU
-from liftcore.runtime.progress import Progress, silent
-from liftcore.scene.cameras import Camera, Cameras, photo_size
+from liftcore.runtime.progress import Progress, shown_progress
+from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.compositing import CompositingParams
 from liftcore.scene.drawing import in_photo
 from liftcore.scene.panorama import with_panoramas
@@ -49,7 +51,7 @@ from liftcore.scene.views import cameras_of_views, some_of
 from liftcore.solve.diagnostics import is_stretched, shape_warnings
 from liftcore.values.lens import photo_as_pinhole_sees
 from liftcore.values.lift_views import LiftViews
-from liftcore.values.pack import Views, pair
+from liftcore.values.pack import Views, pair, read_features
 from liftcore.values.settings import LiftSettings
 from liftcore.values.views import FeatureGrid, Regions
 
@@ -90,24 +92,43 @@ class CheckReport:
 
 
 def check_scene(
-    splats: Splats,
-    cameras: Cameras,
-    photos: Mapping[str, Path] | None = None,
-    features: Views | None = None,
-    progress: Progress = silent,
+    splats: Splats | Path | str,
+    cameras: Cameras | Path | str,
+    photos: Mapping[str, Path] | Sequence[Path] | None = None,
+    features: Views | Sequence[Path | str] | None = None,
+    progress: Progress | bool | None = False,
     settings: LiftSettings | None = None,
 ) -> CheckReport:
     """Render some views and hold them against what is known of them.
 
     Args:
-        photos: view -> image (`liftcore.features.encoders.encode.find_images`). features: of the views.
-        progress: told about a stage "check", in views.
+        splats, cameras: or where they lie, as `read_splats` and `read_cameras` take them.
+        photos: view -> image; or images and folders of them. features: of the views; or the paths of feature packs.
+        progress: as `liftcore.lift` has it; told about a stage "check", in views.
         settings: of the lift that is to come; its ``antialiased`` counts. None: the default ones.
 
     Raises:
         InvalidInput: an image that cannot be read. InvalidFeatures: features that cannot be read.
+        InvalidSplats, InvalidCameras: as readers of splats and cameras have it.
     """
-    settings = (settings or LiftSettings.of()).for_splats(splats)
+    settings = settings or LiftSettings.of()
+    features = features if features is None or isinstance(features, Views) else read_features(*features)
+    images = photos if isinstance(photos, Mapping) else find_images(photos or ())
+    splats = splats if isinstance(splats, Splats) else read_splats(splats, settings.kernel)
+    if not isinstance(cameras, Cameras):
+        cameras = read_cameras(cameras, views=features.views if features is not None else list(images))
+    with shown_progress(progress) as reporter:
+        return _check(splats, cameras, images, features, reporter, settings.for_splats(splats))
+
+
+def _check(
+    splats: Splats,
+    cameras: Cameras,
+    photos: Mapping[str, Path],
+    features: Views | None,
+    progress: Progress,
+    settings: LiftSettings,
+) -> CheckReport:
     trained = CompositingParams(antialiased=settings.antialiased is True)
     wrong: list[str] = []
     contradicting = rendering_warnings(splats.render_mode, trained.antialiased, splats.kernel)
@@ -115,7 +136,6 @@ def check_scene(
     notes += [f"cameras: {text}" for text in cameras.warnings]
     if trained.antialiased:
         notes.append(f"splats: rendered antialiased: {rendering_reason(splats.render_mode, True)}")
-    photos = photos or {}
     files, whole = _paired_photos(photos, cameras, features is not None, wrong, notes)
     sizes = {name: _photo_of(cameras[name], whole[name]) for name in files}
     headers = {name: read_header(file) for name, file in files.items()}
@@ -125,7 +145,7 @@ def check_scene(
     alike = {name: file for name, file in files.items() if name not in odd}
     names = _some(list(alike) or list(cameras), VIEWS)
     shown = [name for name in names if name in alike]
-    pictures = {name: _photo(files[name], sizes[name], photo_size(cameras[name]), whole[name]) for name in shown}
+    pictures = {name: _photo(files[name], sizes[name], cameras[name].photo_size, whole[name]) for name in shown}
     raster, views, renders = open_raster(splats, CPU), [], {}
     unfilled: dict[str, np.ndarray] = {}
     for number, name in enumerate(names):
@@ -217,7 +237,7 @@ def _background(
 def _photo_of(camera: Camera, panorama: Camera | None) -> tuple[int, int]:
     """Width and height of the photo that a camera is of; of a ``panorama`` that camera, a face, of the whole one."""
     face = None if panorama is None else panorama.face
-    return photo_size(camera) if face is None else (face.width, face.height)
+    return camera.photo_size if face is None else (face.width, face.height)
 
 
 def _other_shapes(

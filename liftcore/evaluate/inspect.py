@@ -17,9 +17,10 @@ from liftcore.features.smoothness import some_grids, unlike_maps
 from liftcore.io.cameras import TRANSFORMS, camera_source, has_nerfstudio_beside, other_models, read_cameras
 from liftcore.io.kinds import SplatFormat, identify
 from liftcore.io.ply import nearest_dialect
+from liftcore.io.remote import local_path
 from liftcore.io.splats import format_of, read_splats, splat_files
 from liftcore.io.transforms import FRAME_FILE
-from liftcore.scene.cameras import Cameras, distortion_warning, photo_size
+from liftcore.scene.cameras import Cameras, distortion_warning
 from liftcore.scene.compositing import ALPHA_FLOOR
 from liftcore.scene.splats import Kernel, Splats
 from liftcore.solve.diagnostics import UNSEEN
@@ -50,8 +51,12 @@ NARROW = 4  # times longer than wide, or wider: photos are not
 UNIT_TOLERANCE = 0.01  # a float16 unit vector of 512 channels is within it
 
 
-def inspect_file(path: Path) -> dict[str, Any]:
+def inspect_file(path: Path | str, kind: str = "") -> dict[str, Any]:
     """Describe a file of splats, cameras, features, masks, a lift or a table of text embeddings.
+
+    Args:
+        path: of the file or folder; it may lie elsewhere (`io.remote`). kind: what it is described as, one of
+            DESCRIPTIONS; empty: what it looks like.
 
     Returns:
         ``kind``, ``bytes``, counts and ranges of the kind, and ``warnings``: what looks wrong.
@@ -59,17 +64,19 @@ def inspect_file(path: Path) -> dict[str, Any]:
     Raises:
         InvalidInput: the file is missing, malformed or none of these.
     """
+    path = local_path(path)
     if not path.exists():
         raise InvalidInput(str(path), expected="a file or a folder", got="nothing of that name")
     found = identify(path)
-    describe, files_of = DESCRIPTIONS.get(found.kind or "", (None, None))
+    kind = kind or found.kind or ""
+    describe, files_of = DESCRIPTIONS.get(kind, (None, None))
     if describe is None or files_of is None:
         if not found.recognised and (path.is_dir() or path.suffix.lower() == ".json"):
             describe_camera_file(path)  # raises with what cameras lack
         raise InvalidInput(str(path), expected=ANY_KIND, got=found.name, hint=found.hint)
     description = describe(path)  # first: a reader says better which of its files is not there
     size = sum(file.stat().st_size for file in files_of(path))
-    return {"kind": found.kind, "bytes": size, **description}
+    return {"kind": kind, "bytes": size, **description}
 
 
 def describe_lift_file(path: Path) -> dict[str, Any]:
@@ -140,7 +147,7 @@ def describe_camera_file(path: Path) -> dict[str, Any]:
 def describe_cameras(cameras: Cameras) -> dict[str, Any]:
     """Counts, ranges and warnings of cameras."""
     centres = np.stack([camera.centre for camera in cameras.values()])
-    sizes = sorted({"{}x{}".format(*photo_size(camera)) for camera in cameras.values()})
+    sizes = sorted({"{}x{}".format(*camera.photo_size) for camera in cameras.values()})
     focals = [focal for camera in cameras.values() for focal in (camera.fx, camera.fy)]
     return {
         "views": len(cameras),

@@ -10,7 +10,6 @@ from liftcore.evaluate.protocols import SEGMENTERS, EvaluationProtocol, Predicti
 from liftcore.query.scene import Scene
 from liftcore.query.scores import DEFAULT_NEGATIVES
 from liftcore.runtime.progress import Progress, silent
-from liftcore.scene.cameras import photo_size
 from liftcore.text import RememberingEncoder, TextEncoder
 
 
@@ -199,7 +198,8 @@ def evaluate_scene(
         warnings.append(f"{labels.name}: {_named(lifted)} were lifted, though the list holds them out")
     elif lifted:
         warnings.append(f"{labels.name}: {len(lifted)} of {len(truth)} judged frames were lifted: {_named(lifted)}")
-    encoder = RememberingEncoder(encoder)  # each protocol asks for the same words
+    if not isinstance(encoder, RememberingEncoder):  # each protocol asks for the same words
+        encoder = RememberingEncoder(encoder)
     protocols, unmeasured = _measurable(settings, encoder)
     warnings += [f"{labels.name}: {text}" for text in unmeasured]
     texts, unknown = _readable(truth, encoder)
@@ -295,7 +295,7 @@ def _truth(
     if len(paired) < len(wanted):
         lost = [view for view in wanted if view not in cameras]
         warnings.append(f"{labels.name}: {_named(lost)} have labels but no camera and were skipped")
-    truth = {view: labels.objects(view, *photo_size(cameras[view])) for view in paired}
+    truth = {view: labels.objects(view, *cameras[view].photo_size) for view in paired}
     empty = [view for view, things in truth.items() if not any(thing.mask.any() for thing in things)]
     if empty:
         warnings.append(f"{labels.name}: {_named(empty)} have no labelled object")

@@ -40,9 +40,10 @@ from liftcore.query.result import LiftResult
 from liftcore.query.scene import Scene
 from liftcore.raster import open_raster
 from liftcore.runtime.device import CPU, choose_device
-from liftcore.runtime.progress import Progress
+from liftcore.runtime.progress import Progress, one_step
 from liftcore.scene.cameras import Cameras
 from liftcore.scene.drawing import in_photo
+from liftcore.scene.kernel import Kernel
 from liftcore.scene.splats import Splats
 from liftcore.scene.views import cameras_of_views
 from liftcore.text.table import TableEncoder
@@ -153,13 +154,20 @@ class RunSpec:
 
 
 def compare(
-    scene: SceneFiles, budget: float, settings: Mapping[str, Any], threads: int | None, progress: Progress
+    scene: SceneFiles,
+    budget: float,
+    settings: Mapping[str, Any],
+    threads: int | None,
+    progress: Progress,
+    kernel: Kernel | None = None,
 ) -> dict[str, Any]:
     """Measure what fits the budget, and choose.
 
     Args:
         budget: seconds. The exact run is made whatever it is, from few views if need be.
         settings: of all runs, beside what they compare.
+        kernel: of the splats, to compile what the runs load before the budget begins: else the first of a kind on a
+            machine eats it up.
 
     Returns:
         Plain numbers: the ``runs``, what was ``skipped`` for want of time, what the settings ``refused``, which
@@ -169,12 +177,18 @@ def compare(
         InvalidInput: the scene lacks what is needed; or whatever a lift refuses.
         Unavailable: a run did not end within a day.
     """
+    candidates = candidates_of(settings)
+    if kernel is not None:
+        device = choose_device(settings.get("device", "auto"))
+        with one_step(progress, "compile"):
+            for candidate in candidates:
+                warm_up_lift(kernel, device, LiftSettings.of(**{**settings, **candidate.settings}))
+    progress("tradeoff", 0, len(candidates), "runs")
     start, runs, judged, skipped = time.monotonic(), [], [], []
     with tempfile.TemporaryDirectory(prefix="splatlift-tradeoff-") as folder:
         spec = _plan_runs(scene, settings, threads, Path(folder))
         lifted = len(spec.lifted)
         spec = _fitting(spec, budget)
-        candidates = candidates_of(settings)
         for number, candidate in enumerate(candidates):
             if candidate is EXACT or time.monotonic() - start + candidate.times * runs[0]["process_s"] <= budget:
                 named = {

@@ -1,9 +1,11 @@
-"""What a comparison leaves behind: ``tradeoff.png``, ``tradeoff.md`` and ``tradeoff.json`` in a folder."""
+"""A comparison of speeds, and what it leaves behind: ``tradeoff.png``, ``.md`` and ``.json`` in a folder."""
 
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from matplotlib.axes import Axes
@@ -11,7 +13,11 @@ from matplotlib.figure import Figure
 
 from liftcore.evaluate.hardware import machine_line
 from liftcore.evaluate.ranking import NAMES
+from liftcore.evaluate.tradeoff import SceneFiles, compare
 from liftcore.io.files import whole_file
+from liftcore.io.json_file import finite
+from liftcore.runtime.progress import Progress, shown_progress
+from liftcore.scene.kernel import Kernel
 
 HEADS = ("run", "views", "wall s", "CPU s", "faster by CPU", "peak MiB", "cosine", "5 %", "lost", "centred",
          "mask IoU", "phrase IoU", "95 %")  # fmt: skip
@@ -23,7 +29,56 @@ KEY = (
     "both less the mean of what is observed, a region at a time. *95 %* is the interval of what runs are judged by, "
     "over draws of its views."
 )
+TITLE = "Speed against accuracy"
 LOST = 0.001  # of the splats, that are worth a sentence
+
+
+@dataclass(frozen=True)
+class SpeedComparison:
+    """Runs of a scene at several speeds and presets, and which to take."""
+
+    document: dict[str, Any]
+    """plain numbers, ready for JSON"""
+
+    def lines(self) -> list[str]:
+        """The table with what it says and how it was made, as Markdown."""
+        return page_of(self.document)
+
+    def save(self, folder: Path) -> list[Path]:
+        """Write ``tradeoff.json``, ``.png`` (a chart) and ``.md`` in a folder; their paths."""
+        return save(self.document, folder)
+
+
+def compare_speeds(
+    files: SceneFiles,
+    *,
+    budget: float = 600.0,
+    settings: Mapping[str, Any] = MappingProxyType({}),
+    kernel: Kernel | None = None,
+    threads: int | None = None,
+    progress: Progress | bool | None = None,
+    scene: str = "",
+    command: str = "",
+) -> SpeedComparison:
+    """Lift a scene at several speeds and by several presets, as many as fit a budget of time, and choose.
+
+    Each run is a process of its own.
+
+    Args:
+        files: of the scene, and what to judge by; without labels held-out views are judged by.
+        budget: seconds. The exact run is made whatever it is, from few views if need be.
+        settings: of all runs, beside ``speed``, which is compared.
+        kernel: of the splats, to compile what the runs load before the budget begins.
+        threads, progress: as `liftcore.lift` has them.
+        scene, command: that the report names.
+
+    Raises:
+        InvalidInput: the scene lacks what is needed; or whatever a lift refuses.
+        Unavailable: a run did not end within a day.
+    """
+    with shown_progress(progress) as reporter:
+        found = compare(files, budget, settings, threads, reporter, kernel)
+    return SpeedComparison(finite({"title": TITLE, "scene": scene, "command": command} | found))
 
 
 def save(document: Mapping[str, Any], out: Path) -> list[Path]:

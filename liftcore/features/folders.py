@@ -53,6 +53,11 @@ class ViewFolder(Mapping[str, V_co]):
         return len(self.files)
 
 
+def folders_of(views: Iterable[str]) -> list[str]:
+    """The folders that are part of names like ``camA/000``, sorted."""
+    return sorted({view.rpartition("/")[0] for view in views if "/" in view})
+
+
 def array_views(folder: Path, layout: Layout = "hwc") -> ViewFolder[FeatureGrid]:
     """The grids of a folder of ``.npy``, ``.npz`` or ``.pt`` files [h, w, F], or [F, h, w] with the layout ``chw``.
 

@@ -27,15 +27,6 @@ def is_remote(path: Path | str) -> bool:
     return isinstance(path, str) and REMOTE.match(path) is not None
 
 
-class Elsewhere(str):
-    """The text of an argument that names a protocol."""
-
-
-def place(text: str) -> Path | Elsewhere:
-    """An argument of the command line: a path, or where a file lies elsewhere."""
-    return Elsewhere(text) if is_remote(text) else Path(text)
-
-
 def check_path(path: object, argument: str = "path") -> None:
     """Refuse what names no file.
 

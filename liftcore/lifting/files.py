@@ -12,11 +12,11 @@ from liftcore.io.remote import local_path
 from liftcore.io.splats import read_splats
 from liftcore.lifting.checkpoint import Checkpoint
 from liftcore.lifting.engines.base import Engine
-from liftcore.lifting.pipeline import lift
+from liftcore.lifting.pipeline import lift, plan
 from liftcore.lifting.planning.plan import Plan
 from liftcore.query.result import LiftResult
 from liftcore.runtime.device import choose_device
-from liftcore.runtime.progress import Progress, Timings
+from liftcore.runtime.progress import Progress, Timings, shown_progress
 from liftcore.scene.cameras import Cameras
 from liftcore.scene.splats import Splats
 from liftcore.values.lift_file import input_files
@@ -28,41 +28,54 @@ def lift_files(
     splats: Path | str,
     cameras: Path | str,
     features: Sequence[Path | str],
-    settings: LiftSettings,
+    settings: LiftSettings | None = None,
     *,
     threads: int | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     on_plan: Callable[[Plan], None] | None = None,
-    checkpoint: Checkpoint | None = None,
+    checkpoint: Checkpoint | Path | str | None = None,
     engine: Engine | None = None,
 ) -> LiftResult:
-    """Lift the features of packs onto the splats of a file, as `liftcore.lift` does.
+    """Lift the features of packs onto the splats of a file, as `liftcore.lift` does; the lift remembers the files.
 
     Args:
-        splats: a PLY of any dialect. cameras: COLMAP, transforms.json or cameras.json. features: feature packs.
+        splats: of any format that `read_splats` knows. cameras: likewise of `read_cameras`. features: feature packs.
+            All may lie elsewhere (`io.remote`).
+        settings: None: the default ones. The others are as `liftcore.lift` has them.
 
     Raises:
         InvalidInput: a file is malformed, or the packs do not fit the cameras.
         Unavailable: there is no such device as asked for.
     """
+    settings = settings or LiftSettings.of()
     choose_device(settings.device)  # told before gigabytes are read
     paths = local_path(splats), local_path(cameras), _checked(features)
-    timings = Timings(progress)
-    with timings.step("read"):
-        sources = open_files(*paths, settings)
-    with timings.step("digest"):
-        inputs = input_files(*paths, views=sources[2].views)
-    given = {
-        "threads": threads,
-        "progress": timings.progress,
-        "on_plan": on_plan,
-        "checkpoint": checkpoint,
-        "engine": engine,
-    }
-    made = lift(*sources, settings, **given)
+    with shown_progress(progress) as reporter:
+        timings = Timings(reporter)
+        with timings.step("read"):
+            sources = open_files(*paths, settings)
+        with timings.step("digest"):
+            inputs = input_files(*paths, views=sources[2].views)
+        given = {"threads": threads, "on_plan": on_plan, "checkpoint": checkpoint, "engine": engine}
+        made = lift(*sources, settings, progress=reporter, **given)
     own = {"splats": inputs[0], "cameras": inputs[1], "features": tuple(inputs[2:])}
     own["timings"] = timings.seconds | made.metadata.timings
     return replace(made, metadata=made.metadata.model_copy(update=own))
+
+
+def plan_files(
+    splats: Path | str,
+    cameras: Path | str,
+    features: Sequence[Path | str],
+    settings: LiftSettings | None = None,
+    *,
+    threads: int | None = None,
+    in_blocks: bool = False,
+) -> Plan:
+    """What `lift_files` with the same arguments would do, as `liftcore.plan` has it."""
+    settings = settings or LiftSettings.of()
+    sources = open_files(local_path(splats), local_path(cameras), features, settings)
+    return plan(*sources, settings, threads=threads, in_blocks=in_blocks)
 
 
 def open_files(

@@ -99,10 +99,20 @@ class OpenedLift:
         self._embeddings = arrays.get("embeddings")
         self.object, self.object_views = arrays.get("object"), arrays.get("object_views")
 
-    def encoder(self, encoder: TextEncoder | str | Path | None = None) -> TextEncoder:
+    def encoder(
+        self,
+        encoder: TextEncoder | str | Path | None = None,
+        *,
+        hint: str = "give encoder=, or vectors",
+        stand_in: bool = True,
+    ) -> TextEncoder:
         """The encoder of a specification, opened once and with its last texts remembered; one of yours as it is.
 
-        None: the lift's own words, else that of its text space, or the table of it that ships.
+        None: the lift's own words, else that of its text space.
+
+        Args:
+            hint: what to do where there is none. stand_in: where the weights of the space's encoder cannot be had,
+                take the table of it that ships, which knows its own words alone.
 
         Raises:
             InvalidQuery: it is something else, or the lift's text space names none.
@@ -119,10 +129,8 @@ class OpenedLift:
             return self.table
         key = None if encoder is None else str(encoder)
         if key not in self._encoders:
-            hint = "give encoder=, or vectors"
-            opened = (
-                encoder_of_space(self.metadata.text_space, hint, stand_in=True) if key is None else open_encoder(key)
-            )
+            space = self.metadata.text_space
+            opened = encoder_of_space(space, hint, stand_in=stand_in) if key is None else open_encoder(key)
             self._encoders[key] = RememberingEncoder(opened)
         return self._encoders[key]
 
@@ -366,11 +374,11 @@ class OpenedLift:
             InvalidQuery: its image is larger than pictures may be.
             InvalidLift: the cameras moved or changed since the lift.
         """
-        from liftcore.scene.cameras import drawn_by, photo_size
+        from liftcore.scene.cameras import drawn_by
         from liftcore.scene.drawing import in_photo
 
         camera = self.camera(view)
-        for width, height in (photo_size(camera), photo_size(drawn_by(camera))):
+        for width, height in (camera.photo_size, drawn_by(camera).photo_size):
             if width * height > MOST_PIXELS:
                 raise InvalidQuery(
                     "view", expected=f"an image of at most {MOST_PIXELS} pixels to draw",

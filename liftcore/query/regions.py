@@ -95,8 +95,6 @@ def _labelled(regions: Regions, example: Region) -> np.ndarray:
 
 def _map_places(scene: OpenedLift, view: str, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """[H] and [W], the row and column of the label map [L, h, w] that each row and column of the photo reads."""
-    from liftcore.scene.cameras import photo_size
-
-    width, height = photo_size(scene.cameras[view])
+    width, height = scene.cameras[view].photo_size
     rows, columns = ((np.arange(n) + 0.5) * m / n for n, m in zip((height, width), labels.shape[1:], strict=True))
     return rows.astype(np.int64), columns.astype(np.int64)

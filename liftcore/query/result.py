@@ -155,9 +155,20 @@ class LiftResult(Lift):
         with shown_progress(progress) as reporter:
             return refine(self, splats, smoothness, reporter, threads)
 
-    def save(self, path: Path | str) -> None:
-        """Write a lift file (`liftcore.values.lift_file`), whole or not at all."""
-        save_lift(self, path)
+    def save(self, path: Path | str, *, progress: Progress | bool | None = False) -> None:
+        """Write a lift file (`liftcore.values.lift_file`), whole or not at all.
+
+        Args:
+            path: a file; with ``.shards`` at its end, a folder of shards. Either may lie elsewhere (`io.remote`).
+            progress: as `liftcore.lift` has it; there is one step.
+
+        Raises:
+            InvalidInput: it lies elsewhere and cannot be sent there.
+        """
+        from liftcore.runtime.progress import one_step, shown_progress
+
+        with shown_progress(progress) as reporter, one_step(reporter, "save"):
+            save_lift(self, path)
 
     def show(
         self,

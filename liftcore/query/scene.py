@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from liftcore.errors import InvalidLift
 from liftcore.query.opened import OpenedLift
-from liftcore.runtime.progress import Progress, silent
+from liftcore.runtime.progress import Progress, shown_progress
 
 if TYPE_CHECKING:  # these load torch
     import numpy as np
@@ -161,22 +161,24 @@ class Scene(OpenedLift):
         vectors: Any = None,
         *,
         encoder: TextEncoder | str | Path | None = None,
-        progress: Progress = silent,
+        progress: Progress | bool | None = False,
     ) -> Segmentation:
         """Name every splat by the word that it is most like, or by none (`liftcore.query.segment`).
 
         Args:
             words: n different ones; None: all words of the encoder, which is a table. vectors: as in `catalogue`.
+            progress: as `liftcore.lift` has it.
         """
         from liftcore.query.presence import references_of
         from liftcore.query.segment import segment
 
-        if vectors is not None:
-            return segment(self, words or (), vectors, progress)
-        reader = self.encoder(encoder)
-        words = self.words(reader) if words is None else words
-        references = references_of(reader, self.metadata.text_space)
-        return segment(self, words, reader.encode(words), progress, references)
+        with shown_progress(progress) as reporter:
+            if vectors is not None:
+                return segment(self, words or (), vectors, reporter)
+            reader = self.encoder(encoder)
+            words = self.words(reader) if words is None else words
+            references = references_of(reader, self.metadata.text_space)
+            return segment(self, words, reader.encode(words), reporter, references)
 
     def what(
         self,

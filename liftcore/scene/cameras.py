@@ -266,6 +266,12 @@ class Camera:
         return float(self.K[1, 2])
 
     @property
+    def photo_size(self) -> tuple[int, int]:
+        """Width and height in pixels of the photo that it stands for: with a lens larger than its own."""
+        whole = self.lens or self
+        return whole.width, whole.height
+
+    @property
     def centre(self) -> np.ndarray:
         """[3] f64, the camera's centre in the world frame."""
         rotation, translation = self.viewmat[:3, :3], self.viewmat[:3, 3]
@@ -523,18 +529,12 @@ def faces_of(name: str, width: int, height: int, viewmat: np.ndarray) -> list[Ca
     return found
 
 
-def photo_size(camera: Camera) -> tuple[int, int]:
-    """Width and height in pixels of the photo that a camera stands for."""
-    whole = camera.lens or camera
-    return whole.width, whole.height
-
-
 def photo_sizes(photos: Collection[str], cameras: Cameras) -> dict[str, tuple[int, int]]:
     """Photo's name -> width and height in pixels, as the camera or the panorama says that it is paired with."""
     panoramas = {
         camera.face.photo: (camera.face.width, camera.face.height) for camera in cameras.values() if camera.face
     }
-    known = {name: photo_size(camera) for name, camera in cameras.items()}
+    known = {name: camera.photo_size for name, camera in cameras.items()}
     paired = cameras_of_views(photos, [*known, *(name for name in panoramas if name not in known)])
     return {photo: known.get(name) or panoramas[name] for photo, name in paired.items()}
 

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from liftcore.runtime.jit import vectorised
 from liftcore.runtime.one_thread import one_thread
-from liftcore.scene.cameras import Camera, photo_size
+from liftcore.scene.cameras import Camera
 from liftcore.scene.compositing import LOW_PASS, MAX_LOG_SCALE
 from liftcore.scene.splats import Splats
 from liftcore.solve.codebook import row_lengths
@@ -297,7 +297,7 @@ def _shapes(packs: Views, camera: Camera) -> str:
 
 def _photo(packs: Views, camera: Camera) -> tuple[int, int]:
     face = (packs.seeing(camera.name) or camera).face  # None of a map of the face itself
-    return photo_size(camera) if face is None else (face.width, face.height)
+    return camera.photo_size if face is None else (face.width, face.height)
 
 
 def _odd(size: tuple[int, int], photo: tuple[int, int]) -> bool:

@@ -17,7 +17,7 @@ its neighbours by ``a_jk sqrt(w_k)``, and those behind it the mean of these, rin
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -134,17 +134,6 @@ def smooth(
             "are less smooth than asked for"
         )
     return X, facts
-
-
-def smoothing_line(facts: Mapping[str, Any]) -> str:
-    """The facts of the step, as a sentence for people."""
-    moved = "not at all" if facts["moved"] is None else f"by {facts['moved']:.1%} of their length"
-    by = "place and colour" if facts["colours"] else "place alone, as the splats have no colours"
-    return (
-        f"smoothness {facts['smoothness']:g}: features moved {moved} towards their neighbours' in {by}; "
-        f"{facts['filled']} splats without evidence took their neighbours' "
-        f"({facts['steps']} steps, {facts['residual']:.1g} of the gradient left)"
-    )
 
 
 def warm_up_smoothing() -> None:

@@ -359,6 +359,11 @@ class LiftSettings(BaseModel):
         return cls.of(**chosen | own | dict(others))
 
     @classmethod
+    def hint_of_name(cls, name: str) -> str:
+        """A hint that names the settings most like one that is not there."""
+        return nearest(name.replace("-", "_"), cls.model_fields, 3)
+
+    @classmethod
     def of_json(cls, values: Mapping[str, Any]) -> Self:
         """Settings from JSON, where a number is a number and a boolean no number.
 

@@ -18,7 +18,7 @@ import httpx
 import numpy as np
 from PIL import Image
 
-from liftcore.cli.options import Parser
+from liftcore.cli import Parser
 from liftcore.errors import InvalidInput, SplatliftError, Unavailable
 from liftcore.text import NO_WORDS
 

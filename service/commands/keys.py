@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from liftcore.cli.options import Parser, whole
+from liftcore.cli import Parser, whole
 from liftcore.errors import NotFound
 from service.commands.serve import data_directory_errors
 from service.errors import InvalidRequest

@@ -23,7 +23,7 @@ from types import FrameType
 import uvicorn
 from fastapi import FastAPI
 
-from liftcore.cli.options import Parser
+from liftcore.cli import Parser
 from service.app import assemble
 from service.auth import is_loopback
 from service.encoders import require_encoder_files

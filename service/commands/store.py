@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from liftcore.cli.options import Parser
+from liftcore.cli import Parser
 from liftcore.errors import NotFound
 from service.commands.serve import data_directory_errors
 from service.settings import ServiceSettings, read_settings

@@ -24,9 +24,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import Parser
+from liftcore.cli import Parser, place
 from liftcore.errors import InvalidInput, InvalidLift, Unavailable
-from liftcore.io.remote import place
 from liftcore.text import BUILT_IN, NO_WORDS, OWN_WORDS
 from service.app import assemble
 from service.commands.serve import bind, server_of

@@ -10,7 +10,7 @@ from typing import Any
 
 from liftcore.io.json_file import finite
 from liftcore.lifting.checkpoint import Checkpoint
-from liftcore.lifting.engines import engine_named
+from liftcore.lifting.engines import open_engine
 from liftcore.lifting.files import lift_files
 from liftcore.lifting.pipeline import log_warnings
 from liftcore.lifting.planning.plan import Plan
@@ -38,7 +38,7 @@ def lift_as_ordered(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
 
     settings = LiftSettings.of(**order["settings"])
     address = order["ray_address"] if order["engine"] == "ray" else None
-    engine = engine_named(order["engine"], address, order["threads"])
+    engine = open_engine(order["engine"], address, order["threads"])
     made = lift_files(
         Path(order["splats"]),
         Path(order["cameras"]),

@@ -190,7 +190,7 @@ def test_our_own_fault_exits_1_with_one_line(
     def broken(path: Path) -> dict[str, Any]:
         raise RuntimeError("two\nlines")
 
-    monkeypatch.setattr("liftcore.evaluate.inspect.inspect_file", broken)
+    monkeypatch.setattr("liftcore.evaluate.inspect_file", broken)
     status, out, err = run(capsys, "inspect", scene, "--json")
     assert (status, out) == (1, "")
     assert_one_line(err)

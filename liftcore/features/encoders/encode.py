@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,10 +16,13 @@ from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from liftcore.errors import InvalidInput
-from liftcore.features.encoders import ImageEncoder, Pixels
-from liftcore.features.folders import files_below, grids_of
-from liftcore.io.photos import ORIENTATION, UNREAD, UPRIGHT, PhotoHeader, Reading, header_of
-from liftcore.runtime.progress import Progress, silent
+from liftcore.features.encoders import ImageEncoder, Pixels, open_image_encoder
+from liftcore.features.folders import files_below, folders_of, grids_of
+from liftcore.io.cameras import read_cameras
+from liftcore.io.outputs import check_output, writing
+from liftcore.io.photos import ORIENTATION, UNREAD, UPRIGHT, PhotoHeader, Reading, header_of, orientation_warnings
+from liftcore.runtime.progress import Progress, shown_progress, silent
+from liftcore.scene.cameras import Cameras, photo_sizes
 from liftcore.scene.views import IMAGE_SUFFIXES, require_name, without_image_suffix
 from liftcore.values.pack import write_pack
 from liftcore.values.views import check_finite
@@ -58,7 +62,7 @@ class Encoded:
     wide: tuple[str, ...]  # views that float16 cannot hold, stored as float32
 
 
-def encode_images(
+def write_encoded(
     images: Mapping[str, Path],
     encoder: ImageEncoder,
     out: Path,
@@ -136,6 +140,66 @@ def _stored(grid: Tensor, name: str, settings: EncodeSettings) -> Tensor:
     if settings.normalised:
         grid = torch.nn.functional.normalize(grid, dim=-1)
     return grid if float(grid.abs().max()) > LARGEST_F16 else grid.to(torch.float16)
+
+
+def encode_images(
+    images: Sequence[Path],
+    out: Path,
+    encoder: ImageEncoder | str,
+    *,
+    device: str = "cpu",
+    cameras: Cameras | Path | str | None = None,
+    size: int | None = None,
+    batch: int = 1,
+    normalised: bool = True,
+    progress: Progress | bool | None = None,
+) -> dict[str, Any]:
+    """Encode photos and write them as a feature pack, whole or not at all.
+
+    Args:
+        images: images, and folders of them; a view is named after its image.
+        out: the pack to write.
+        encoder: or its specification, as `open_image_encoder` takes it.
+        device: where a model that is opened runs, as torch names it.
+        cameras: of the photos, or where they lie: their sizes tell whether photos with an EXIF orientation are read
+            as stored or turned.
+        size, batch, normalised: as `EncodeSettings` has them.
+        progress: as `liftcore.lift` has it.
+
+    Returns:
+        Plain facts of the pack, ready for JSON, with ``warnings``.
+
+    Raises:
+        InvalidInput: a file is no image, the size is too large or too small, a feature is not finite, the pack cannot
+            be written, or the encoder's specification is none.
+        Unavailable: the weights, or the device, are not on this machine.
+    """
+    photos = find_images(images)
+    check_output(out, list(photos.values()), "pack")
+    opened = open_image_encoder(encoder, device) if isinstance(encoder, str) else encoder
+    if isinstance(cameras, Path | str):
+        cameras = read_cameras(cameras, views=list(photos))
+    sizes = {} if cameras is None else photo_sizes(photos, cameras)
+    with shown_progress(progress) as reporter, writing(out):
+        encoded = write_encoded(photos, opened, out, EncodeSettings(size, batch, normalised), reporter, sizes)
+    warnings = orientation_warnings(encoded.readings, "their cameras")
+    if encoded.wide:
+        warnings.append(f"{len(encoded.wide)} views have features beyond float16 and are stored as float32")
+    if opened.text_space == "none":
+        warnings.append("these features have no words: a lift of them is asked by example")
+    return {
+        "out": str(out),
+        "bytes": out.stat().st_size,
+        "views": encoded.views,
+        "folders": folders_of(photos),
+        "channels": opened.channels,
+        "patch": opened.pixels.patch,
+        "size": size or opened.pixels.shorter,
+        "encoder": opened.name,
+        "text_space": opened.text_space,
+        "normalised": normalised,
+        "warnings": warnings,
+    }
 
 
 def find_images(paths: Sequence[Path]) -> dict[str, Path]:

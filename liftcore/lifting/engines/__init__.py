@@ -12,8 +12,12 @@ if TYPE_CHECKING:
 ENGINES = ("local", "ray")
 
 
-def engine_named(name: str | None, address: str | None = None, threads: int | None = None) -> Engine | None:
-    """The engine of that name; None for none.
+def open_engine(name: str | None, address: str | None = None, threads: int | None = None) -> Engine | None:
+    """The engine of a name, which `liftcore.lift` takes; None for none.
+
+    Args:
+        name: local or ray. address: of the Ray cluster, ``HOST:PORT`` or ``auto``; None starts one here. threads: of
+            the local engine.
 
     Raises:
         InvalidSettings: there is none, or an address without Ray. Unavailable: as `RayEngine` has it.

@@ -21,7 +21,7 @@ from typing import Any, cast
 import pytest
 
 import liftcore as lc
-from liftcore.lifting.engines import engine_named
+from liftcore.lifting.engines import open_engine
 from liftcore.lifting.engines.base import LocalEngine
 from liftcore.lifting.engines.ray import RayEngine, check_reach
 from liftcore.values.pack import write_pack
@@ -142,9 +142,9 @@ def test_cluster_that_others_reach_must_ask_for_a_token(monkeypatch: pytest.Monk
 
 
 def test_engines_are_named() -> None:
-    assert engine_named(None) is None
-    assert isinstance(engine_named("local", threads=1), LocalEngine)
+    assert open_engine(None) is None
+    assert isinstance(open_engine("local", threads=1), LocalEngine)
     with pytest.raises(lc.InvalidSettings, match="engine: expected local or ray, got 'dask'"):
-        engine_named("dask")
+        open_engine("dask")
     with pytest.raises(lc.InvalidSettings, match="an address beside the engine ray alone"):
-        engine_named("local", "auto")
+        open_engine("local", "auto")

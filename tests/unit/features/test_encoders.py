@@ -22,10 +22,10 @@ from liftcore.features.encoders.encode import (
     MAX_CELLS,
     Encoded,
     EncodeSettings,
-    encode_images,
     find_images,
     grid_size,
     read_image,
+    write_encoded,
 )
 from liftcore.features.encoders.timm_backbone import TimmEncoder, cell_shift
 from liftcore.io.photos import Reading, read_header
@@ -67,7 +67,7 @@ def encode(tmp_path: Path) -> Encode:
     ) -> tuple[Encoded, dict[str, Tensor]]:
         out = tmp_path / "out" / "pack.safetensors"
         chosen = EncodeSettings(**{"normalised": False, **settings})
-        done = encode_images(find_images([folder]), encoder or MeanColour(), out, chosen, sizes=sizes)
+        done = write_encoded(find_images([folder]), encoder or MeanColour(), out, chosen, sizes=sizes)
         assert [path.name for path in out.parent.iterdir()] == [out.name]
         packs = read_features(out)
         grids = {}

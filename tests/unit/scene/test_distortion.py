@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from liftcore.errors import InvalidCameras
 from liftcore.io.colmap import MODELS_BY_NAME, calibration
-from liftcore.scene.cameras import Camera, behind_lens, distortion_warning, drawn_by, photo_size, pixel_of
+from liftcore.scene.cameras import Camera, behind_lens, distortion_warning, drawn_by, pixel_of
 from liftcore.scene.distortion import FARTHEST, Brown, Distortion, Fisheye, Lens, photo_places
 
 POINTS = np.array([[0.1, 0.2], [-0.6, 0.45], [0.7, -0.5], [0.0, 0.55]])
@@ -121,7 +121,7 @@ def lens_of(view: Camera) -> Lens:
 def test_the_pinhole_of_a_photo_is_the_largest_that_it_shows_whole(name: str) -> None:
     view = camera(LENSES[name])
     lens = lens_of(view)
-    assert photo_size(view) == (64, 48)
+    assert view.photo_size == (64, 48)
     assert (view.fx, view.fy) == (lens.fx, lens.fy)
 
     def outside(of: Camera) -> float:

@@ -1,0 +1,121 @@
+"""Files to write, looked at before the work: an hour of it is not lost over a misspelt name."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from liftcore.errors import InvalidInput
+from liftcore.io.remote import is_remote, require_storage
+
+
+@dataclass(frozen=True)
+class OutputType:
+    """What is written to a file."""
+
+    name: str  # as errors have it
+    suffixes: tuple[str, ...]
+    kind: str | None  # of `liftcore.io.kinds`, that a file may have which is replaced
+    kind_name: str = ""  # of a file without a kind, what the name of its kind begins with; empty: of a text
+
+
+OUTPUT_TYPES = {
+    "splats": OutputType("splats", (".ply", ".splat", ".spz"), "splats"),
+    "ply": OutputType("a PLY", (".ply",), "splats"),
+    "png": OutputType("a picture", (".png",), None, "a picture"),
+    "npy": OutputType("an array", (".npy",), None, "a NumPy array"),
+    "lift": OutputType("a lift", (".safetensors", ".shards"), "lift"),
+    "pack": OutputType("a feature pack", (".safetensors",), "features"),
+    "csv": OutputType("a table", (".csv",), None),
+    "json": OutputType("JSON", (".json",), None),
+}
+CONVERTED = (".sog", ".glb", ".html", ".csv", ".compressed.ply", ".splat", ".spz")  # which splat-transform writes
+
+
+def check_output(path: Path | str, inputs: Sequence[Path], kind: str) -> Path | str:
+    """An output path that can be written, and is no folder, none of the inputs and no file of another kind.
+
+    A file of the kind that is written is replaced. Of a lift that lies elsewhere (`liftcore.io.remote`) the storage
+    is looked at; of one in shards the index is the file.
+
+    Args:
+        path: as the user gave it. inputs: files, and folders of cameras, that are read for it. kind: what goes there,
+            one of OUTPUT_TYPES.
+
+    Returns:
+        The file: the path itself, or the index of a folder of shards.
+
+    Raises:
+        InvalidInput: it is one of these, its suffix is not written, no file can be made there, or its storage does
+            not open.
+    """
+    from liftcore.io.shards import INDEX, SUFFIX
+
+    if is_remote(path):
+        require_storage(str(path))
+        return path
+    path = Path(path)
+    if kind == "lift" and path.suffix == SUFFIX:
+        path, kind = path / INDEX, "json"
+    written = OUTPUT_TYPES[kind]
+    with writing(path):
+        if path.is_dir():
+            raise InvalidInput("output", expected="a file to write", got=f"the folder {path}")
+        if path.exists() and any(map(path.samefile, _files_of(inputs))):
+            raise InvalidInput("output", expected="another file than the inputs", got=str(path))
+        _require_suffix(path, written)
+        _require_same_kind(path, written)
+        folder = next(parent for parent in path.absolute().parents if os.path.lexists(parent))
+        if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
+            raise InvalidInput("output", expected="a folder that can be written", got=str(folder))
+    return path
+
+
+def _files_of(inputs: Sequence[Path]) -> list[Path]:
+    """The files of inputs that are there; of a folder of cameras those that are read."""
+    from liftcore.io.cameras import camera_source
+
+    files = (file for source in inputs for file in (camera_source(source).files if source.is_dir() else [source]))
+    return [file for file in files if file.exists()]
+
+
+def _require_suffix(path: Path, written: OutputType) -> None:
+    name = path.name.lower()
+    if name.endswith(written.suffixes) and not name.endswith(".compressed.ply"):
+        return
+    hint = ""
+    if ".ply" in written.suffixes and name.endswith(CONVERTED):
+        stem = path.name[: -len(next(suffix for suffix in CONVERTED if name.endswith(suffix)))]
+        hint = f"write {stem}.ply, and convert it: npx @playcanvas/splat-transform {stem}.ply {path.name}"
+    ends = " or ".join(written.suffixes)
+    raise InvalidInput("output", expected=f"a name of {written.name}, ending in {ends}", got=str(path), hint=hint)
+
+
+def _require_same_kind(path: Path, written: OutputType) -> None:
+    from liftcore.io.kinds import identify
+
+    if not path.is_file() or path.stat().st_size == 0:
+        return
+    found = identify(path)
+    is_unnamed = found.kind is None and found.name.startswith(written.kind_name)
+    if not (found.kind == written.kind if written.kind else is_unnamed):
+        expected = f"a new file, or one of {written.name} to replace"
+        hint = "name another file, or remove that one first"
+        raise InvalidInput("output", expected=expected, got=f"{path}, which is {found.name}", hint=hint)
+
+
+@contextmanager
+def writing(path: Path | str) -> Iterator[None]:
+    """Say which output failed, and why, when the disk is full or the folder is not for us to write.
+
+    Raises:
+        InvalidInput: the operating system refused.
+    """
+    try:
+        yield
+    except OSError as error:
+        got = f"{path} ({error.strerror or error})"
+        raise InvalidInput("output", expected="a file that can be written", got=got) from None

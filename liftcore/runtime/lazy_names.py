@@ -1,0 +1,44 @@
+"""Names of a package that are loaded when they are asked for, as its stub lists them."""
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from typing import Any
+
+
+def lazy_names(package: str, file: str) -> "tuple[Callable[[str], Any], Callable[[], list[str]]]":
+    """``__getattr__`` and ``__dir__`` of a module beside whose file lies a stub (``.pyi``) of imports alone.
+
+    The stub is read when the first name is asked for. ``__all__`` is its names, sorted, without ``__version__``.
+    """
+    modules: dict[str, str] = {}
+
+    def read_stub() -> dict[str, str]:
+        import re
+        from pathlib import Path
+
+        if not modules:
+            stub = Path(file).with_suffix(".pyi").read_text(encoding="utf-8")
+            modules.update((name, module) for module, name in re.findall(r"(?m)^from (\S+) import (\w+)", stub))
+        return modules
+
+    def get(name: str) -> "Any":
+        import sys
+        from importlib import import_module
+
+        known = read_stub()
+        if name == "__all__":
+            value = sorted(known.keys() - {"__version__"})
+        elif name in known:
+            value = getattr(import_module(known[name]), name)
+        else:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        vars(sys.modules[package])[name] = value
+        return value
+
+    def names() -> list[str]:
+        import sys
+
+        return sorted({*vars(sys.modules[package]), *read_stub()})
+
+    return get, names
