@@ -1,4 +1,4 @@
-"""What can be wrong with what a user gives us.
+"""Public: errors, of what can be wrong with what a user gives us.
 
     SplatliftError                 every error that is the user's to mend
     ├── InvalidInput               a file or value is malformed      -> exit 2, HTTP 422
@@ -18,6 +18,11 @@ Every error names the argument, what was expected and what came, and says what t
 """
 
 from __future__ import annotations
+
+__all__ = [
+    "InvalidCameras", "InvalidFeatures", "InvalidInput", "InvalidLift", "InvalidMasks", "InvalidPhotos",
+    "InvalidQuery", "InvalidSettings", "InvalidSplats", "InvalidTable", "NotFound", "SplatliftError", "Unavailable",
+]  # fmt: skip
 
 
 class SplatliftError(Exception):

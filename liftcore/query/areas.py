@@ -34,7 +34,6 @@ def feature_shown(scene: OpenedLift, area: Area) -> np.ndarray:
         InvalidQuery: the area is empty, reaches out of the image, lies at the rim of a wide lens, or shows no scene.
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
-
     camera = scene.cameras[area.view]
     inside, around = _pixels(area, *camera.photo_size)
     rows = _rendered(scene, camera, area, inside)

@@ -1,4 +1,4 @@
-"""Text encoders behind one protocol: words in, unit vectors out. Importing this loads no torch."""
+"""Public: text encoders behind one protocol, words in, unit vectors out. Importing this loads no torch."""
 
 import logging
 from collections import OrderedDict
@@ -11,6 +11,7 @@ import numpy as np
 from liftcore.errors import InvalidQuery, Unavailable
 from liftcore.runtime.plugins import find_plugin, plugin_names
 
+__all__ = ["BUILT_IN", "NO_WORDS", "OWN_WORDS", "TextEncoder", "open_encoder"]
 ENCODER_SPECS = (
     "table:FILE.safetensors",
     "lvis",
