@@ -75,6 +75,7 @@ serve: $(READY)
 # Needs Node.js with npm; what it builds is committed, so that nobody else does.
 web: $(READY)  ## the page, from service/web/src into service/web/built
 	$(BIN)/python -m liftcore.io.kinds > service/web/src/kinds.json
+	$(BIN)/python -m liftcore.query.question > service/web/src/question.json
 	cd service/web && npm ci --silent && node build.mjs
 	cp service/web/node_modules/axe-core/axe.min.js tests/browser/axe.min.js
 

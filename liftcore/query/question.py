@@ -7,6 +7,7 @@ Nothing here loads numpy or torch: help and the HTTP process do without.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable, Mapping
 from functools import cached_property
@@ -466,3 +467,13 @@ class CoveringRegion(Value):
     level: int = Field(description="of the view's label map")
     region: int = Field(description="its label there")
     share: float = Field(description="of the view's pixels that it covers")
+
+
+def page_fields() -> dict[str, Any]:
+    """What the page knows of a question: the JSON schema of each field that decides what is found."""
+    fields = Query.model_json_schema()["properties"]
+    return {name: fields[name] for name in Query.deciding()}
+
+
+if __name__ == "__main__":  # what `make web` builds the page with
+    print(json.dumps(page_fields(), indent=1))

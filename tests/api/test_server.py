@@ -24,6 +24,7 @@ from safetensors.numpy import save
 
 from liftcore.cli import build_parser, main
 from liftcore.lifting.files import lift_files
+from liftcore.query.question import page_fields
 from liftcore.values.lift_file import save_lift
 from liftcore.values.settings import LiftSettings
 from service.commands.serve import settings_of
@@ -247,6 +248,11 @@ def test_built_page_is_of_these_sources() -> None:
     for name in ("page.js", "page.css"):
         assert told in (WEB / name).read_text(encoding="utf-8").split("\n", 1)[0], "run `make web`"
     assert (WEB / "page.html").read_text(encoding="utf-8").count(f"?{digest.hexdigest()[:16]}") == 2
+
+
+def test_page_knows_every_field_of_a_question() -> None:
+    built = WEB.parent / "src" / "question.json"
+    assert json.loads(built.read_text(encoding="utf-8")) == page_fields(), "run `make web`"
 
 
 def test_page_names_its_libraries_and_no_registry() -> None:

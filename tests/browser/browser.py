@@ -98,13 +98,17 @@ class Browser:
 
     def press(self, selector: str, x: float = 0.5, y: float = 0.5, *, shift: bool = False) -> None:
         """Click an element, x and y as shares of its box."""
+        self.drag(selector, (x, y), shift=shift)
+
+    def drag(self, selector: str, *places: tuple[float, float], shift: bool = False) -> None:
+        """Press the mouse at the first place, shares of an element's box, and let it go at the last."""
         self.value(f"document.querySelector({json.dumps(selector)}).scrollIntoView({{block: 'nearest'}})")
         box = self.value(f"document.querySelector({json.dumps(selector)}).getBoundingClientRect().toJSON()")
-        place = {"x": box["left"] + x * box["width"], "y": box["top"] + y * box["height"]}
-        for kind in ("mousePressed", "mouseReleased"):
-            self._call(
-                "Input.dispatchMouseEvent", type=kind, button="left", clickCount=1, modifiers=SHIFT * shift, **place
-            )
+        points = [{"x": box["left"] + x * box["width"], "y": box["top"] + y * box["height"]} for x, y in places]
+        moves = [("mouseMoved", point) for point in points[1:]]
+        for kind, point in (("mousePressed", points[0]), *moves, ("mouseReleased", points[-1])):
+            mouse = {"button": "left", "buttons": 1, "clickCount": 1, "modifiers": SHIFT * shift}
+            self._call("Input.dispatchMouseEvent", type=kind, **mouse, **point)
 
     def key(self, name: str, *, shift: bool = False) -> None:
         """Press a key and let it go."""

@@ -283,10 +283,15 @@ def test_link_opens_question_layer_and_camera_again(page: Browser, served: Serve
     page.until(FOUND)
     assert page.value(WORDS) == ["apple", "lamp"] and page.value("splatlift.look.what") == "pca"
     assert page.value("splatlift.viewer.place3d") == pytest.approx(place, rel=1e-3, abs=1e-3)
-    page.open(f"{served.address}/?lift={served.lift}&view=right&text=apple&threshold=0.5&what=odd&show=odd")
+    rest = "instances=2&keep=largest&weigh=odd"
+    page.open(f"{served.address}/?lift={served.lift}&view=right&text=apple&threshold=0.5&what=odd&show=odd&{rest}")
     page.until(READY)
     page.until(FOUND)
     assert page.value("[splatlift.look.view.name, splatlift.ask.now.cut]") == ["right", 0.5]
+    asked = dict(page.value("[...splatlift.ask.parameters(splatlift.ask.now)]"))
+    given = {"threshold": "0.5", "instances": "2", "keep": "largest", "absent": "keep"}  # a cut holds all the same
+    assert asked == {"lift": served.lift, "text": "apple", **given}
+    assert "instances=2" in page.value("location.search") and "weigh" not in page.value("location.search")
     assert page.value("[splatlift.look.what, splatlift.look.mode]") == ["rgb", "scene"]
 
 
@@ -310,6 +315,15 @@ def test_photo_view_shows_the_mask_and_takes_examples(page: Browser) -> None:
     page.until(f"{EXAMPLES}.length === 1")
     assert page.value(EXAMPLES) == ["left:7,12"]
     page.until("document.querySelectorAll('#picture .mark').length === 1")
+    page.drag("#render", (20.5 / 32, 2.5 / 24), (29.5 / 32, 21.5 / 24), shift=True)
+    page.until("splatlift.ask.now.unlike.length === 1")
+    assert page.value("splatlift.ask.now.unlike") == ["left:box:20,2,30,22"]
+    page.until(FOUND)
+    page.until("document.querySelectorAll('#picture .mark').length === 2")
+    box = page.value("document.querySelector('#picture .mark.box.unlike').getBoundingClientRect().toJSON()")
+    picture = page.value("document.querySelector('#render').getBoundingClientRect().toJSON()")
+    assert (box["left"] - picture["left"]) / picture["width"] == pytest.approx(20 / 32, abs=0.01)
+    assert box["width"] / picture["width"] == pytest.approx(10 / 32, abs=0.03)
     page.value("document.querySelector('#mask').width = 3200")  # as many pixels as a window does not have
     for width, height in ((1200, 700), (1000, 500), (390, 844)):
         page.window(width, height)

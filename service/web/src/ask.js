@@ -2,6 +2,7 @@
 import { at, count, el, percent, plural, tell } from "./dom.js";
 import { countFrom, drawHistogram, histogram, passing } from "./histogram.js";
 import { COLOURS, rgb } from "./painter.js";
+import { asked, blank, linked, notation, read, search } from "./question.js";
 import { bytes, json, npy, words } from "./service.js";
 
 const MOST = COLOURS.length; // questions at a time
@@ -12,6 +13,7 @@ export class Ask {
   constructor({ changed, fly }) {
     Object.assign(this, { changed, fly, questions: [], active: 0, thing: -1, negatives: [], heat: false, turn: 0, lift: null });
     at("query").addEventListener("submit", event => { event.preventDefault(); this.fromForm(); });
+    Object.assign(at("example"), { maxLength: notation.maxLength, placeholder: notation.description, title: notation.description });
     at("by-example").addEventListener("submit", event => { event.preventDefault(); this.typed(false); });
     at("less").addEventListener("click", () => this.typed(true));
     at("clear").addEventListener("click", () => this.reset(true));
@@ -94,55 +96,52 @@ export class Ask {
   // From a link.
   restore(parameters) {
     const given = name => parameters.getAll(name);
-    this.questions = given("text").slice(0, MOST).map((text, place) => fresh({ text: [text] }, place));
+    const terms = given("text").slice(0, MOST).map(text => ({ text: [text] }));
     at("words").value = given("text").join(", ");
     at("but").value = given("negatives").join(", ");
-    if (given("like").length) this.questions.push(fresh({ like: given("like") }, this.questions.length));
-    if (!this.questions.length) return undefined;
-    this.questions[this.questions.length - 1].unlike.push(...given("unlike"));
-    const cuts = given("threshold");
-    this.questions.forEach((question, place) => { question.threshold = number(cuts[place] ?? cuts[0]); });
+    if (given("like").length) terms.push({ like: given("like") });
+    if (!terms.length) return undefined;
+    terms.at(-1).unlike = given("unlike");
+    this.questions = terms.map((one, place) => fresh({ ...read(parameters, place), ...one }, place));
     at("heat").checked = this.heat = parameters.get("layer") === "attention" || parameters.has("heat");
     return this.ask();
   }
 
   link(parameters) {
-    for (const question of this.questions) {
-      for (const name of ["text", "like", "unlike"]) for (const term of question[name]) parameters.append(name, term);
-    }
-    for (const text of this.negatives) if (this.questions.length) parameters.append("negatives", text);
-    const cuts = this.questions.map(question => question.threshold);
-    if (cuts.some(cut => cut !== "auto")) for (const cut of cuts) parameters.append("threshold", cut);
+    const negatives = this.questions.length ? this.negatives : []; // the same of all
+    for (const [name, value] of search({ ...linked(this.questions), negatives })) parameters.append(name, value);
     if (this.heat) parameters.set("heat", "1");
   }
 
-  // What a question is in the service's notation.
+  // What the service is asked by a question.
+  body(question) {
+    const cut = question.threshold !== "auto" && !question.answer?.present; // which holds all the same
+    return { lift: this.lift.id, ...asked({ ...question, negatives: this.negatives, ...(cut && { absent: "keep" }) }) };
+  }
+
+  // The same in an address.
   parameters(question, more = {}) {
-    const asked = new URLSearchParams({ lift: this.lift.id, threshold: question.threshold, ...more });
-    for (const name of ["text", "like", "unlike"]) for (const term of question[name]) asked.append(name, term);
-    for (const text of this.negatives) asked.append("negatives", text);
-    if (question.threshold !== "auto" && !question.answer?.present) asked.set("absent", "keep"); // its cut holds all the same
-    return asked;
+    return search({ ...this.body(question), ...more });
   }
 
   async ask(only = null) {
     if (!this.lift) return;
     const mine = ++this.turn;
     const waits = question => !question.answer && !question.problem; // what it was asked last is late from here on
-    const asked = only ? this.questions.filter(question => question === only || waits(question)) : this.questions;
-    if (asked.length === this.questions.length) this.negatives = split(at("but").value); // else the others' answers are without
-    for (const question of asked) Object.assign(question, { answer: null, things: [], problem: null, anyway: false });
+    const anew = only ? this.questions.filter(question => question === only || waits(question)) : this.questions;
+    if (anew.length === this.questions.length) this.negatives = split(at("but").value); // else the others' answers are without
+    for (const question of anew) Object.assign(question, { answer: null, things: [], problem: null, anyway: false });
     this.thing = -1;
     at("stage").classList.add("asking");
     this.show();
-    await Promise.all(asked.map(question => this.answer(question, mine)));
+    await Promise.all(anew.map(question => this.answer(question, mine)));
     if (mine !== this.turn) return; // a later question was asked meanwhile
     at("stage").classList.remove("asking");
     this.show();
     this.changed();
-    const wrong = asked.find(question => question.problem);
+    const wrong = anew.find(question => question.problem);
     if (wrong) tell(words(wrong.problem), true);
-    await Promise.all(asked.map(question => this.things(question)));
+    await Promise.all(anew.map(question => this.things(question)));
   }
 
   async answer(question, mine) {
@@ -358,11 +357,10 @@ export class Ask {
   }
 }
 
-const fresh = (terms, place) => ({ text: [], like: [], unlike: [], threshold: "auto", things: [], ...terms, colour: COLOURS[place % COLOURS.length] });
+const fresh = (terms, place) => ({ ...blank(), things: [], ...terms, colour: COLOURS[place % COLOURS.length] });
 const split = text => text.split(",").map(word => word.trim()).filter(Boolean);
-const number = given => (given === undefined || given === "" || Number.isNaN(Number(given)) ? "auto" : Number(given));
 const lit = question => question.anyway || question.threshold !== "auto" || (question.answer.clear && question.answer.present !== false);
-const shown = term => term.replace(/^splat:/, "splat ").replace(/^region:(.*):(\d+):(\d+)$/, "a mask of $1");
+const shown = term => term.replace(/^splat:/, "splat ").replace(/^region:(.*):(\d+):(\d+)$/, "a mask of $1").replace(/^(.*):(box|stroke):[\d,\s]+$/, "a $2 of $1");
 export const label = question => question.text.join(", ") || (question.like.length > 1 ? `like ${question.like.length} examples` : `like ${shown(question.like[0] || "")}`);
 const quoted = question => (question.text.length ? `\u201c${question.text.join(", ")}\u201d` : "Such a thing");
 const measures = ({ low, high }) => ` ${low.map((value, axis) => (high[axis] - value).toPrecision(2)).join(" \u00d7 ")}`;
@@ -372,7 +370,7 @@ const reason = ({ why }) => why.replace(/^(?:'.*?'|".*?") is not there: (.)/, (_
 function decided({ answer, threshold, anyway }) {
   if (answer.present === false) return `It is not here; this is what comes closest. ${reason(answer)}`;
   if (!answer.clear && threshold === "auto" && anyway) return "This is what comes closest; it hardly stands apart from the rest.";
-  if (threshold !== "auto") return "You set this cut. The dashes mark the automatic one.";
+  if (typeof threshold === "number") return "You set this cut. The dashes mark the automatic one.";
   const how = /least, in log-odds/.test(answer.threshold.explanation)
     ? "moving it a little changes least of what is found" : "no gap is clear, so it splits the scores into two groups";
   return `The cut was found by itself: there, ${how}.`;

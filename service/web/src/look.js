@@ -16,6 +16,7 @@ const LAYERS = {
   depth: "The depth of the splats: near is bright.",
 };
 const MODES = ["scene", "both", "view"];
+const SHIFTED = 5; // pixels that the pointer may move in a click
 const IN_VIEWS = ["rgb", "pca", "cluster", "confidence", "depth"]; // that the service draws of a view
 
 export class Look {
@@ -30,7 +31,10 @@ export class Look {
     at("view").addEventListener("change", () => this.go(at("view").value));
     at("view-before").addEventListener("click", () => this.step(-1));
     at("view-after").addEventListener("click", () => this.step(1));
+    at("picture").addEventListener("pointerdown", event => this.pressed(event));
+    at("picture").addEventListener("pointermove", event => this.dragged(event));
     at("picture").addEventListener("click", event => this.clicked(event));
+    at("picture").addEventListener("dragstart", event => event.preventDefault()); // of the picture itself
   }
 
   get what() {
@@ -183,26 +187,65 @@ export class Look {
   marks() {
     for (const old of at("picture").querySelectorAll(".mark")) old.remove();
     for (const { term, unlike } of this.examples?.() || []) {
-      const place = /^(.*):(\d+),(\d+)$/.exec(term);
-      if (!place || place[1] !== this.view.name) continue;
-      at("picture").append(el("span", {
-        className: unlike ? "mark unlike" : "mark",
-        style: { left: `${100 * (Number(place[2]) + 0.5) / this.view.width}%`, top: `${100 * (Number(place[3]) + 0.5) / this.view.height}%` },
-      }));
+      const [, view, kind, listed] = AREA.exec(term) || [];
+      if (view !== this.view.name) continue;
+      const numbers = listed.split(",").map(Number);
+      if (kind === "box") this.mark(numbers, unlike);
+      else for (let place = 0; place < numbers.length; place += 2) this.mark(numbers.slice(place, place + 2), unlike);
     }
   }
 
+  mark([x0, y0, x1, y1], unlike) {
+    const className = `mark${unlike ? " unlike" : ""}${x1 === undefined ? "" : " box"}`;
+    at("picture").append(el("span", { className, style: this.placed(x1 === undefined ? [x0 + 0.5, y0 + 0.5] : [x0, y0, x1, y1]) }));
+  }
+
+  // Pixels of the view as shares of its picture.
+  placed([x0, y0, x1, y1]) {
+    const { width, height } = this.view;
+    const sides = x1 === undefined ? {} : { width: `${100 * (x1 - x0) / width}%`, height: `${100 * (y1 - y0) / height}%` };
+    return { left: `${100 * x0 / width}%`, top: `${100 * y0 / height}%`, ...sides };
+  }
+
+  // The pixel under the pointer, or the nearest one at the rim; null without a picture.
+  pixel({ clientX, clientY }) {
+    const { naturalWidth: width, naturalHeight: height } = at("render");
+    const box = at("render").getBoundingClientRect();
+    if (!width || !box.width) return null;
+    const within = (share, side) => Math.max(0, Math.min(side - 1, Math.floor(share * side)));
+    return [within((clientX - box.left) / box.width, width), within((clientY - box.top) / box.height, height)];
+  }
+
+  // A mouse or a pen draws a box; a finger moves the page.
+  pressed(event) {
+    this.from = event.button === 0 && event.pointerType !== "touch" ? { pixel: this.pixel(event), x: event.clientX, y: event.clientY } : null;
+    this.box = null;
+    at("drawn").hidden = true;
+    if (this.from?.pixel) at("picture").setPointerCapture(event.pointerId);
+  }
+
+  dragged(event) {
+    const { from } = this;
+    if (!from?.pixel || !event.buttons || (!this.box && Math.hypot(event.clientX - from.x, event.clientY - from.y) <= SHIFTED)) return;
+    const [across, down] = [0, 1].map(axis => [from.pixel[axis], this.pixel(event)[axis]].sort((one, other) => one - other));
+    this.box = [across[0], down[0], across[1] + 1, down[1] + 1];
+    Object.assign(at("drawn").style, this.placed(this.box));
+    at("drawn").hidden = false;
+  }
+
   clicked(event) {
-    const image = at("render");
-    const box = image.getBoundingClientRect();
-    if (!image.naturalWidth || !box.width || !event.detail) return;
-    const x = Math.floor((event.clientX - box.left) / box.width * image.naturalWidth);
-    const y = Math.floor((event.clientY - box.top) / box.height * image.naturalHeight);
-    if (x < 0 || y < 0 || x >= image.naturalWidth || y >= image.naturalHeight) return;
-    if (this.masks?.picking) this.masks.at(this.view.name, x, y, event.shiftKey);
-    else this.pick(`${this.view.name}:${x},${y}`, event.shiftKey);
+    const { box } = this;
+    this.box = this.from = null;
+    at("drawn").hidden = true;
+    const pixel = this.pixel(event);
+    if (!pixel || !event.detail) return;
+    if (box) this.pick(`${this.view.name}:box:${box}`, event.shiftKey);
+    else if (this.masks?.picking) this.masks.at(this.view.name, ...pixel, event.shiftKey);
+    else this.pick(`${this.view.name}:${pixel}`, event.shiftKey);
   }
 }
+
+const AREA = /^(.+?)(?::(box|stroke))?:\s*([\d,\s]+)$/; // the notation of a pixel, a box or a stroke
 
 // What a mask leaves out, under a veil; its edge in a colour.
 export function veiled(mask, [r, g, b]) {

@@ -165,7 +165,7 @@ export class Names {
     const asked = this.shown ? this.asked : this.body();
     const told = asked.words && !asked.words.length ? {} : asked;
     try {
-      const answer = await post("/query/what", { lift: lift.id, example, ...told, top: 5 });
+      const answer = await post("/query/what", { lift: lift.id, example, ...told });
       if (this.spot?.example !== example) return;
       this.spot.words = answer.words;
     } catch (problem) {

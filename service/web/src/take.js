@@ -1,5 +1,6 @@
 // The panel of taking away: files of the question on the screen, and the lines that ask it elsewhere.
 import { at, el, tell } from "./dom.js";
+import { search } from "./question.js";
 import { keyOf, save, saveBlob, words } from "./service.js";
 
 export class Take {
@@ -55,33 +56,24 @@ export class Take {
       at("python").textContent = posted("segment", JSON.stringify(this.named(), null, 1), ['for word in found["found"]:', '    print(word["value"], word["word"], word["splats"])']);
       return;
     }
-    const asked = [...this.ask.parameters(now)].map(([name, value]) => ` \\\n  --data-urlencode ${quote(`${name}=${value}`)}`).join("");
-    at("curl").textContent = `curl -fsSG${key} ${address()}${asked}`;
-    at("python").textContent = (local(now) ? ofFile : overHttp)(this.ask.parameters(now), now.answer.encoder);
+    const asked = this.ask.body(now);
+    const terms = [...search(asked)].map(([name, value]) => ` \\\n  --data-urlencode ${quote(`${name}=${value}`)}`).join("");
+    at("curl").textContent = `curl -fsSG${key} ${address()}${terms}`;
+    at("python").textContent = local(now) ? ofFile(asked, now.answer.encoder)
+      : posted("", JSON.stringify(asked, null, 1), ['print(found["count"], found["why"], found["threshold"])']);
   }
 }
 
 // Encoders that open on any machine by their name alone; `prompts` are the lift's own words.
 const local = ({ text, like, unlike, answer }) => text.length && !like.length && !unlike.length && ["lvis", "minilm", "prompts"].includes(answer.encoder);
 const address = what => new URL(what ? `query/${what}` : "query", document.baseURI); // also behind a proxy's prefix
-const list = terms => `[${terms.map(term => JSON.stringify(term)).join(", ")}]`;
-
-const TERMS = ["text", "like", "unlike", "negatives"];
 
 // The question in Python, of the lift file.
-function ofFile(asked, encoder) {
-  const given = [list(asked.getAll("text")), asked.has("negatives") && list(asked.getAll("negatives")), encoder !== "prompts" && `encoder="${encoder}"`, asked.get("threshold") !== "auto" && `threshold=${asked.get("threshold")}`,
-    asked.has("absent") && 'absent="keep"'].filter(Boolean).join(", ");
-  return ["import liftcore as lc", "", `lift = lc.load_lift("lift-${asked.get("lift")}.safetensors")`,
-    `found = lift.query(${given})`, "print(int(found.splats.sum()), found.why, found.explanation)"].join("\n");
-}
-
-// The same, of this service.
-function overHttp(asked) {
-  const cut = asked.get("threshold");
-  const told = [["lift", JSON.stringify(asked.get("lift"))], ...TERMS.filter(name => asked.has(name)).map(name => [name, list(asked.getAll(name))]),
-    ["threshold", cut === "auto" ? '"auto"' : cut], ...(asked.has("absent") ? [["absent", '"keep"']] : [])];
-  return posted("", `{${told.map(([name, value]) => `"${name}": ${value}`).join(", ")}}`, ['print(found["count"], found["why"], found["threshold"])']);
+function ofFile({ lift, ...asked }, encoder) {
+  const query = `lc.Query(${Object.entries(asked).map(([name, value]) => `${name}=${JSON.stringify(value)}`).join(", ")})`;
+  const more = encoder === "prompts" ? "" : `, encoder="${encoder}"`;
+  return ["import liftcore as lc", "", `scene = lc.Scene("lift-${lift}.safetensors")`, `found = scene.ask(${query}${more})`,
+    "print(found.count, found.why, found.threshold.explanation)"].join("\n");
 }
 
 // A question of the service in Python, from its body and what is printed of the answer.
