@@ -1,8 +1,9 @@
 """The query process: answers, scores, masks, maps, renders and splats over open scenes, as its server asks for them.
 
-Run as ``python -m service.queries.answers SCENES CACHE_BYTES ENCODER``. A line on stdin is a JSON list of requests:
-the first of them is answered by a message on stdout, the others wait behind it. It ends when stdin does. The compiled
-kernels and the encoder named are loaded beside the first requests, which wait for no more than they need.
+Run as ``python -m service.queries.answers SCENES CACHE_BYTES ENCODER``. Its stdin is a socket, a connection of
+multiprocessing's, that brings JSON lists of requests: the first of each is answered, the others wait behind it. It
+ends when its server does. The compiled kernels and the encoder named are loaded beside the first requests, which wait
+for no more than they need.
 """
 
 from __future__ import annotations
@@ -12,15 +13,17 @@ import errno
 import hashlib
 import itertools
 import json
+import os
 import sys
 import threading
 import traceback
-from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import torch
+from cachetools import LRUCache
 
 from liftcore import (
     Answer,
@@ -48,10 +51,10 @@ from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.scene.splats import Kernel
 from liftcore.scene.views import cameras_of_views
 from liftcore.text import OWN_WORDS, RememberingEncoder
-from service.child import fault_of, own_stdout
+from service.child import fault_of
 from service.encoders import encoder_version
 from service.errors import NoSpace
-from service.queries.client import PIPE_BYTES, Frame, write_frame
+from service.queries.client import PIPE_BYTES, Frame, send_frame
 
 WARM_UP_TEXT = "something"
 WORD_FILES = {"word_labels": "splat_labels", "word_map": "labels", "word_picture": "picture"}  # of `blocks_of`
@@ -60,57 +63,10 @@ PRODUCT_BYTES = 128 << 20  # of the cosines that one pass over a lift's features
 COSINE_BYTES = 4  # of a splat and a direction
 ANSWER_BYTES = 6  # of a splat: its score, whether it was seen, whether it was selected
 ENTRY_BYTES = 2 << 10  # of what is kept, beside its tensors and its question
-T = TypeVar("T")
 NUMBER_BYTES = 32  # of a number of a question: a Python float and the place in its tuple
 
 
-def _one(value: object) -> int:
-    return 1
-
-
-class Kept(Generic[T]):
-    """A cache with a size: the values used last, as many as fit; the very last is kept whatever its size.
-
-    Args:
-        limit: how much they may be together.
-        size_of: how much one is; left out, each is one.
-    """
-
-    def __init__(self, limit: int, size_of: Callable[[T], int] = _one) -> None:
-        self.limit = limit
-        self._size_of = size_of
-        self._values: OrderedDict[object, tuple[T, int]] = OrderedDict()  # with how much each is
-        self._size = 0
-
-    @property
-    def size(self) -> int:
-        """How much is kept."""
-        return self._size
-
-    def __contains__(self, key: object) -> bool:
-        return key in self._values
-
-    def get(self, key: object, make: Callable[[], T]) -> T:
-        """The value of a key, made when it is not here."""
-        if key not in self._values:
-            self._make_room(1)  # of values that are one each, the old and the new are never here together
-            self.put(key, make())
-        self._values.move_to_end(key)
-        return self._values[key][0]
-
-    def put(self, key: object, value: T) -> None:
-        """Keep a value."""
-        _, old = self._values.pop(key, (None, 0))
-        self._size -= old
-        size = self._size_of(value)
-        self._make_room(size)
-        self._values[key] = value, size
-        self._size += size
-
-    def _make_room(self, coming: int) -> None:
-        while self._values and self._size + coming > self.limit:
-            _, (_, size) = self._values.popitem(last=False)
-            self._size -= size
+Kept = Answer | Objects | ViewMask | Segmentation | Catalogue
 
 
 class Answers:
@@ -122,8 +78,9 @@ class Answers:
     """
 
     def __init__(self, *, scenes: int, cache_bytes: int) -> None:
-        self._scenes: Kept[Scene] = Kept(scenes)
-        self._cache: Kept[Answer | Objects | ViewMask | Segmentation | Catalogue] = Kept(cache_bytes, bytes_of)
+        self._scenes = LRUCache[str, Scene](scenes)
+        most = max(1, cache_bytes)
+        self._cache = LRUCache[object, Kept](most, lambda made: min(bytes_of(made), most))
         self._encoders: dict[str, tuple[object, TextEncoder]] = {}  # spec -> version of its file, encoder
         self._opening = threading.RLock()  # of encoders, which the warm-up opens too
         self._warm: set[Kernel] = set()  # kernels of splats whose compiled code is loaded, or being loaded
@@ -140,7 +97,7 @@ class Answers:
     @property
     def kept_bytes(self) -> int:
         """The size of the answers, objects and views that are kept."""
-        return self._cache.size
+        return int(self._cache.currsize)
 
     def warm_up(self, encoder: str, version: object) -> None:
         """Load what the first query would wait for: an encoder, and the compiled kernels.
@@ -172,7 +129,7 @@ class Answers:
         scene = self._scene(requests[0])
         splats = len(scene.features)
         room = min(
-            PRODUCT_BYTES // (COSINE_BYTES * splats), self._cache.limit // (ANSWER_BYTES * splats + ENTRY_BYTES)
+            PRODUCT_BYTES // (COSINE_BYTES * splats), self._cache.maxsize // (ANSWER_BYTES * splats + ENTRY_BYTES)
         )
         asked: dict[str, Question] = {}
         for request in requests:
@@ -185,10 +142,20 @@ class Answers:
                     room -= len(found.rows)
         if asked:
             for key, answer in zip(asked, answers(scene, list(asked.values())), strict=True):
-                self._cache.put(key, answer)
+                self._cache[key] = answer
+
+    def _kept(self, key: object, make: Callable[[], Kept]) -> Kept:
+        """What the cache has of a key, made where it has nothing."""
+        if key not in self._cache:
+            self._cache[key] = make()
+        return self._cache[key]
 
     def _scene(self, request: dict[str, Any]) -> Scene:
-        scene = self._scenes.get(request["lift"], lambda: self._open(request))
+        if request["lift"] not in self._scenes:
+            if self._scenes.currsize == self._scenes.maxsize:  # the old and the new are never here together
+                self._scenes.popitem()
+            self._scenes[request["lift"]] = self._open(request)
+        scene = self._scenes[request["lift"]]
         if "features" in request:
             scene.find_packs([Path(path) for path in request["features"]])
         return scene
@@ -217,7 +184,7 @@ class Answers:
         return question(self._scene(request), query, encoder, query.places)
 
     def _answer(self, request: dict[str, Any]) -> Answer:
-        made = self._cache.get(_key(request), lambda: answers(self._scene(request), [self._question(request)])[0])
+        made = self._kept(_key(request), lambda: answers(self._scene(request), [self._question(request)])[0])
         assert isinstance(made, Answer)
         return made
 
@@ -228,13 +195,13 @@ class Answers:
             return view_mask(self._scene(request), answer, view_of(request), group=lambda *_: self._grouped(request))
 
         seen_from = json.dumps(request.get("camera", request.get("view")))
-        made = self._cache.get((_key(request), "view", seen_from), make)
+        made = self._kept((_key(request), "view", seen_from), make)
         assert isinstance(made, ViewMask)
         return made
 
     def _grouped(self, request: dict[str, Any]) -> Objects:
         answer = self._answer(request)
-        made = self._cache.get((_key(request), "objects"), lambda: objects(self._scene(request), answer))
+        made = self._kept((_key(request), "objects"), lambda: objects(self._scene(request), answer))
         assert isinstance(made, Objects)
         return made
 
@@ -292,7 +259,7 @@ class Answers:
             words, encoder = self._words(request)
             return self._scene(request).segment(words, encoder=encoder)
 
-        made = self._cache.get((_key(request), "words"), make)
+        made = self._kept((_key(request), "words"), make)
         assert isinstance(made, Segmentation)
         return made
 
@@ -307,7 +274,7 @@ class Answers:
 
     def _catalogue(self, request: dict[str, Any]) -> Frame:
         key = ("catalogue", request["lift"], request["encoder"], json.dumps(request["encoder_version"]))
-        found = self._cache.get(key, lambda: self._named_objects(request))
+        found = self._kept(key, lambda: self._named_objects(request))
         assert isinstance(found, Catalogue)
         first, last = request["first"], request["first"] + request["count"]
         rows = found.features[first:last] if request["means"] else [None] * len(found.objects[first:last])
@@ -445,13 +412,14 @@ def _warm_up(answers: Answers, encoder: str) -> None:
 
 
 def main() -> None:
-    """Answer until stdin ends."""
-    out = own_stdout()
+    """Answer until the server is gone."""
+    server = Connection(os.dup(sys.stdin.fileno()))
     use_one_library_thread()
     answers = Answers(scenes=int(sys.argv[1]), cache_bytes=int(sys.argv[2]))
     threading.Thread(target=_warm_up, args=(answers, sys.argv[3]), daemon=True).start()
-    for line in sys.stdin.buffer:
-        write_frame(out, reply_to(json.loads(line), answers))
+    with contextlib.suppress(EOFError, ConnectionError):
+        while True:
+            send_frame(server, reply_to(json.loads(server.recv_bytes()), answers))
 
 
 if __name__ == "__main__":

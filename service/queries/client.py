@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import json
 import logging
 import os
+import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import IO, Any
+from multiprocessing.connection import Connection
+from typing import Any
 
 from liftcore.errors import SplatliftError
 from service.child import error_of, is_stopped
@@ -21,6 +22,7 @@ from service.errors import Busy, ClientLeft, Crashed, TimedOut, require_share
 
 # Without these each array of a query is mapped anew and its pages are faulted in one by one: a fifth of its time.
 MEMORY = {"MALLOC_MMAP_THRESHOLD_": str(64 << 20), "MALLOC_TRIM_THRESHOLD_": str(256 << 20)}
+STDERR = 2  # where what libraries of the worker print goes
 PIPE_BYTES = 256 << 10  # of an answer; the HTTP process holds it in memory while a client reads it: more is a file
 AHEAD_BYTES = 1 << 20  # of requests that are sent along with the one before them
 
@@ -29,29 +31,16 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Frame:
-    """A message through the worker's pipes, with an optional picture or array: a line of JSON, then as many bytes as
-    it says."""
+    """An answer of the worker: what is told of it, with an optional picture or array."""
 
     header: dict[str, Any]
     body: bytes = field(default=b"", repr=False)
 
 
-def write_frame(out: IO[bytes], frame: Frame) -> None:
-    """Send one message, as the worker does; it gets requests as a line of JSON, a list."""
-    line = json.dumps({"bytes": len(frame.body), "header": frame.header}, allow_nan=False)
-    out.write(line.encode() + b"\n")
-    out.write(frame.body)
-    out.flush()
-
-
-def read_frame(source: IO[bytes]) -> Frame | None:
-    """The next message, None when the other side is gone."""
-    line = source.readline()
-    if not line.endswith(b"\n"):
-        return None
-    message = json.loads(line)
-    body = source.read(message["bytes"])
-    return Frame(message["header"], body) if len(body) == message["bytes"] else None
+def send_frame(worker: Connection, frame: Frame) -> None:
+    """Send an answer, as the worker does; it gets requests as a JSON list."""
+    worker.send_bytes(json.dumps(frame.header, allow_nan=False).encode())
+    worker.send_bytes(frame.body)
 
 
 @dataclass(frozen=True)
@@ -99,6 +88,7 @@ class QueryClient:
         self._turns: dict[str, int] = {}  # key -> the number of its last turn
         self._stopped = False
         self._process: subprocess.Popen[bytes] | None = None  # of whose turn it is, but for a look and a kill
+        self._worker: Connection | None = None  # to it, likewise
         self._told: Callable[[str, str, float], None] | None = None
         self._spawned = 0
 
@@ -262,17 +252,21 @@ class QueryClient:
         Raises:
             TimedOut: it takes too long; a new one starts.
         """
-        process = self._process
-        assert process is not None and process.stdin is not None and process.stdout is not None
+        process, worker = self._process, self._worker
+        assert process is not None and worker is not None
         room = itertools.accumulate(map(len, ahead))
         sent = [call.line, *(line for line, size in zip(ahead, room, strict=True) if size <= AHEAD_BYTES)]
-        reply = None
-        with _ended_at(call.deadline, process) as expired, contextlib.suppress(BrokenPipeError):
-            process.stdin.write(b"[" + b", ".join(sent) + b"]\n")  # a process that is stopped does not read it
-            process.stdin.flush()
-            reply = read_frame(process.stdout)
-        if not expired.is_set():
-            return reply
+        deadline = threading.Timer(_left(call), process.kill)  # it may be stopped, and neither read nor write
+        deadline.start()
+        try:
+            worker.send_bytes(b"[" + b", ".join(sent) + b"]")
+            return Frame(json.loads(worker.recv_bytes()), worker.recv_bytes())
+        except (EOFError, OSError):
+            if _left(call):
+                return None
+        finally:
+            deadline.cancel()
+            deadline.join()
         self._spawn()
         raise TimedOut("query", expected=f"an answer within {self._limits.seconds:g} s", got="none yet")
 
@@ -281,45 +275,24 @@ class QueryClient:
         command = [sys.executable, "-m", "service.queries.answers"]
         command += [str(self._limits.scenes), str(self._limits.cache_bytes), self._limits.encoder]
         self._spawned += 1
-        self._process = subprocess.Popen(
-            command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            start_new_session=True,
-            env=MEMORY | os.environ,
-        )
+        ours, theirs = socket.socketpair()
+        with ours, theirs:
+            self._process = subprocess.Popen(
+                command, stdin=theirs.fileno(), stdout=STDERR, start_new_session=True, env=MEMORY | os.environ
+            )
+            self._worker = Connection(ours.detach())
         if self._stopped:  # whoever stopped us may have looked before there was a process
             self._process.kill()
 
     def _bury(self) -> None:
         process, self._process = self._process, None
-        if process is None:
-            return
-        process.kill()
-        process.wait()
-        for pipe in (process.stdin, process.stdout):
-            assert pipe is not None
-            with contextlib.suppress(BrokenPipeError):
-                pipe.close()
+        if process is not None:
+            process.kill()
+            process.wait()
+        if self._worker is not None:
+            self._worker.close()
+            self._worker = None
 
 
 def _left(call: _Call) -> float:
     return max(0.0, call.deadline - time.monotonic())
-
-
-@contextlib.contextmanager
-def _ended_at(deadline: float, process: subprocess.Popen[bytes]) -> Iterator[threading.Event]:
-    """Kill the process when the block still runs at its deadline; the event says whether that came."""
-    expired = threading.Event()
-
-    def expire() -> None:
-        expired.set()
-        process.kill()
-
-    timer = threading.Timer(max(0.0, deadline - time.monotonic()), expire)
-    timer.start()
-    try:
-        yield expired
-    finally:
-        timer.cancel()
-        timer.join()

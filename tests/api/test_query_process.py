@@ -26,7 +26,7 @@ from liftcore.query.terms import Vector
 from service.auth import EVERYBODY
 from service.errors import Busy, ClientLeft, TimedOut, TooMany
 from service.queries import answers, client, questions
-from service.queries.answers import Answers, Kept, bytes_of, reply_to
+from service.queries.answers import Answers, bytes_of, reply_to
 from service.queries.client import Asker, Frame, QueryClient, QueryLimits
 from service.routes.queries import query_request
 from tests.crash.conftest import address_of, until
@@ -40,16 +40,17 @@ from .tiny_scene import CHANNELS, WORDS
 # Answers a request once the file that it names is there, and writes down which it answers and what waits behind it.
 STAND_IN = """
 import json, sys, time
+from multiprocessing.connection import Connection
 from pathlib import Path
-from service.queries.client import Frame, write_frame
-folder = Path(sys.argv[1])
-for line in sys.stdin.buffer:
-    first, *others = json.loads(line)
+from service.queries.client import Frame, send_frame
+folder, server = Path(sys.argv[1]), Connection(sys.stdin.fileno())
+while True:
+    first, *others = json.loads(server.recv_bytes())
     with (folder / "asked").open("a") as log:
         print(json.dumps([first["name"], [other["name"] for other in others]]), file=log)
     while not (folder / first["after"]).exists():
         time.sleep(0.005)
-    write_frame(sys.stdout.buffer, Frame({"name": first["name"]}))
+    send_frame(server, Frame({"name": first["name"]}))
 """
 Start = Callable[..., QueryClient]
 
@@ -347,20 +348,6 @@ def test_objects_of_an_answer_are_made_once_for_all_its_masks(
     assert len(made) == 1
     reply_to([request_of("mask", text=["lamp"])], kept)
     assert len(made) == 2
-
-
-def test_cache_keeps_what_was_used_last_and_knows_its_size() -> None:
-    sized: list[str] = []
-    kept: Kept[str] = Kept(7, lambda word: sized.append(word) or len(word))
-    for word in ("one", "two", "three", "three"):
-        kept.put(word, word)
-        assert kept.size <= 7
-    assert ("one" in kept, "two" in kept, "three" in kept) == (False, False, True)
-    assert kept.get("two", lambda: "2") == "2" and kept.get("three", lambda: "again") == "three"
-    kept.put("long", "longer than all")
-    assert kept.size == len("longer than all")
-    assert kept.get("long", lambda: "again") == "longer than all"
-    assert len(sized) <= 6  # each once: a look at all of them at each question would be slow
 
 
 def test_question_counts_with_its_answer() -> None:
