@@ -13,7 +13,6 @@ from liftcore import __version__
 from service import problems
 from service.auth import STRANGER, Gate
 from service.errand import get_ready
-from service.jobs.device import Devices
 from service.jobs.process import JobLimits
 from service.jobs.supervisor import Supervisor
 from service.middleware import AnswerHead, RecordedApp, Turns
@@ -45,7 +44,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         app.state.deps = deps = AppState(
             settings=settings, version=build, store=store, caller=STRANGER,
-            runner=runner, devices=Devices(), queries=worker,
+            runner=runner, queries=worker,
             streams=streams, photos=PhotoIndexes(), metrics=metrics, readiness=readiness,
             checks=threads(settings.parallel_checks),  # uploads that are validated at the same time
             planning=threads(1),  # plans, for which no upload waits

@@ -18,7 +18,6 @@ from liftcore.errors import SplatliftError
 from service import errand
 from service.auth import CALLER, Caller
 from service.errors import NotReady
-from service.jobs.device import Devices
 from service.jobs.supervisor import Supervisor
 from service.models import Version
 from service.observe import Metrics
@@ -148,7 +147,6 @@ class AppState:
     store: Store
     caller: Caller
     runner: Supervisor
-    devices: Devices
     queries: QueryClient
     streams: EventStreams
     photos: PhotoIndexes

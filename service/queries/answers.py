@@ -48,6 +48,7 @@ from liftcore.query.scores import warm_up as warm_up_scores
 from liftcore.query.segment import words_of
 from liftcore.query.terms import Example, Region, Vector, parse_example
 from liftcore.raster.cpu.warm_up import warm_up
+from liftcore.runtime.device import choose_device
 from liftcore.scene.splats import Kernel
 from liftcore.scene.views import cameras_of_views
 from liftcore.text import OWN_WORDS, RememberingEncoder
@@ -92,6 +93,7 @@ class Answers:
             "what": self._what,
             "catalogue": self._catalogue,
             "regions": self._regions,
+            "device": self._device,
         }
 
     @property
@@ -289,6 +291,13 @@ class Answers:
     def _regions(self, request: dict[str, Any]) -> Frame:
         found = self._scene(request).regions(request["view"], request["x"], request["y"])
         return Frame({"regions": [one.model_dump(mode="json") for one in found]})
+
+    def _device(self, request: dict[str, Any]) -> Frame:
+        try:
+            choose_device(request["device"])
+        except SplatliftError as error:
+            return Frame({"lack": fault_of(error)})
+        return Frame({"lack": None})
 
     def _named_objects(self, request: dict[str, Any]) -> Catalogue:
         """The objects of a lift; all words of the table that the request names, if it does, name them."""

@@ -89,6 +89,7 @@ class QueryClient:
         self._stopped = False
         self._process: subprocess.Popen[bytes] | None = None  # of whose turn it is, but for a look and a kill
         self._worker: Connection | None = None  # to it, likewise
+        self._cuda: dict[str, Any] | None = None  # what the worker says of the device
         self._told: Callable[[str, str, float], None] | None = None
         self._spawned = 0
 
@@ -183,6 +184,25 @@ class QueryClient:
             if self._told is not None:
                 self._told(request["operation"], outcome, time.monotonic() - begun)
         return reply
+
+    def require_device(self, device: str) -> None:
+        """Refuse a device that is not there; ``auto`` and ``cpu`` always are.
+
+        The worker looks, once, as this process never loads torch. When it cannot be asked the device is let through:
+        the job looks again, and fails in the same words.
+
+        Raises:
+            Unavailable: what is missing, as the lift would say it.
+        """
+        if device != "cuda":
+            return
+        if self._cuda is None:
+            try:
+                self._cuda = self.call({"operation": "device", "device": device}).header
+            except (Busy, TimedOut, Crashed):
+                return
+        if self._cuda["lack"] is not None:
+            raise error_of(self._cuda["lack"])
 
     def _wait_for_turn(self, call: _Call) -> list[bytes]:
         """Wait until nobody is to be asked before this call; what waits behind it."""

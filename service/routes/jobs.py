@@ -103,7 +103,7 @@ def _planned(order: models.LiftRequest, deps: AppState) -> models.Plan:
     settings = LiftSettings.of_json(order.settings).model_dump(mode="json")
     wanted = JobOrder(order.splats, order.cameras, tuple(order.features), settings)
     _require_fit(wanted, deps)
-    deps.devices.require(wanted.settings.get("device", "auto"))
+    deps.queries.require_device(wanted.settings.get("device", "auto"))
     limits = ErrandLimits(deps.settings.check_seconds, deps.settings.check_memory_bytes, deps.ending)
     splats, cameras, *packs = [deps.store.assets.get(deps.owner, *named) for named in wanted.assets()]
     document = {
@@ -149,7 +149,7 @@ def _take(order: models.LiftRequest, deps: AppState, key: str | None, *, sent: d
     job, new = deps.store.jobs.repeated(deps.owner, wanted), False
     if job is None:
         _require_fit(wanted, deps)
-        deps.devices.require(wanted.settings.get("device", "auto"))
+        deps.queries.require_device(wanted.settings.get("device", "auto"))
         job, new = deps.store.jobs.submit(deps.owner, wanted, max_queued=deps.settings.max_queued)
         deps.runner.wake()
     return _reply(deps.store.jobs.get(deps.owner, job), 202 if new else 200)

@@ -6,7 +6,6 @@ import errno
 import io
 import json
 import shutil
-import sys
 import tempfile
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -28,10 +27,9 @@ from liftcore.runtime.device import choose_device
 from liftcore.runtime.progress import Progress
 from liftcore.values.settings import LiftSettings
 from service.child import fault_of
-from service.jobs import child, comparing, device
+from service.jobs import child, comparing
 from service.jobs import supervisor as pace
 from service.jobs.child import Reporter
-from service.jobs.device import Devices
 from service.jobs.lifting import plan_document
 from service.models import AssetKind
 from service.store.jobs import LINE_CHARACTERS, LOG_LINES, EventKind, log_line, note
@@ -311,56 +309,26 @@ def test_lift_and_its_files_are_found_where_they_were_downloaded(
 # The process of a job: a device that is not there, a full disk, and no path of the server
 
 
-LACK = Unavailable("device", expected="a card", got="none", hint="take device=cpu")
-
-
-def test_card_that_is_missing_refuses_the_order_at_once(
-    client: TestClient, uploaded: Uploaded, monkeypatch: pytest.MonkeyPatch
+def test_card_that_is_missing_refuses_the_order_in_the_words_of_a_lift(
+    client: TestClient, uploaded: Uploaded
 ) -> None:
-    monkeypatch.setattr(device, "ask", lambda asked: {"event": "fault", "fault": fault_of(LACK)})
     jobs = len(client.get("/jobs").json()["jobs"])
-    problem = assert_problem(client.post("/lift", json=uploaded.order(device="cuda")))
-    assert (problem["status"], problem["type"]) == (422, "/problems/unavailable")
-    assert (problem["argument"], problem["hint"]) == ("device", LACK.hint)
     unknown = assert_problem(client.post("/lift", json=uploaded.order(device="gpu")))
     assert unknown["type"] == "/problems/invalid-settings"
+    try:
+        choose_device("cuda")
+    except Unavailable as lack:
+        for _ in range(2):
+            problem = assert_problem(client.post("/lift", json=uploaded.order(device="cuda")))
+            assert (problem["status"], problem["type"]) == (422, "/problems/unavailable")
+            told = [problem[name] for name in ("argument", "expected", "got", "hint")]
+            assert told == [lack.argument, lack.expected, lack.got, lack.hint]
+    else:
+        assert client.post("/lift/plan", json=uploaded.order(device="cuda")).status_code == 200
     assert len(client.get("/jobs").json()["jobs"]) == jobs
 
 
-def test_device_is_looked_for_once_and_what_cannot_be_found_out_is_let_through(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    looks: list[str] = []
-    found = Devices()
-    for told, refused in ((None, False), ({"event": "fault", "fault": fault_of(LACK)}, True)):
-        monkeypatch.setattr(device, "ask", lambda asked, told=told: looks.append(asked) or told)
-        for _ in range(2):
-            if refused:
-                with pytest.raises(Unavailable):
-                    found.require("cuda")
-            else:
-                found.require("cuda")
-    found.require("auto")
-    found.require("cpu")
-    assert looks == ["cuda"] * 3  # a look without an answer is taken again
-
-
-def test_process_that_looks_says_what_a_lift_would_say() -> None:
-    try:
-        choose_device("cuda")
-    except Unavailable as error:
-        with pytest.raises(Unavailable) as caught:
-            Devices().require("cuda")
-        assert str(caught.value) == str(error)
-    else:
-        Devices().require("cuda")
-
-
-def test_look_that_fails_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "executable", "/nowhere/python")
-    Devices().require("cuda")
-
-
+LACK = Unavailable("device", expected="a card", got="none", hint="take device=cpu")
 JOB_FOLDER = "/folder/of/a/job"
 
 

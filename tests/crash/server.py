@@ -60,6 +60,8 @@ class NoQueries:
 
     def tell(self, told: object) -> None: ...
 
+    def require_device(self, device: str) -> None: ...
+
     def alive(self) -> bool:
         return True
 
