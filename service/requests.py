@@ -12,7 +12,6 @@ from typing import Annotated, Any, Generic, TypeVar
 
 import anyio
 from fastapi import APIRouter, Depends, Request
-from fastapi.dependencies.models import Dependant
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import APIRoute
 from pydantic import BaseModel, ValidationError
@@ -41,7 +40,7 @@ async def _known_only(request: Request) -> None:
         return
     route: APIRoute = request.scope["route"]
     described = [parameter["name"] for parameter in (route.openapi_extra or {}).get("parameters", ())]
-    known = [*_names(route.dependant), *described]
+    known = [*_names(route), *described]
     for name in given:
         if name not in known:
             raise InvalidRequest(
@@ -53,9 +52,9 @@ async def _known_only(request: Request) -> None:
 KnownParameters = Depends(_known_only)
 
 
-def _names(route: Dependant) -> Iterator[str]:
+def _names(route: APIRoute) -> Iterator[str]:
     """The query parameters that a route declares, one by one or as the fields of a model."""
-    for field in route.query_params:
+    for field in route.dependant.query_params:
         declared = field.field_info.annotation
         if isinstance(declared, type) and issubclass(declared, BaseModel):
             yield from declared.model_fields
