@@ -66,6 +66,7 @@ JOB_ID = r"^[0-9a-f]{32}$"
 COMPARED = "speed"  # what only the runs of a trade-off set
 PRINTABLE = r"^[^\x00-\x1f\x7f]*$"
 
+BUILT = ConfigDict(defer_build=False)  # of models that FastAPI reads bodies by
 AssetId = Annotated[str, Field(pattern=ASSET_ID, description="sha256: and the digest of the bytes, in hex")]
 JobId = Annotated[str, Field(pattern=JOB_ID)]
 Text = Annotated[str, Field(min_length=1, max_length=limits.WORD_CHARACTERS)]
@@ -150,6 +151,7 @@ class Names(BaseModel):
 class LiftRequest(Body):
     """What to lift. The assets must be here already."""
 
+    model_config = BUILT
     splats: AssetId
     cameras: AssetId
     features: Annotated[
@@ -287,6 +289,7 @@ Named = Annotated[str, Field(min_length=1, max_length=limits.SETTING_CHARACTERS,
 class PackChange(Body):
     """Names of a feature pack; what is left out stays as the pack says it."""
 
+    model_config = BUILT
     encoder: Named | None = Field(None, description="what made the features")
     text_space: Named | None = Field(None, description="the text encoder that shares their space; 'none' for none")
 
@@ -294,6 +297,7 @@ class PackChange(Body):
 class LiftChange(Body):
     """What to change of a lift; what is left out stays."""
 
+    model_config = BUILT
     name: (
         Annotated[str, Field(max_length=limits.LIFT_NAME_CHARACTERS, pattern=PRINTABLE), AfterValidator(str.strip)]
         | None

@@ -23,7 +23,7 @@ from liftcore.query.question import (
 from liftcore.query.terms import NOTATIONS
 from liftcore.runtime.fields import Body, NoBoolean, takes
 from service import limits
-from service.models import AssetId, JobId, Text
+from service.models import BUILT, AssetId, JobId, Text
 
 THE_LIFT = "the lift; may be left out when there is exactly one"
 
@@ -72,6 +72,7 @@ def _same(name: str) -> Any:
 class Question(Query, LiftQuestion):
     """A question to a lift."""
 
+    model_config = BUILT
     error_type: ClassVar = None
     text: Texts = _same("text")
     like: Examples = _same("like")
@@ -90,16 +91,21 @@ class Words(LiftQuestion, Body):
 class AskedToSegment(Words, Seen):
     """Every splat's best word."""
 
+    model_config = BUILT
+
 
 class AskedWhat(Words):
     """What is this?"""
 
+    model_config = BUILT
     example: AnExample = Field(description="what is meant")
     top: Annotated[int, Field(ge=1, le=1000), NoBoolean] = Field(5, description="how many words")
 
 
 class AskedToRender(Picture):
     """A picture of a lift's scene."""
+
+    model_config = BUILT
 
     lift: JobId | None = Field(None, description=THE_LIFT)
 

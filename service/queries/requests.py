@@ -18,7 +18,6 @@ from service.encoders import encoder_file, encoder_spec, encoder_version
 from service.errors import InvalidRequest
 from service.queries import questions
 from service.queries.client import PIPE_BYTES, Asker, Frame
-from service.requests import BodyBytes
 from service.state import AppState, Deps
 from service.store.assets import kernel_of
 from service.store.lifts import LiftRecord
@@ -37,7 +36,7 @@ MEDIA_TYPES = {
 
 
 # The body is read before this listens, as both listen to the client.
-async def _asking(request: Request, deps: Deps, body: BodyBytes) -> AsyncIterator[Callable[[dict[str, Any]], Frame]]:
+async def _asking(request: Request, deps: Deps) -> AsyncIterator[Callable[[dict[str, Any]], Frame]]:
     """Ask the query process for this caller, who may leave: a query that waits then is not answered."""
     asker = Asker(deps.caller.key or "")
 

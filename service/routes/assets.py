@@ -14,7 +14,7 @@ from service import limits, models
 from service.content import FILE, Cursor, Limit, StoredFile, file_answer, listed
 from service.errand import ErrandLimits, run_errand
 from service.errors import Crashed
-from service.requests import described_body, json_body
+from service.requests import JsonRoute
 from service.state import AppState, Deps
 from service.store.assets import SHOWN_CHARACTERS, AssetRecord
 from service.uploads.intake import AssetIntake, Intake, Taken, require_plain, require_size
@@ -24,7 +24,7 @@ BATCH = 1 << 20  # bytes gathered before a thread writes them
 HEADER_LENGTH_BYTES = 8  # that a safetensors file begins with
 MAX_DIGITS = 20  # of a Content-Length: h11 takes no more
 
-router = APIRouter(prefix="/assets", tags=["assets"])
+router = APIRouter(prefix="/assets", tags=["assets"], route_class=JsonRoute)
 # By the name of the other routes' part: to OpenAPI, two templates that match the same paths are one path twice.
 AssetKind = Annotated[models.AssetKind, Path(alias="asset", description="what it is")]
 AssetId = Annotated[str, Path(description="sha256: and the digest of the bytes, in hex")]
@@ -32,7 +32,6 @@ Sha256 = Annotated[
     str | None,
     Query(pattern="^[0-9a-fA-F]{64}$", description="of the content; checked if given"),
 ]
-CHANGE_BODY = json_body(models.PackChange)
 NamesCursor = Annotated[int, Query(ge=0, le=10**9, description="the `next` of the page before")]
 RAW_BODY = {
     "requestBody": {
@@ -133,9 +132,8 @@ def get_content(asset: AssetId, request: Request, deps: Deps) -> Response:
     response_model=models.Asset,
     status_code=201,
     responses={200: {"model": models.Asset, "description": "It was here already"}},
-    openapi_extra=described_body(models.PackChange),
 )
-async def change_pack(asset: AssetId, deps: Deps, change: models.PackChange = CHANGE_BODY) -> Response:
+async def change_pack(asset: AssetId, change: models.PackChange, deps: Deps) -> Response:
     """Name the encoder or the text space of a feature pack: the same features under these names, as another asset."""
     made, new = await anyio.to_thread.run_sync(_retagged, asset, change, deps, limiter=deps.checks)
     return _reply(made, 201 if new else 200)

@@ -21,12 +21,12 @@ from service.errors import InvalidRequest, OverLimit
 from service.jobs.fit import check_fit, check_kernel, check_labels, check_settings, scratch_bytes
 from service.observe import current_id
 from service.problems import problem_of
-from service.requests import described_body, json_body
+from service.requests import JsonRoute
 from service.state import AppState, Deps
 from service.store.assets import ALL
 from service.store.jobs import Event, EventKind, JobOrder, JobRecord, fingerprint, labels_of
 
-router = APIRouter()
+router = APIRouter(route_class=JsonRoute)
 
 Key = Annotated[
     str | None,
@@ -65,31 +65,24 @@ REPEATED: dict[int | str, dict[str, Any]] = {
 }
 
 
-LIFT_BODY, TRADEOFF_BODY = json_body(models.LiftRequest), json_body(models.TradeoffRequest)
-
-
 @router.post(
     "/lift", response_model=models.Job, status_code=202, responses=REPEATED, tags=["jobs"],
-    openapi_extra=described_body(models.LiftRequest),
 )  # fmt: skip
-async def submit(deps: Deps, order: models.LiftRequest = LIFT_BODY, key: Key = None) -> Response:
+async def submit(order: models.LiftRequest, deps: Deps, key: Key = None) -> Response:
     """Lift features onto splats. The job is on the disk before this answers."""
     return await anyio.to_thread.run_sync(_lift, order, deps, key, limiter=deps.ordering)
 
 
-@router.post(
-    "/lift/plan", response_model=models.Plan, tags=["jobs"], openapi_extra=described_body(models.LiftRequest)
-)
-async def plan(deps: Deps, order: models.LiftRequest = LIFT_BODY) -> models.Plan:
+@router.post("/lift/plan", response_model=models.Plan, tags=["jobs"])
+async def plan(order: models.LiftRequest, deps: Deps) -> models.Plan:
     """What a lift would do and need, without doing it: the views that it takes, and the memory."""
     return await anyio.to_thread.run_sync(_planned, order, deps, limiter=deps.planning)
 
 
 @router.post(
     "/tradeoff", name="submit", response_model=models.Job, status_code=202, responses=REPEATED, tags=["trade-offs"],
-    openapi_extra=described_body(models.TradeoffRequest),
 )  # fmt: skip
-async def submit_tradeoff(deps: Deps, order: models.TradeoffRequest = TRADEOFF_BODY, key: Key = None) -> Response:
+async def submit_tradeoff(order: models.TradeoffRequest, deps: Deps, key: Key = None) -> Response:
     """Compare the dial and the presets on a scene within a budget. The job is on the disk before this answers."""
     return await anyio.to_thread.run_sync(_compare, order, deps, key, limiter=deps.ordering)
 

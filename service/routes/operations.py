@@ -18,7 +18,6 @@ from fastapi.responses import HTMLResponse, JSONResponse
 
 from service import models
 from service.auth import with_keys
-from service.requests import with_bodies
 from service.state import CHECKS, Deps
 
 WEB = Path(__file__).parents[1] / "web" / "built"  # by `make web`
@@ -117,7 +116,7 @@ class Documents:
         """The one of the two, as JSON."""
         with self._turn:
             if not self._made:
-                found = with_bodies(self._app.openapi())
+                found = self._app.openapi()
                 self._made = tuple(bytes(JSONResponse(made).body) for made in (found, with_keys(found)))
         return self._made[keys]
 

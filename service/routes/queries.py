@@ -5,18 +5,18 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
-from fastapi import APIRouter, Depends, Request, Response
+from fastapi import APIRouter, Request, Response
 from fastapi import Query as Parameter
 
 from liftcore import Query
 from service.encoders import encoder_label
-from service.queries import questions
+from service.queries.questions import AskedToRender, LiftQuestion, ObjectsAnswer, QueryAnswer, Question
 from service.queries.requests import Ask, find_lift, query_request, scene_request, seen_from, tagged_answer
-from service.requests import Asked, both
+from service.requests import JsonRoute, Parameters, both
 from service.state import AppState, Deps
 from service.store.lifts import LiftRecord
 
-router = APIRouter(tags=["queries"])
+router = APIRouter(tags=["queries"], route_class=JsonRoute)
 
 
 def bytes_of(media_type: str) -> dict[int | str, dict[str, Any]]:
@@ -25,16 +25,14 @@ def bytes_of(media_type: str) -> dict[int | str, dict[str, Any]]:
 
 
 PNG, NPY, PLY = bytes_of("image/png"), bytes_of("application/x-npy"), bytes_of("application/octet-stream")
-TERMS = (*questions.LiftQuestion.model_fields, *Query.deciding())
-ASKED, WHERE = Asked(questions.Question, TERMS), Asked(questions.Question, (*TERMS, "view", "top"))
-IN_VIEW = Asked(questions.Question, (*TERMS, "view"), needs=("view",))
-PICTURE = Asked(questions.AskedToRender, ("lift", "view", "what"), needs=("view",))
-Question = Annotated[questions.Question, Depends(ASKED)]
-InView = Annotated[questions.Question, Depends(IN_VIEW)]
+TERMS = (*LiftQuestion.model_fields, *Query.deciding())
+ASKED, WHERE = Parameters(Question, TERMS), Parameters(Question, (*TERMS, "view", "top"))
+IN_VIEW = Parameters(Question, (*TERMS, "view"), needs=("view",))
+PICTURE = Parameters(AskedToRender, ("lift", "view", "what"), needs=("view",))
 
 
-@both(router, "/query", WHERE, response_model=questions.QueryAnswer)
-def query(asked: Annotated[questions.Question, Depends(WHERE)], deps: Deps, ask: Ask) -> dict[str, Any]:
+@both(router, "/query", WHERE, response_model=QueryAnswer)
+def query(asked: Question, deps: Deps, ask: Ask) -> dict[str, Any]:
     """Where it is: scores in numbers, the best splats, a box, and links to objects, splats and pictures.
 
     In a body examples may be vectors; POST the same body to the links of those.
@@ -53,7 +51,7 @@ def query(asked: Annotated[questions.Question, Depends(WHERE)], deps: Deps, ask:
     }
 
 
-@both(router, "/query/objects", ASKED, response_model=questions.ObjectsAnswer)
+@both(router, "/query/objects", ASKED, response_model=ObjectsAnswer)
 def objects(asked: Question, deps: Deps, ask: Ask) -> dict[str, Any]:
     """The things that were found, splats that touch one another: where each lies, and how large it is."""
     lift = find_lift(asked.lift, deps)
@@ -73,13 +71,13 @@ def selection(asked: Question, request: Request, deps: Deps, ask: Ask) -> Respon
 
 
 @both(router, "/query/mask", IN_VIEW, responses=PNG, response_class=Response)
-def mask(asked: InView, request: Request, deps: Deps, ask: Ask) -> Response:
+def mask(asked: Question, request: Request, deps: Deps, ask: Ask) -> Response:
     """Where it is in a view, or from a camera of your own in a body: a PNG, white where it is."""
     return _entity("mask", asked, request, deps, ask, seen_from(asked))
 
 
 @both(router, "/query/attention", IN_VIEW, responses=PNG, response_class=Response)
-def attention(asked: InView, request: Request, deps: Deps, ask: Ask) -> Response:
+def attention(asked: Question, request: Request, deps: Deps, ask: Ask) -> Response:
     """How well each pixel of a view, or of a camera of your own in a body, answers to it: a PNG."""
     return _entity("attention", asked, request, deps, ask, seen_from(asked))
 
@@ -95,9 +93,7 @@ def splats(asked: Question, request: Request, deps: Deps, ask: Ask, what: Splats
 
 
 @both(router, "/render", PICTURE, responses=PNG, response_class=Response)
-def render(
-    asked: Annotated[questions.AskedToRender, Depends(PICTURE)], request: Request, deps: Deps, ask: Ask
-) -> Response:
+def render(asked: AskedToRender, request: Request, deps: Deps, ask: Ask) -> Response:
     """The splats from a view, in their colours or in those of their features or clusters, or their depth: a PNG.
 
     Depths are those of the splats' centres along the camera's axis, weighted as the colours are. They are grey, near
@@ -112,7 +108,7 @@ def render(
 
 def _entity(
     operation: str,
-    asked: questions.Question,
+    asked: Question,
     request: Request,
     deps: AppState,
     ask: Ask,
@@ -123,7 +119,7 @@ def _entity(
     return tagged_answer(request, deps, query_request(operation, asked, lift, deps) | (more or {}), lift, ask)
 
 
-def _answer_links(asked: questions.Question, lift: LiftRecord, view: str | None, *, found: bool) -> dict[str, str]:
+def _answer_links(asked: Question, lift: LiftRecord, view: str | None, *, found: bool) -> dict[str, str]:
     """The URLs of other looks at the same query; vectors do not fit in one, and are sent there again.
 
     Where nothing was ``found`` there are no objects.
@@ -145,13 +141,13 @@ def shown(example: str | tuple[float, ...]) -> str:
     return example if isinstance(example, str) else f"a vector of {len(example)} channels"
 
 
-def _link(path: str, asked: questions.Question, **more: str) -> str:
+def _link(path: str, asked: Question, **more: str) -> str:
     """A route with the fields that are not as they are without being asked for, and always the threshold."""
     if not all(isinstance(example, str) for example in (*asked.like, *asked.unlike)):
         return path
     pairs: list[tuple[str, str]] = []
     for name in (*Query.deciding(), "encoder", "table"):
         value = getattr(asked, name)
-        if name == "threshold" or value != questions.Question.model_fields[name].default:
+        if name == "threshold" or value != Question.model_fields[name].default:
             pairs += [(name, str(one)) for one in (value if isinstance(value, list) else [value])]
     return f"{path}{'&' if '?' in path else '?'}{urlencode(pairs + list(more.items()))}"

@@ -11,7 +11,7 @@ from fastapi.responses import JSONResponse
 from liftcore.scene.origin import FILE_ORIGIN
 from service import limits, models
 from service.content import FILE, TAGGED, Cursor, Limit, StoredFile, file_answer, kept, listed, unchanged
-from service.requests import described_body, json_body
+from service.requests import JsonRoute
 from service.routes.assets import RAW_BODY, Sha256, taken
 from service.routes.queries import PNG
 from service.state import Deps
@@ -30,7 +30,7 @@ LiftCameras = Annotated[
     ),
 ]
 
-router = APIRouter()
+router = APIRouter(route_class=JsonRoute)
 
 
 @router.get("/lifts", response_model=models.Lifts, tags=["lifts"])
@@ -58,16 +58,12 @@ async def upload_lift(request: Request, deps: Deps, sha256: Sha256 = None, camer
     return JSONResponse(shape_lift(lift).model_dump(mode="json"), 201 if new else 200, headers=location)
 
 
-CHANGE_BODY = json_body(models.LiftChange)
-
-
 @router.patch(
     "/lifts/{lift}",
     response_model=models.LiftResult,
-    openapi_extra=described_body(models.LiftChange),
     tags=["lifts"],
 )
-def change_lift(lift: str, deps: Deps, change: models.LiftChange = CHANGE_BODY) -> models.LiftResult:
+def change_lift(lift: str, change: models.LiftChange, deps: Deps) -> models.LiftResult:
     """Give a lift a name, or photos of its views; what is left out stays."""
     return shape_lift(deps.store.lifts.change(deps.owner, lift, change.model_dump(exclude_unset=True)))
 

@@ -9,19 +9,16 @@ from fastapi import APIRouter, Response
 from service.encoders import encoder_label
 from service.queries import questions
 from service.queries.requests import Ask, find_lift, made, scene_request, seen_from, with_encoder
-from service.requests import described_body, json_body
+from service.requests import JsonRoute
 from service.routes.queries import NPY, PNG, shown
 from service.state import AppState, Deps
 from service.store.lifts import LiftRecord
 
-router = APIRouter(prefix="/query", tags=["queries"])
-
-SEGMENT_BODY, WHAT_BODY = json_body(questions.AskedToSegment), json_body(questions.AskedWhat)
-SEGMENT, WHAT = described_body(questions.AskedToSegment), described_body(questions.AskedWhat)
+router = APIRouter(prefix="/query", tags=["queries"], route_class=JsonRoute)
 
 
-@router.post("/segment", response_model=questions.SegmentAnswer, openapi_extra=SEGMENT)
-def segment(deps: Deps, ask: Ask, asked: questions.AskedToSegment = SEGMENT_BODY) -> Response:
+@router.post("/segment", response_model=questions.SegmentAnswer)
+def segment(asked: questions.AskedToSegment, deps: Deps, ask: Ask) -> Response:
     """Which of many words are there, and where: to every splat the word that it is most like, or none."""
     lift = find_lift(asked.lift, deps)
     wanted = _wanted("segment", asked, lift, deps)
@@ -29,29 +26,29 @@ def segment(deps: Deps, ask: Ask, asked: questions.AskedToSegment = SEGMENT_BODY
     return made(deps, wanted | {"head": head}, lift, ask, {})
 
 
-@router.post("/segment/labels", responses=NPY, response_class=Response, openapi_extra=SEGMENT)
-def labels(deps: Deps, ask: Ask, asked: questions.AskedToSegment = SEGMENT_BODY) -> Response:
+@router.post("/segment/labels", responses=NPY, response_class=Response)
+def labels(asked: questions.AskedToSegment, deps: Deps, ask: Ask) -> Response:
     """The value of every splat's word, 0 for none: .npy, int32 [P]."""
     lift = find_lift(asked.lift, deps)
     return made(deps, _wanted("word_labels", asked, lift, deps), lift, ask, {})
 
 
-@router.post("/segment/map", responses=PNG, response_class=Response, openapi_extra=SEGMENT)
-def word_map(deps: Deps, ask: Ask, asked: questions.AskedToSegment = SEGMENT_BODY) -> Response:
+@router.post("/segment/map", responses=PNG, response_class=Response)
+def word_map(asked: questions.AskedToSegment, deps: Deps, ask: Ask) -> Response:
     """The values of a view's pixels in colours, with a palette: a PNG whose text `legend` has the words by value."""
     lift = find_lift(asked.lift, deps)
     return made(deps, _wanted("word_map", asked, lift, deps) | seen_from(asked), lift, ask, {})
 
 
-@router.post("/segment/picture", responses=PNG, response_class=Response, openapi_extra=SEGMENT)
-def picture(deps: Deps, ask: Ask, asked: questions.AskedToSegment = SEGMENT_BODY) -> Response:
+@router.post("/segment/picture", responses=PNG, response_class=Response)
+def picture(asked: questions.AskedToSegment, deps: Deps, ask: Ask) -> Response:
     """A view tinted with the colours of its words, beside a drawn legend: a PNG."""
     lift = find_lift(asked.lift, deps)
     return made(deps, _wanted("word_picture", asked, lift, deps) | seen_from(asked), lift, ask, {})
 
 
-@router.post("/what", response_model=questions.WhatAnswer, openapi_extra=WHAT)
-def what(deps: Deps, ask: Ask, asked: questions.AskedWhat = WHAT_BODY) -> questions.WhatAnswer:
+@router.post("/what", response_model=questions.WhatAnswer)
+def what(asked: questions.AskedWhat, deps: Deps, ask: Ask) -> questions.WhatAnswer:
     """What is this? The words that a pixel, a splat, a region or a vector is most like."""
     lift = find_lift(asked.lift, deps)
     wanted = _wanted("what", asked, lift, deps) | {"example": asked.example, "top": asked.top}
