@@ -12,6 +12,7 @@ from fastapi import FastAPI
 from liftcore import __version__
 from service import problems
 from service.auth import STRANGER, Gate
+from service.content import EventStreams
 from service.errand import get_ready
 from service.jobs.process import JobLimits
 from service.jobs.supervisor import Supervisor
@@ -20,12 +21,11 @@ from service.observe import Metrics, versions
 from service.photos import PhotoIndexes
 from service.queries.client import QueryClient, QueryLimits
 from service.requests import KnownParameters
-from service.routes import assets, jobs, operations, queries, results, scene, words
+from service.routes import assets, jobs, lifts, operations, queries
 from service.settings import ServiceSettings
 from service.state import AppState, Readiness, Stopping
 from service.store.collect import Collector
 from service.store.store import Store
-from service.streams import EventStreams
 
 
 def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, worker: QueryClient) -> FastAPI:
@@ -80,7 +80,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
     app.add_middleware(Turns)
     problems.install(app)
     app.include_router(operations.router)  # probes and links to the page may carry what they like
-    for module in (assets, jobs, results, scene, queries, words):
+    for module in (assets, jobs, lifts, queries):
         app.include_router(module.router, dependencies=[KnownParameters])
     return app
 

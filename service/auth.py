@@ -31,16 +31,24 @@ from service.errors import (
     require_share,
 )
 from service.problems import CLOSE
-from service.scopes import SAFE, Scope, allows, needed
 from service.settings import ServiceSettings
 from service.store.keys import KeyRecord, KeyStore
-from service.store.owners import NOBODY, SERVICE, Owner
+from service.store.owners import NOBODY, SERVICE, Owner, Scope
 
 CALLER = "caller"  # of the scope's state
 LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
 BEARER = re.compile(r"bearer +([A-Za-z0-9._~+/-]+=*)", re.ASCII | re.IGNORECASE)  # RFC 6750, 2.1
 LOOKUPS = 4  # threads that look keys up, so that slow routes cannot keep anyone waiting at the gate
 CHECKED = re.compile("PUT /assets/.*|POST /lifts|PATCH /assets/.*|POST (/lift/plan)")  # by a process each
+# Open to everybody: what says nothing of anyone's work. The page asks for a key itself; the API is described to those
+# who have none yet, and browsers send none with a link.
+OPEN = frozenset(
+    {
+        "/", "/web/page.js", "/web/page.css", "/web/LICENSES.txt", "/healthz", "/readyz", "/version",
+        "/openapi.json", "/docs", "/docs/swagger-ui-bundle.js", "/docs/swagger-ui.css",
+    }
+)  # fmt: skip
+SAFE = frozenset({"GET", "HEAD"})
 WORKLESS = frozenset({"GET", "HEAD", "OPTIONS"})  # methods that start nothing: a stop refuses the others
 SCHEMES = {
     "key": {
@@ -146,6 +154,23 @@ class Gate:
             max_queued=settings.key_queued if quota.max_queued is None else quota.max_queued,
         )
         return Caller(owner, settings.key_uploads if quota.max_uploads is None else quota.max_uploads, key.id)
+
+
+def needed(method: str, path: str) -> Scope | None:
+    """The scope that a request needs, None when it needs no key. What is not listed as open is not."""
+    if method in SAFE and path in OPEN:
+        return None
+    if path == "/metrics":
+        return Scope.METRICS
+    asks = method == "POST" and (
+        path in ("/query", "/render") or path.startswith("/query/")
+    )  # a question may have a body
+    return Scope.READ if method in SAFE or asks else Scope.WRITE
+
+
+def allows(scopes: frozenset[Scope], wanted: Scope) -> bool:
+    """Whether a key of these scopes may do what needs that one."""
+    return wanted in scopes or Scope.ADMIN in scopes
 
 
 def bearer(headers: Headers) -> str | None:

@@ -22,7 +22,32 @@ from pydantic_core import CoreSchema, PydanticCustomError
 from liftcore.runtime.fields import Body, NoBoolean, takes
 from liftcore.scene.origin import FILE_ORIGIN
 from liftcore.values.settings import LiftSettings
-from service import limits
+
+# What one file or request may hold, beside the sizes that the operator sets (`service.settings`).
+# Texts, in characters
+VIEW_CHARACTERS = 500  # of a view's name, so that a query can say it
+WORD_CHARACTERS = 1000  # of a word, of a text that is asked for, and of what a pack is named
+FILE_CHARACTERS = 4 << 20  # of all names, or all words, of a file: a hundred thousand of 40
+PAGE_CHARACTERS = 256 << 10  # of the names, or words, of one answer
+LIFT_NAME_CHARACTERS = 100
+SETTING_CHARACTERS = 1000  # of a name or a text among settings
+ASKED_CHARACTERS = 4000  # of the texts of a question together: an encoder takes seconds for more
+
+# Numbers
+PACKS = 64  # of a lift
+SETTINGS = 100  # of a lift
+ASKED = 32  # texts, or examples, of a question
+VECTOR = 65_536  # numbers of a vector
+WORDS = 4096  # that are asked at once
+PAGE = 1000  # records of a list, names or views in one answer
+
+# JSON bodies, before they are parsed: what a question needs at most is 4,096 words, or 32 vectors of 4,096 numbers
+BODY_BRACKETS = 10_000
+BODY_COMMAS = 140_000
+
+# Zips
+PHOTOS = 10_000
+DIRECTORY_BYTES = 8 << 20  # of the list of what is in a zip of photos: of 20,000 files with long names
 
 
 def _once(texts: list[str]) -> list[str]:
@@ -48,10 +73,8 @@ def _bounded(given: Any) -> Any:
     """What is too much to be settings is refused before any of it is looked at."""
     if isinstance(given, dict):
         texts = (text for pair in given.items() for text in pair if isinstance(text, str))
-        if len(given) > limits.SETTINGS or any(len(text) > limits.SETTING_CHARACTERS for text in texts):
-            told = {
-                "expected": f"at most {limits.SETTINGS} settings of at most {limits.SETTING_CHARACTERS} characters"
-            }
+        if len(given) > SETTINGS or any(len(text) > SETTING_CHARACTERS for text in texts):
+            told = {"expected": f"at most {SETTINGS} settings of at most {SETTING_CHARACTERS} characters"}
             raise PydanticCustomError("too_many_settings", "{expected}", told)
     return given
 
@@ -69,7 +92,7 @@ PRINTABLE = r"^[^\x00-\x1f\x7f]*$"
 BUILT = ConfigDict(defer_build=False)  # of models that FastAPI reads bodies by
 AssetId = Annotated[str, Field(pattern=ASSET_ID, description="sha256: and the digest of the bytes, in hex")]
 JobId = Annotated[str, Field(pattern=JOB_ID)]
-Text = Annotated[str, Field(min_length=1, max_length=limits.WORD_CHARACTERS)]
+Text = Annotated[str, Field(min_length=1, max_length=WORD_CHARACTERS)]
 Scalar = Annotated[bool | int | float | str, takes("a boolean, a number or a text")]
 
 
@@ -155,8 +178,8 @@ class LiftRequest(Body):
     splats: AssetId
     cameras: AssetId
     features: Annotated[
-        list[AssetId], Field(min_length=1, fail_fast=True), AfterValidator(_once), Field(max_length=limits.PACKS)
-    ] = Field(description=f"feature packs, each counts once; at most {limits.PACKS}")
+        list[AssetId], Field(min_length=1, fail_fast=True), AfterValidator(_once), Field(max_length=PACKS)
+    ] = Field(description=f"feature packs, each counts once; at most {PACKS}")
     settings: Annotated[dict[str, Scalar], Bounded, Published(LiftSettings)] = Field(
         default_factory=dict,
         description="preset and knobs of the lift; those left out take the values of the preset and the speed",
@@ -283,7 +306,7 @@ class LiftResult(BaseModel):
     links: dict[str, str]
 
 
-Named = Annotated[str, Field(min_length=1, max_length=limits.SETTING_CHARACTERS, pattern=PRINTABLE)]
+Named = Annotated[str, Field(min_length=1, max_length=SETTING_CHARACTERS, pattern=PRINTABLE)]
 
 
 class PackChange(Body):
@@ -299,8 +322,7 @@ class LiftChange(Body):
 
     model_config = BUILT
     name: (
-        Annotated[str, Field(max_length=limits.LIFT_NAME_CHARACTERS, pattern=PRINTABLE), AfterValidator(str.strip)]
-        | None
+        Annotated[str, Field(max_length=LIFT_NAME_CHARACTERS, pattern=PRINTABLE), AfterValidator(str.strip)] | None
     ) = Field(None, description="for people; null or an empty one takes the name away")
     photos: AssetId | None = Field(None, description="an asset of kind photos; null takes them away")
 

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from prometheus_client import (
     CollectorRegistry,
@@ -38,7 +38,9 @@ from service.models import JobState
 from service.queries.client import QueryClient
 from service.store.schema import VERSION
 from service.store.store import Store
-from service.streams import EventStreams
+
+if TYPE_CHECKING:
+    from service.content import EventStreams
 
 # Ids of requests
 

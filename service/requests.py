@@ -17,7 +17,7 @@ from pydantic import BaseModel, ValidationError
 from starlette.exceptions import HTTPException
 
 from liftcore.runtime.fields import NAME_CHARACTERS, one_of
-from service import limits
+from service import models
 from service.content import TAGGED
 from service.errors import InvalidRequest, UnreadableBody
 from service.problems import CLOSE
@@ -114,8 +114,8 @@ class _BoundedRequest(Request):
 
 def _parsed(content: bytes) -> Any:
     # To parse them takes a tenth of a second of everybody's time, whatever they are.
-    if content.count(b"[") + content.count(b"{") > limits.BODY_BRACKETS or content.count(b",") > limits.BODY_COMMAS:
-        expected = f"JSON of at most {limits.BODY_COMMAS} values and {limits.BODY_BRACKETS} lists and objects"
+    if content.count(b"[") + content.count(b"{") > models.BODY_BRACKETS or content.count(b",") > models.BODY_COMMAS:
+        expected = f"JSON of at most {models.BODY_COMMAS} values and {models.BODY_BRACKETS} lists and objects"
         raise InvalidRequest("body", expected=expected, got="more", hint=BODY)
     try:
         return json.loads(content)

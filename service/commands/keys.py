@@ -17,10 +17,10 @@ from liftcore.cli import Parser, whole
 from liftcore.errors import NotFound
 from service.commands.serve import data_directory_errors
 from service.errors import InvalidRequest
-from service.scopes import parse_scopes
 from service.settings import read_settings
 from service.store.database import DATABASE, Database
 from service.store.keys import KeyRecord, KeyStore, Quota
+from service.store.owners import parse_scopes
 
 MAX_NAME = 100
 QUOTAS = {

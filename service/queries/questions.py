@@ -22,7 +22,7 @@ from liftcore.query.question import (
 )
 from liftcore.query.terms import NOTATIONS
 from liftcore.runtime.fields import Body, NoBoolean, takes
-from service import limits
+from service import models
 from service.models import BUILT, AssetId, JobId, Text
 
 THE_LIFT = "the lift; may be left out when there is exactly one"
@@ -41,16 +41,16 @@ def at_most(characters: int) -> AfterValidator:
 
 
 # The first thing that is wrong is all that is told: whoever sends a hundred thousand is not answered about each.
-Texts = Annotated[list[Text], Field(max_length=limits.ASKED, fail_fast=True), at_most(limits.ASKED_CHARACTERS)]
+Texts = Annotated[list[Text], Field(max_length=models.ASKED, fail_fast=True), at_most(models.ASKED_CHARACTERS)]
 Numbers = Annotated[
     tuple[Annotated[float, Field(allow_inf_nan=False, strict=True)], ...],
-    Field(min_length=1, max_length=limits.VECTOR, fail_fast=True),
+    Field(min_length=1, max_length=models.VECTOR, fail_fast=True),
 ]
 AnExample = Annotated[
     Notation | Numbers,
-    takes(f"{NOTATIONS}, or a vector of 1 to {limits.VECTOR} finite numbers"),
+    takes(f"{NOTATIONS}, or a vector of 1 to {models.VECTOR} finite numbers"),
 ]
-Examples = Annotated[list[AnExample], Field(max_length=limits.ASKED, fail_fast=True)]
+Examples = Annotated[list[AnExample], Field(max_length=models.ASKED, fail_fast=True)]
 
 
 class LiftQuestion(BaseModel):
@@ -83,7 +83,7 @@ class Question(Query, LiftQuestion):
 class Words(LiftQuestion, Body):
     """Many words at once."""
 
-    words: Annotated[list[Text], Field(max_length=limits.WORDS, fail_fast=True)] | None = Field(
+    words: Annotated[list[Text], Field(max_length=models.WORDS, fail_fast=True)] | None = Field(
         None, description="what may be there, each word once; all words of a table if left out"
     )
 

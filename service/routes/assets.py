@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypeVar
 import anyio
 from fastapi import APIRouter, Path, Query, Request, Response
 
-from service import limits, models
+from service import models
 from service.content import FILE, Cursor, Limit, StoredFile, file_answer, listed
 from service.errand import ErrandLimits, run_errand
 from service.errors import Crashed
@@ -100,7 +100,7 @@ async def _receive(request: Request, feed: Callable[[bytes], Any]) -> None:
 
 
 @router.get("", response_model=models.Assets)
-def list_assets(deps: Deps, limit: Limit = limits.PAGE, cursor: Cursor = None) -> Response:
+def list_assets(deps: Deps, limit: Limit = models.PAGE, cursor: Cursor = None) -> Response:
     """The assets, newest first, in pages. Lists of names and words are told with each asset alone."""
     return listed("assets", partial(deps.store.assets.page, deps.owner), shape, limit=limit, cursor=cursor)
 
@@ -112,10 +112,10 @@ def get_asset(asset: AssetId, deps: Deps) -> Response:
 
 
 @router.get("/{asset}/names", response_model=models.Names)
-def get_names(asset: AssetId, deps: Deps, limit: Limit = limits.PAGE, cursor: NamesCursor = 0) -> models.Names:
+def get_names(asset: AssetId, deps: Deps, limit: Limit = models.PAGE, cursor: NamesCursor = 0) -> models.Names:
     """The names of views, or the words, that an asset holds, in pages: of long ones a page may have fewer."""
     names = deps.store.assets.names(deps.owner, asset, cursor, limit + 1)
-    most = max(1, sum(total <= limits.PAGE_CHARACTERS for total in accumulate(map(len, names[:limit]))))
+    most = max(1, sum(total <= models.PAGE_CHARACTERS for total in accumulate(map(len, names[:limit]))))
     return models.Names(names=names[:most], next=cursor + most if len(names) > most else None)
 
 

@@ -13,7 +13,7 @@ from fastapi.responses import JSONResponse
 
 from liftcore.errors import InvalidSettings
 from liftcore.values.settings import LiftSettings
-from service import limits, models
+from service import models
 from service.child import error_of
 from service.content import Cursor, Limit, listed
 from service.errand import ErrandLimits, run_errand
@@ -165,7 +165,7 @@ def _require_fit(order: JobOrder, deps: AppState) -> None:
 
 
 @router.get("/jobs", response_model=models.Jobs, tags=["jobs"])
-def list_jobs(deps: Deps, limit: Limit = limits.PAGE, cursor: Cursor = None) -> Response:
+def list_jobs(deps: Deps, limit: Limit = models.PAGE, cursor: Cursor = None) -> Response:
     """The jobs, newest first, in pages."""
     return listed("jobs", partial(deps.store.jobs.page, deps.owner), shape, limit=limit, cursor=cursor)
 

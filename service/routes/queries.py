@@ -1,4 +1,4 @@
-"""/query and /render: where words and examples are in a scene, and pictures of it."""
+"""/query and /render: where words and examples are in a scene, what is there of many words, and pictures of it."""
 
 from __future__ import annotations
 
@@ -10,8 +10,28 @@ from fastapi import Query as Parameter
 
 from liftcore import Query
 from service.encoders import encoder_label
-from service.queries.questions import AskedToRender, LiftQuestion, ObjectsAnswer, QueryAnswer, Question
-from service.queries.requests import Ask, find_lift, query_request, scene_request, seen_from, tagged_answer
+from service.queries.questions import (
+    AskedToRender,
+    AskedToSegment,
+    AskedWhat,
+    LiftQuestion,
+    ObjectsAnswer,
+    QueryAnswer,
+    Question,
+    SegmentAnswer,
+    WhatAnswer,
+    Words,
+)
+from service.queries.requests import (
+    Ask,
+    find_lift,
+    made,
+    query_request,
+    scene_request,
+    seen_from,
+    tagged_answer,
+    with_encoder,
+)
 from service.requests import JsonRoute, Parameters, both
 from service.state import AppState, Deps
 from service.store.lifts import LiftRecord
@@ -151,3 +171,50 @@ def _link(path: str, asked: Question, **more: str) -> str:
         if name == "threshold" or value != Question.model_fields[name].default:
             pairs += [(name, str(one)) for one in (value if isinstance(value, list) else [value])]
     return f"{path}{'&' if '?' in path else '?'}{urlencode(pairs + list(more.items()))}"
+
+
+@router.post("/query/segment", response_model=SegmentAnswer)
+def segment(asked: AskedToSegment, deps: Deps, ask: Ask) -> Response:
+    """Which of many words are there, and where: to every splat the word that it is most like, or none."""
+    lift = find_lift(asked.lift, deps)
+    wanted = _word_request("segment", asked, lift, deps)
+    head = {"lift": lift.id, "encoder": encoder_label(wanted["encoder"])}
+    return made(deps, wanted | {"head": head}, lift, ask, {})
+
+
+@router.post("/query/segment/labels", responses=NPY, response_class=Response)
+def labels(asked: AskedToSegment, deps: Deps, ask: Ask) -> Response:
+    """The value of every splat's word, 0 for none: .npy, int32 [P]."""
+    lift = find_lift(asked.lift, deps)
+    return made(deps, _word_request("word_labels", asked, lift, deps), lift, ask, {})
+
+
+@router.post("/query/segment/map", responses=PNG, response_class=Response)
+def word_map(asked: AskedToSegment, deps: Deps, ask: Ask) -> Response:
+    """The values of a view's pixels in colours, with a palette: a PNG whose text `legend` has the words by value."""
+    lift = find_lift(asked.lift, deps)
+    return made(deps, _word_request("word_map", asked, lift, deps) | seen_from(asked), lift, ask, {})
+
+
+@router.post("/query/segment/picture", responses=PNG, response_class=Response)
+def picture(asked: AskedToSegment, deps: Deps, ask: Ask) -> Response:
+    """A view tinted with the colours of its words, beside a drawn legend: a PNG."""
+    lift = find_lift(asked.lift, deps)
+    return made(deps, _word_request("word_picture", asked, lift, deps) | seen_from(asked), lift, ask, {})
+
+
+@router.post("/query/what", response_model=WhatAnswer)
+def what(asked: AskedWhat, deps: Deps, ask: Ask) -> WhatAnswer:
+    """What is this? The words that a pixel, a splat, a region or a vector is most like."""
+    lift = find_lift(asked.lift, deps)
+    wanted = _word_request("what", asked, lift, deps) | {"example": asked.example, "top": asked.top}
+    return WhatAnswer(
+        lift=lift.id, encoder=encoder_label(wanted["encoder"]), example=shown(asked.example), **ask(wanted).header
+    )
+
+
+def _word_request(operation: str, asked: Words, lift: LiftRecord, deps: AppState) -> dict[str, Any]:
+    request = with_encoder(scene_request(operation, lift, deps), asked, lift, deps)
+    packs = [deps.store.assets.get(deps.owner, asset) for asset in lift.features]
+    names = request["names"] | {str(pack.path): f"features {pack.id}" for pack in packs}
+    return request | {"words": asked.words, "features": [str(pack.path) for pack in packs], "names": names}

@@ -13,10 +13,9 @@ from typing import Literal, Self
 
 from liftcore.errors import NotFound
 from service.errors import InvalidRequest
-from service.scopes import Scope, parse_scopes
 from service.store.database import Database, insert, keys_were_made, open_to_read, remember_keys, unusable
 from service.store.jobs import stop_waiting
-from service.store.owners import ENDED_KEYS
+from service.store.owners import ENDED_KEYS, Scope, parse_scopes
 
 PREFIX = "splatlift_"  # by which people, and scanners for leaked secrets, know what it is
 SECRET_BYTES = 32

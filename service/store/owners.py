@@ -1,18 +1,42 @@
-"""Whose things are whose, and what one owner may fill."""
+"""Whose things are whose, what one owner may do, and what they may fill."""
 
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Iterable
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any
 
-from service.errors import OverQuota, TooMany
+from service.errors import InvalidRequest, OverQuota, TooMany
 
 # For WHERE clauses over a table with a column `owner`; its names are bound by `Owner.terms`.
 SEEN = "(:sees_all OR owner = :owner)"
 # Keys that nobody comes in with any more; `:now` in seconds since 1970. A NULL is no end.
 ENDED_KEYS = "SELECT id FROM keys WHERE revoked IS NOT NULL OR expires <= :now"
 QUEUE_RETRY_SECONDS = 30  # a lift takes seconds to minutes, and one must end before the line is shorter
+
+
+class Scope(StrEnum):
+    """A kind of request that a key allows."""
+
+    READ = "read"  # look: assets, jobs, results, queries, pictures
+    WRITE = "write"  # upload, order, cancel, delete
+    METRICS = "metrics"  # /metrics, which tells of everybody's work together, and nothing else
+    ADMIN = "admin"  # all of these, on everybody's things
+
+
+def parse_scopes(names: Iterable[str]) -> frozenset[Scope]:
+    """Scopes by their names.
+
+    Raises:
+        InvalidRequest: there is none, or one is unknown.
+    """
+    names = [name.strip() for name in names if name.strip()]
+    wrong = next((name for name in names if name not in set(Scope)), None if names else "none")
+    if wrong is not None:
+        raise InvalidRequest("scopes", expected=f"one or more of {', '.join(Scope)}", got=wrong[:80])
+    return frozenset(map(Scope, names))
 
 
 @dataclass(frozen=True)

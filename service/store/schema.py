@@ -122,7 +122,7 @@ CREATE TABLE keys (
     digest TEXT NOT NULL UNIQUE,    -- sha256 of the secret in hex; the secret itself is nowhere
     old_digest TEXT,                -- of the secret before a rotation, which counts
     old_until REAL,                 -- until then
-    scopes TEXT NOT NULL,           -- as service.scopes.Scope, with spaces between
+    scopes TEXT NOT NULL,           -- as service.store.owners.Scope, with spaces between
     max_bytes INTEGER,              -- what is not set is as the server's settings have it
     max_queued INTEGER,
     max_uploads INTEGER,

@@ -21,7 +21,7 @@ from liftcore.runtime.plugins import Plugin
 from liftcore.text.table import TableEncoder
 from liftcore.values.lift_file import has_poses, parse_metadata, read_lift
 from liftcore.values.pack import read_features
-from service import limits
+from service import models
 from service.child import fault_of
 from service.models import AssetKind, UploadKind
 from service.photos import describe_photos
@@ -57,18 +57,18 @@ def require_texts(argument: str, texts: Sequence[str], longest: int, error: type
                 got=f"{len(text)}: {text[:40]!r}..." if text else "an empty one",
                 hint="name each image, without folders where that is enough" if argument == "view name" else "",
             )  # fmt: skip
-    if (together := sum(map(len, texts))) > limits.FILE_CHARACTERS:
-        most = f"at most {limits.FILE_CHARACTERS} characters of all together"
+    if (together := sum(map(len, texts))) > models.FILE_CHARACTERS:
+        most = f"at most {models.FILE_CHARACTERS} characters of all together"
         raise error(argument, expected=most, got=f"{together} in {len(texts)}", hint="several files hold more")
 
 
 def check_features(path: Path) -> dict[str, Any]:
     """Read and describe every observation."""
     packs = read_features(path)
-    require_texts("word", packs.table.words if packs.table else (), limits.WORD_CHARACTERS, InvalidFeatures)
+    require_texts("word", packs.table.words if packs.table else (), models.WORD_CHARACTERS, InvalidFeatures)
     for name in ("encoder", "text_space"):
-        if len(told := getattr(packs, name)) > limits.WORD_CHARACTERS:
-            expected = f"at most {limits.WORD_CHARACTERS} characters"
+        if len(told := getattr(packs, name)) > models.WORD_CHARACTERS:
+            expected = f"at most {models.WORD_CHARACTERS} characters"
             raise InvalidFeatures(name, expected=expected, got=f"{len(told)}: {told[:40]!r}...")
     return {"suffix": ".safetensors", "found": describe_packs(packs)}
 
@@ -109,8 +109,8 @@ def check_lift(path: Path, cameras: Path | None = None) -> dict[str, Any]:
                 raise InvalidLift("lift", expected="finite numbers", got=f"others in {name!r} from row {first} on")
     if "object" in arrays and (missing := set(range(len(arrays["object_views"]))) - set(np.unique(arrays["object"]))):
         raise InvalidLift("lift", expected="splats of each object", got=f"none of object {min(missing)}")
-    require_texts("view name", metadata["views"], limits.VIEW_CHARACTERS, InvalidLift)
-    require_texts("word", metadata["words"], limits.WORD_CHARACTERS, InvalidLift)
+    require_texts("view name", metadata["views"], models.VIEW_CHARACTERS, InvalidLift)
+    require_texts("word", metadata["words"], models.WORD_CHARACTERS, InvalidLift)
     if None in metadata["timings"].values():  # as JSON has what is not finite
         raise InvalidLift("lift", expected="finite timings", got="others", hint="a list of lifts tells them")
     brief = len(json.dumps({name: value for name, value in metadata.items() if name not in LONG}))
@@ -143,8 +143,8 @@ def run(named: str, file: str, *more: str) -> dict[str, Any]:
     path = Path(file)
     try:
         checked = CHECKS[kind](path, *map(Path, more))
-        require_texts("view name", checked["found"].get("names", ()), limits.VIEW_CHARACTERS, INVALID[kind])
-        require_texts("word", checked["found"].get("words", ()), limits.WORD_CHARACTERS, INVALID[kind])
+        require_texts("view name", checked["found"].get("names", ()), models.VIEW_CHARACTERS, INVALID[kind])
+        require_texts("word", checked["found"].get("words", ()), models.WORD_CHARACTERS, INVALID[kind])
     except SplatliftError as error:
         return _invalid(_of_another_kind(kind, path) or error, kind, path)
     except MemoryError:

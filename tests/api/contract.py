@@ -26,9 +26,9 @@ from service.app import create_app, job_limits, query_limits
 from service.errand import Heard
 from service.jobs.supervisor import Supervisor
 from service.queries.client import QueryClient
-from service.scopes import Scope
 from service.settings import ServiceSettings
 from service.store.keys import Quota
+from service.store.owners import Scope
 from service.store.store import Store
 from service.uploads.intake import Report
 from tests.crash.conftest import address_of, listening, stand_in, until

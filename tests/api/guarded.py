@@ -17,12 +17,11 @@ from service.app import create_app
 from service.jobs.supervisor import Supervisor
 from service.models import JobKind
 from service.queries.client import QueryClient
-from service.scopes import Scope
 from service.settings import ServiceSettings
 from service.store.jobs import JobOrder
 from service.store.keys import Quota
 from service.store.lifts import FinishedLift, FinishedTradeoff
-from service.store.owners import Owner
+from service.store.owners import Owner, Scope
 from service.store.store import Store
 from tests.crash.conftest import order
 from tests.crash.server import NoQueries

@@ -22,17 +22,16 @@ from starlette.datastructures import Headers
 
 from liftcore.cli import main
 from liftcore.errors import SplatliftError
-from service.auth import CALLER, Gate, Hosts, host_name, is_loopback
+from service.auth import CALLER, OPEN, Gate, Hosts, host_name, is_loopback, needed
 from service.commands.serve import require_keys
+from service.content import EventStreams, is_last
 from service.errors import Busy, ForeignOrigin, Misdirected, TooMany
 from service.models import JobState
-from service.scopes import OPEN, Scope, needed
 from service.settings import ServiceSettings
 from service.store.jobs import Event
 from service.store.keys import Quota
-from service.store.owners import SERVICE, Owner
+from service.store.owners import SERVICE, Owner, Scope
 from service.store.store import Store
-from service.streams import EventStreams, is_last
 from tests.crash.conftest import order
 
 from .conftest import app_of, parts_of
@@ -285,7 +284,7 @@ def test_revoked_key_loses_its_streams(house: Guarded, monkeypatch: pytest.Monke
         sent.set()
         return is_last(event)
 
-    monkeypatch.setattr("service.streams.is_last", noted)
+    monkeypatch.setattr("service.content.is_last", noted)
 
     def follow() -> None:
         replies.append(house.ask("alice", "GET", f"/jobs/{house.queued}/events"))  # its job does not end

@@ -27,11 +27,11 @@ from pydantic import ValidationError
 
 from service import middleware
 from service.commands.serve import AnnouncingServer
+from service.content import EventStreams
 from service.errand import ErrandLimits
 from service.errors import Busy, NoSpace
 from service.jobs.supervisor import Supervisor
-from service.limits import BODY_BRACKETS, BODY_COMMAS, PACKS, SETTINGS
-from service.models import AssetKind
+from service.models import BODY_BRACKETS, BODY_COMMAS, PACKS, SETTINGS, AssetKind
 from service.observe import SAME_A_MINUTE, JsonLines, Sparing, TextLines, working_for
 from service.queries.client import Frame
 from service.queries.questions import Question
@@ -41,7 +41,6 @@ from service.store.database import Database
 from service.store.files import DataDirectory
 from service.store.owners import SERVICE
 from service.store.store import Store
-from service.streams import EventStreams
 from service.uploads.intake import check
 from tests.crash.conftest import order, until
 from tests.crash.server import NoQueries

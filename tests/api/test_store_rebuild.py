@@ -11,9 +11,9 @@ import pytest
 from fastapi.testclient import TestClient
 
 from liftcore.cli import INTERRUPTED, main
+from service.auth import needed
 from service.commands.serve import require_keys
 from service.errors import Misconfigured, StaleDatabase
-from service.scopes import needed
 from service.settings import ServiceSettings
 from service.store.collect import collect
 from service.store.database import DATABASE

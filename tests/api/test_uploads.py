@@ -13,9 +13,9 @@ from fastapi.testclient import TestClient
 
 from liftcore.evaluate.inspect import inspect_file
 from liftcore.io import safetensors_file
-from service.scopes import parse_scopes
 from service.store.files import DataDirectory
 from service.store.keys import Quota
+from service.store.owners import parse_scopes
 from service.store.store import Store
 from service.uploads.intake import AssetIntake, Intake
 from tests.crash.server import standing_in

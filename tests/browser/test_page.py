@@ -9,8 +9,8 @@ from typing import Any
 import httpx
 import pytest
 
-from service.scopes import Scope
 from service.store.keys import Quota
+from service.store.owners import Scope
 from tests.api.tiny_scene import make_scene
 
 from .browser import Browser

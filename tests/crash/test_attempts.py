@@ -33,10 +33,9 @@ from service.jobs.process import LONGEST, JobProcess
 from service.jobs.supervisor import Lease
 from service.models import AssetKind, JobState
 from service.observe import JsonLines
-from service.scopes import Scope
 from service.store.jobs import MAX_ATTEMPTS, EventKind
 from service.store.keys import Quota
-from service.store.owners import SERVICE, Owner
+from service.store.owners import SERVICE, Owner, Scope
 from service.store.store import Store
 from service.uploads import intake
 from tests.scenes import look_at, random_splats

@@ -13,12 +13,11 @@ import pytest
 from liftcore.cli import main
 from service.errors import Misconfigured
 from service.models import AssetKind, JobState
-from service.scopes import Scope
 from service.store import backup
 from service.store.backup import back_up, restore, verify
 from service.store.database import KEYS_REQUIRED
 from service.store.keys import Quota
-from service.store.owners import SERVICE
+from service.store.owners import SERVICE, Scope
 from service.store.store import Store
 
 from .conftest import Supervising, asset_of, ended, order, supervised, until

@@ -16,14 +16,13 @@ from liftcore.cli import main
 from service.commands import serve
 from service.errors import Misconfigured, StaleDatabase
 from service.models import AssetKind, JobKind, JobState
-from service.scopes import Scope
 from service.store import database as markers
 from service.store.assets import ALL
 from service.store.collect import Collector, collect, empty_quarantine
 from service.store.database import DATABASE
 from service.store.files import DataDirectory
 from service.store.keys import Quota
-from service.store.owners import SERVICE, Owner
+from service.store.owners import SERVICE, Owner, Scope
 from service.store.schema import SCHEMA
 from service.store.store import Store
 

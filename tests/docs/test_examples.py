@@ -34,16 +34,16 @@ from liftcore.io.splats import read_splats, write_splats
 from liftcore.text.table import TableEncoder
 from liftcore.values.pack import read_features, write_pack
 from service import models
+from service.auth import OPEN
 from service.commands.scene_folder import find_scene
 from service.queries import questions
-from service.routes import assets, jobs, operations, queries, results, scene, words
-from service.scopes import OPEN
+from service.routes import assets, jobs, lifts, operations, queries
 from tests.api.tiny_scene import HEIGHT, WIDTH, WORDS, cameras_document, codebook, colmap_zip, labels, make_scene
 from tests.run_lengths import sam_records
 
 from .readme import FOR_USERS, GUIDE, PYTHON, ROOT, SERVICE, SETTINGS, blocks, text
 
-ROUTES: tuple[ModuleType, ...] = (operations, assets, jobs, results, scene, queries, words)
+ROUTES: tuple[ModuleType, ...] = (operations, assets, jobs, lifts, queries)
 SHAPES: dict[str, type[BaseModel]] = {  # a field that no other answer has -> the answer
     "counts": models.Asset,
     "attempt": models.Job,

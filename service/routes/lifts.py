@@ -1,0 +1,242 @@
+"""/lifts and /tradeoffs: what jobs made, with the id of its job; and what a viewer draws of a lift."""
+
+from __future__ import annotations
+
+import hashlib
+from functools import partial
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi.responses import JSONResponse, StreamingResponse
+
+from liftcore.errors import NotFound
+from liftcore.scene.origin import FILE_ORIGIN
+from service import models
+from service.content import FILE, TAGGED, Cursor, Limit, StoredFile, file_answer, kept, listed, unchanged
+from service.encoders import encoder_label
+from service.photos import in_camera_orientation
+from service.queries import questions
+from service.queries.requests import NO_ENCODER, Ask, made, scene_request, tagged_answer, with_encoder, with_packs
+from service.requests import JsonRoute
+from service.routes.assets import RAW_BODY, Sha256, taken
+from service.routes.queries import NPY, PLY, PNG
+from service.state import AppState, Deps
+from service.store.lifts import LiftRecord, TradeoffRecord
+from service.uploads import LIFT
+from service.uploads.intake import LiftIntake
+
+MARKDOWN_TYPE = "text/markdown; charset=utf-8"
+MARKDOWN: dict[int | str, dict[str, Any]] = {200: {"content": {MARKDOWN_TYPE: {"schema": {"type": "string"}}}}}
+
+LiftCameras = Annotated[
+    str | None,
+    Query(
+        pattern=models.ASSET_ID,
+        description="an asset with the cameras of its views, in place of those that it was made with",
+    ),
+]
+
+_BYTES = {"schema": {"type": "string", "format": "binary"}}
+PHOTO: dict[int | str, dict[str, Any]] = {200: {"content": {"image/jpeg": _BYTES, "image/png": _BYTES}}}
+
+View = Annotated[str, Query(min_length=1, max_length=models.VIEW_CHARACTERS, description="the name of a camera")]
+ViewsCursor = Annotated[int, Query(ge=0, le=10**9, description="the `next` of the page before")]
+Pixel = Annotated[int, Query(ge=0, le=10**9, description="of the photo: x from the left, y from the top")]
+Level = Annotated[int, Query(ge=0, le=10**9, description="as GET /lifts/{lift}/regions tells it")]
+ObjectId = Annotated[int, Path(ge=0, le=10**9, description="the id of an object of the lift")]
+Layer = Annotated[
+    Literal["pca", "cluster", "evidence", "agreement", "confidence"],
+    Query(description="principal components of features, clusters, or one of the others through a colour map"),
+]
+
+router = APIRouter(route_class=JsonRoute)
+
+
+@router.get("/lifts", response_model=models.Lifts, tags=["lifts"])
+def list_lifts(deps: Deps, limit: Limit = models.PAGE, cursor: Cursor = None) -> Response:
+    """The lifts, newest first, in pages."""
+    return listed("lifts", partial(deps.store.lifts.page, deps.owner), shape_lift, limit=limit, cursor=cursor)
+
+
+@router.post(
+    "/lifts",
+    response_model=models.LiftResult,
+    status_code=201,
+    responses={200: {"model": models.LiftResult, "description": "It was here already"}},
+    openapi_extra=RAW_BODY,
+    tags=["lifts"],
+)
+async def upload_lift(request: Request, deps: Deps, sha256: Sha256 = None, cameras: LiftCameras = None) -> Response:
+    """Bring a lift file of the command line, which is checked whole.
+
+    Its splats and its file of cameras must be assets (404 names the missing one), its feature packs only for examples
+    by region. ``cameras`` names other cameras with the same poses, such as a zip of the folder that was lifted with.
+    """
+    lift, new = await taken(partial(LiftIntake, cameras=cameras), LIFT, request, deps, sha256)
+    location = {"Location": f"/lifts/{lift.id}"}
+    return JSONResponse(shape_lift(lift).model_dump(mode="json"), 201 if new else 200, headers=location)
+
+
+@router.patch(
+    "/lifts/{lift}",
+    response_model=models.LiftResult,
+    tags=["lifts"],
+)
+def change_lift(lift: str, change: models.LiftChange, deps: Deps) -> models.LiftResult:
+    """Give a lift a name, or photos of its views; what is left out stays."""
+    return shape_lift(deps.store.lifts.change(deps.owner, lift, change.model_dump(exclude_unset=True)))
+
+
+@router.get("/lifts/{lift}", response_model=models.LiftResult, tags=["lifts"])
+def get_lift(lift: str, deps: Deps) -> models.LiftResult:
+    """One lift: its settings, certificate and timings."""
+    return shape_lift(deps.store.lifts.get(deps.owner, lift))
+
+
+@router.get("/lifts/{lift}/features", response_class=Response, responses=FILE, tags=["lifts"])
+def get_features(lift: str, request: Request, deps: Deps) -> Response:
+    """The lift file (safetensors), or a range of it."""
+    found = deps.store.lifts.get(deps.owner, lift)
+    return file_answer(request, StoredFile(found.path, found.bytes, found.sha256, f"lift-{found.id}.safetensors"))
+
+
+@router.get("/tradeoffs/{tradeoff}", response_model=models.Tradeoff, tags=["trade-offs"])
+def get_tradeoff(tradeoff: str, deps: Deps) -> models.Tradeoff:
+    """What was found: the runs, and which to take."""
+    return shape_tradeoff(deps.store.tradeoffs.get(deps.owner, tradeoff))
+
+
+@router.get("/tradeoffs/{tradeoff}/chart", response_class=Response, responses=PNG | TAGGED, tags=["trade-offs"])
+def get_chart(tradeoff: str, request: Request, deps: Deps) -> Response:
+    """Accuracy over time, and how near the dial stays to the exact lift, as a picture."""
+    found = deps.store.tradeoffs.get(deps.owner, tradeoff)
+    etag = f'"{found.sha256}"'
+    return unchanged(request, etag) or Response(found.chart, media_type="image/png", headers=kept(etag))
+
+
+@router.get("/tradeoffs/{tradeoff}/table", response_class=Response, responses=MARKDOWN, tags=["trade-offs"])
+def get_table(tradeoff: str, deps: Deps) -> Response:
+    """The runs as a table, with what it says and how it was made."""
+    return Response(deps.store.tradeoffs.get(deps.owner, tradeoff).page, headers={"Content-Type": MARKDOWN_TYPE})
+
+
+# What a viewer draws of a lift
+
+
+@router.get("/lifts/{lift}/splats", responses=PLY | TAGGED, response_class=Response, tags=["lifts"])
+def splats(lift: str, request: Request, deps: Deps, ask: Ask) -> Response:
+    """The scene for a web viewer: `.splat`, 32 bytes a splat, rows as in the lift.
+
+    2DGS discs are thin Gaussians there, and DBS kernels the Gaussians of nearest size.
+    """
+    found = deps.store.lifts.get(deps.owner, lift)
+    return tagged_answer(request, deps, scene_request("scene", found, deps), found, ask)
+
+
+@router.get("/lifts/{lift}/colours", responses=NPY | TAGGED, response_class=Response, tags=["lifts"])
+def colours(lift: str, request: Request, deps: Deps, ask: Ask, what: Layer = "pca") -> Response:
+    """A colour for every splat: .npy, uint8 [P, 3], sRGB. Splats without a feature are grey."""
+    found = deps.store.lifts.get(deps.owner, lift)
+    return tagged_answer(request, deps, scene_request("layer", found, deps) | {"what": what}, found, ask)
+
+
+@router.get("/lifts/{lift}/photo", responses=PHOTO | TAGGED, response_class=Response, tags=["lifts"])
+def photo(lift: str, view: View, request: Request, deps: Deps, ask: Ask) -> Response:
+    """The photo of a view, as it was uploaded.
+
+    Where its camera is of the stored pixels, an EXIF orientation becomes 1, so that no browser turns the photo.
+    """
+
+    def camera_size() -> tuple[int, int] | None:
+        cameras = ask(scene_request("views", found, deps) | {"view": view}).header["views"]
+        return (cameras[0]["width"], cameras[0]["height"]) if cameras else None
+
+    found = deps.store.lifts.get(deps.owner, lift)
+    zipped = None if found.photos is None else deps.store.assets.get(deps.owner, found.photos)
+    opened = None if zipped is None else deps.photos.of(zipped.path).open(view)
+    if zipped is None or opened is None:
+        got, hint = f"none of {view!r}"[:200], "PUT /assets/photos, then PATCH /lifts/{lift} with its id"
+        raise NotFound("view", expected="a view of which the lift has a photo", got=got, hint=hint)
+    media_type, size, blocks = opened
+    blocks, is_changed = in_camera_orientation(blocks, camera_size)
+    etag = f'"{hashlib.sha256(f"{zipped.id} {view} {is_changed}".encode()).hexdigest()}"'
+    headers = kept(etag) | {"Content-Length": str(size)}
+    return unchanged(request, etag) or StreamingResponse(blocks, media_type=media_type, headers=headers)
+
+
+def _with_photo(deps: AppState, lift: LiftRecord, views: list[str]) -> set[str]:
+    if lift.photos is None:
+        return set()
+    return deps.photos.of(deps.store.assets.get(deps.owner, lift.photos).path).names(views)
+
+
+@router.get("/lifts/{lift}/views", response_model=models.Views, tags=["lifts"])
+def views(lift: str, deps: Deps, ask: Ask, limit: Limit = models.PAGE, cursor: ViewsCursor = 0) -> models.Views:
+    """The cameras of the scene with their poses, in pages; also those that were not lifted."""
+    found = deps.store.lifts.get(deps.owner, lift)
+    answer = ask(scene_request("views", found, deps) | {"first": cursor, "count": limit}).header
+    names = [view["name"] for view in answer["views"]]
+    lifted, photos = deps.store.lifts.lifted(deps.owner, lift, names), _with_photo(deps, found, names)
+    told = [
+        models.View(lifted=view["name"] in lifted, photo=view["name"] in photos, **view) for view in answer["views"]
+    ]
+    return models.Views(views=told, next=cursor + limit if answer["more"] else None)
+
+
+@router.get("/lifts/{lift}/regions", response_model=questions.CoveringRegions, tags=["lifts"])
+def regions(lift: str, view: View, x: Pixel, y: Pixel, deps: Deps, ask: Ask) -> questions.CoveringRegions:
+    """The regions of the lift's feature packs that cover a pixel of a view's photo: each is an example to ask by."""
+    found = deps.store.lifts.get(deps.owner, lift)
+    wanted = with_packs(scene_request("regions", found, deps), found, deps, "lift") | {"view": view, "x": x, "y": y}
+    return questions.CoveringRegions(lift=found.id, view=view, **ask(wanted).header)
+
+
+@router.get("/lifts/{lift}/regions/mask", responses=PNG | TAGGED, response_class=Response, tags=["lifts"])
+def region_mask(
+    lift: str, view: View, level: Level, region: Level, request: Request, deps: Deps, ask: Ask
+) -> Response:
+    """The pixels of a view's photo that one region covers: a PNG, white where it is."""
+    found = deps.store.lifts.get(deps.owner, lift)
+    wanted = with_packs(scene_request("region_mask", found, deps), found, deps, "lift")
+    wanted |= {"view": view, "level": level, "region": region}
+    return tagged_answer(request, deps, wanted, found, ask)
+
+
+@router.get("/lifts/{lift}/objects", response_model=questions.SceneObjects, tags=["lifts"])
+def scene_objects(
+    lift: str, deps: Deps, ask: Ask, asked: Annotated[questions.AskedForSceneObjects, Query()]
+) -> Response:
+    """The things in the scene, found by masks alone when it was lifted; a vocabulary names them."""
+    found = deps.store.lifts.get(deps.owner, lift)
+    wanted: dict[str, Any] = scene_request("catalogue", found, deps) | NO_ENCODER | {"words": None}
+    if asked.table is not None or asked.encoder is not None:
+        wanted = with_encoder(wanted, asked, found, deps)
+    named = None if wanted["encoder"] is None else encoder_label(wanted["encoder"])
+    wanted |= {"first": asked.cursor, "count": asked.limit, "means": asked.features}
+    return made(deps, wanted | {"head": {"lift": found.id, "encoder": named}}, found, ask, {})
+
+
+@router.get("/lifts/{lift}/objects/{thing}/splats", responses=PLY | TAGGED, response_class=Response, tags=["lifts"])
+def object_splats(lift: str, thing: ObjectId, request: Request, deps: Deps, ask: Ask) -> Response:
+    """The splats of one object and no others: a PLY of the dialect that was lifted."""
+    found = deps.store.lifts.get(deps.owner, lift)
+    wanted = scene_request("splats", found, deps) | {"what": f"object-{thing}", "object": thing}
+    return tagged_answer(request, deps, wanted, found, ask)
+
+
+def shape_lift(lift: LiftRecord) -> models.LiftResult:
+    """A lift as clients get it; paths of this machine stay here."""
+    own = f"/lifts/{lift.id}"
+    links = {"self": own, "job": f"/jobs/{lift.id}", "features": f"{own}/features"}
+    links |= {"views": f"{own}/views", "objects": f"{own}/objects", "query": f"/query?lift={lift.id}&text="}
+    told = {"views": [], "words": [], "origin": FILE_ORIGIN, **lift.metadata, **vars(lift), "links": links}
+    return models.LiftResult(**{name: told[name] for name in models.LiftResult.model_fields})
+
+
+def shape_tradeoff(tradeoff: TradeoffRecord) -> models.Tradeoff:
+    """A trade-off as clients get it."""
+    own = f"/tradeoffs/{tradeoff.id}"
+    links = {"self": own, "job": f"/jobs/{tradeoff.id}", "chart": f"{own}/chart", "table": f"{own}/table"}
+    ours = ("id", "splats", "cameras", "features", "labels", "created")
+    told = {name: getattr(tradeoff, name) for name in ours}
+    return models.Tradeoff.model_validate({**tradeoff.document, **told, "links": links})
