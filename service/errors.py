@@ -11,7 +11,7 @@ SplatliftError
     ├── TimedOut, ClientLeft, Crashed                               what ended without an answer
     └── Misconfigured (StaleDatabase)                               at the start only
 
-Statuses and titles are in `service.problems`, which no child process loads.
+Those of liftcore have their statuses and titles in `service.problems`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from liftcore.errors import SplatliftError
 class ServiceError(SplatliftError):
     """An error of the service around the core; ``headers`` are what an answer tells beside the problem."""
 
-    kind = "service"
+    kind, status, title = "service", 422, "The input is not usable"
 
     def __init__(
         self, argument: str, *, expected: str, got: str, hint: str = "", headers: Mapping[str, str] | None = None
@@ -36,97 +36,97 @@ class ServiceError(SplatliftError):
 class Unauthorized(ServiceError):
     """No key, or one that is not valid (any more)."""
 
-    kind = "unauthorized"
+    kind, status, title = "unauthorized", 401, "A key is needed"
 
 
 class MissingScope(ServiceError):
     """A key that was not made for this."""
 
-    kind = "missing-scope"
+    kind, status, title = "missing-scope", 403, "The key may not do that"
 
 
 class ForeignOrigin(ServiceError):
     """A web page of another site asks in its visitor's name."""
 
-    kind = "foreign-origin"
+    kind, status, title = "foreign-origin", 403, "Pages of other sites may not do that"
 
 
 class Misdirected(ServiceError):
     """A Host header that does not mean this service."""
 
-    kind = "misdirected"
+    kind, status, title = "misdirected", 421, "This is another host"
 
 
 class OverQuota(ServiceError):
     """More bytes than a key may store."""
 
-    kind = "over-quota"
+    kind, status, title = "over-quota", 403, "The key's quota is used up"
 
 
 class InvalidRequest(ServiceError):
     """A parameter or a body that the route does not understand."""
 
-    kind = "invalid-request"
+    kind, status, title = "invalid-request", 422, "The request is malformed"
 
 
 class UnreadableBody(ServiceError):
     """A body that no reader of JSON gets to the end of."""
 
-    kind = "malformed-request"
+    kind, status, title = "malformed-request", 400, "The request is malformed"
 
 
 class DigestMismatch(ServiceError):
     """The body's sha256 is not the promised one."""
 
-    kind = "digest-mismatch"
+    kind, status, title = "digest-mismatch", 422, "The body is not what its digest promised"
 
 
 class UnsupportedEncoding(ServiceError):
     """A body that is compressed."""
 
-    kind = "unsupported-encoding"
+    kind, status, title = "unsupported-encoding", 415, "The content encoding is not supported"
 
 
 class TooLarge(ServiceError):
     """More bytes than the operator allows."""
 
-    kind = "too-large"
+    kind, status, title = "too-large", 413, "The body is too large"
 
 
 class RangeNotSatisfiable(ServiceError):
     """A Range header that asks beyond the end."""
 
-    kind = "range-not-satisfiable"
+    kind, status, title = "range-not-satisfiable", 416, "The range is beyond the end"
 
 
 class InUse(ServiceError):
     """An asset that a job or a lift still needs."""
 
-    kind = "in-use"
+    kind, status, title = "in-use", 409, "The asset is in use"
 
 
 class Conflict(ServiceError):
     """A job whose state does not allow what was asked."""
 
-    kind = "conflict"
+    kind, status, title = "conflict", 409, "The job's state does not allow that"
 
 
 class KeyReused(ServiceError):
     """An Idempotency-Key that came with another order before."""
 
-    kind = "key-reused"
+    kind, status, title = "key-reused", 422, "The key belongs to another order"
 
 
 class OverLimit(ServiceError):
     """A job that needs more time or memory than the operator allows."""
 
-    kind = "over-limit"
+    kind, status, title = "over-limit", 422, "The job needs more than the server allows"
 
 
 class NoSpace(ServiceError):
     """Less free disk than the operator wants to keep."""
 
-    kind = "no-space"
+    kind, status, title = "no-space", 507, "There is no room left"
 
 
 class RetryLater(ServiceError):
@@ -140,37 +140,37 @@ class RetryLater(ServiceError):
 class TooMany(RetryLater):
     """More jobs in line, or uploads, queries or streams at a time, than a key may have."""
 
-    kind = "too-many"
+    kind, status, title = "too-many", 429, "The key asks for too much at a time"
 
 
 class Busy(RetryLater):
     """The service has as much waiting work as it accepts."""
 
-    kind = "busy"
+    kind, status, title = "busy", 503, "The server is busy"
 
 
 class NotReady(Busy):
     """The service cannot work now: it stops, or a check failed."""
 
-    kind = "not-ready"
+    kind, status, title = "not-ready", 503, "The server is not ready"
 
 
 class TimedOut(ServiceError):
     """A query that took longer than the operator allows."""
 
-    kind = "timed-out"
+    kind, status, title = "timed-out", 504, "The query took too long"
 
 
 class ClientLeft(ServiceError):
     """A client that did not wait for its turn: nobody reads the answer."""
 
-    kind = "client-left"
+    kind, status, title = "client-left", 400, "The client left"
 
 
 class Crashed(ServiceError):
     """A process of the service died without an answer."""
 
-    kind = "crashed"
+    kind, status, title = "crashed", 500, "A process of the server died"
 
 
 class Misconfigured(ServiceError):

@@ -43,7 +43,7 @@ NO_SPACE = "There is no room left"
 BUSY = "The server is busy"
 MALFORMED = "The request is malformed"
 
-# Exception -> status and title. The nearest class in the exception's ancestry counts; `type` is its `kind`.
+# Exception of the library -> status and title, of the nearest class in its ancestry; `type` is its `kind`.
 TABLE: dict[type[SplatliftError], tuple[int, str]] = {
     SplatliftError: (422, "The input is not usable"),
     core.InvalidInput: (422, "The input is malformed"),
@@ -58,28 +58,6 @@ TABLE: dict[type[SplatliftError], tuple[int, str]] = {
     core.InvalidQuery: (422, "The query cannot be answered as asked"),
     core.NotFound: (404, "There is no such thing here"),
     core.Unavailable: (422, "This server lacks what that needs"),
-    errors.Unauthorized: (401, "A key is needed"),
-    errors.MissingScope: (403, "The key may not do that"),
-    errors.ForeignOrigin: (403, "Pages of other sites may not do that"),
-    errors.Misdirected: (421, "This is another host"),
-    errors.OverQuota: (403, "The key's quota is used up"),
-    errors.TooMany: (429, "The key asks for too much at a time"),
-    errors.InvalidRequest: (422, MALFORMED),
-    errors.UnreadableBody: (400, MALFORMED),
-    errors.DigestMismatch: (422, "The body is not what its digest promised"),
-    errors.UnsupportedEncoding: (415, "The content encoding is not supported"),
-    errors.TooLarge: (413, "The body is too large"),
-    errors.RangeNotSatisfiable: (416, "The range is beyond the end"),
-    errors.InUse: (409, "The asset is in use"),
-    errors.Conflict: (409, "The job's state does not allow that"),
-    errors.KeyReused: (422, "The key belongs to another order"),
-    errors.OverLimit: (422, "The job needs more than the server allows"),
-    errors.NoSpace: (507, NO_SPACE),
-    errors.Busy: (503, BUSY),
-    errors.NotReady: (503, "The server is not ready"),
-    errors.TimedOut: (504, "The query took too long"),
-    errors.ClientLeft: (400, "The client left"),
-    errors.Crashed: (500, "A process of the server died"),
 }
 
 # Errors that the framework raises by status, not by class.
@@ -105,7 +83,10 @@ log = logging.getLogger(__name__)
 
 def problem_of(error: SplatliftError) -> Problem:
     """The error as a problem."""
-    status, title = next(TABLE[cls] for cls in type(error).__mro__ if cls in TABLE)
+    if isinstance(error, errors.ServiceError):
+        status, title = error.status, error.title
+    else:
+        status, title = next(TABLE[cls] for cls in type(error).__mro__ if cls in TABLE)
     told = {name: getattr(error, name) for name in ("argument", "expected", "got")}
     return Problem(
         type=f"/problems/{error.kind}", title=title, status=status, detail=str(error), hint=error.hint or None, **told

@@ -17,6 +17,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from liftcore.errors import InvalidInput
+from liftcore.runtime.folders import cache_folder
 
 REMOTE = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+(::[^:]+)*://")
 OPENED = "a file or folder that fsspec opens, such as s3://bucket/scene.ply (needs s3fs) or file:///scene.ply"
@@ -60,7 +61,7 @@ def local_path(path: Path | str) -> Path:
         # file that is asked for itself `find` tells nothing, and of one in a folder over HTTP no size and no tag.
         told = {name: known if known.get("size") is not None else storage.info(name) for name, known in found.items()}
         versions = sorted((name, storage.ukey(name), sorted(map(str, told[name].items()))) for name in found)
-        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "splatlift" / "remote"
+        base = cache_folder("remote")
         name = PurePosixPath(place.rstrip("/")).name
         copy = base / hashlib.sha256(repr((url, versions)).encode()).hexdigest()[:32] / name
         if copy.exists():

@@ -25,7 +25,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -40,6 +39,7 @@ from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.question import Presence
 from liftcore.query.scores import cosines
 from liftcore.query.threshold import LEAST_SHARE
+from liftcore.runtime.folders import cache_folder
 from liftcore.text import LVIS_TABLE, RememberingEncoder, TextEncoder
 from liftcore.text.table import TableEncoder
 
@@ -266,8 +266,7 @@ def _shipped() -> References:
 
 
 def _place(name: str) -> Path:
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return base / "splatlift" / "references" / f"{hashlib.sha256(name.encode()).hexdigest()[:16]}.safetensors"
+    return cache_folder("references") / f"{hashlib.sha256(name.encode()).hexdigest()[:16]}.safetensors"
 
 
 def _kept(name: str) -> References | None:

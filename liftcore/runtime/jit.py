@@ -19,6 +19,8 @@ import numba
 from numba import njit
 from numba.core import config
 
+from liftcore.runtime.folders import cache_folder
+
 # What compiled code in other files is made of: a change in any of these compiles all kernels anew.
 SHARED_SOURCES = (
     "runtime/jit.py",
@@ -37,8 +39,7 @@ def _source_digest() -> str:
 
 
 def _cache_folder() -> Path:
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    folder = base / "splatlift" / "kernels" / _source_digest()
+    folder = cache_folder("kernels") / _source_digest()
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
     if os.access(folder, os.W_OK):

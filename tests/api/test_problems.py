@@ -16,7 +16,7 @@ from fastapi.testclient import TestClient
 from liftcore.errors import SplatliftError
 from liftcore.query.terms import NOTATIONS
 from liftcore.values.settings import LiftSettings
-from service import problems
+from service import errors, problems
 from service.child import error_of, fault_of
 from service.models import COMPARED
 from service.problems import TABLE, problem_of
@@ -116,12 +116,13 @@ def test_error_that_nobody_foresaw_says_nothing_of_itself(error: Exception, stat
 
 
 def test_every_error_has_a_row_and_crosses_processes() -> None:
-    for cls in TABLE:
+    classes = [*TABLE, *(cls for cls in vars(errors).values() if isinstance(cls, type) and "status" in vars(cls))]
+    for cls in classes:
         error = cls("place", expected="this", got="that at /data/blobs/x", hint="try")
         back = error_of(fault_of(error, {"/data/blobs/x": "splats y"}))
         assert type(back) is cls and back.got == "that at splats y"
         assert problem_of(back).type == f"/problems/{cls.kind}"
-    kinds = [cls.kind for cls in TABLE]
+    kinds = [cls.kind for cls in classes]
     assert len(set(kinds)) == len(kinds)
     assert issubclass(next(iter(TABLE)), SplatliftError)
 

@@ -22,7 +22,6 @@ were drawn by hand for this purpose (`BOXES`):
 """
 
 import json
-import os
 import subprocess
 import sys
 import tarfile
@@ -48,6 +47,7 @@ from liftcore.query.question import Query
 from liftcore.query.render import overlay, view_mask
 from liftcore.query.scene import Scene
 from liftcore.query.terms import Pixel
+from liftcore.runtime.folders import cache_folder
 from liftcore.text.table import TableEncoder
 from liftcore.values.pack import read_features
 from tests.benchmarks.base import box_iou, command_line, scene_files, tell
@@ -103,7 +103,7 @@ BY_EXAMPLE: tuple[Question, ...] = (
 
 def environment() -> Path:
     """The folder of the networks, which the first run fills: ``venv``, ``node_modules`` and ``models``."""
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "splatlift" / "real_chain"
+    base = cache_folder("real_chain")
     if (base / "models" / "hed.npz").is_file():
         return base
     (base / "models").mkdir(parents=True, exist_ok=True)
