@@ -33,9 +33,8 @@ CONTEXT.set_forkserver_preload(
     [
         "service.one_thread",
         "service.errand",
-        "service.uploads.check",
-        "service.uploads.renaming",
-        "service.jobs.planning",
+        "service.tasks",
+        "liftcore.cli.__main__",  # a task imports anew what the server's process began with
     ]
 )
 TICK_SECONDS = 0.5  # how soon the end of the server is seen by who waits
@@ -96,12 +95,12 @@ def _template() -> int | None:
     return None
 
 
-def run_errand(module: str, arguments: Sequence[str], scratch: Path, limits: ErrandLimits) -> Heard | None:
-    """Call the ``run`` of a module in a process of its own, and wait for what it gives.
+def run_errand(task: str, arguments: Sequence[str], scratch: Path, limits: ErrandLimits) -> Heard | None:
+    """Call a function in a process of its own, and wait for what it gives.
 
     Args:
-        module: by its name, as this process must not import what it needs.
-        arguments: of that function, which gives a JSON object with an ``event``.
+        task: the name of the function, such as ``service.tasks.check``: this process must not import what it needs.
+        arguments: of the function, which gives a JSON object with an ``event``.
         scratch: the folder for its temporary files.
         limits: beyond that of time it is ended; one that meets that of memory dies, or says so.
 
@@ -111,17 +110,17 @@ def run_errand(module: str, arguments: Sequence[str], scratch: Path, limits: Err
     Raises:
         Busy: the server ended meanwhile, or there is no process.
     """
-    task, pipe = _start(module, list(arguments), str(scratch), limits.memory_bytes)
+    process, pipe = _start(task, list(arguments), str(scratch), limits.memory_bytes)
     with pipe:
         last = _listen(pipe, limits)
     if last is not None:
-        wait([task.sentinel], GONE_SECONDS)
+        wait([process.sentinel], GONE_SECONDS)
     with _TURN:
-        if task.is_alive():
-            task.kill()
-        task.join()
-        status = task.exitcode
-        task.close()  # with its lifeline, which ends one whose template is gone
+        if process.is_alive():
+            process.kill()
+        process.join()
+        status = process.exitcode
+        process.close()  # with its lifeline, which ends one whose template is gone
     if limits.ending.is_set() and last is None:
         raise Busy("upload", expected="a running server", got="one that stops", hint="send it again")
     if last is None:
@@ -166,7 +165,7 @@ def _listen(pipe: Connection, limits: ErrandLimits) -> dict[str, Any] | None:
     return None
 
 
-def _work(pipe: Connection, module: str, arguments: list[str], scratch: str, memory_bytes: int) -> None:
+def _work(pipe: Connection, task: str, arguments: list[str], scratch: str, memory_bytes: int) -> None:
     """A task, in its own process."""
     os.setsid()
     parent = multiprocessing.parent_process()
@@ -176,7 +175,8 @@ def _work(pipe: Connection, module: str, arguments: list[str], scratch: str, mem
     for stream in (1, 2):
         os.dup2(printed, stream)
     os.environ["TMPDIR"] = tempfile.tempdir = scratch
-    run = importlib.import_module(module).run
+    module, _, name = task.rpartition(".")
+    run = getattr(importlib.import_module(module), name)
     most = memory_of("self", "VmData") + memory_bytes  # imports hold half a gigabyte with CUDA's torch
     resource.setrlimit(resource.RLIMIT_DATA, (most, most))
     for message in ({"event": "ready"}, None):

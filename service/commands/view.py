@@ -40,7 +40,7 @@ from service.store.lifts import FinishedLift, order_of
 from service.store.owners import SERVICE
 from service.store.rebuild import header_of
 from service.store.store import Store
-from service.uploads.intake import check
+from service.uploads import check
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -17,7 +17,7 @@ from service.errors import Crashed
 from service.requests import JsonRoute
 from service.state import AppState, Deps
 from service.store.assets import SHOWN_CHARACTERS, AssetRecord
-from service.uploads.intake import AssetIntake, Intake, Taken, require_plain, require_size
+from service.uploads import AssetIntake, Intake, Taken, require_plain, require_size
 
 T = TypeVar("T")
 BATCH = 1 << 20  # bytes gathered before a thread writes them
@@ -149,7 +149,7 @@ def _retagged(asset: str, change: models.PackChange, deps: AppState) -> tuple[As
         with deps.store.files.scratch() as scratch, found.path.open("rb") as pack:
             header = scratch / "header"
             given = [str(found.path), change.model_dump_json(exclude_none=True), str(header)]
-            heard = run_errand("service.uploads.renaming", given, scratch, allowed)
+            heard = run_errand("service.tasks.rename", given, scratch, allowed)
             if heard is None or heard.last["event"] != "valid":
                 raise Crashed(
                     "asset", expected="a pack whose header is read", got="one that is not", hint="try again"

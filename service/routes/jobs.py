@@ -107,7 +107,7 @@ def _planned(order: models.LiftRequest, deps: AppState) -> models.Plan:
     with deps.store.files.scratch() as scratch:
         file = scratch / "order.json"
         file.write_text(json.dumps(document))
-        heard = run_errand("service.jobs.planning", [str(file)], scratch, limits)
+        heard = run_errand("service.tasks.plan", [str(file)], scratch, limits)
     if heard is not None and heard.last["event"] == "valid":
         return models.Plan.model_validate(heard.last["plan"])
     if heard is not None and heard.last["event"] == "invalid":

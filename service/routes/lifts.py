@@ -22,8 +22,7 @@ from service.routes.assets import RAW_BODY, Sha256, taken
 from service.routes.queries import NPY, PLY, PNG
 from service.state import AppState, Deps
 from service.store.lifts import LiftRecord, TradeoffRecord
-from service.uploads import LIFT
-from service.uploads.intake import LiftIntake
+from service.uploads import LIFT, LiftIntake
 
 MARKDOWN_TYPE = "text/markdown; charset=utf-8"
 MARKDOWN: dict[int | str, dict[str, Any]] = {200: {"content": {MARKDOWN_TYPE: {"schema": {"type": "string"}}}}}

@@ -23,8 +23,7 @@ from service.store.assets import CheckedUpload
 from service.store.lifts import FinishedLift, order_of
 from service.store.owners import SERVICE
 from service.store.store import Store
-from service.uploads import LIFT
-from service.uploads.intake import Report, check
+from service.uploads import LIFT, Report, check
 
 
 def rebuild(store: Store, settings: ServiceSettings) -> dict[str, Any]:

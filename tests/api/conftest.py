@@ -13,6 +13,7 @@ import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
+from service import tasks
 from service.app import assemble
 from service.models import AssetKind
 from service.settings import ServiceSettings
@@ -20,7 +21,6 @@ from service.state import AppState
 from service.store.assets import CheckedUpload
 from service.store.owners import SERVICE
 from service.store.store import Store
-from service.uploads import check
 
 from .following import ended
 from .tiny_scene import CHANNELS, TinyScene, make_scene, text_table
@@ -66,7 +66,7 @@ def put(client: TestClient, kind: AssetKind, content: bytes) -> str:
         draft.write_bytes(content)
         copy = folder / "copy"
         copy.write_bytes(content)
-        said = check.run(kind, str(copy))
+        said = tasks.check(kind, str(copy))
         digest = hashlib.sha256(content).hexdigest()
         upload = CheckedUpload(draft, kind, digest, said["suffix"], said["counts"], said["warnings"])
         return store.assets.add(SERVICE, upload)[0].id

@@ -30,7 +30,7 @@ from service.settings import ServiceSettings
 from service.store.keys import Quota
 from service.store.owners import Scope
 from service.store.store import Store
-from service.uploads.intake import Report
+from service.uploads import Report
 from tests.crash.conftest import address_of, listening, stand_in, until
 
 CHECKS = (
@@ -61,7 +61,7 @@ def served(data: Path, *, keys: bool, **settings: Any) -> Iterator[tuple[str, st
     report = Report(".bin", {"names": ["v"], "channels": 1, "classes": 1, "words": ["apple"], **lift}, [])
     planned = Heard({"event": "valid", "plan": {"summary": [], "warnings": []}}, 0, "")
     with (
-        mock.patch("service.uploads.intake.check", lambda *given: report),
+        mock.patch("service.uploads.check", lambda *given: report),
         mock.patch("service.routes.jobs.run_errand", lambda *given: planned),
     ):
         try:

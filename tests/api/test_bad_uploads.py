@@ -18,10 +18,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import save
 
+from service import tasks
 from service.child import error_of
 from service.models import AssetKind
 from service.problems import problem_of
-from service.uploads import check
 
 from .bombs import camera_documents, features
 from .test_problems import assert_problem
@@ -88,7 +88,7 @@ def test_names_of_cameras_are_as_long_as_a_query_may_say(tmp_path: Path) -> None
     for image, said in (("a" * 500, None), ("a" * 501, "501: 'aaa"), ("", "an empty one")):
         path = tmp_path / "draft.cameras"
         path.write_bytes(camera_of(image))
-        told = check.run(AssetKind.CAMERAS, str(path))
+        told = tasks.check(AssetKind.CAMERAS, str(path))
         assert told["event"] == ("valid" if said is None else "invalid")
         if said is not None:
             fault = told["fault"]
@@ -142,7 +142,7 @@ ALL_IN_ONE_PROCESS = """
 import json, resource, sys
 from pathlib import Path
 from service.child import memory_of
-from service.uploads import check
+from service import tasks
 from tests.api.bombs import CORPUS
 folder = Path(sys.argv[1])
 resource.setrlimit(resource.RLIMIT_DATA, (memory_of("self", "VmData") + int(sys.argv[2]),) * 2)
@@ -150,7 +150,7 @@ for kind, corpus in CORPUS.items():
     for name, content in corpus().items():
         path = folder / f"draft.{kind}"
         path.write_bytes(content)
-        print(json.dumps([kind, name, check.run(kind, str(path))]))
+        print(json.dumps([kind, name, tasks.check(kind, str(path))]))
 """
 
 
@@ -221,7 +221,7 @@ def test_real_file_with_changed_bytes_is_taken_or_refused_and_never_crashes(
     content = content[: round(end * len(content))] if end < 1 else content
     path = tmp_path / f"draft.{kind}"
     path.write_bytes(gzip.compress(content) if packed else content)
-    said = check.run(kind, str(path))
+    said = tasks.check(kind, str(path))
     if said["event"] == "valid":
         json.dumps(said, allow_nan=False, ensure_ascii=False).encode()
     else:

@@ -41,7 +41,7 @@ from service.store.database import Database
 from service.store.files import DataDirectory
 from service.store.owners import SERVICE
 from service.store.store import Store
-from service.uploads.intake import check
+from service.uploads import check
 from tests.crash.conftest import order, until
 from tests.crash.server import NoQueries
 from tests.crash.service_process import ServiceProcess, processes_of, template_of

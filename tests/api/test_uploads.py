@@ -17,7 +17,7 @@ from service.store.files import DataDirectory
 from service.store.keys import Quota
 from service.store.owners import parse_scopes
 from service.store.store import Store
-from service.uploads.intake import AssetIntake, Intake
+from service.uploads import AssetIntake, Intake
 from tests.crash.server import standing_in
 
 from .conftest import Uploaded

@@ -26,7 +26,7 @@ import liftcore as lc
 from liftcore.io.splats import write_splats
 from liftcore.io.transforms import transforms_of
 from liftcore.values.pack import write_pack
-from service import errand
+from service import errand, uploads
 from service.jobs.child import Reporter
 from service.jobs.lifting import lift_as_ordered
 from service.jobs.process import LONGEST, JobProcess
@@ -37,7 +37,6 @@ from service.store.jobs import MAX_ATTEMPTS, EventKind
 from service.store.keys import Quota
 from service.store.owners import SERVICE, Owner, Scope
 from service.store.store import Store
-from service.uploads import intake
 from tests.scenes import look_at, random_splats
 
 from .conftest import Supervising, alive, ended, order, state_of, supervised, until
@@ -258,7 +257,7 @@ def errand_of(content: str, folder: Path) -> Iterator[tuple[subprocess.Popen[str
         import pathlib, threading
         from service.errand import ErrandLimits, run_errand
         limits = ErrandLimits(600, 8 << 30, threading.Event())
-        print(run_errand("task", [{str(told)!r}], pathlib.Path({str(folder)!r}), limits).last["event"])
+        print(run_errand("task.run", [{str(told)!r}], pathlib.Path({str(folder)!r}), limits).last["event"])
     """
     found = {"PYTHONPATH": f"{folder}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
     with subprocess.Popen(
@@ -299,9 +298,9 @@ def test_check_may_take_memory_by_the_size_of_its_upload(
 
     with (tmp_path / "upload").open("wb") as handle:
         handle.truncate(size)
-    monkeypatch.setattr(intake, "run_errand", noted)
+    monkeypatch.setattr(uploads, "run_errand", noted)
     with pytest.raises(OSError, match=f"may take {most}$"):
-        intake.check(
+        uploads.check(
             AssetKind.SPLATS, tmp_path / "upload", tmp_path, errand.ErrandLimits(1.0, 8 << 30, threading.Event())
         )
 

@@ -23,11 +23,11 @@ from liftcore.query.result import load_lift
 from liftcore.text import open_encoder
 from liftcore.values.lift_file import input_file
 from liftcore.values.pack import read_features
+from service import tasks
 from service.encoders import require_encoder_files
 from service.errors import Misconfigured
 from service.models import AssetKind
 from service.settings import ServiceSettings
-from service.uploads import check
 from tests.scenes import random_splats
 
 SOG = Path(__file__).parents[2] / "data" / "splats" / "degree3.sog"
@@ -290,6 +290,6 @@ def test_a_file_in_the_place_of_another_kind_is_named_for_what_it_is_everywhere(
                 require_encoder_files(settings.model_copy(update={"encoder": f"table:{path}"}))
         for kind in (*AssetKind, "lift"):
             if kind != name:
-                reply = check.run(kind, str(path))
+                reply = tasks.check(kind, str(path))
                 assert reply["event"] == "invalid" and known.name in reply["fault"]["got"], (name, kind)
                 assert known.kind is None or f"/{known.kind}" in reply["fault"]["hint"], (name, kind)

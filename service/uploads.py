@@ -1,4 +1,4 @@
-"""A body on its way to a checked file: counted and digested as it comes, then read in a child process."""
+"""Uploads: a body on its way to a checked file, counted and digested as it comes, then read in a child process."""
 
 from __future__ import annotations
 
@@ -10,7 +10,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO, Generic, TypeVar
 
-from liftcore.errors import InvalidLift, NotFound
+from liftcore.errors import (
+    InvalidCameras,
+    InvalidFeatures,
+    InvalidInput,
+    InvalidLift,
+    InvalidMasks,
+    InvalidPhotos,
+    InvalidSplats,
+    InvalidTable,
+    NotFound,
+)
 from liftcore.scene.views import require_pairs
 from service.child import error_of
 from service.errand import ErrandLimits, run_errand
@@ -21,7 +31,19 @@ from service.store.files import is_whole
 from service.store.lifts import FinishedLift, LiftRecord, order_of
 from service.store.owners import Owner
 from service.store.store import Store
-from service.uploads import INVALID
+
+LIFT = "lift"
+
+# What a malformed file of a kind is told as.
+INVALID: dict[UploadKind, type[InvalidInput]] = {
+    AssetKind.SPLATS: InvalidSplats,
+    AssetKind.CAMERAS: InvalidCameras,
+    AssetKind.FEATURES: InvalidFeatures,
+    AssetKind.MASKS: InvalidMasks,
+    AssetKind.TABLE: InvalidTable,
+    AssetKind.PHOTOS: InvalidPhotos,
+    LIFT: InvalidLift,
+}
 
 STEP = 4 << 20  # bytes of content between two looks at what may still be stored
 CHECK_BASE_BYTES, CHECK_FACTOR = 1 << 30, 16  # private memory of a check: a reader holds several copies of a file
@@ -232,7 +254,7 @@ def check(kind: UploadKind, path: Path, scratch: Path, limits: ErrandLimits, *be
     """
     memory = min(limits.memory_bytes, CHECK_BASE_BYTES + CHECK_FACTOR * sum(map(_size, (path, *beside))))
     given = [kind, str(path), *map(str, beside)]
-    heard = run_errand("service.uploads.check", given, scratch, replace(limits, memory_bytes=memory))
+    heard = run_errand("service.tasks.check", given, scratch, replace(limits, memory_bytes=memory))
     if heard is None:
         raise INVALID[kind](
             kind, expected=f"a file that is read within {limits.seconds:g} s", got="one that takes longer"

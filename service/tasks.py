@@ -1,4 +1,5 @@
-"""The errand that reads an upload before it becomes an asset (`service.errand`)."""
+"""What runs in a process of its own while a request waits (`service.errand`): an upload is read before it becomes an
+asset, a pack named anew, a lift planned that nobody has ordered yet."""
 
 from __future__ import annotations
 
@@ -16,13 +17,18 @@ from liftcore.evaluate.class_masks import describe_masks
 from liftcore.evaluate.inspect import describe_camera_file, describe_packs, describe_splat_file, describe_table
 from liftcore.io.json_file import finite
 from liftcore.io.kinds import EXPORT_PLY, SUFFIX, SplatFormat, identify, wrong_kind
+from liftcore.io.safetensors_file import with_metadata
 from liftcore.io.splats import format_of
+from liftcore.lifting import pipeline
+from liftcore.lifting.files import open_files
 from liftcore.runtime.plugins import Plugin
 from liftcore.text.table import TableEncoder
 from liftcore.values.lift_file import has_poses, parse_metadata, read_lift
 from liftcore.values.pack import read_features
+from liftcore.values.settings import LiftSettings
 from service import models
 from service.child import fault_of
+from service.jobs.lifting import plan_document
 from service.models import AssetKind, UploadKind
 from service.photos import describe_photos
 from service.store.lifts import LONG, SHOWN_BYTES
@@ -133,7 +139,7 @@ CHECKS: dict[UploadKind, Callable[..., dict[str, Any]]] = {
 }
 
 
-def run(named: str, file: str, *more: str) -> dict[str, Any]:
+def check(named: str, file: str, *more: str) -> dict[str, Any]:
     """Check one file of a kind: ``valid`` with what was found, or ``invalid`` with the error.
 
     Args:
@@ -180,3 +186,26 @@ def _of_another_kind(kind: UploadKind, path: Path) -> InvalidInput | None:
 
 def _out_of_memory(kind: UploadKind) -> InvalidInput:
     return INVALID[kind](kind, expected="a file that fits the memory of a check", got="one that needs more")
+
+
+def rename(pack: str, changes: str, header: str) -> dict[str, Any]:
+    """Write what a checked pack begins with, its length and its header, under other names.
+
+    Args:
+        changes: the names, a JSON object. header: the file to write.
+    """
+    Path(header).write_bytes(next(with_metadata(Path(pack), json.loads(changes))))
+    return {"event": "valid"}
+
+
+def plan(file: str) -> dict[str, Any]:
+    """Plan by the JSON file of a job's order: ``valid`` with the plan, or ``invalid`` with the error."""
+    order = json.loads(Path(file).read_bytes())
+    try:
+        settings = LiftSettings.of(**order["settings"])
+        packs = [Path(path) for path in order["features"]]
+        sources = open_files(Path(order["splats"]), Path(order["cameras"]), packs, settings)
+        found = pipeline.plan(*sources, settings, in_blocks=order["engine"] is not None)
+        return {"event": "valid", "plan": plan_document(found, order["names"])}
+    except SplatliftError as error:
+        return {"event": "invalid", "fault": fault_of(error, order["names"])}
