@@ -14,7 +14,7 @@ from typing import Any
 from liftcore.errors import NotFound
 from service.errors import InUse
 from service.models import AssetKind, UploadKind
-from service.store.database import Database, Page, after, insert, page_of, record_of
+from service.store.database import Database, Page, insert, page_of, record_of
 from service.store.files import DataDirectory, is_whole
 from service.store.owners import SEEN, Owner, require_quota
 
@@ -165,14 +165,8 @@ class AssetStore:
 
     def page(self, owner: Owner, limit: int, cursor: str | None = None) -> Page[AssetRecord]:
         """So many assets after a cursor, newest first, without the names and words that they hold."""
-        terms = owner.terms(most=limit + 1, **after(cursor))
         with self._database.read() as connection:
-            rows = connection.execute(
-                f"{VISIBLE} WHERE created < :created OR (created = :created AND id > :after)"
-                " ORDER BY created DESC, id LIMIT :most",
-                terms,
-            ).fetchall()
-        return page_of(rows, limit, self._record)
+            return page_of(connection, VISIBLE, owner.terms(), limit, cursor, self._record)
 
     def all(self, owner: Owner) -> list[AssetRecord]:
         """Every asset, newest first, without the names and words that it holds."""

@@ -10,8 +10,8 @@ import re
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
@@ -30,7 +30,7 @@ BUSY_SECONDS = 10.0  # that a write waits for others, of this process and of oth
 LOOK_SECONDS = 0.3  # that a look at the pages may take: of two hundred megabytes or so
 LOOK_STEPS = 1000  # of SQLite's machine, between two looks at the clock
 READERS = 4  # at once: more threads in SQLite and with what it gave only keep the event loop from its turn
-CURSOR = r"^[0-9.e+-]{1,30}~[0-9a-z:]{1,80}$"  # when the last one of a page was made, and its id
+CURSOR = r"^[0-9]{1,20}(\.[0-9]{1,20})?(e[+-]?[0-9]{1,2})?~[0-9a-z:]{1,80}$"  # of a page's last one: when, and its id
 
 R = TypeVar("R")
 log = logging.getLogger(__name__)
@@ -392,23 +392,35 @@ class Page(Generic[R]):
     cursor: str | None
 
 
-def after(cursor: str | None) -> dict[str, Any]:
-    """Terms ``:created`` and ``:after`` of a query for what is older than that, or for the newest.
+def page_of(
+    connection: sqlite3.Connection,
+    listed: str,
+    terms: Mapping[str, Any],
+    limit: int,
+    cursor: str | None,
+    record: Callable[[sqlite3.Row], R],
+) -> Page[R]:
+    """So many records after a cursor, newest first.
+
+    Args:
+        connection: to read with.
+        listed: a SELECT of all of them, with columns ``created`` and ``id``.
+        terms: for the names in it.
+        limit: how many at most.
+        cursor: of the page before, None for the first one.
+        record: a row as a record.
 
     Raises:
         InvalidRequest: it is no cursor.
-    """
-    if cursor is None:
-        return {"created": float("inf"), "after": ""}
-    created, _, ident = cursor.partition("~")
-    with suppress(ValueError):
-        if re.match(CURSOR, cursor):
-            return {"created": float(created), "after": ident}
-    raise InvalidRequest("cursor", expected="the next of a page", got=repr(cursor[:80]))
-
-
-def page_of(rows: Sequence[sqlite3.Row], limit: int, record: Callable[[sqlite3.Row], R]) -> Page[R]:
-    """A page of the first ``limit`` rows, where one more was asked for."""
+    """  # fmt: skip
+    if cursor is not None and not re.match(CURSOR, cursor):
+        raise InvalidRequest("cursor", expected="the next of a page", got=repr(cursor[:80]))
+    created, _, ident = ("inf", "", "") if cursor is None else cursor.partition("~")
+    rows = connection.execute(
+        f"SELECT * FROM ({listed}) WHERE created <= :created AND (created < :created OR id > :after)"
+        " ORDER BY created DESC, id LIMIT :most",
+        {**terms, "created": float(created), "after": ident, "most": limit + 1},
+    ).fetchall()
     last = rows[limit - 1] if len(rows) > limit else None
-    cursor = None if last is None else f"{last['created']!r}~{last['id']}"
-    return Page([record(row) for row in rows[:limit]], cursor)
+    following = None if last is None else f"{last['created']!r}~{last['id']}"
+    return Page([record(row) for row in rows[:limit]], following)

@@ -23,7 +23,7 @@ from service.child import fault_of
 from service.errors import Busy, Conflict, Crashed, KeyReused, Unauthorized
 from service.models import ENDED, AssetKind, JobKind, JobState
 from service.store.assets import own
-from service.store.database import Database, Page, after, insert, page_of, parsed, record_of
+from service.store.database import Database, Page, insert, page_of, parsed, record_of
 from service.store.files import DataDirectory
 from service.store.owners import ENDED_KEYS, QUEUE_RETRY_SECONDS, SEEN, Owner, require_quota, require_turn
 
@@ -188,14 +188,9 @@ class JobStore:
 
     def page(self, owner: Owner, limit: int, cursor: str | None = None) -> Page[JobRecord]:
         """So many jobs after a cursor, newest first."""
-        terms = owner.terms(most=limit + 1, **after(cursor))
         with self._database.read() as connection:
-            rows = connection.execute(
-                f"SELECT * FROM jobs WHERE {SEEN} AND created <= :created AND (created < :created OR id > :after)"
-                " ORDER BY created DESC, id LIMIT :most",
-                terms,
-            ).fetchall()
-            return page_of(rows, limit, lambda row: record(connection, row))
+            listed = f"SELECT * FROM jobs WHERE {SEEN}"
+            return page_of(connection, listed, owner.terms(), limit, cursor, lambda row: record(connection, row))
 
     def all(self, owner: Owner) -> list[JobRecord]:
         """Every job, newest first."""

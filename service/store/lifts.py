@@ -18,7 +18,7 @@ from liftcore.errors import NotFound
 from liftcore.scene.render_mode import BY_HAND
 from service.errors import InvalidRequest
 from service.store.assets import own
-from service.store.database import Database, Page, after, insert, page_of, parsed, record_of
+from service.store.database import Database, Page, insert, page_of, parsed, record_of
 from service.store.files import DataDirectory
 from service.store.jobs import JobOrder, succeed, told
 from service.store.owners import SEEN, Owner, require_quota
@@ -292,14 +292,8 @@ class LiftStore:
 
     def page(self, owner: Owner, limit: int, cursor: str | None = None) -> Page[LiftRecord]:
         """So many lifts after a cursor, newest first."""
-        terms = owner.terms(most=limit + 1, **after(cursor))
         with self._database.read() as connection:
-            rows = connection.execute(
-                f"{VISIBLE} AND lifts.created <= :created AND (lifts.created < :created OR id > :after)"
-                " ORDER BY lifts.created DESC, id LIMIT :most",
-                terms,
-            ).fetchall()
-        return page_of(rows, limit, self._record)
+            return page_of(connection, VISIBLE, owner.terms(), limit, cursor, self._record)
 
     def all(self, owner: Owner) -> list[LiftRecord]:
         """Every lift, newest first."""
