@@ -1,9 +1,11 @@
 """The feature that an area of a camera's image shows: of a pixel, a box or a stroke.
 
 A pixel shows ``sum_j A_ij x_j``. Of a box or a stroke evenly chosen pixels are taken. A box around a thing holds some
-of what is behind it, and so does the band around the box, of about the same area: the pixel is chosen that is most
-like those of the box on the mean, less how like it is to those of the band. A stroke has no band. The feature is the
-mean of the area's pixels that are like the chosen one, so that what is in the area besides does not count.
+of what is behind it, and so does the band around the box, of about the same area: a pixel i of the box counts by
+``w_i = (1 - r_i)^2``, where r_i is its cosine to the pixels of the band, but for the nearest REACH of them. Pixels of
+a stroke count alike. The feature is ``sum_k w_k u_k`` of the unit features u_k that are like that of the pixel i for
+which ``sum_k w_k cos(u_i, u_k)`` is largest: what else is in the area does not count. Cosines are those of examples,
+as seen from the scene's mean.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
 MINIMUM_ROW_SUM = 0.5  # below it a ray mostly misses the scene: no histogram, no mask and no example takes it
 AREA_PIXELS = 256  # of an area that are looked at
 BAND = 0.2  # of a box's side, on each side of it: 1.4 x 1.4 is twice the area
+REACH = 0.15  # of the band, into which the thing may reach out of a box that is drawn too small
 
 
 def feature_shown(scene: OpenedLift, area: Area) -> np.ndarray:
@@ -115,14 +118,15 @@ def _rendered(scene: OpenedLift, camera: Camera, area: Area | None, pixels: np.n
 
 
 def _common(scene: OpenedLift, rows: np.ndarray, around: np.ndarray) -> np.ndarray:
-    """[F] f64, what most of the features [n, F] of an area are like, and few of those [m, F] around it."""
+    """[F] f64, the common feature of those [n, F] of an area, which is not that of those [m, F] around it."""
     lengths = np.linalg.norm(rows, axis=1, keepdims=True)
     units = (rows / np.maximum(lengths, np.finfo(np.float64).tiny)).astype(np.float32)
     everywhere = np.concatenate([rows, around]).astype(np.float32)
     alike = cosines_about(everywhere, norms_of(everywhere), scene.mean, units)  # [n + m, n], as an example scores
-    likeness = alike[: len(rows)].mean(axis=0)
+    among, weights = alike[: len(rows)], np.ones(len(rows))
     if len(around):
-        likeness -= alike[len(rows) :].mean(axis=0)
+        weights = (1 - np.quantile(alike[len(rows) :], 1 - REACH, axis=0)) ** 2
+    likeness = (weights[:, None] * among).sum(axis=0)
     chosen = int(np.argmax(np.where(lengths[:, 0] > 0, likeness, -np.inf)))
-    to_chosen = alike[: len(rows), chosen]
-    return units[to_chosen >= min(LEAST_LIKENESS, to_chosen[chosen])].sum(axis=0, dtype=np.float64)
+    like = among[:, chosen] >= min(LEAST_LIKENESS, among[chosen, chosen])
+    return ((weights if weights[like].any() else np.ones(len(rows))) * like) @ units.astype(np.float64)

@@ -240,6 +240,9 @@ def test_box_is_what_is_in_it_and_not_around_it(scene: Scene) -> None:
     assert boxed @ thing > 0.9
     (whole,) = directions(of(scene, rows), Query(like=["middle:box:0,0,32,24"]), None)  # nothing is around it
     assert whole @ near > 0.9
+    (within,) = directions(scene, Query(like=["middle:box:15,8,18,15"]), None)  # the same is around it
+    (thing,) = directions(scene, Query(like=["region:left:0:1"]), None)
+    assert within @ thing > 0.9
 
 
 def test_stroke_may_slip_over_an_edge(scene: Scene) -> None:
