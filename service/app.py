@@ -36,8 +36,8 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
     stopping = Stopping(streams, runner, notice_seconds=settings.notice_seconds)
     metrics = Metrics(store, worker, streams, build)
     readiness = Readiness(store, runner, worker, stopping)
-    runner.tell(metrics.attempted)
-    worker.tell(metrics.queried)
+    runner.on_attempt_finished(metrics.attempted)
+    worker.on_call_finished(metrics.queried)
     collector = Collector(store, settings)
 
     @asynccontextmanager

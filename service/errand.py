@@ -56,7 +56,7 @@ class ErrandLimits:
 
 
 @dataclass(frozen=True)
-class Heard:
+class TaskResult:
     """What a task said until it ended."""
 
     last: dict[str, Any]  # its result; {"event": "ready"} of one that began, {"event": "nothing"} of one that did not
@@ -95,7 +95,7 @@ def _template() -> int | None:
     return None
 
 
-def run_errand(task: str, arguments: Sequence[str], scratch: Path, limits: ErrandLimits) -> Heard | None:
+def run_errand(task: str, arguments: Sequence[str], scratch: Path, limits: ErrandLimits) -> TaskResult | None:
     """Call a function in a process of its own, and wait for what it gives.
 
     Args:
@@ -112,7 +112,7 @@ def run_errand(task: str, arguments: Sequence[str], scratch: Path, limits: Erran
     """
     process, pipe = _start(task, list(arguments), str(scratch), limits.memory_bytes)
     with pipe:
-        last = _listen(pipe, limits)
+        last = _read_last_message(pipe, limits)
     if last is not None:
         wait([process.sentinel], GONE_SECONDS)
     with _TURN:
@@ -127,7 +127,7 @@ def run_errand(task: str, arguments: Sequence[str], scratch: Path, limits: Erran
         return None
     printed = scratch / PRINTED
     trace = printed.read_text(errors="replace") if printed.exists() else ""
-    return Heard(last, None if status == TEMPLATE_DIED else status, trace)
+    return TaskResult(last, None if status == TEMPLATE_DIED else status, trace)
 
 
 def _start(*given: Any) -> tuple[ForkServerProcess, Connection]:
@@ -139,7 +139,7 @@ def _start(*given: Any) -> tuple[ForkServerProcess, Connection]:
     for _ in range(2):  # the template may have died while idle
         read, write = os.pipe()
         ours, theirs = Connection(read, writable=False), Connection(write, readable=False)
-        task = CONTEXT.Process(target=_work, args=(theirs, *given), daemon=True)
+        task = CONTEXT.Process(target=_child_main, args=(theirs, *given), daemon=True)
         try:
             with theirs, _TURN:
                 get_ready()
@@ -150,7 +150,7 @@ def _start(*given: Any) -> tuple[ForkServerProcess, Connection]:
     raise Busy("upload", expected="room for a process", got="none", hint="try again soon")
 
 
-def _listen(pipe: Connection, limits: ErrandLimits) -> dict[str, Any] | None:
+def _read_last_message(pipe: Connection, limits: ErrandLimits) -> dict[str, Any] | None:
     """The last that a task says until it ends; None when it must be ended."""
     said = bytearray()
     deadline = time.monotonic() + limits.seconds
@@ -165,7 +165,7 @@ def _listen(pipe: Connection, limits: ErrandLimits) -> dict[str, Any] | None:
     return None
 
 
-def _work(pipe: Connection, task: str, arguments: list[str], scratch: str, memory_bytes: int) -> None:
+def _child_main(pipe: Connection, task: str, arguments: list[str], scratch: str, memory_bytes: int) -> None:
     """A task, in its own process."""
     os.setsid()
     parent = multiprocessing.parent_process()

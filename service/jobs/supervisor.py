@@ -37,7 +37,10 @@ LOOKS = 4  # a child that is silent for this part of its lease is looked at
 BUSY_SECONDS = 0.1  # of a processor: a silent child that takes so much meanwhile is alive
 CHILD = (sys.executable, "-m", "service.jobs.child")
 DRAFTS = {JobKind.LIFT: ".safetensors", JobKind.TRADEOFF: ".png"}  # what a child writes
-TROUBLE = (OSError, sqlite3.OperationalError)  # of the server, not of the job: a full disk, a locked database
+TRANSIENT_ERRORS = (
+    OSError,
+    sqlite3.OperationalError,
+)  # of the server: a full disk, a locked database
 
 log = logging.getLogger(__name__)
 
@@ -61,10 +64,10 @@ class Supervisor:
         self._limits = limits
         self._command = command
         self._clock = clock
-        self._bell = threading.Condition()
+        self._condition = threading.Condition()
         self._rung = 0
         self._stopping = threading.Event()
-        self._told: Callable[[str, float], None] | None = None
+        self._callback: Callable[[str, float], None] | None = None
         self._beginning = threading.Lock()
         self._left_behind = True  # jobs of the server before us may seem to run
         self._threads = [
@@ -77,9 +80,9 @@ class Supervisor:
         for thread in self._threads:
             thread.start()
 
-    def tell(self, told: Callable[[str, float], None]) -> None:
+    def on_attempt_finished(self, callback: Callable[[str, float], None]) -> None:
         """Call this after each attempt, with the state that its job came to and the seconds that it took."""
-        self._told = told
+        self._callback = callback
 
     def alive(self) -> bool:
         """Whether all threads live."""
@@ -87,9 +90,9 @@ class Supervisor:
 
     def wake(self) -> None:
         """Say that there is a new job."""
-        with self._bell:
+        with self._condition:
             self._rung += 1
-            self._bell.notify_all()
+            self._condition.notify_all()
 
     def stop(self) -> None:
         """End the running children and put their jobs back in line; returns when no child is left."""
@@ -123,8 +126,8 @@ class Supervisor:
 
     def _rest(self, rung: int) -> None:
         """Wait for a ring of the bell after that one, for a stop, or for IDLE_SECONDS."""
-        with self._bell:
-            self._bell.wait_for(lambda: self._rung != rung or self._stopping.is_set(), IDLE_SECONDS)
+        with self._condition:
+            self._condition.wait_for(lambda: self._rung != rung or self._stopping.is_set(), IDLE_SECONDS)
 
     def _pause(self, troubled: int) -> None:
         """Wait while the server has trouble: longer each time, then for a disk above its floor, though not for ever:
@@ -148,19 +151,19 @@ class Supervisor:
             log.info("job %s, attempt %d begins", job.id, job.attempt)
             try:
                 Attempt(job, self._store, self._limits, self._command, self._clock).run(self._stopping)
-            except TROUBLE as error:
+            except TRANSIENT_ERRORS as error:
                 log.exception("job %s could not be kept up", job.id)
                 kept_up, why = False, f"the server could not keep it up: {error}"
-                insist(lambda: attempts.release(job.id, job.attempt, why), self._stopping)
+                retry_until_committed(lambda: attempts.release(job.id, job.attempt, why), self._stopping)
             except Exception as error:
                 log.exception("job %s could not be run", job.id)
                 unforeseen = Crashed("job", expected="a process that runs", got="an error of the server")
                 fault = fault_of(error if isinstance(error, SplatliftError) else unforeseen)
-                insist(lambda: attempts.fail(job.id, job.attempt, fault), self._stopping)
+                retry_until_committed(lambda: attempts.fail(job.id, job.attempt, fault), self._stopping)
             outcome, seconds = attempts.state(SERVICE, job.id) or "deleted", time.monotonic() - begun
             log.info("job %s, attempt %d: %s after %.3f s", job.id, job.attempt, outcome, seconds)
-        if self._told is not None:
-            self._told(outcome, seconds)
+        if self._callback is not None:
+            self._callback(outcome, seconds)
         return kept_up
 
 
@@ -230,7 +233,7 @@ class Notes:
             return
         try:
             self.flush()
-        except TROUBLE as error:
+        except TRANSIENT_ERRORS as error:
             log.warning("what job %s tells cannot be noted yet: %s", self._job.id, error)
             self._again = time.monotonic() + AGAIN_SECONDS
 
@@ -238,7 +241,7 @@ class Notes:
         """Write what waits.
 
         Raises:
-            TROUBLE: it cannot be written now, and waits on.
+            TRANSIENT_ERRORS: it cannot be written now, and waits on.
         """
         while self._waiting:
             kind, data = self._waiting[0]
@@ -272,18 +275,20 @@ class Attempt:
         """From the start of the child to the end of its process group, and the state that follows from it.
 
         Raises:
-            TROUBLE: the server could not keep it up; no process of it is left, and its state is as it was.
+            TRANSIENT_ERRORS: the server could not keep it up; no process of it is left, and its state is as it was.
         """
         files = self._store.files
         with files.draft(DRAFTS[self._job.kind]) as draft, files.scratch() as scratch:
             order = scratch / "order.json"
             order.write_text(json.dumps(self._order(draft)), encoding="utf-8")
-            self._log(f"attempt {self._job.attempt} begins{self._asked()}{self._kept()}")
+            self._log(f"attempt {self._job.attempt} begins{self._request()}{self._earlier_work()}")
             command, environment = [*self._command, str(order)], {"TMPDIR": str(scratch)}
             with JobProcess(command, environment, self._job.id) as process:
                 why = self._follow(process, stopping)
                 status = process.end()
-            insist(lambda: self._settle(draft, why or _told(status), stopping.is_set()), stopping)
+            retry_until_committed(
+                lambda: self._settle(draft, why or _describe_exit(status), stopping.is_set()), stopping
+            )
         if self._store.jobs.state(SERVICE, self._job.id) in ENDED:
             files.forget_work(self._job.id)
 
@@ -333,7 +338,7 @@ class Attempt:
     def _is_wanted(self) -> bool:
         try:
             return self._store.jobs.state(SERVICE, self._job.id) is JobState.RUNNING
-        except TROUBLE:  # nobody can have canceled it in a database that cannot be read
+        except TRANSIENT_ERRORS:  # nobody can have canceled it in a database that cannot be read
             return True
 
     def _settle(self, draft: Path, why: str | SplatliftError, stopping: bool) -> None:
@@ -367,10 +372,10 @@ class Attempt:
     def _log(self, text: str) -> None:
         self._notes.add(EventKind.LOG, text)
 
-    def _asked(self) -> str:
+    def _request(self) -> str:
         return f", asked for by request {self._job.request_id}" if self._job.request_id else ""
 
-    def _kept(self) -> str:
+    def _earlier_work(self) -> str:
         kept = sum(1 for _ in self._store.files.work(self._job.id).rglob("*.safetensors"))
         return f", {kept} files of earlier work are kept" if kept else ""
 
@@ -427,7 +432,7 @@ class StagePace:
         }
 
 
-def insist(note: Callable[[], None], stopping: threading.Event) -> None:
+def retry_until_committed(note: Callable[[], None], stopping: threading.Event) -> None:
     """Note the end of an attempt, however long the disk is full: else its job would seem to run for ever.
 
     A stop ends that; the next start then finds the job running, and puts it back in line.
@@ -436,12 +441,12 @@ def insist(note: Callable[[], None], stopping: threading.Event) -> None:
         try:
             note()
             return
-        except TROUBLE as error:
+        except TRANSIENT_ERRORS as error:
             log.warning("the end of a job cannot be noted yet: %s", error)
             if stopping.is_set():
                 raise
             stopping.wait(AGAIN_SECONDS)
 
 
-def _told(status: int) -> str:
+def _describe_exit(status: int) -> str:
     return f"its process ended with signal {-status}" if status < 0 else f"its process ended with status {status}"

@@ -56,7 +56,7 @@ class QueryLimits:
 
 
 @dataclass(eq=False)
-class Asker:
+class Waiter:
     """Who asks, and whether they still wait for the answer."""
 
     key: str = ""  # the id of a key; empty while there are none: then all share one line
@@ -68,7 +68,7 @@ class _Call:
     """A request in the line."""
 
     line: bytes  # the request as JSON
-    asker: Asker
+    waiter: Waiter
     deadline: float  # of time.monotonic
 
 
@@ -82,7 +82,7 @@ class QueryClient:
 
     def __init__(self, limits: QueryLimits) -> None:
         self._limits = limits
-        self._bell = threading.Condition()  # guards all below but the process; rings when any of it changes
+        self._condition = threading.Condition()  # guards all below but the process; notified when any of it changes
         self._line: list[_Call] = []
         self._busy_with: object | None = None  # the call that speaks with the process, or whoever revives it
         self._turns: dict[str, int] = {}  # key -> the number of its last turn
@@ -90,7 +90,7 @@ class QueryClient:
         self._process: subprocess.Popen[bytes] | None = None  # of whose turn it is, but for a look and a kill
         self._worker: Connection | None = None  # to it, likewise
         self._cuda: dict[str, Any] | None = None  # what the worker says of the device
-        self._told: Callable[[str, str, float], None] | None = None
+        self._callback: Callable[[str, str, float], None] | None = None
         self._spawned = 0
 
     def start(self) -> None:
@@ -99,18 +99,18 @@ class QueryClient:
 
     def stop(self) -> None:
         """End the process, and with it a query that still runs; those that wait are told to ask elsewhere."""
-        with self._bell:
+        with self._condition:
             self._stopped = True
-            self._bell.notify_all()
+            self._condition.notify_all()
             process = self._process
             if process is not None:
                 process.kill()
-            self._bell.wait_for(lambda: self._busy_with is None and not self._line)
-        self._bury()
+            self._condition.wait_for(lambda: self._busy_with is None and not self._line)
+        self._reap()
 
-    def tell(self, told: Callable[[str, str, float], None]) -> None:
+    def on_call_finished(self, callback: Callable[[str, str, float], None]) -> None:
         """Call this after each call, with its operation, what came of it and the seconds that it took."""
-        self._told = told
+        self._callback = callback
 
     @property
     def restarts(self) -> int:
@@ -131,7 +131,7 @@ class QueryClient:
         """Whether the process lives; when it does not, a new one starts."""
         if self.alive():
             return True
-        with self._bell:
+        with self._condition:
             if self._busy_with is not None or self._stopped:
                 return False  # whoever speaks with it will see
             self._busy_with = self
@@ -143,18 +143,18 @@ class QueryClient:
             self._end_turn()
         return False
 
-    def leave(self, asker: Asker) -> None:
+    def cancel(self, waiter: Waiter) -> None:
         """Say that nobody waits for the answers of this one any more. Never waits."""
-        asker.left = True
-        with self._bell:
-            self._bell.notify_all()
+        waiter.left = True
+        with self._condition:
+            self._condition.notify_all()
 
-    def call(self, request: dict[str, Any], asker: Asker | None = None) -> Frame:
+    def call(self, request: dict[str, Any], waiter: Waiter | None = None) -> Frame:
         """Ask the worker.
 
         Args:
             request: what is asked, as JSON takes it.
-            asker: for whom.
+            waiter: for whom.
 
         Raises:
             SplatliftError: the worker's own error, as if raised here.
@@ -165,7 +165,7 @@ class QueryClient:
             Crashed: the worker died twice over this call, or failed with an error that is ours.
         """
         begun, outcome = time.monotonic(), "crashed"
-        call = _Call(json.dumps(request, allow_nan=False).encode(), asker or Asker(), begun + self._limits.seconds)
+        call = _Call(json.dumps(request, allow_nan=False).encode(), waiter or Waiter(), begun + self._limits.seconds)
         try:
             ahead = self._wait_for_turn(call)
             try:
@@ -181,8 +181,8 @@ class QueryClient:
             outcome = error.kind
             raise
         finally:
-            if self._told is not None:
-                self._told(request["operation"], outcome, time.monotonic() - begun)
+            if self._callback is not None:
+                self._callback(request["operation"], outcome, time.monotonic() - begun)
         return reply
 
     def require_device(self, device: str) -> None:
@@ -206,36 +206,38 @@ class QueryClient:
 
     def _wait_for_turn(self, call: _Call) -> list[bytes]:
         """Wait until nobody is to be asked before this call; what waits behind it."""
-        with self._bell:
-            self._require_place(call.asker.key)
+        with self._condition:
+            self._require_place(call.waiter.key)
             self._line.append(call)
             try:
-                self._bell.wait_for(lambda: self._stopped or call.asker.left or self._next() is call, _left(call))
+                self._condition.wait_for(
+                    lambda: self._stopped or call.waiter.left or self._next() is call, _left(call)
+                )
                 came = not self._stopped and self._next() is call
             finally:
                 self._line.remove(call)
-                self._bell.notify_all()
+                self._condition.notify_all()
             if self._stopped:
                 raise Busy("query", expected="a running server", got="one that stops", hint="ask the next one")
-            if call.asker.left:
+            if call.waiter.left:
                 raise ClientLeft("query", expected="a client that waits for its turn", got="one that left")
             if not came:
                 raise self._busy()
             self._busy_with = call
-            self._turns[call.asker.key] = 1 + max(self._turns.values(), default=0)
-            return [other.line for other in self._line if not other.asker.left]
+            self._turns[call.waiter.key] = 1 + max(self._turns.values(), default=0)
+            return [other.line for other in self._line if not other.waiter.left]
 
     def _end_turn(self) -> None:
-        with self._bell:
+        with self._condition:
             self._busy_with = None
-            self._bell.notify_all()
+            self._condition.notify_all()
 
     def _next(self) -> _Call | None:
         """Whose turn it is: the oldest call of the key that had its last turn before all others."""
         if self._busy_with is not None:
             return None
-        waiting = (call for call in self._line if not call.asker.left)
-        return min(waiting, key=lambda call: self._turns.get(call.asker.key, 0), default=None)
+        waiting = (call for call in self._line if not call.waiter.left)
+        return min(waiting, key=lambda call: self._turns.get(call.waiter.key, 0), default=None)
 
     def _require_place(self, key: str) -> None:
         speaking = self._busy_with if isinstance(self._busy_with, _Call) else None
@@ -245,7 +247,7 @@ class QueryClient:
         most = self._limits.of_a_key
         if key and most is not None:  # with one place in all there are no shares
             most = max(1, min(most, self._limits.waiting - 1))
-            require_share("query", sum(call.asker.key == key for call in taken), most)
+            require_share("query", sum(call.waiter.key == key for call in taken), most)
 
     def _busy(self) -> Busy:
         line = f"at most {self._limits.waiting} waiting queries"
@@ -291,7 +293,7 @@ class QueryClient:
         raise TimedOut("query", expected=f"an answer within {self._limits.seconds:g} s", got="none yet")
 
     def _spawn(self) -> None:
-        self._bury()
+        self._reap()
         command = [sys.executable, "-m", "service.queries.answers"]
         command += [str(self._limits.scenes), str(self._limits.cache_bytes), self._limits.encoder]
         self._spawned += 1
@@ -304,7 +306,7 @@ class QueryClient:
         if self._stopped:  # whoever stopped us may have looked before there was a process
             self._process.kill()
 
-    def _bury(self) -> None:
+    def _reap(self) -> None:
         process, self._process = self._process, None
         if process is not None:
             process.kill()

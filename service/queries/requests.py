@@ -17,7 +17,7 @@ from service.content import BINARY, Draft, kept, unchanged
 from service.encoders import encoder_file, encoder_spec, encoder_version
 from service.errors import InvalidRequest
 from service.queries import questions
-from service.queries.client import PIPE_BYTES, Asker, Frame
+from service.queries.client import PIPE_BYTES, Frame, Waiter
 from service.state import AppState, Deps
 from service.store.assets import kernel_of
 from service.store.lifts import LiftRecord
@@ -38,16 +38,16 @@ MEDIA_TYPES = {
 # The body is read before this listens, as both listen to the client.
 async def _asking(request: Request, deps: Deps) -> AsyncIterator[Callable[[dict[str, Any]], Frame]]:
     """Ask the query process for this caller, who may leave: a query that waits then is not answered."""
-    asker = Asker(deps.caller.key or "")
+    waiter = Waiter(deps.caller.key or "")
 
     async def listen() -> None:
         while (await request.receive())["type"] != "http.disconnect":
             pass
-        deps.queries.leave(asker)
+        deps.queries.cancel(waiter)
 
     listening = asyncio.create_task(listen())
     try:
-        yield lambda wanted: deps.queries.call(wanted, asker)
+        yield lambda wanted: deps.queries.call(wanted, waiter)
     finally:
         listening.cancel()
 

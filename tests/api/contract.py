@@ -23,7 +23,7 @@ from unittest import mock
 import httpx
 
 from service.app import create_app, job_limits, query_limits
-from service.errand import Heard
+from service.errand import TaskResult
 from service.jobs.supervisor import Supervisor
 from service.queries.client import QueryClient
 from service.settings import ServiceSettings
@@ -59,7 +59,7 @@ def served(data: Path, *, keys: bool, **settings: Any) -> Iterator[tuple[str, st
     metadata = {"splats": nowhere, "cameras": nowhere, "features": [], "settings": {}, "views": ["v"]}
     lift = {"metadata": metadata, "count": 1}
     report = Report(".bin", {"names": ["v"], "channels": 1, "classes": 1, "words": ["apple"], **lift}, [])
-    planned = Heard({"event": "valid", "plan": {"summary": [], "warnings": []}}, 0, "")
+    planned = TaskResult({"event": "valid", "plan": {"summary": [], "warnings": []}}, 0, "")
     with (
         mock.patch("service.uploads.check", lambda *given: report),
         mock.patch("service.routes.jobs.run_errand", lambda *given: planned),

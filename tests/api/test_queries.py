@@ -268,7 +268,7 @@ def test_large_array_is_sent_from_a_file(
 ) -> None:
     content = bytes(3 * BLOCK_BYTES + 7)
 
-    def call(wanted: dict[str, Any], asker: object) -> Frame:
+    def call(wanted: dict[str, Any], waiter: object) -> Frame:
         Path(wanted["draft"]).write_bytes(content)
         return Frame({})
 

@@ -27,7 +27,7 @@ from service.auth import EVERYBODY
 from service.errors import Busy, ClientLeft, TimedOut, TooMany
 from service.queries import answers, client, questions
 from service.queries.answers import Answers, bytes_of, reply_to
-from service.queries.client import Asker, Frame, QueryClient, QueryLimits
+from service.queries.client import Frame, QueryClient, QueryLimits, Waiter
 from service.routes.queries import query_request
 from tests.crash.conftest import address_of, until
 from tests.crash.server import NoQueries
@@ -62,13 +62,13 @@ class Calls:
         self.worker, self.came = worker, dict[str, str]()
         self._threads: list[threading.Thread] = []
 
-    def begin(self, name: str, asker: Asker, after: str = "open") -> None:
+    def begin(self, name: str, waiter: Waiter, after: str = "open") -> None:
         """Call, and return once it waits or is asked."""
         known, asked = self.worker.waiting, {"operation": "query", "name": name, "after": after}
 
         def run() -> None:
             try:
-                self.came[name] = self.worker.call(asked, asker).header["name"]
+                self.came[name] = self.worker.call(asked, waiter).header["name"]
             except SplatliftError as error:
                 self.came[name] = error.kind
 
@@ -110,7 +110,7 @@ def asked(folder: Path) -> list[tuple[str, list[str]]]:
 
 
 def test_keys_take_turns_however_many_calls_one_has(start: Start, tmp_path: Path) -> None:
-    calls, anna, bob = Calls(start()), Asker("anna"), Asker("bob")
+    calls, anna, bob = Calls(start()), Waiter("anna"), Waiter("bob")
     for name in ("a0", "a1", "a2", "a3"):
         calls.begin(name, anna)
     for name in ("b0", "b1"):
@@ -124,10 +124,10 @@ def test_keys_take_turns_however_many_calls_one_has(start: Start, tmp_path: Path
 
 
 def test_call_whose_client_left_is_not_asked(start: Start, tmp_path: Path) -> None:
-    calls, stays, leaves = Calls(start()), Asker(), Asker()
+    calls, stays, leaves = Calls(start()), Waiter(), Waiter()
     calls.begin("first", stays)
     calls.begin("gone", leaves)
-    calls.worker.leave(leaves)
+    calls.worker.cancel(leaves)
     until(lambda: "gone" in calls.came)  # at once, while the first is still asked
     assert calls.came == {"gone": ClientLeft.kind}
     calls.begin("last", stays)
@@ -140,12 +140,12 @@ def test_call_whose_client_left_is_not_asked(start: Start, tmp_path: Path) -> No
 def test_key_has_a_share_of_the_places(start: Start, of_a_key: int, waiting: int, share: int) -> None:
     calls = Calls(start(of_a_key=of_a_key, waiting=waiting))
     for number in range(share + 1):
-        calls.begin(f"a{number}", Asker("anna"))
+        calls.begin(f"a{number}", Waiter("anna"))
     until(lambda: calls.came == {f"a{share}": TooMany.kind})
-    calls.begin("b", Asker("bob"))
+    calls.begin("b", Waiter("bob"))
     assert "b" not in calls.came
     for number in range(waiting - share):
-        calls.begin(f"c{number}", Asker(f"carl{number}"))
+        calls.begin(f"c{number}", Waiter(f"carl{number}"))
     until(lambda: len(calls.came) == 2)
     assert Busy.kind in calls.came.values()  # beyond all places
     until(lambda: calls.worker.waiting == waiting - 1)
@@ -163,7 +163,7 @@ def test_every_call_has_one_time_for_waiting_and_answer(start: Start, tmp_path: 
     worker = start(seconds=4.0)  # a process begins within it, on a busy machine too
     calls = Calls(worker)
     for name in ("never", "behind"):
-        calls.begin(name, Asker(), after="never")
+        calls.begin(name, Waiter(), after="never")
     calls.end()
     assert calls.came["never"] == TimedOut.kind and calls.came["behind"] in (TimedOut.kind, Busy.kind)
     assert worker.call({"operation": "query", "name": "next", "after": "at once"}) == Frame({"name": "next"})
@@ -193,7 +193,7 @@ def test_process_that_reads_nothing_holds_the_turn_no_longer(start: Start, monke
 def test_stop_answers_who_waits(start: Start) -> None:
     calls = Calls(start())
     for name in ("asked", "waits"):
-        calls.begin(name, Asker())
+        calls.begin(name, Waiter())
     calls.worker.stop()
     calls.end()
     assert set(calls.came.values()) == {Busy.kind}
@@ -203,15 +203,15 @@ class Patient(NoQueries):
     """Stands in for the query process: a call waits until its client has left."""
 
     def __init__(self) -> None:
-        self.askers: list[Asker] = []
+        self.waiters: list[Waiter] = []
 
-    def call(self, request: dict[str, Any], asker: Asker) -> Frame:
-        self.askers.append(asker)
-        until(lambda: asker.left)
+    def call(self, request: dict[str, Any], waiter: Waiter) -> Frame:
+        self.waiters.append(waiter)
+        until(lambda: waiter.left)
         raise ClientLeft("query", expected="a client that waits", got="one that left")
 
-    def leave(self, asker: Asker) -> None:
-        asker.left = True
+    def cancel(self, waiter: Waiter) -> None:
+        waiter.left = True
 
 
 @pytest.mark.parametrize("method", ["GET", "POST"])
@@ -227,9 +227,9 @@ def test_closed_connection_is_a_client_that_left(tmp_path: Path, method: str) ->
     with running(tmp_path / "data", queries=cast("QueryClient", queries), **chosen) as server:
         with socket.create_connection(address_of(server), timeout=60) as connection:
             connection.sendall((head + sent[method]).encode())
-            until(lambda: queries.askers)
-            assert not queries.askers[0].left and queries.askers[0].key == house.ids["alice"]
-        until(lambda: queries.askers[0].left)
+            until(lambda: queries.waiters)
+            assert not queries.waiters[0].left and queries.waiters[0].key == house.ids["alice"]
+        until(lambda: queries.waiters[0].left)
         until(lambda: not server.server_state.connections)
 
 

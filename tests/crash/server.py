@@ -58,7 +58,7 @@ class NoQueries:
 
     def stop(self) -> None: ...
 
-    def tell(self, told: object) -> None: ...
+    def on_call_finished(self, callback: object) -> None: ...
 
     def require_device(self, device: str) -> None: ...
 
@@ -68,7 +68,7 @@ class NoQueries:
     def revive(self) -> bool:
         return True
 
-    def call(self, request: dict[str, Any], asker: Any) -> Frame:
+    def call(self, request: dict[str, Any], waiter: Any) -> Frame:
         """An answer as of a large lift."""
         with Path(request["draft"]).open("wb") as draft:
             draft.truncate(ANSWER_BYTES)
