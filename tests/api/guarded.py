@@ -37,6 +37,8 @@ METADATA = {
 class NoJobs(NoQueries):
     """Stands in for the supervisor: jobs stay where the tests put them."""
 
+    def on_attempt_finished(self, callback: object) -> None: ...
+
     def wake(self) -> None: ...
 
 
