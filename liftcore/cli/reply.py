@@ -92,12 +92,27 @@ def place_of(point: tuple[float, ...]) -> str:
 
 def smoothing_line(facts: Mapping[str, Any]) -> str:
     """What smoothing did (``diagnostics["smoothing"]``), as a sentence for people."""
+    reason = _choice_reason(facts["smoothness"], facts["candidates"]) if "candidates" in facts else ""
+    if not facts["smoothness"]:
+        return f"smoothness 0{reason}"
     moved = "not at all" if facts["moved"] is None else f"by {facts['moved']:.1%} of their length"
     by = "place and colour" if facts["colours"] else "place alone, as the splats have no colours"
     return (
-        f"smoothness {facts['smoothness']:g}: features moved {moved} towards their neighbours' in {by}; "
+        f"smoothness {facts['smoothness']:g}{reason}: features moved {moved} towards their neighbours' in {by}; "
         f"{facts['filled']} splats without evidence took their neighbours' "
         f"({facts['steps']} steps, {facts['residual']:.1g} of the gradient left)"
+    )
+
+
+def _choice_reason(chosen: float, candidates: Sequence[Mapping[str, float]]) -> str:
+    """Why auto chose its lambda, as a clause."""
+    if not candidates:
+        return ", as there are no two halves of the views to tell what the scene gains by more"
+    bits = {one["smoothness"]: one["information"] for one in candidates}
+    if not chosen:
+        return f", as half of the views tells no more of the other half with it ({bits[0]:.3f} bits a splat without)"
+    return (
+        f", by which half of the views tells {bits[chosen]:.3f} bits a splat of the other half, {bits[0]:.3f} without"
     )
 
 

@@ -21,6 +21,7 @@ from liftcore.raster import open_raster
 from liftcore.raster.base import Raster
 from liftcore.runtime.device import Device
 from liftcore.runtime.progress import Timings
+from liftcore.scene.neighbours import SplatGraph
 from liftcore.scene.splats import Splats
 from liftcore.solve.aggregate import Aggregation, aggregate, solve_from_kept_regions
 from liftcore.solve.closed_form import solve
@@ -31,6 +32,7 @@ from liftcore.solve.loss import huber_factors
 from liftcore.solve.objects import RegionObjects, region_objects
 from liftcore.solve.reweight import Agreement, agreement_factors, reweighted, whole_regions
 from liftcore.solve.smooth import smooth
+from liftcore.solve.smooth_by_halves import choose_smoothness
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import LiftSettings
@@ -156,11 +158,19 @@ class InMemory(Steps[SceneWeights]):
         return X, facts
 
     def smooth(self, W: SceneWeights, X: Tensor, support: Support) -> tuple[Tensor, dict[str, Any]]:
+        graph, strength, choice = SplatGraph.of(self.splats, self.threads), self.settings.smoothness, dict[str, Any]()
+        if strength == "auto":
+            with self.timings.stage("halves"):
+                chosen = choose_smoothness(
+                    W.weights.cpu(), W.geometry.codebook, graph, support.confidence, means=self.splats.means,
+                    seed=self.settings.seed, progress=self.timings.progress, threads=self.threads,
+                )  # fmt: skip
+            strength, choice = chosen.smoothness, {"candidates": chosen.facts()}
         seen = torch.from_numpy(support.sums > 0)
-        return smooth(
-            X, self.splats, support.evidence, support.confidence, seen, self.settings.smoothness,
-            self.timings.progress, self.threads,
-        )  # fmt: skip
+        X, facts = smooth(
+            X, graph, support.evidence, support.confidence, seen, strength, self.timings.progress, self.threads
+        )
+        return X, facts | choice
 
     def aggregate(self, W: SceneWeights, X: Tensor, clusters: RegionObjects | None) -> tuple[Tensor, Aggregation]:
         settings, agreement, judged = self.settings, W.agreement, None

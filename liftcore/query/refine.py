@@ -10,6 +10,7 @@ from liftcore.errors import InvalidLift, InvalidSettings
 from liftcore.runtime.memory import free_memory, zeros
 from liftcore.runtime.progress import Progress, silent
 from liftcore.runtime.torch_modes import usual_modes
+from liftcore.scene.neighbours import SplatGraph
 from liftcore.solve.smooth import smooth
 from liftcore.values.settings import LiftSettings
 
@@ -42,23 +43,27 @@ def refine(
         InvalidSettings: smoothness is zero or out of range.
         InvalidLift: it was smoothed before, or its splats have the features of clusters.
     """
-    smoothness = LiftSettings.of(smoothness=smoothness).smoothness
-    if not smoothness:
+    strength = LiftSettings.of(smoothness=smoothness).smoothness
+    if strength == "auto":
+        hint = "a lift keeps no weights of its views: lift again with smoothness=auto, or name a number"
+        raise InvalidSettings("smoothness", expected="a number above 0", got="auto", hint=hint)
+    if not strength:
         raise InvalidSettings("smoothness", expected="a number above 0", got="0", hint="1 is a good first try")
     lift.require_splats(splats)
     settings = lift.settings
     if settings.smoothness:
-        got = f"one of smoothness={settings.smoothness:g}"
+        got = f"one of smoothness={settings.smoothness}"
         raise InvalidLift("lift", expected="a lift without smoothness", got=got, hint="refine the lift it came from")
     if settings.aggregation:
-        hint = f"lift again with smoothness={smoothness:g} beside aggregation: clusters are made of smooth features"
+        hint = f"lift again with smoothness={strength:g} beside aggregation: clusters are made of smooth features"
         raise InvalidLift("lift", expected="each splat's own features", got="a lift with aggregation", hint=hint)
     start, place = time.perf_counter(), lift.features.device
     lift = lift.cpu()
     free = free_memory()
     in_file = free is not None and lift.features.nbytes > ROOM * free
     X = zeros(tuple(lift.features.shape), lift.features.dtype, name="features", in_file=in_file).copy_(lift.features)
-    X, facts = smooth(X, splats, lift.evidence, lift.confidence, lift.seen, smoothness, progress, threads)
+    graph = SplatGraph.of(splats, threads)
+    X, facts = smooth(X, graph, lift.evidence, lift.confidence, lift.seen, strength, progress, threads)
     certificate: dict[str, Any] = lift.diagnostics | {"smoothing": facts}
     certificate |= {name: None for name in OF_FEATURES if name in certificate}
     if "beta" in certificate:
@@ -66,7 +71,7 @@ def refine(
     if "warning" in facts:
         certificate["warnings"] = [*certificate.get("warnings", ()), facts["warning"]]
     changes = {
-        "settings": settings.model_copy(update={"smoothness": smoothness}),
+        "settings": settings.model_copy(update={"smoothness": strength}),
         "certificate": certificate,
         "timings": lift.metadata.timings | {"smooth": time.perf_counter() - start},
     }

@@ -36,8 +36,9 @@ LEAST_CONFIDENCE = 0.02  # that a splat counts by: one view alone says something
 LEAST_WEIGHT = 1e-30  # of the largest; a splat below it has no evidence
 BLOCK = 32  # channels solved at a time: four [P, 32] f32
 ROWS = 1 << 13  # splats of one piece of work
-TOLERANCE = 1e-3  # of each channel's gradient, relative to that at X0, over sqrt(1 + lambda): what varies slowly
+TOLERANCE = 3e-3  # of each channel's gradient, relative to that at X0, over sqrt(1 + lambda): what varies slowly
 # over the scene has little of the gradient, the less the larger lambda
+ROUGHLY = 2e-2  # a tolerance by which features are compared, not delivered
 STEPS = 200  # of conjugate gradients at most; with lambda 4 about 20 are enough
 
 
@@ -52,7 +53,7 @@ class _System:
     tolerance: float  # of the gradient, relative to that at X0
 
     @classmethod
-    def of(cls, graph: SplatGraph, weights: np.ndarray, smoothness: float) -> _System:
+    def of(cls, graph: SplatGraph, weights: np.ndarray, smoothness: float, tolerance: float = TOLERANCE) -> _System:
         """Of weights [P] f64 in the graph's order, at most one."""
         roots, counts = np.sqrt(weights), np.diff(graph.starts)
         couplings = (smoothness * graph.affinities * np.repeat(roots, counts) * roots[graph.neighbours]).astype(
@@ -61,14 +62,14 @@ class _System:
         rows = np.repeat(np.arange(len(weights), dtype=np.int32), counts)
         diagonal = weights + np.bincount(rows, couplings, minlength=len(weights))
         inverse = np.divide(1.0, diagonal, out=np.zeros_like(diagonal), where=weights > 0)
-        tolerance = TOLERANCE / (1.0 + smoothness) ** 0.5
-        return cls(graph, weights.astype(np.float32), couplings, inverse.astype(np.float32), tolerance)
+        relative = tolerance / (1.0 + smoothness) ** 0.5
+        return cls(graph, weights.astype(np.float32), couplings, inverse.astype(np.float32), relative)
 
 
 @one_thread()
 def smooth(
     X: Tensor,
-    splats: Splats,
+    graph: SplatGraph,
     evidence: Tensor,
     confidence: Tensor | None,
     seen: Tensor,
@@ -82,10 +83,10 @@ def smooth(
 
     Args:
         X: [P, F] f16 or f32 on the CPU, changed in place.
-        splats: P, that were lifted; their colours of degree 0 count where they have any.
+        graph: of the P splats that were lifted.
         evidence: [P] f32, sums of plain weights. confidence: [P] f32; None counts as one everywhere.
         seen: [P] bool, the splats whose row of X was solved for; the others take their neighbours' features.
-        smoothness: lambda, above zero.
+        smoothness: lambda; zero leaves X as it is.
         threads: None takes the cores that this process may use. The number changes no bit.
         block: channels solved at a time; the number changes no bit.
 
@@ -95,9 +96,8 @@ def smooth(
         ``sum_j w_j |x_j - x0_j|^2 / sum_j w_j |x0_j|^2``), ``filled``, the splats without evidence that took a
         feature, and whether ``colours`` counted.
     """
-    graph = SplatGraph.of(splats, threads)
-    weights = _weights(evidence, confidence, seen)[graph.order]
-    rings = _rings(graph, weights)
+    weights = smoothing_weights(torch.where(seen, evidence, 0.0), confidence)[graph.order]
+    rings = _rings(graph, weights) if smoothness else []
     system = _System.of(graph, weights, smoothness)
     has_evidence, has_feature = weights > 0, weights > 0
     for rows, _ in rings:
@@ -106,7 +106,7 @@ def smooth(
     places, channels = order[torch.from_numpy(rows_with_feature)], X.shape[1]
     squares, steps, residual = np.zeros((2, channels)), 0, 0.0
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
-        for begin in range(0, channels if has_evidence.any() else 0, block):
+        for begin in range(0, channels if smoothness and has_evidence.any() else 0, block):
             own = slice(begin, min(begin + block, channels))
             values = X[:, own].index_select(0, order).float().numpy()
             values[~has_evidence] = 0.0
@@ -136,16 +136,27 @@ def smooth(
     return X, facts
 
 
+def smooth_channels(
+    graph: SplatGraph, values: np.ndarray, weights: np.ndarray, smoothness: float, pool: Executor
+) -> np.ndarray:
+    """Smooth features [P, C] f32 with weights [P] f64 up to one, in the graph's order, as well as comparisons need.
+
+    Splats without evidence come back as zeros.
+    """
+    known = np.where(weights[:, None] > 0, values, np.float32(0.0))
+    return _solve(_System.of(graph, weights, smoothness, ROUGHLY), known, pool)[0]
+
+
 def warm_up_smoothing() -> None:
     """Compile the kernels, or load them from the disk cache."""
-    splats = Splats(torch.eye(3), torch.zeros(3, 4), torch.zeros(3, 3), torch.zeros(3))
+    graph = SplatGraph.of(Splats(torch.eye(3), torch.zeros(3, 4), torch.zeros(3, 3), torch.zeros(3)), 1)
     ones = torch.ones(3)
-    smooth(torch.eye(3), splats, ones, None, ones > 0, 1.0, threads=1)
+    smooth(torch.eye(3), graph, ones, None, ones > 0, 1.0, threads=1)
 
 
-def _weights(evidence: Tensor, confidence: Tensor | None, seen: Tensor) -> np.ndarray:
-    """[P] f64, w over its largest value: zero where no labelled ray reached a splat."""
-    weights = torch.where(seen, evidence, 0.0).double()
+def smoothing_weights(evidence: Tensor, confidence: Tensor | None) -> np.ndarray:
+    """[P] f64, w over its largest value: zero where a splat has no evidence."""
+    weights = evidence.double()
     if confidence is not None:
         weights *= confidence.double().clamp_min(LEAST_CONFIDENCE)
     values = weights.nan_to_num(0.0).numpy()

@@ -48,7 +48,7 @@ class LiftOptions(TypedDict, total=False):
     aggregation_channels: int
     certificate_rays: int
     seed: int
-    smoothness: float
+    smoothness: float | Literal["auto"]
     cg_steps: int
     damping: float
     cg_basis: int

@@ -180,11 +180,10 @@ class LiftSettings(BaseModel):
         json_schema_extra={"maximum": MOST_CERTIFICATE_RAYS},  # of a new lift
     )
     seed: int = Field(0, ge=0, lt=2**31, description="of samples, random projections and strides")
-    smoothness: float = Field(
+    smoothness: Annotated[float, Field(ge=0, le=1e6)] | Literal["auto"] = Field(
         0.0,
-        ge=0,
-        le=1e6,
-        description="lambda of the term that draws splats near in place and colour together, 0 = off",
+        description="lambda of the term that draws splats near in place and colour together, 0 = off; auto: the one "
+        "with which half of the views tells most of the other half",
     )
     cg_steps: int = Field(0, ge=0, le=10_000, description="least-squares steps from the closed form on, 0 = none")
     damping: float = Field(1.0, ge=0, le=1e6, description="mu, pulls least squares towards the closed form")

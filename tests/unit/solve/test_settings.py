@@ -100,4 +100,6 @@ def test_keyword_arguments_of_a_lift_are_typed_as_its_settings() -> None:
             allowed = annotation | Literal[tuple(str(one) for one in annotation)]
         elif annotation == LiftSettings.model_fields["levels"].annotation:
             allowed = Literal["rows", "composite"] | int
+        elif name == "smoothness":
+            allowed = float | Literal["auto"]
         assert hints[name] == allowed, name

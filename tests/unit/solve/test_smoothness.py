@@ -18,7 +18,10 @@ from liftcore.cli.reply import smoothing_line
 from liftcore.lifting.files import lift_files
 from liftcore.scene.neighbours import SplatGraph
 from liftcore.scene.splats import Splats
+from liftcore.solve.codebook import Codebook, ViewCodebook
 from liftcore.solve.smooth import STEPS, smooth
+from liftcore.solve.smooth_by_halves import STRENGTHS, SmoothnessChoice, choose_smoothness
+from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import LiftSettings
 from tests.scenes import random_splats, write_scene
 from tests.unit.command_line import run
@@ -41,7 +44,7 @@ class Scene:
         self.confidence: Tensor = torch.from_numpy(rng.random(count)).float()
 
     def smooth(self, smoothness: float, **how: Any) -> Tensor:
-        given = self.splats, self.evidence, self.confidence, self.seen, smoothness
+        given = SplatGraph.of(self.splats), self.evidence, self.confidence, self.seen, smoothness
         return smooth(self.X.clone(), *given, **how)[0]
 
     def minimum(self, smoothness: float) -> tuple[np.ndarray, np.ndarray]:
@@ -63,7 +66,7 @@ def test_features_are_those_of_the_least_sum(seed: int, count: int, smoothness: 
     X, weights = scene.minimum(smoothness)
     apart = np.sqrt(weights[:, None]) * (scene.smooth(smoothness).double().numpy() - X)
     moved = np.sqrt(weights[:, None]) * (scene.X.double().numpy() - X)
-    assert np.linalg.norm(apart) <= 1e-2 * np.linalg.norm(moved) + 1e-6 * np.sqrt(weights.sum())
+    assert np.linalg.norm(apart) <= 2e-2 * np.linalg.norm(moved) + 1e-6 * np.sqrt(weights.sum())
 
 
 @settings(max_examples=20, deadline=None)
@@ -98,7 +101,7 @@ def test_no_channel_leaves_the_range_of_the_features(dtype: torch.dtype, longest
     scene = Scene(1, 300)
     X = (scene.X / scene.X.abs().max() * longest).to(dtype)
     low, high = X[scene.seen].aminmax(dim=0)
-    smoothed, facts = smooth(X.clone(), scene.splats, scene.evidence, None, scene.seen, 1e6)
+    smoothed, facts = smooth(X.clone(), SplatGraph.of(scene.splats), scene.evidence, None, scene.seen, 1e6)
     assert smoothed.dtype == dtype
     assert ((smoothed >= low.clamp_max(0)) & (smoothed <= high.clamp_min(0))).all()
     assert ("warning" in facts) == (facts["steps"] >= STEPS)
@@ -110,7 +113,7 @@ def test_splats_that_no_neighbour_reaches_stay_as_they_are() -> None:
     far[40:] += 1e4
     splats, seen = replace(scene.splats, means=far), torch.arange(60) < 40
     X = (scene.X.abs() + 1) * seen[:, None]
-    smoothed, facts = smooth(X.clone(), splats, scene.evidence, None, seen, 1.0)
+    smoothed, facts = smooth(X.clone(), SplatGraph.of(splats), scene.evidence, None, seen, 1.0)
     assert facts["filled"] == 0
     assert not smoothed[40:].any()
     assert (smoothed[:40] >= 1).all()
@@ -119,13 +122,55 @@ def test_splats_that_no_neighbour_reaches_stay_as_they_are() -> None:
 def test_features_that_are_one_stay_as_they_are() -> None:
     scene = Scene(2, 200, unseen=0.0)
     X = torch.ones(200, 3)
-    smoothed, facts = smooth(X.clone(), scene.splats, scene.evidence, scene.confidence, scene.seen, 4.0)
+    smoothed, facts = smooth(
+        X.clone(), SplatGraph.of(scene.splats), scene.evidence, scene.confidence, scene.seen, 4.0
+    )
     assert torch.equal(smoothed, X)
     assert facts["moved"] == facts["steps"] == facts["filled"] == 0
-    nothing, facts = smooth(0 * X, scene.splats, scene.evidence, scene.confidence, ~scene.seen, 4.0)
+    nothing, facts = smooth(0 * X, SplatGraph.of(scene.splats), scene.evidence, scene.confidence, ~scene.seen, 4.0)
     assert not nothing.any()
     assert facts["moved"] is None
     assert "not at all" in smoothing_line(facts)
+
+
+PLACES = np.random.default_rng(2).random((900, 2))  # of splats on a square
+THINGS = (4 * PLACES[:, 0]).astype(int)  # four stripes
+STRIPES = np.random.default_rng(4).normal(size=(4, 6))[THINGS]
+
+
+def chosen(truth: np.ndarray, noise: float, views: int = 6, **how: Any) -> SmoothnessChoice:
+    """The choice for splats at PLACES, a colour a stripe, each with a noisy copy of its truth [P, F] in each view."""
+    rng, count = np.random.default_rng(3), len(PLACES)
+    means = torch.from_numpy(np.column_stack([PLACES, np.zeros(count)])).float()
+    colours = torch.from_numpy(THINGS - 1.5).float()[:, None, None].expand(-1, 1, 3)
+    graph = SplatGraph.of(replace(random_splats(3, count), means=means, sh=colours))
+    rows = truth + noise * rng.normal(size=(views, *truth.shape))
+    regions = (torch.arange(views)[None] * count + torch.arange(count)[:, None]).reshape(-1).int()
+    starts, evidence = torch.arange(count + 1) * views, torch.full((count,), float(views))
+    every = torch.arange(count, dtype=torch.int32)
+    offsets = torch.arange(views + 1) * count
+    W = RegionWeights(every, starts, regions, torch.ones(views * count), every, evidence, offsets)
+    codebook = Codebook(tuple(ViewCodebook(torch.from_numpy(own).float()) for own in rows))
+    return choose_smoothness(W, codebook, graph, None, **how)
+
+
+def test_strength_is_large_for_noise_and_small_for_what_differs_from_splat_to_splat() -> None:
+    choice = chosen(STRIPES, 2.0)
+    assert choice.smoothness >= STRENGTHS[1]
+    assert 0 < 1.2 * choice.information[0.0] < choice.information[choice.smoothness] < 2.1  # 2 bits name one of four
+    mixed = np.random.default_rng(6).permutation(STRIPES)  # neighbours are no more alike than others
+    for truth, noise in ((mixed, 0.3), (mixed, 1.0), (np.random.default_rng(7).normal(size=STRIPES.shape), 0.3)):
+        assert chosen(truth, noise).smoothness <= STRENGTHS[0]
+
+
+def test_strength_is_the_same_for_any_number_of_threads() -> None:
+    assert chosen(STRIPES, 1.0, threads=1) == chosen(STRIPES, 1.0, threads=3)
+
+
+@pytest.mark.parametrize("views", [1, 2])
+def test_strength_is_zero_where_halves_tell_nothing(views: int) -> None:
+    noise = 0.0 if views == 2 else 1.0  # all that two views say is one vector
+    assert chosen(np.ones_like(STRIPES), noise, views) == SmoothnessChoice(0.0, {})
 
 
 @pytest.fixture(scope="module")
@@ -158,10 +203,29 @@ def test_refined_lift_is_the_lift_with_that_smoothness(files: tuple[Path, Path, 
     assert "smooth" in refined.metadata.timings
 
 
+def test_lift_with_auto_is_the_lift_with_the_chosen_strength(files: tuple[Path, Path, Path]) -> None:
+    def lifted(smoothness: float | str) -> lc.LiftResult:
+        return lift_files(files[0], files[1], files[2:], LiftSettings.of(smoothness=smoothness))
+
+    auto = lifted("auto")
+    facts = dict(auto.diagnostics["smoothing"])
+    candidates = facts.pop("candidates")
+    assert facts["smoothness"] in [one["smoothness"] for one in candidates]
+    fixed = lifted(facts["smoothness"])
+    assert torch.equal(auto.features, fixed.features)
+    assert facts["smoothness"] == 0 or facts == fixed.diagnostics["smoothing"]
+    assert "of the views" in smoothing_line(auto.diagnostics["smoothing"])
+    assert auto.settings.smoothness == "auto"
+    with pytest.raises(lc.InvalidLift, match="smoothness=auto"):
+        auto.refined(lc.read_splats(files[0]), smoothness=1)
+
+
 def test_refinement_that_cannot_be_is_refused_in_words(files: tuple[Path, Path, Path], plain: lc.LiftResult) -> None:
     splats = lc.read_splats(files[0])
     with pytest.raises(lc.InvalidSettings, match="smoothness: expected a number above 0"):
         plain.refined(splats, smoothness=0)
+    with pytest.raises(lc.InvalidSettings, match="lift again with smoothness=auto"):
+        plain.refined(splats, smoothness="auto")  # pyright: ignore[reportArgumentType]
     with pytest.raises(lc.InvalidSettings, match="smoothness"):
         plain.refined(splats, smoothness=float("nan"))
     with pytest.raises(lc.InvalidSplats, match="splats"):
