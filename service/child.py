@@ -6,9 +6,11 @@ import contextlib
 import fcntl
 import json
 import os
+import select
 import signal
 import sys
 import threading
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -16,6 +18,7 @@ from typing import Any, BinaryIO
 from liftcore.errors import SplatliftError
 
 FIELDS = ("argument", "expected", "got", "hint")
+PIECE = 1 << 16
 ORPHANED = 3  # the exit status of a process whose server is gone
 
 
@@ -29,6 +32,40 @@ def own_stdout() -> BinaryIO:
 def line_of(message: Mapping[str, Any]) -> bytes:
     """A message as a line of JSON in UTF-8: of many names in other scripts, escapes would be three times that."""
     return json.dumps(message, ensure_ascii=False).encode("utf-8", "surrogatepass") + b"\n"
+
+
+class Messages:
+    """JSON lines that a process writes to a pipe.
+
+    Args:
+        pipe: its file number, whose closing is the caller's.
+    """
+
+    def __init__(self, pipe: int) -> None:
+        self.open = True  # until the pipe is closed at its other end
+        self._pipe = pipe
+        self._poll = select.poll()  # not select(), which takes no file of a number above 1023
+        self._poll.register(pipe, select.POLLIN)
+        self._rest: list[bytes] = []  # pieces of a line whose end has not come
+        os.set_blocking(pipe, False)
+
+    def read(self, seconds: float) -> list[dict[str, Any]]:
+        """What has come; returns at the first words, at the end, or after so many seconds."""
+        if not self.open:
+            time.sleep(seconds)
+            return []
+        if not self._poll.poll(seconds * 1000):
+            return []
+        lines: list[bytes] = []
+        with contextlib.suppress(BlockingIOError):
+            while piece := os.read(self._pipe, PIECE):
+                first, *more = piece.split(b"\n")
+                self._rest.append(first)
+                for begun in more:  # joined once, at its end: a message may be of a hundred thousand names
+                    lines.append(b"".join(self._rest))
+                    self._rest = [begun]
+            self.open = False  # a half line at the end is what a killed writer leaves
+        return [json.loads(line) for line in lines]
 
 
 def end_with_parent(lifeline: int) -> None:

@@ -7,7 +7,6 @@ seconds, and a fork begins at once. The template computes nothing, and ends once
 from __future__ import annotations
 
 import importlib
-import json
 import multiprocessing
 import os
 import resource
@@ -25,7 +24,7 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any
 
-from service.child import children_of, end_with_parent, is_stopped, line_of, memory_of
+from service.child import Messages, children_of, end_with_parent, is_stopped, line_of, memory_of
 from service.errors import Busy
 
 CONTEXT = multiprocessing.get_context("forkserver")
@@ -39,7 +38,6 @@ CONTEXT.set_forkserver_preload(
 )
 TICK_SECONDS = 0.5  # how soon the end of the server is seen by who waits
 GONE_SECONDS = 5.0  # for a task to end once it has said its result
-PIECE = 1 << 16
 LONGEST_FOLDER = 70  # characters of the temporary folder, in which the template has its socket: a path has 107
 PRINTED = "printed"  # the file for what a task prints, beside its temporary ones
 TEMPLATE_DIED = 255  # what multiprocessing tells in place of an exit status that nobody has
@@ -152,16 +150,12 @@ def _start(*given: Any) -> tuple[ForkServerProcess, Connection]:
 
 def _read_last_message(pipe: Connection, limits: ErrandLimits) -> dict[str, Any] | None:
     """The last that a task says until it ends; None when it must be ended."""
-    said = bytearray()
+    messages, last = Messages(pipe.fileno()), {"event": "nothing"}
     deadline = time.monotonic() + limits.seconds
     while not limits.ending.is_set() and (left := deadline - time.monotonic()) > 0:
-        if not pipe.poll(min(left, TICK_SECONDS)):
-            continue
-        piece = os.read(pipe.fileno(), PIECE)
-        if not piece:
-            lines = said.split(b"\n")[:-1]  # a half line at the end is what a killed writer leaves
-            return json.loads(lines[-1]) if lines else {"event": "nothing"}
-        said += piece
+        last = [last, *messages.read(min(left, TICK_SECONDS))][-1]
+        if not messages.open:
+            return last
     return None
 
 
@@ -179,8 +173,8 @@ def _child_main(pipe: Connection, task: str, arguments: list[str], scratch: str,
     run = getattr(importlib.import_module(module), name)
     most = memory_of("self", "VmData") + memory_bytes  # imports hold half a gigabyte with CUDA's torch
     resource.setrlimit(resource.RLIMIT_DATA, (most, most))
-    for message in ({"event": "ready"}, None):
-        line = memoryview(line_of(message or run(*arguments)))
-        while line:
-            line = line[os.write(pipe.fileno(), line) :]
+    with os.fdopen(pipe.fileno(), "wb", closefd=False) as out:
+        out.write(line_of({"event": "ready"}))
+        out.flush()
+        out.write(line_of(run(*arguments)))
     os._exit(0)  # no time for what libraries do at an exit

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import os
-import select
 import signal
 import subprocess
 import threading
@@ -14,12 +12,11 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Self
+from typing import IO, Self
 
-from service.child import children_of, memory_of
+from service.child import Messages, children_of, memory_of
 from service.observe import current_id, working_for
 
-PIECE = 1 << 16
 GONE_SECONDS = 3.0  # the kernel takes a moment to end a group
 LONGEST = 8192  # bytes of a record of the log; what is longer without an end of line comes in pieces
 MARK = "SPLATLIFT_JOB_PROCESS"  # a job's processes carry its id under this name, for who looks at a machine
@@ -59,13 +56,8 @@ class JobProcess:
         )
         assert self._process.stdout is not None and self._process.stderr is not None
         self._printed = log_lines(self._process.stderr, job)
-        self._pipe = self._process.stdout.fileno()
-        self._poll = select.poll()  # not select(), which takes no file of a number above 1023
-        self._poll.register(self._pipe, select.POLLIN)
-        self._open = True
-        self._rest: list[bytes] = []  # pieces of a line whose end has not come
+        self.listen = Messages(self._process.stdout.fileno()).read
         self._status: int | None = None
-        os.set_blocking(self._pipe, False)
 
     def __enter__(self) -> Self:
         return self
@@ -77,24 +69,6 @@ class JobProcess:
     def pid(self) -> int:
         """The child's process id, which is also its group's."""
         return self._process.pid
-
-    def listen(self, seconds: float) -> list[dict[str, Any]]:
-        """What the child says; returns at its first words, at its end, or after so many seconds."""
-        if not self._open:
-            time.sleep(seconds)
-            return []
-        if not self._poll.poll(seconds * 1000):
-            return []
-        lines: list[bytes] = []
-        with contextlib.suppress(BlockingIOError):
-            while piece := os.read(self._pipe, PIECE):
-                first, *more = piece.split(b"\n")
-                self._rest.append(first)
-                for begun in more:  # joined once, at its end: an answer may be of a hundred thousand names
-                    lines.append(b"".join(self._rest))
-                    self._rest = [begun]
-            self._open = False  # a half line at the end is what a killed writer leaves
-        return [json.loads(line) for line in lines]
 
     def ended(self) -> bool:
         """Whether the child itself has ended."""
