@@ -41,11 +41,11 @@ def run(options: argparse.Namespace) -> int:
         free_outputs(files, made_from(scene))
     encoder, words = _vocabulary(options, scene)
     found = scene.catalogue(words, encoder=encoder)
-    things = [dict(one) for one in found.objects]
-    if options.features:
-        things = [one | {"feature": row.tolist()} for one, row in zip(things, found.features, strict=True)]
+    answer = found.summary(features=options.features)
     document: dict[str, Any] = {"encoder": None if encoder is None else encoder.name}
-    document |= {"explanation": found.explanation, "objects": things}
+    document["answer"] = answer.model_dump(mode="json")
+    # The keys of before, which go with the next release.
+    document |= {"explanation": found.explanation, "objects": [vars(one) for one in answer.objects]}
     exports: dict[str, Any] = {"csv": partial(scene.export, source=found)}
     if options.splats:
         from liftcore.files import check_output

@@ -46,6 +46,7 @@ def run(options: argparse.Namespace) -> int:
     given = [path for path in (options.lift, options.table, options.words, options.camera) if path]
     free_outputs(files, given)
     from liftcore import read_example
+    from liftcore.models import BestWords
 
     scene = opened_lift(options)
     if files:
@@ -55,20 +56,16 @@ def run(options: argparse.Namespace) -> int:
     document: dict[str, Any] = {"encoder": encoder.name, "words": len(words)}
     if options.what:
         named = [(notation, read_example(notation, "--what")) for notation in options.what]
-        document["what"] = {
-            said: [vars(word) for word in scene.what(example, words, top=options.top, encoder=encoder)]
-            for said, example in named
-        }
+        best = {said: scene.what(example, words, top=options.top, encoder=encoder) for said, example in named}
+        document["examples"] = [
+            BestWords(example=said, words=nearest).model_dump(mode="json") for said, nearest in best.items()
+        ]
+        document["what"] = {said: [vars(word) for word in nearest] for said, nearest in best.items()}  # for a release
     if files or not options.what:
         found = scene.segment(words, encoder=encoder, progress=True)
-        document |= {
-            "splats": len(found.labels),
-            "none": int((found.labels < 0).sum()),
-            "found": [
-                {"value": value, **vars(named), "colour": found.colours[value].tolist()}
-                for value, named in enumerate(found.found, 1)
-            ],
-        }
+        document["answer"] = found.summary.model_dump(mode="json")
+        # The keys of before, which go with the next release.
+        document |= vars(found.summary) | {"found": [vars(named) for named in found.found]}
         exports = {kind: partial(scene.export, source=found, what=kind, view=view) for kind in files}
         document["files"] = write_files(files, exports)
     reply(document, as_json=options.json, lines=_lines(document))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,7 @@ import numpy as np
 from liftcore.errors import InvalidQuery, NotFound
 from liftcore.query.objects import largest_box
 from liftcore.query.opened import OpenedLift, as_numpy
-from liftcore.query.question import SceneObject
+from liftcore.query.question import ListedObjects, SceneObject
 from liftcore.query.scores import cosines, norms_of
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.origin import MAP_REACH
@@ -46,6 +46,16 @@ class Catalogue:
     def __repr__(self) -> str:
         some = ", ".join(f"{one.name or one.id}: {one.splats}" for one in self.objects)
         return one_line(self, f"{len(self.objects)} objects", f"features={list(self.features.shape)}", some or "none")
+
+    def listed(self, first: int = 0, last: int | None = None, *, features: bool = False) -> Iterator[SceneObject]:
+        """The objects from a place to another; with ``features`` each has its mean feature."""
+        rows = zip(self.objects[first:last], self.features[first:last], strict=True)
+        return (one.model_copy(update={"feature": tuple(row.tolist())}) if features else one for one, row in rows)
+
+    def summary(self, *, features: bool = False) -> ListedObjects:
+        """All of them, as JSON has them."""
+        things = tuple(self.listed(features=features))
+        return ListedObjects(explanation=self.explanation, count=len(things), objects=things)
 
 
 def catalogue(scene: OpenedLift, words: Sequence[str] = (), vectors: Any = None) -> Catalogue:

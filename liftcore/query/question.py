@@ -427,10 +427,12 @@ class Objects(Value):
 
 
 class NamedSplats(Value):
-    """A word that is there."""
+    """A word that is there, and how pictures show it."""
 
     word: str
     row: int = Field(description="among the words that were asked")
+    value: int = Field(description="of its splats and pixels in labels and maps; 0 is none")
+    colour: tuple[int, int, int] = Field(description="sRGB, 0 to 255, in pictures")
     splats: int = Field(description="how many it names")
     share: float = Field(description="of the evidence of all seen splats")
     score: float = Field(description="the mean cosine of its splats, by evidence")
@@ -439,11 +441,27 @@ class NamedSplats(Value):
     box: Box = Field(description="of its splats' centres, but for a thousandth of the evidence at each end")
 
 
+class FoundWords(Value):
+    """Which of many words are there."""
+
+    words: int = Field(description="how many were asked")
+    splats: int = Field(description="P")
+    none: int = Field(description="splats that none of the words names")
+    found: tuple[NamedSplats, ...] = Field(description="those that are there, with the most evidence first")
+
+
 class BestWord(Value):
     """How like a word something is."""
 
     word: str
     score: float = Field(description="their cosine")
+
+
+class BestWords(Value):
+    """The words that something is most like."""
+
+    example: str
+    words: tuple[BestWord, ...] = Field(description="the nearest first")
 
 
 class SceneObject(Value):
@@ -457,6 +475,17 @@ class SceneObject(Value):
     centre: Point = Field(description="the middle of its box: x y z, frame of the splat file")
     box: Box = Field(description="of its largest group of splats that touch, without outliers elsewhere")
     views: tuple[str, ...] = Field(description="that show most of it, the best first")
+    feature: tuple[float, ...] | None = Field(
+        default=None, description="where it is asked for: the mean of its unit features [F], unit"
+    )
+
+
+class ListedObjects(Value):
+    """The things in a scene, or some of them, those with the most evidence first."""
+
+    explanation: str = Field(description="why there are so many; or why there are none")
+    count: int = Field(description="of all pages")
+    objects: tuple[SceneObject, ...]
 
 
 class CoveringRegion(Value):

@@ -25,7 +25,7 @@ from liftcore.query.directions import directions
 from liftcore.query.objects import trimmed_box
 from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.presence import LEAST_WORDS, References, judge, references_beside
-from liftcore.query.question import BestWord, NamedSplats, Query
+from liftcore.query.question import BestWord, FoundWords, NamedSplats, Query
 from liftcore.query.scores import cosines, norms_of
 from liftcore.query.terms import Example
 from liftcore.query.threshold import find_threshold
@@ -73,7 +73,18 @@ class Segmentation:
     @property
     def colours(self) -> np.ndarray:
         """[len(found) + 1, 3] u8 sRGB, by ``values``: grey, then a colour a word."""
-        return np.roll(cluster_colours(len(self.found)), 1, axis=0)
+        return _palette(len(self.found))
+
+    @property
+    def summary(self) -> FoundWords:
+        """What is there, and what has no name."""
+        none = int((self.labels < 0).sum())
+        return FoundWords(words=len(self.words), splats=len(self.labels), none=none, found=self.found)
+
+
+def _palette(words: int) -> np.ndarray:
+    """[words + 1, 3] u8 sRGB, grey first."""
+    return np.roll(cluster_colours(words), 1, axis=0)
 
 
 def words_of(encoder: TextEncoder) -> list[str]:
@@ -147,21 +158,29 @@ def segment(
     score = np.where(labels != NO_WORD, named.score, 0.0).astype(np.float32)
     apart = (labels != NO_WORD) & (other > -np.inf)
     margin = np.subtract(named.score, other, out=np.zeros_like(score), where=apart)
-    found = [
+    groups = [
+        (float(weights[mine].sum() / weights.sum()), row, mine)
+        for row in np.unique(labels[labels != NO_WORD]).tolist()
+        if weights[mine := np.flatnonzero(labels == row)].any()
+    ]
+    groups.sort(key=lambda group: -group[0])
+    palette = _palette(len(groups)).tolist()
+    found = tuple(
         NamedSplats(
             word=words[row],
             row=row,
+            value=value,
+            colour=palette[value],
             splats=len(mine),
-            share=float(weights[mine].sum() / weights.sum()),
+            share=share,
             score=float(np.average(named.score[mine], weights=weights[mine])),
             margin=float(np.average(margin[mine], weights=weights[mine])),
             threshold=float(thresholds[row]),
             box=trimmed_box(scene.splats.positions(mine), weights[mine]),
         )
-        for row in np.unique(labels[labels != NO_WORD]).tolist()
-        if weights[mine := np.flatnonzero(labels == row)].any()
-    ]
-    return Segmentation(words, labels, score, margin, tuple(sorted(found, key=lambda one: -one.share)))
+        for value, (share, row, mine) in enumerate(groups, 1)
+    )
+    return Segmentation(words, labels, score, margin, found)
 
 
 class _Nearest:

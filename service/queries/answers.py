@@ -266,8 +266,8 @@ class Answers:
         return made
 
     def _segment(self, request: dict[str, Any]) -> Frame:
-        told = describe_words(self._named(request))
-        return _json(request, {name: told[name] for name in ("words", "splats", "none")}, "found", told["found"])
+        told = self._named(request).summary.model_dump(mode="json")
+        return _json(request, told, "found", told.pop("found"))
 
     def _what(self, request: dict[str, Any]) -> Frame:
         (words, encoder), example = self._words(request), _example(request["example"], "example")
@@ -279,11 +279,7 @@ class Answers:
         found = self._kept(key, lambda: self._named_objects(request))
         assert isinstance(found, Catalogue)
         first, last = request["first"], request["first"] + request["count"]
-        rows = found.features[first:last] if request["means"] else [None] * len(found.objects[first:last])
-        things = (
-            one.model_dump(mode="json") | {"feature": None if row is None else row.tolist()}
-            for one, row in zip(found.objects[first:last], rows, strict=True)
-        )
+        things = (one.model_dump(mode="json") for one in found.listed(first, last, features=request["means"]))
         after = last if last < len(found.objects) else None
         told = {"explanation": found.explanation, "count": len(found.objects), "next": after}
         return _json(request, told, "objects", things)
@@ -386,16 +382,6 @@ def open_scene(request: dict[str, Any]) -> Scene:
     """The lift, with its splats and cameras where the store has them now: data directories may move."""
     splats, cameras = Path(request["splats"]), Path(request["cameras"])
     return Scene(Path(request["lift"]), splats=splats, cameras=cameras)
-
-
-def describe_words(found: Segmentation) -> dict[str, Any]:
-    """What is there, of many words, as JSON takes it."""
-    named = [
-        word.model_dump(mode="json") | {"value": value, "colour": found.colours[value].tolist()}
-        for value, word in enumerate(found.found, 1)
-    ]
-    counts = {"words": len(found.words), "splats": len(found.labels), "none": int((found.labels < 0).sum())}
-    return {**counts, "found": named}
 
 
 def _camera(camera: Camera, name: str) -> dict[str, Any]:

@@ -9,15 +9,15 @@ from pydantic_core import PydanticCustomError
 
 from liftcore.query.question import (
     Answer,
-    BestWord,
+    BestWords,
     CoveringRegion,
     Found,
-    NamedSplats,
+    FoundWords,
+    ListedObjects,
     Notation,
     Objects,
     Picture,
     Query,
-    SceneObject,
     Seen,
 )
 from liftcore.query.terms import NOTATIONS
@@ -116,29 +116,16 @@ class OfLift(BaseModel):
     lift: JobId
 
 
-class FoundWord(NamedSplats):
-    """A word that is there, and how pictures show it."""
-
-    value: int = Field(description="of its splats and pixels in labels and maps; 0 is none")
-    colour: list[int] = Field(description="sRGB, 0 to 255, in pictures")
-
-
-class SegmentAnswer(OfLift):
+class SegmentAnswer(FoundWords, OfLift):
     """What is there, of many words."""
 
     encoder: str = Field(description="the text encoder that was asked, without its file")
-    words: int = Field(description="how many were asked")
-    splats: int = Field(description="P")
-    none: int = Field(description="splats that none of the words names")
-    found: list[FoundWord] = Field(description="those that are there, with the most evidence first")
 
 
-class WhatAnswer(OfLift):
+class WhatAnswer(BestWords, OfLift):
     """The words that something is most like."""
 
     encoder: str
-    example: str
-    words: list[BestWord] = Field(description="the nearest first")
 
 
 class QueryAnswer(Answer, OfLift):
@@ -152,12 +139,6 @@ class QueryAnswer(Answer, OfLift):
 
 class ObjectsAnswer(Found, Objects, OfLift):
     """The things that were found."""
-
-
-class ListedObject(SceneObject):
-    """A thing in the scene, in a list."""
-
-    feature: list[float] | None = Field(description="with features=true: the mean of its unit features [F], unit")
 
 
 class CoveringRegions(OfLift):
@@ -181,11 +162,8 @@ class AskedForSceneObjects(BaseModel):
     cursor: int = Field(0, ge=0, le=10**9, description="the `next` of the page before")
 
 
-class SceneObjects(OfLift):
+class SceneObjects(ListedObjects, OfLift):
     """Some of the objects of a lift, those with the most evidence first."""
 
     encoder: str | None = Field(description="what named them, without its file; null for nothing")
-    explanation: str = Field(description="why there are so many; or why there are none")
-    count: int = Field(description="of all pages")
-    objects: list[ListedObject]
     next: int | None = Field(description="the cursor of the page after this one; null at the end")

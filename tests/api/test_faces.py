@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import liftcore as lc
-from liftcore import cli
+from liftcore import cli, models
 from service.store.owners import SERVICE
 
 from .conftest import parts_of
@@ -89,22 +90,60 @@ class Faces:
 
     def command(self, asked: dict[str, Any]) -> dict[str, Any] | None:
         """The same of the command line; it takes feature packs where the lift remembers them."""
-        words = ["query", self.path, "--splats", self.splats, "--cameras", self.cameras, "--objects", "--json"]
+        words = [*self.places, "--objects"]
         words += [text for text in asked.get("text", ()) if text]
         for name, value in asked.items():
             flag = FLAGS.get(name, f"--{name.replace('_', '-')}")
             words += [part for one in (value if isinstance(value, list) else [value]) for part in (flag, one)]
             words = words[: -2 * len(value)] if name == "text" and value else words
+        return self.printed("query", *words).get("answer")
+
+    @property
+    def places(self) -> list[Path | str]:
+        """The lift and its files, as commands take them."""
+        return [self.path, "--splats", self.splats, "--cameras", self.cameras]
+
+    def printed(self, command: str, *words: object) -> dict[str, Any]:
+        """What a command prints; nothing where it refuses."""
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(io.StringIO()):
-            status = cli.main([str(word) for word in (*words, "--table", self.table)])
+            status = cli.main([command, *map(str, words), "--table", str(self.table), "--json"])
         assert status in (0, cli.BAD_INPUT)
-        return json.loads(printed.getvalue())["answer"] if status == 0 else None
+        return json.loads(printed.getvalue()) if status == 0 else {}
 
 
 @pytest.fixture(scope="module")
 def faces(client: TestClient, lift: dict[str, Any], table: Path) -> Faces:
     return Faces(client, lift["id"], table)
+
+
+def test_words_and_things_have_the_same_answers(faces: Faces, table: Path, tmp_path: Path) -> None:
+    beside = tmp_path / "scene.lift"  # the command for objects looks for the splats there
+    shutil.copy(faces.path, beside)
+    shutil.copy(faces.splats, tmp_path / lc.load_lift(beside).metadata.splats.path)
+    encoder = faces.scene.encoder(f"table:{table}")
+    expected = {
+        "segment": faces.scene.segment(encoder=encoder).summary,
+        "what": models.BestWords(example="splat:0", words=faces.scene.what("splat:0", encoder=encoder)),
+        "objects": faces.scene.catalogue(faces.scene.words(encoder), encoder=encoder).summary(features=True),
+    }
+    served = faces.client.put("/assets/table", content=table.read_bytes()).json()["id"]
+    asked = {"lift": faces.lift, "table": served}
+    told = {
+        "segment": faces.client.post("/query/segment", json=asked).json(),
+        "what": faces.client.post("/query/what", json=asked | {"example": "splat:0"}).json(),
+        "objects": faces.client.get(
+            f"/lifts/{faces.lift}/objects", params={"table": served, "features": True}
+        ).json(),
+    }
+    printed = {
+        "segment": faces.printed("segment", *faces.places)["answer"],
+        "what": faces.printed("segment", *faces.places, "--what", "splat:0")["examples"][0],
+        "objects": faces.printed("objects", beside, "--features")["answer"],
+    }
+    for name, answer in expected.items():
+        document = answer.model_dump(mode="json")
+        assert {field: told[name][field] for field in document} == document == printed[name]
 
 
 @settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow])

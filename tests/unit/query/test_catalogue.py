@@ -61,6 +61,7 @@ def test_the_command_lists_names_and_writes_them(
     assert main(["objects", str(tiny_lift), *named, *files]) == 0
     told = json.loads(capsys.readouterr().out)
     assert {one["name"] for one in told["objects"]} == set(WORDS) and len(told["objects"][0]["feature"]) == CHANNELS
+    assert told["answer"]["count"] == 3 and told["answer"]["objects"][2]["feature"] == told["objects"][2]["feature"]
     assert (tmp_path / "things.csv").read_text().count("\n") == 4
     assert sorted(path.name for path in (tmp_path / "things").iterdir()) == [f"object-{k}.ply" for k in range(3)]
     assert main(["objects", str(tiny_lift)]) == 0 and "3 objects" in capsys.readouterr().out

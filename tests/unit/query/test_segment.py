@@ -179,11 +179,23 @@ def test_command_names_splats_and_examples(tiny_lift: Path, tmp_path: Path, caps
     assert cli.main([*command, "--view", "middle", *written, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert {named["word"] for named in document["found"]} == {"apple", "book", "lamp"}
+    told = document["answer"]  # as HTTP has it; the other keys are those of before
+    assert {name: document[name] for name in ("words", "splats", "none")} == {
+        "words": 3,
+        "splats": 60,
+        "none": told["none"],
+    }
+    assert [[*one["box"].values()] for one in told["found"]] == [one["box"] for one in document["found"]]
     assert document["files"] == {kind: str(path) for kind, path in files.items()}
     values = np.load(files["splat_labels"])
     for named in document["found"]:
         assert (values == named["value"]).sum() == named["splats"]
-    assert cli.main([*command, "--words", str(tmp_path / "words.txt"), "--what", "splat:0", "--top", "1"]) == 0
+    asked = [*command, "--words", str(tmp_path / "words.txt"), "--what", "splat:0", "--top", "1"]
+    assert cli.main([*asked, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    (best,) = document["examples"]
+    assert best["example"] == "splat:0" and best["words"] == document["what"]["splat:0"]
+    assert cli.main(asked) == 0
     assert capsys.readouterr().out.startswith("splat:0: apple ")
     assert cli.main([*command, "--words", str(tmp_path / "words.txt")]) == 0
     assert "2 of 2 words are there" in capsys.readouterr().out
