@@ -24,8 +24,7 @@ from service.requests import KnownParameters
 from service.routes import assets, jobs, lifts, operations, queries
 from service.settings import ServiceSettings
 from service.state import AppState, Readiness, Stopping
-from service.store.collect import Collector
-from service.store.store import Store
+from service.store.store import Collector, Store
 
 
 def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, worker: QueryClient) -> FastAPI:

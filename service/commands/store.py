@@ -11,9 +11,8 @@ from liftcore.cli import Parser
 from liftcore.errors import NotFound
 from service.commands.serve import data_directory_errors
 from service.settings import ServiceSettings, read_settings
-from service.store.backup import back_up, restore, verify
 from service.store.database import DATABASE
-from service.store.rebuild import rebuild
+from service.store.recovery import back_up, rebuild, restore, verify
 from service.store.store import Store
 
 LOST = (

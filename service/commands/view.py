@@ -38,7 +38,7 @@ from service.settings import ServiceSettings
 from service.store.assets import CheckedUpload
 from service.store.lifts import FinishedLift, order_of
 from service.store.owners import SERVICE
-from service.store.rebuild import header_of
+from service.store.recovery import header_of
 from service.store.store import Store
 from service.uploads import check
 

@@ -1,13 +1,23 @@
-"""The store: everything below one data directory."""
+"""The store: everything below one data directory; and garbage, files that nothing in the database reaches and no
+running work needs."""
 
 from __future__ import annotations
 
+import logging
+import math
+import shutil
 import sqlite3
+import sys
+import threading
+import time
+from collections.abc import Container, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
 from service.errors import Misconfigured, StaleDatabase
+from service.models import ENDED
+from service.settings import ServiceSettings
 from service.store.assets import AssetStore
 from service.store.database import (
     DATABASE,
@@ -22,6 +32,7 @@ from service.store.files import DataDirectory
 from service.store.jobs import JobStore
 from service.store.keys import KeyStore, any_key
 from service.store.lifts import LiftStore, TradeoffStore
+from service.store.owners import SERVICE
 
 
 @dataclass(frozen=True)
@@ -100,3 +111,113 @@ def _database(files: DataDirectory, *, new: bool, rebuilding: bool) -> Database:
     if any_key(path):
         remember_keys(files.root)
     return database
+
+
+# Garbage, and jobs that ended long ago
+
+log = logging.getLogger(__name__)
+
+
+def collect(store: Store, older_than: float) -> list[Path]:
+    """Clear away what crashes left behind: blobs and lifts without a row, drafts without a writer, unused work.
+
+    What the database does not know goes to quarantine: it may be that the database is wrong. Drafts, which nobody was
+    told of, and the work of jobs that it says have ended are removed.
+
+    Args:
+        store: whose files are looked through.
+        older_than: seconds since 1970; what was changed later stays.
+
+    Returns:
+        What was moved or removed.
+    """
+    files, moved = store.files, []
+    files.make_folders()
+    with files.blobs_changing, store.database.read() as connection:  # so no upload is between its blob and its row
+        known = {row["file"] for row in connection.execute("SELECT file FROM assets")}
+        moved += _lost(files, (files.root / "blobs").glob("*/*"), known, older_than)
+    with store.database.write() as connection:  # so no lift is between its file and its row
+        known = {row["file"] for row in connection.execute("SELECT file FROM lifts")}
+        moved += _lost(files, (files.root / "lifts").iterdir(), known, older_than)
+    ended, unknown = _unused_work(store)
+    moved += files.quarantine(path for path in unknown if _changed(path) < older_than)
+    removed = [path for path in ended + files.left_over() if _changed(path) < older_than]
+    for path in removed:
+        shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+    return moved + removed
+
+
+def _lost(files: DataDirectory, found: Iterable[Path], known: Container[str], older_than: float) -> list[Path]:
+    """Move files that have no row to quarantine."""
+    lost = [path for path in found if files.relative(path) not in known and _changed(path) < older_than]
+    return files.quarantine(lost)
+
+
+def empty_quarantine(files: DataDirectory, since_before: float) -> list[Path]:
+    """Remove what was moved to quarantine long ago.
+
+    Args:
+        files: whose quarantine it is.
+        since_before: seconds since 1970; what was moved later stays.
+
+    Returns:
+        The folders that were removed.
+    """
+    removed = [folder for folder, since in files.quarantined() if since < since_before]
+    for folder in removed:
+        shutil.rmtree(folder)
+    return removed
+
+
+def _unused_work(store: Store) -> tuple[list[Path], list[Path]]:
+    """Folders of jobs that have ended, which never run again, and of jobs that the database does not know."""
+    states = {folder: store.jobs.state(SERVICE, folder.name) for folder in (store.files.root / "work").iterdir()}
+    ended = [folder for folder, state in states.items() if state in ENDED]
+    return ended, [folder for folder, state in states.items() if state is None]
+
+
+def _changed(path: Path) -> float:
+    try:
+        return path.stat().st_mtime
+    except FileNotFoundError:  # its owner was quicker
+        return float("inf")
+
+
+class Collector:
+    """A thread that collects at start-up and now and then."""
+
+    def __init__(self, store: Store, settings: ServiceSettings) -> None:
+        self._store = store
+        self._settings = settings
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._loop, name="collector", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End; returns when the thread has."""
+        self._stopping.set()
+        self._thread.join()
+
+    def _loop(self) -> None:
+        while True:
+            try:
+                self._collect()
+            except Exception:  # a full disk today must not stop the collection of tomorrow
+                log.exception("the collection of garbage stumbled")
+            if self._stopping.wait(self._settings.garbage_seconds):
+                return
+
+    def _collect(self) -> None:
+        store, settings, now = self._store, self._settings, time.time()
+        for path in empty_quarantine(store.files, now - settings.quarantine_seconds):
+            log.info("removed %s, whose time in quarantine is over", path)
+        before = -math.inf if settings.keep_jobs_seconds is None else now - settings.keep_jobs_seconds
+        most = sys.maxsize if settings.keep_jobs is None else settings.keep_jobs
+        if forgotten := store.jobs.forget_ended(before, most):
+            log.info("forgot %d jobs that ended long ago, without a result", forgotten)
+        store.database.keep_reserve()
+        for path in collect(store, now - settings.garbage_grace_seconds):
+            log.info("moved %s away, which nothing refers to", path)

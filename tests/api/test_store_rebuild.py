@@ -15,10 +15,9 @@ from service.auth import needed
 from service.commands.serve import require_keys
 from service.errors import Misconfigured, StaleDatabase
 from service.settings import ServiceSettings
-from service.store.collect import collect
 from service.store.database import DATABASE
 from service.store.owners import SERVICE
-from service.store.store import Store
+from service.store.store import Store, collect
 
 from .conftest import Uploaded, app_of, serving
 from .following import ended
@@ -115,7 +114,7 @@ def test_rebuild_that_was_cut_off_does_not_let_the_server_start(
     def cut_off(*given: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("service.store.rebuild._add_lift", cut_off)
+    monkeypatch.setattr("service.store.recovery._add_lift", cut_off)
     assert main(["store", "rebuild", "--data", str(data)]) == INTERRUPTED
     monkeypatch.undo()
     with pytest.raises(StaleDatabase):

@@ -23,7 +23,7 @@ from safetensors.numpy import load_file, save
 import liftcore as lc
 from liftcore.text import BUILT_IN, LVIS_TABLE, open_encoder
 from liftcore.values.pack import write_pack
-from service.commands.scene_folder import SHIPPED
+from service.commands.demo import SHIPPED
 
 EVERY = 3  # of the views with features
 PACK = "features_hard"

@@ -13,11 +13,11 @@ import pytest
 from liftcore.cli import main
 from service.errors import Misconfigured
 from service.models import AssetKind, JobState
-from service.store import backup
-from service.store.backup import back_up, restore, verify
+from service.store import recovery
 from service.store.database import KEYS_REQUIRED
 from service.store.keys import Quota
 from service.store.owners import SERVICE, Scope
+from service.store.recovery import back_up, restore, verify
 from service.store.store import Store
 
 from .conftest import Supervising, asset_of, ended, order, supervised, until
@@ -77,14 +77,14 @@ def test_job_that_runs_during_a_backup_ends_in_the_restored(
 def test_asset_that_is_deleted_during_a_backup_is_no_loss(
     filled: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asset, copy = asset_of(filled, AssetKind.MASKS, {}), backup.copy_database
+    asset, copy = asset_of(filled, AssetKind.MASKS, {}), recovery.copy_database
 
     def copy_then_delete(source: Path, target: Path) -> None:
         copy(source, target)
         if filled.assets.find(SERVICE, asset) is not None:
             filled.assets.delete(SERVICE, asset)
 
-    monkeypatch.setattr(backup, "copy_database", copy_then_delete)
+    monkeypatch.setattr(recovery, "copy_database", copy_then_delete)
     assert back_up(filled.files.root, tmp_path / "backup") == 4
     assert verify(tmp_path / "backup") == [] and files(tmp_path / "backup") == files(filled.files.root)
 

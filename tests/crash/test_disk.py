@@ -22,11 +22,10 @@ from liftcore.cli import main
 from service.commands import serve
 from service.errors import Misconfigured
 from service.store import database as databases
-from service.store.collect import collect
 from service.store.database import DATABASE, RESERVE, Database
 from service.store.keys import any_key
 from service.store.owners import SERVICE
-from service.store.store import Store
+from service.store.store import Store, collect
 
 from .conftest import ended, order, until
 from .server import standing_in

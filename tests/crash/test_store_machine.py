@@ -19,11 +19,10 @@ from liftcore.errors import NotFound
 from service.errors import Busy, Conflict, InUse, KeyReused
 from service.models import ENDED, AssetKind, JobKind, JobState
 from service.store.assets import CheckedUpload
-from service.store.collect import collect
 from service.store.jobs import MAX_ATTEMPTS, EventKind, JobOrder
 from service.store.lifts import FinishedLift, FinishedTradeoff
 from service.store.owners import SERVICE, Owner, stored_bytes
-from service.store.store import Store
+from service.store.store import Store, collect
 
 from .conftest import METADATA
 

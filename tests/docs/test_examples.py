@@ -35,7 +35,7 @@ from liftcore.text.table import TableEncoder
 from liftcore.values.pack import read_features, write_pack
 from service import models
 from service.auth import OPEN
-from service.commands.scene_folder import find_scene
+from service.commands.demo import find_scene
 from service.queries import questions
 from service.routes import assets, jobs, lifts, operations, queries
 from tests.api.tiny_scene import HEIGHT, WIDTH, WORDS, cameras_document, codebook, colmap_zip, labels, make_scene

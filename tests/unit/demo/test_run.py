@@ -11,7 +11,7 @@ from liftcore.errors import Unavailable
 from liftcore.query.result import load_lift
 from liftcore.text import LVIS_TABLE
 from service.commands import demo
-from service.commands.scene_folder import SHIPPED
+from service.commands.demo import SHIPPED
 
 pytestmark = pytest.mark.slow
 

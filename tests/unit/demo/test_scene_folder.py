@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 
 from liftcore.errors import InvalidInput
 from liftcore.io.transforms import FRAME_FILE
-from service.commands.scene_folder import find_scene
+from service.commands.demo import find_scene
 
 INRIA_CAMERA = {
     "id": 0, "img_name": "v", "width": 4, "height": 3, "fx": 4.0, "fy": 4.0,
