@@ -31,22 +31,24 @@ METRICS: dict[int | str, dict[str, Any]] = {
     }
 }
 
-# What the page may do: ask this service, and sort and unpack splats, which is done by WebAssembly in workers.
-PAGE_POLICY = {
-    "default-src": "'none'",
-    "script-src": "'self' 'wasm-unsafe-eval'",
-    "style-src": "'self'",
-    "img-src": "'self' blob: data:",
-    "connect-src": "'self'",
-    "worker-src": "blob:",
-    "base-uri": "'none'",
-    "form-action": "'none'",
-    "frame-ancestors": "'none'",
-}
-PAGE_HEADERS = {
-    "Content-Security-Policy": "; ".join(f"{name} {value}" for name, value in PAGE_POLICY.items()),
-    "Cache-Control": "no-cache",
-}
+
+def _policy(scripts: str, styles: str, **more: str) -> dict[str, str]:
+    """The header of a page that runs these scripts and no others, whatever comes to be in it."""
+    rules = {
+        "default-src": "'none'",
+        "script-src": scripts,
+        "style-src": styles,
+        "img-src": "'self' blob: data:",
+        "connect-src": "'self'",
+        "form-action": "'none'",
+        "base-uri": "'none'",
+        "frame-ancestors": "'none'",
+    } | {name.replace("_", "-"): value for name, value in more.items()}
+    return {"Content-Security-Policy": "; ".join(f"{name} {value}" for name, value in rules.items())}
+
+
+# The page asks this service, and sorts and unpacks splats, which is done by WebAssembly in workers.
+PAGE_HEADERS = _policy("'self' 'wasm-unsafe-eval'", "'self'", worker_src="blob:") | {"Cache-Control": "no-cache"}
 KEPT = {"Cache-Control": "public, max-age=31536000, immutable"}  # the page asks for them by their digest
 
 router = APIRouter(tags=["operations"])
@@ -86,24 +88,6 @@ def page() -> HTMLResponse:
     return HTMLResponse((WEB / "page.html").read_text(encoding="utf-8"), headers=PAGE_HEADERS)
 
 
-@router.get("/web/page.js", include_in_schema=False)
-def page_script() -> Response:
-    """What draws the page."""
-    return Response((WEB / "page.js").read_bytes(), media_type="text/javascript", headers=KEPT)
-
-
-@router.get("/web/page.css", include_in_schema=False)
-def page_style() -> Response:
-    """How it looks."""
-    return Response((WEB / "page.css").read_bytes(), media_type="text/css", headers=KEPT)
-
-
-@router.get("/web/LICENSES.txt", include_in_schema=False)
-def page_licences() -> Response:
-    """The licences of the libraries in it."""
-    return Response((WEB / "LICENSES.txt").read_bytes(), media_type="text/plain; charset=utf-8")
-
-
 class Documents:
     """The routes as OpenAPI has them, without keys and with them: made once, as that takes half a second."""
 
@@ -138,38 +122,24 @@ def docs() -> HTMLResponse:
         swagger_css_url="docs/swagger-ui.css",
         swagger_favicon_url=NO_PICTURE,
     )
-    return _guarded(bytes(page.body).decode(), styles="'self' 'unsafe-inline'")  # it styles as it goes
+    html = bytes(page.body).decode()
+    inline = re.findall("<script>(.*?)</script>", html, re.DOTALL)
+    digests = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in inline)
+    scripts = " ".join(("'self'", *(f"'sha256-{digest}'" for digest in digests)))
+    policy = _policy(scripts, "'self' 'unsafe-inline'", form_action="'self'")  # it styles as it goes
+    return HTMLResponse(html, headers=policy)
 
 
-@router.get("/docs/swagger-ui-bundle.js", include_in_schema=False)
-def script() -> Response:
-    """What draws that page."""
-    return Response((SWAGGER / "swagger-ui-bundle.js").read_bytes(), media_type="text/javascript")
+def _serve(path: str, file: Path, media_type: str, headers: dict[str, str] | None = None) -> None:
+    """Register a file that a page asks for."""
+
+    @router.get(path, include_in_schema=False)
+    def content() -> Response:
+        return Response(file.read_bytes(), media_type=media_type, headers=headers)
 
 
-@router.get("/docs/swagger-ui.css", include_in_schema=False)
-def style() -> Response:
-    """How it looks."""
-    return Response((SWAGGER / "swagger-ui.css").read_bytes(), media_type="text/css")
-
-
-def _guarded(page: str, styles: str = "") -> HTMLResponse:
-    """A page that runs its own scripts and no others, whatever comes to be in it."""
-    policy = {
-        "default-src": "'none'",
-        "script-src": f"'self' {_digests(page, 'script')}",
-        "style-src": styles or _digests(page, "style"),
-        "img-src": "'self' blob: data:",
-        "connect-src": "'self'",
-        "form-action": "'self'",
-        "base-uri": "'none'",
-        "frame-ancestors": "'none'",
-    }
-    headers = {"Content-Security-Policy": "; ".join(f"{name} {value}" for name, value in policy.items())}
-    return HTMLResponse(page, headers=headers)
-
-
-def _digests(page: str, tag: str) -> str:
-    inline = re.findall(f"<{tag}>(.*?)</{tag}>", page, re.DOTALL)
-    made = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in inline)
-    return " ".join(f"'sha256-{digest}'" for digest in made)
+_serve("/web/page.js", WEB / "page.js", "text/javascript", KEPT)
+_serve("/web/page.css", WEB / "page.css", "text/css", KEPT)
+_serve("/web/LICENSES.txt", WEB / "LICENSES.txt", "text/plain; charset=utf-8")
+_serve("/docs/swagger-ui-bundle.js", SWAGGER / "swagger-ui-bundle.js", "text/javascript")
+_serve("/docs/swagger-ui.css", SWAGGER / "swagger-ui.css", "text/css")
