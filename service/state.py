@@ -18,6 +18,7 @@ from liftcore.errors import SplatliftError
 from service import errand
 from service.auth import CALLER, Caller
 from service.content import EventStreams
+from service.errand import ErrandLimits
 from service.errors import NotReady
 from service.jobs.supervisor import Supervisor
 from service.models import Version
@@ -159,6 +160,11 @@ class AppState:
     ordering: anyio.CapacityLimiter
     scrapes: anyio.CapacityLimiter
     ending: threading.Event = field(default_factory=threading.Event)  # set when what still runs must end
+
+    @property
+    def check_limits(self) -> ErrandLimits:
+        """What the check of an upload, or a plan, may take."""
+        return ErrandLimits(self.settings.check_seconds, self.settings.check_memory_bytes, self.ending)
 
     @property
     def owner(self) -> Owner:

@@ -10,17 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO, Generic, TypeVar
 
-from liftcore.errors import (
-    InvalidCameras,
-    InvalidFeatures,
-    InvalidInput,
-    InvalidLift,
-    InvalidMasks,
-    InvalidPhotos,
-    InvalidSplats,
-    InvalidTable,
-    NotFound,
-)
+from liftcore import errors
+from liftcore.errors import InvalidInput, InvalidLift, NotFound
 from liftcore.scene.views import require_pairs
 from service.child import error_of
 from service.errand import ErrandLimits, run_errand
@@ -36,13 +27,7 @@ LIFT = "lift"
 
 # What a malformed file of a kind is told as.
 INVALID: dict[UploadKind, type[InvalidInput]] = {
-    AssetKind.SPLATS: InvalidSplats,
-    AssetKind.CAMERAS: InvalidCameras,
-    AssetKind.FEATURES: InvalidFeatures,
-    AssetKind.MASKS: InvalidMasks,
-    AssetKind.TABLE: InvalidTable,
-    AssetKind.PHOTOS: InvalidPhotos,
-    LIFT: InvalidLift,
+    kind: getattr(errors, f"Invalid{kind.capitalize()}") for kind in (*AssetKind, LIFT)
 }
 
 STEP = 4 << 20  # bytes of content between two looks at what may still be stored

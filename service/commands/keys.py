@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -152,17 +153,9 @@ def _revoke(keys: KeyStore, given: argparse.Namespace) -> None:
 
 
 def _document(key: KeyRecord) -> dict[str, Any]:
-    return {
-        "id": key.id,
-        "name": key.name,
-        "scopes": sorted(key.scopes),
-        "max_bytes": key.quota.max_bytes,
-        "max_queued": key.quota.max_queued,
-        "max_uploads": key.quota.max_uploads,
-        "created": key.created,
-        "expires": key.expires,
-        "revoked": key.revoked,
-    }
+    fields = asdict(key)
+    quota = fields.pop("quota")
+    return {**fields, **quota, "scopes": sorted(key.scopes)}
 
 
 def _state(key: KeyRecord) -> str:

@@ -30,7 +30,6 @@ from liftcore.text import BUILT_IN, NO_WORDS, OWN_WORDS
 from service.app import assemble
 from service.commands.serve import bind, server_of
 from service.encoders import require_encoder_files
-from service.errand import ErrandLimits
 from service.errors import Misconfigured
 from service.models import AssetKind
 from service.observe import logging_to_stderr
@@ -38,9 +37,8 @@ from service.settings import ServiceSettings
 from service.store.assets import CheckedUpload
 from service.store.lifts import FinishedLift, order_of
 from service.store.owners import SERVICE
-from service.store.recovery import header_of
+from service.store.recovery import checked, header_of
 from service.store.store import Store
-from service.uploads import check
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -187,9 +185,7 @@ def _link(store: Store, settings: ServiceSettings, kind: AssetKind, file: dict[s
     if not file["path"] or not source.exists():
         got = "nothing there" if file["path"] else "a lift of values in memory"
         raise InvalidLift(str(lift), expected=f"its {kind} at {file['path'] or 'a path'}", got=got)
-    with store.files.scratch() as scratch:
-        limits = ErrandLimits(settings.check_seconds, settings.check_memory_bytes, threading.Event())
-        report = check(kind, source, scratch, limits)
+    report = checked(store, settings, kind, source)
     path = store.files.blob(file["sha256"], report.suffix)
     path.parent.mkdir(exist_ok=True)
     path.symlink_to(source.resolve() if source.is_file() else source)

@@ -12,7 +12,7 @@ from fastapi import APIRouter, Path, Query, Request, Response
 
 from service import models
 from service.content import FILE, Cursor, Limit, StoredFile, file_answer, listed
-from service.errand import ErrandLimits, run_errand
+from service.errand import run_errand
 from service.errors import Crashed
 from service.requests import JsonRoute
 from service.state import AppState, Deps
@@ -75,8 +75,7 @@ async def taken(
         known = await write(intake.finish, sha256)
         if known is not None:
             return known, False
-        allowed = ErrandLimits(deps.settings.check_seconds, deps.settings.check_memory_bytes, deps.ending)
-        checked = await anyio.to_thread.run_sync(intake.check, allowed, limiter=deps.checks)
+        checked = await anyio.to_thread.run_sync(intake.check, deps.check_limits, limiter=deps.checks)
         return await write(intake.keep, checked)
     finally:
         with anyio.CancelScope(shield=True):  # removing gigabytes takes its time
@@ -141,7 +140,6 @@ async def change_pack(asset: AssetId, change: models.PackChange, deps: Deps) -> 
 
 def _retagged(asset: str, change: models.PackChange, deps: AppState) -> tuple[AssetRecord, bool]:
     found = deps.store.assets.get(deps.owner, asset, models.AssetKind.FEATURES)
-    allowed = ErrandLimits(deps.settings.check_seconds, deps.settings.check_memory_bytes, deps.ending)
     limit = deps.settings.max_upload_bytes(models.AssetKind.FEATURES)
     intake = AssetIntake(deps.store, deps.owner, models.AssetKind.FEATURES, limit)
     try:
@@ -149,7 +147,7 @@ def _retagged(asset: str, change: models.PackChange, deps: AppState) -> tuple[As
         with deps.store.files.scratch() as scratch, found.path.open("rb") as pack:
             header = scratch / "header"
             given = [str(found.path), change.model_dump_json(exclude_none=True), str(header)]
-            heard = run_errand("service.tasks.rename", given, scratch, allowed)
+            heard = run_errand("service.tasks.rename", given, scratch, deps.check_limits)
             if heard is None or heard.last["event"] != "valid":
                 raise Crashed(
                     "asset", expected="a pack whose header is read", got="one that is not", hint="try again"
@@ -159,7 +157,7 @@ def _retagged(asset: str, change: models.PackChange, deps: AppState) -> tuple[As
             while block := pack.read(BATCH):
                 intake.feed(block)
         known = intake.finish(None)
-        return (known, False) if known is not None else intake.keep(intake.check(allowed))
+        return (known, False) if known is not None else intake.keep(intake.check(deps.check_limits))
     finally:
         intake.close()
 
@@ -173,16 +171,9 @@ def delete_asset(asset: AssetId, deps: Deps) -> None:
 def shape(asset: AssetRecord) -> models.Asset:
     """An asset as clients get it."""
     own = f"/assets/{asset.id}"
-    return models.Asset(
-        id=asset.id,
-        kind=asset.kind,
-        bytes=asset.bytes,
-        counts=asset.counts,
-        warnings=asset.warnings,
-        created=asset.created,
-        links={"self": own, "content": f"{own}/content"}
-        | ({} if asset.kind is models.AssetKind.SPLATS else {"names": f"{own}/names"}),
-    )
+    links = {"self": own, "content": f"{own}/content"}
+    links |= {} if asset.kind is models.AssetKind.SPLATS else {"names": f"{own}/names"}
+    return models.Asset.model_validate({**vars(asset), "links": links})
 
 
 def _reply(asset: AssetRecord, status: int) -> Response:

@@ -16,7 +16,7 @@ from liftcore.values.settings import LiftSettings
 from service import models
 from service.child import error_of
 from service.content import Cursor, Limit, listed
-from service.errand import ErrandLimits, run_errand
+from service.errand import run_errand
 from service.errors import InvalidRequest, OverLimit
 from service.jobs.fit import check_fit, check_kernel, check_labels, check_settings, scratch_bytes
 from service.observe import current_id
@@ -97,7 +97,6 @@ def _planned(order: models.LiftRequest, deps: AppState) -> models.Plan:
     wanted = JobOrder(order.splats, order.cameras, tuple(order.features), settings)
     _require_fit(wanted, deps)
     deps.queries.require_device(wanted.settings.get("device", "auto"))
-    limits = ErrandLimits(deps.settings.check_seconds, deps.settings.check_memory_bytes, deps.ending)
     splats, cameras, *packs = [deps.store.assets.get(deps.owner, *named) for named in wanted.assets()]
     document = {
         "splats": str(splats.path), "cameras": str(cameras.path), "features": [str(pack.path) for pack in packs],
@@ -107,7 +106,7 @@ def _planned(order: models.LiftRequest, deps: AppState) -> models.Plan:
     with deps.store.files.scratch() as scratch:
         file = scratch / "order.json"
         file.write_text(json.dumps(document))
-        heard = run_errand("service.tasks.plan", [str(file)], scratch, limits)
+        heard = run_errand("service.tasks.plan", [str(file)], scratch, deps.check_limits)
     if heard is not None and heard.last["event"] == "valid":
         return models.Plan.model_validate(heard.last["plan"])
     if heard is not None and heard.last["event"] == "invalid":

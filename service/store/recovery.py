@@ -229,13 +229,14 @@ def _add_asset(store: Store, settings: ServiceSettings, path: Path) -> AssetKind
     if path != store.files.blob(digest, path.suffix):
         raise NotFound("asset", expected="a file named after its sha256", got=f"one whose sha256 is {digest}")
     kind = _kind_of(path)
-    report = _checked(store, settings, kind, path)
+    report = checked(store, settings, kind, path)
     # The file is its own draft: it stays where it is.
     store.assets.add(SERVICE, CheckedUpload(path, kind, digest, path.suffix, report.counts, report.warnings))
     return kind
 
 
-def _checked(store: Store, settings: ServiceSettings, kind: UploadKind, *paths: Path) -> Report:
+def checked(store: Store, settings: ServiceSettings, kind: UploadKind, *paths: Path) -> Report:
+    """What the check of an upload finds in a file, beside others."""
     limits = ErrandLimits(settings.check_seconds, settings.check_memory_bytes, threading.Event())
     with store.files.scratch() as scratch:
         return check(kind, paths[0], scratch, limits, *paths[1:])
@@ -277,7 +278,7 @@ def _cameras_of(store: Store, settings: ServiceSettings, lift: Path) -> str | No
     for asset in store.assets.all(SERVICE):
         if asset.kind is AssetKind.CAMERAS:
             with suppress(InvalidInput):
-                _checked(store, settings, LIFT, lift, asset.path)
+                checked(store, settings, LIFT, lift, asset.path)
                 return asset.id
     return None
 
