@@ -97,19 +97,20 @@ class _BoundedRequest(Request):
                 raise HTTPException(413, f"the body has more than {limit} bytes", CLOSE)
         if received > limit:
             raise HTTPException(413, f"the body has more than {limit} bytes")
-        self._content, self._value = bytes(content), None
+        self._begin, self._value = bytes(content[:NAME_CHARACTERS]), None
         if "json" in self.headers.get("content-type", ""):  # else the framework refuses it unread
-            self._value = await anyio.to_thread.run_sync(_parsed, self._content, limiter=deps.parsing)
+            self._value = await anyio.to_thread.run_sync(_parsed, bytes(content), limiter=deps.parsing)
 
     async def body(self) -> bytes:
-        """The bytes."""
-        return self._content
+        """What it begins with: the framework asks whether there is one, and shows what is no JSON."""
+        return self._begin
 
     async def json(self) -> Any:
-        """The values."""
-        if isinstance(self._value, json.JSONDecodeError):
-            raise self._value
-        return self._value
+        """The values, once."""
+        value, self._value = self._value, None
+        if isinstance(value, json.JSONDecodeError):
+            raise value
+        return value
 
 
 def _parsed(content: bytes) -> Any:
