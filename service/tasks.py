@@ -28,7 +28,7 @@ from liftcore.values.pack import read_features
 from liftcore.values.settings import LiftSettings
 from service import models
 from service.child import fault_of
-from service.jobs.lifting import plan_document
+from service.jobs.work import plan_document
 from service.models import AssetKind, UploadKind
 from service.photos import describe_photos
 from service.store.lifts import LONG, SHOWN_BYTES

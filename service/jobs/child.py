@@ -71,14 +71,10 @@ Work = Callable[[dict[str, Any], Reporter], dict[str, Any]]  # an order to what 
 
 
 def work_of(kind: JobKind) -> Work:
-    """What a job of that kind does. Nothing is imported that the other kinds need alone."""
-    if kind is JobKind.TRADEOFF:
-        from service.jobs.comparing import compare_as_ordered
+    """What a job of that kind does, imported beside the heartbeats."""
+    from service.jobs import work
 
-        return compare_as_ordered
-    from service.jobs.lifting import lift_as_ordered
-
-    return lift_as_ordered
+    return work.compare_as_ordered if kind is JobKind.TRADEOFF else work.lift_as_ordered
 
 
 def run(order: dict[str, Any], report: Reporter) -> dict[str, Any]:

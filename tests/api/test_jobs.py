@@ -27,10 +27,10 @@ from liftcore.runtime.device import choose_device
 from liftcore.runtime.progress import Progress
 from liftcore.values.settings import LiftSettings
 from service.child import fault_of
-from service.jobs import child, comparing
+from service.jobs import child
 from service.jobs import supervisor as pace
 from service.jobs.child import Reporter
-from service.jobs.lifting import plan_document
+from service.jobs.work import plan_document
 from service.models import AssetKind
 from service.store.jobs import LINE_CHARACTERS, LOG_LINES, EventKind, log_line, note
 from service.store.owners import SERVICE
@@ -342,7 +342,7 @@ def test_fault_of_a_job_names_what_is_missing_and_no_folder_of_the_server(monkey
     def lift(order: dict[str, Any], progress: Progress) -> dict[str, Any]:
         raise error
 
-    monkeypatch.setattr("service.jobs.lifting.lift_as_ordered", lift)
+    monkeypatch.setattr("service.jobs.work.lift_as_ordered", lift)
     assert told({}) == fault_of(LACK)
     error = OSError(errno.ENOSPC, "No space left on device")
     assert told({})["kind"] == "no-space" and "delete" in told({})["hint"]
@@ -357,7 +357,7 @@ def test_fault_of_a_job_names_what_is_missing_and_no_folder_of_the_server(monkey
 def test_what_a_comparison_refuses_is_the_users_problem_and_names_no_path(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(comparing, "warm_up_lift", lambda *lift: None)
+    monkeypatch.setattr("liftcore.lifting.warm_up.warm_up_lift", lambda *lift: None)
     paths = {kind: str(tmp_path / kind) for kind in ("splats", "cameras", "features")}
     Path(paths["cameras"]).write_bytes(b"of no format")
     order = {

@@ -28,9 +28,9 @@ from liftcore.io.transforms import transforms_of
 from liftcore.values.pack import write_pack
 from service import errand, uploads
 from service.jobs.child import Reporter
-from service.jobs.lifting import lift_as_ordered
 from service.jobs.process import LONGEST, JobProcess
 from service.jobs.supervisor import Lease
+from service.jobs.work import lift_as_ordered
 from service.models import AssetKind, JobState
 from service.observe import JsonLines
 from service.store.jobs import MAX_ATTEMPTS, EventKind
@@ -405,7 +405,7 @@ VIEWS = 20  # three blocks
 KILLED = """if True:
     import io, json, os, signal, sys
     from service.jobs.child import Reporter
-    from service.jobs.lifting import lift_as_ordered
+    from service.jobs.work import lift_as_ordered
 
     class Deadly(Reporter):
         def __call__(self, stage, done, total, unit):

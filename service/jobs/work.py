@@ -1,8 +1,9 @@
-"""What a job of kind ``lift`` does."""
+"""What jobs do: a lift, or a trade-off."""
 
 from __future__ import annotations
 
 import json
+import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -14,12 +15,16 @@ from liftcore.lifting.engines import open_engine
 from liftcore.lifting.files import lift_files
 from liftcore.lifting.pipeline import log_warnings
 from liftcore.lifting.planning.plan import Plan
-from liftcore.runtime.progress import one_step
+from liftcore.runtime.device import choose_device
+from liftcore.runtime.progress import Progress, one_step
+from liftcore.scene.kernel import Kernel
 from liftcore.values.lift import InputFile, LiftMetadata
 from liftcore.values.lift_file import save_lift, sha256_of
 from liftcore.values.settings import LiftSettings
 from service.child import renamed
 from service.jobs.child import Reporter
+
+SHOWN_DIGITS = 12  # of the splats' digest, by which the chart names the scene
 
 
 def lift_as_ordered(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
@@ -83,3 +88,40 @@ def _as_clients_know(metadata: LiftMetadata, names: Mapping[str, str]) -> LiftMe
     }  # a data directory may be behind a link
     inputs = {"splats": named(metadata.splats), "cameras": named(metadata.cameras)}
     return metadata.model_copy(update={**inputs, "features": tuple(map(named, metadata.features))})
+
+
+def compare_as_ordered(order: dict[str, Any], progress: Progress) -> dict[str, Any]:
+    """Compare, and draw the chart at ``output``. Each run is a process of our group, with our environment.
+
+    Returns:
+        What the job's last message tells of it: ``document`` and ``page``.
+
+    Raises:
+        SplatliftError: as `liftcore.evaluate.tradeoff.compare` has it.
+    """
+    from liftcore.evaluate.tradeoff import SceneFiles, candidates_of, compare
+    from liftcore.evaluate.tradeoff_report import page_of, save  # with matplotlib, which no lift needs
+    from liftcore.lifting.warm_up import warm_up_lift
+
+    settings, parameters, labels = order["settings"], order["parameters"], order["labels"]
+    files = Path(order["splats"]), Path(order["cameras"]), tuple(Path(path) for path in order["features"])
+    scene = SceneFiles(*files)
+    if labels:
+        classes = tuple(parameters["labels"]["classes"])
+        scene = SceneFiles(*files, Path(labels["masks"]), Path(labels["table"]), classes)
+    device = choose_device(settings.get("device", "auto"))
+    with one_step(progress, "compile"):  # what the runs load: else the first of a kind eats up the budget
+        for candidate in candidates_of(settings):
+            warm_up_lift(Kernel(order["kernel"]), device, LiftSettings.of(**settings | candidate.settings))
+    progress("tradeoff", 0, len(candidates_of(settings)), "runs")
+    found = compare(scene, parameters["budget_s"], settings, order["threads"], progress)
+    named = {
+        "title": "Speed against accuracy",
+        "scene": f"splats {scene.splats.stem[:SHOWN_DIGITS]}",  # a blob is named by its digest
+        "command": f"POST /tradeoff {json.dumps(parameters | {'settings': settings})}",
+    }
+    document = finite(named | found)
+    with tempfile.TemporaryDirectory(prefix="splatlift-chart-") as folder:
+        chart = next(file for file in save(document, Path(folder)) if file.suffix == ".png")
+        Path(order["output"]).write_bytes(chart.read_bytes())
+    return {"document": document, "page": "\n".join(page_of(document)) + "\n"}
