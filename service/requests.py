@@ -142,11 +142,11 @@ class Parameters(Generic[M]):
     needs: tuple[str, ...] = ()
 
     async def __call__(self, request: Request) -> M:
-        given, fields = request.query_params, self.schema["properties"]
+        query, fields = request.query_params, self.schema["properties"]
         values = {
-            name: given.getlist(name) if fields[name].get("type") == "array" else given[name]
+            name: query.getlist(name) if fields[name].get("type") == "array" else query[name]
             for name in self.names
-            if name in given
+            if name in query
         }
         try:
             model = self.model.model_validate(values)
@@ -154,7 +154,7 @@ class Parameters(Generic[M]):
             first = error.errors(include_url=False)[0]
             raise RequestValidationError([{**first, "loc": ("query", *first["loc"])}]) from None
         for name in self.needs:
-            if name not in given:
+            if name not in query:
                 raise RequestValidationError([{"type": "missing", "loc": ("query", name), "msg": "", "input": None}])
         return model
 
@@ -193,8 +193,8 @@ def _reading(endpoint: F, source: Any) -> F:
     """The endpoint, whose argument ``asked`` comes from there."""
 
     @wraps(endpoint)
-    def reading(**given: Any) -> Any:
-        return endpoint(**given)
+    def reading(**arguments: Any) -> Any:
+        return endpoint(**arguments)
 
     signature = inspect.signature(endpoint, eval_str=True)
     declared = [

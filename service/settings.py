@@ -160,17 +160,17 @@ def variables() -> Iterator[tuple[str, str, str]]:
         yield f"SPLATLIFT_{name.upper()}", shown, field.description or ""
 
 
-def read_settings(**given: Any) -> ServiceSettings:
+def read_settings(**values: Any) -> ServiceSettings:
     """Settings as a command line gives them, else of the environment, else their defaults.
 
     Args:
-        given: field -> value; None is not set.
+        values: field -> value; None is not set.
 
     Raises:
         Misconfigured: a value that a setting does not take.
     """
     try:
-        return ServiceSettings(**{name: value for name, value in given.items() if value is not None})
+        return ServiceSettings(**{name: value for name, value in values.items() if value is not None})
     except SettingsError as error:  # of a variable that is to hold JSON, and does not
         raise _no_json(error) from None
     except ValidationError as error:

@@ -135,8 +135,8 @@ def settings_of(options: argparse.Namespace) -> ServiceSettings:
     for name, _, spec in pairs:
         if not (name and spec):
             raise Misconfigured("--text-space", expected="NAME=SPEC", got=repr(f"{name}={spec}"))
-    given = {name: getattr(options, name) for name in ("host", "port", "data", "encoder")}
-    return read_settings(**given, text_spaces={name: spec for name, _, spec in pairs} or None)
+    values = {name: getattr(options, name) for name in ("host", "port", "data", "encoder")}
+    return read_settings(**values, text_spaces={name: spec for name, _, spec in pairs} or None)
 
 
 @contextmanager
