@@ -102,23 +102,45 @@ def smooth(
     has_evidence, has_feature = weights > 0, weights > 0
     for rows, _ in rings:
         has_feature[rows] = True
-    order, rows_with_feature = torch.from_numpy(graph.order).long(), np.flatnonzero(has_feature)
-    places, channels = order[torch.from_numpy(rows_with_feature)], X.shape[1]
+    order, (count, channels) = torch.from_numpy(graph.order).long(), X.shape
     squares, steps, residual = np.zeros((2, channels)), 0, 0.0
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         for begin in range(0, channels if smoothness and has_evidence.any() else 0, block):
-            own = slice(begin, min(begin + block, channels))
-            values = X[:, own].index_select(0, order).float().numpy()
-            values[~has_evidence] = 0.0
-            low, high = values[has_evidence].min(axis=0), values[has_evidence].max(axis=0)
-            solution, count, gradient = _solve(system, values, pool)
-            steps, residual = max(steps, count), max(residual, gradient)
-            np.clip(solution, low, high, out=solution)
-            squares[:, own] = _movement(system.weights, values, solution, pool)
+            columns = X[:, begin : begin + block]
+            values = np.empty(columns.shape, np.float32)
+
+            def read(rows: slice, columns: Tensor = columns, values: np.ndarray = values) -> tuple[Any, Any]:
+                """Take rows of X in the graph's order; their least and greatest value in each channel."""
+                own, part = has_evidence[rows], values[rows]
+                part[:] = columns.index_select(0, order[rows]).float().numpy()
+                part[~own] = 0.0
+                supported = part[own]
+                return supported.min(axis=0, initial=np.inf), supported.max(axis=0, initial=-np.inf)
+
+            lows, highs = zip(*_map_rows(read, count, pool), strict=True)
+            low, high = np.min(lows, axis=0), np.max(highs, axis=0)
+            solution, taken, gradient = _solve(system, values, pool)
+            steps, residual = max(steps, taken), max(residual, gradient)
+
+            def clip(
+                rows: slice, low: np.ndarray = low, high: np.ndarray = high, values: np.ndarray = solution
+            ) -> None:
+                np.clip(values[rows], low, high, out=values[rows])
+
+            _map_rows(clip, count, pool)
+            squares[:, begin : begin + block] = _movement(system.weights, values, solution, pool)
             for rows, shares in rings:
                 solution[rows] = shares @ solution
-            X[:, own].index_copy_(0, places, torch.from_numpy(solution[rows_with_feature]).to(X.dtype))
-            progress("smooth", own.stop, channels, "channels")
+
+            def write(rows: slice, columns: Tensor = columns, values: np.ndarray = solution) -> None:
+                """Put rows into their places in X."""
+                own = has_feature[rows]
+                columns.index_copy_(
+                    0, order[rows][torch.from_numpy(own)], torch.from_numpy(values[rows][own]).to(X.dtype)
+                )
+
+            _map_rows(write, count, pool)
+            progress("smooth", min(begin + block, channels), channels, "channels")
     moved, whole = squares.sum(axis=1).tolist()
     facts: dict[str, Any] = {
         "smoothness": smoothness,
@@ -266,15 +288,23 @@ def _movement(weights: np.ndarray, before: np.ndarray, after: np.ndarray, pool: 
     return _row_sums(add_movement, (weights, before, after), (2, before.shape[1]), len(before), pool)
 
 
+def _map_rows(work: Callable[[slice], Any], count: int, pool: Executor) -> list[Any]:
+    """What ``work`` returns for each piece of ``count`` rows, in their order."""
+    return list(pool.map(work, (slice(first, min(first + ROWS, count)) for first in range(0, count, ROWS))))
+
+
 def _row_sums(
     work: Callable[..., Any], arguments: tuple[Any, ...], shape: tuple[int, ...], count: int, pool: Executor
 ) -> np.ndarray:
     """What ``work(first, last, *arguments, sums)`` adds up over pieces of ``count`` rows: f64 of the shape."""
-    starts = range(0, count, ROWS)
-    parts = np.zeros((len(starts), *shape))
-    list(pool.map(lambda first, part: work(first, min(first + ROWS, count), *arguments, part), starts, parts))
+
+    def add(rows: slice) -> np.ndarray:
+        part = np.zeros(shape)
+        work(rows.start, rows.stop, *arguments, part)
+        return part
+
     total = np.zeros(shape)
-    for part in parts:
+    for part in _map_rows(add, count, pool):
         total += part
     return total
 
