@@ -1,9 +1,9 @@
 """The query process: answers, scores, masks, maps, renders and splats over open scenes, as its server asks for them.
 
-Run as ``python -m service.queries.answers SCENES CACHE_BYTES ENCODER``. Its stdin is a socket, a connection of
-multiprocessing's, that brings JSON lists of requests: the first of each is answered, the others wait behind it. It
-ends when its server does. The compiled kernels and the encoder named are loaded beside the first requests, which wait
-for no more than they need.
+Run as ``python -m service.queries.answers SOCKET SCENES CACHE_BYTES ENCODER``. The socket, a connection of
+multiprocessing's, brings JSON lists of requests: the first of each is answered, the others wait behind it. When its
+stdin closes it ends by itself. The compiled kernels and the encoder named are loaded beside the first requests, which
+wait for no more than they need.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import errno
 import hashlib
 import itertools
 import json
-import os
 import sys
 import threading
 import traceback
@@ -52,7 +51,7 @@ from liftcore.runtime.device import choose_device
 from liftcore.scene.splats import Kernel
 from liftcore.scene.views import cameras_of_views
 from liftcore.text import OWN_WORDS, RememberingEncoder
-from service.child import fault_of
+from service.child import end_with_parent, fault_of
 from service.encoders import encoder_version
 from service.errors import NoSpace
 from service.queries.client import PIPE_BYTES, Frame, send_frame
@@ -408,10 +407,11 @@ def _warm_up(answers: Answers, encoder: str) -> None:
 
 def main() -> None:
     """Answer until the server is gone."""
-    server = Connection(os.dup(sys.stdin.fileno()))
+    end_with_parent(sys.stdin.fileno())
+    server = Connection(int(sys.argv[1]))
     use_one_library_thread()
-    answers = Answers(scenes=int(sys.argv[1]), cache_bytes=int(sys.argv[2]))
-    threading.Thread(target=_warm_up, args=(answers, sys.argv[3]), daemon=True).start()
+    answers = Answers(scenes=int(sys.argv[2]), cache_bytes=int(sys.argv[3]))
+    threading.Thread(target=_warm_up, args=(answers, sys.argv[4]), daemon=True).start()
     with contextlib.suppress(EOFError, ConnectionError):
         while True:
             send_frame(server, reply_to(json.loads(server.recv_bytes()), answers))

@@ -294,14 +294,15 @@ class QueryClient:
 
     def _spawn(self) -> None:
         self._reap()
-        command = [sys.executable, "-m", "service.queries.answers"]
+        ours, theirs = socket.socketpair()
+        command = [sys.executable, "-m", "service.queries.answers", str(theirs.fileno())]
         command += [str(self._limits.scenes), str(self._limits.cache_bytes), self._limits.encoder]
         self._spawned += 1
-        ours, theirs = socket.socketpair()
         with ours, theirs:
             self._process = subprocess.Popen(
-                command, stdin=theirs.fileno(), stdout=STDERR, start_new_session=True, env=MEMORY | os.environ
-            )
+                command, stdin=subprocess.PIPE, stdout=STDERR, pass_fds=[theirs.fileno()], start_new_session=True,
+                env=MEMORY | os.environ,
+            )  # fmt: skip
             self._worker = Connection(ours.detach())
         if self._stopped:  # whoever stopped us may have looked before there was a process
             self._process.kill()
@@ -310,7 +311,7 @@ class QueryClient:
         process, self._process = self._process, None
         if process is not None:
             process.kill()
-            process.wait()
+            process.communicate()  # closes its lifeline, and waits
         if self._worker is not None:
             self._worker.close()
             self._worker = None

@@ -43,7 +43,7 @@ import json, sys, time
 from multiprocessing.connection import Connection
 from pathlib import Path
 from service.queries.client import Frame, send_frame
-folder, server = Path(sys.argv[1]), Connection(sys.stdin.fileno())
+folder, server = Path(sys.argv[1]), Connection(int(sys.argv[2]))
 while True:
     first, *others = json.loads(server.recv_bytes())
     with (folder / "asked").open("a") as log:
@@ -89,7 +89,7 @@ def start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Start]:
     (tmp_path / "at once").touch()
 
     def run(command: list[str], **how: Any) -> Any:
-        return original([command[0], "-c", STAND_IN, str(tmp_path)], **how)
+        return original([command[0], "-c", STAND_IN, str(tmp_path), command[3]], **how)
 
     def begin(*, seconds: float = 120.0, of_a_key: int | None = None, waiting: int = 16) -> QueryClient:
         limits = QueryLimits(waiting, seconds, scenes=1, cache_bytes=0, encoder="lvis", of_a_key=of_a_key)
