@@ -184,7 +184,7 @@ def test_command_line_example_writes_its_files(scene_folder: Path) -> None:
     main(["lift", "scene.ply", "cameras.json", "features.safetensors", "-o", "scene.lift.safetensors"])
     section = text(GUIDE).partition("## Asking")[2].partition("###")[0]
     commands = [line.split()[1:] for line in section.splitlines() if line.startswith("splatlift ")]
-    assert [command[0] for command in commands] == ["query"] * 3
+    assert [command[0] for command in commands] == ["query"] * 4
     assert [main(command) for command in commands] == [0] * len(commands)
     assert (scene_folder / "apple.png").is_file()
     apple, scores = (read_splats(scene_folder / name) for name in ("apple.ply", "scores.ply"))
@@ -221,7 +221,7 @@ def test_questions_of_the_guide_are_answered(scene_folder: Path, capsys: pytest.
     commands = commands_between(GUIDE, "## Asking", "### Text encoders", scene_folder)
     shutil.copy("kept", "features.safetensors")
     capsys.readouterr()
-    assert [command[0] for command in commands] == ["query"] * 3 + ["segment"] * 2 + ["objects"]
+    assert [command[0] for command in commands] == ["query"] * 4 + ["segment"] * 2 + ["objects"]
     assert [main(command) for command in commands] == [0] * len(commands)
     told = capsys.readouterr().out
     assert "3 of 3 words are there" in told and "middle:6,12: apple " in told
