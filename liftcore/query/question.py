@@ -27,8 +27,7 @@ from pydantic_core import CoreSchema, core_schema
 
 from liftcore.errors import InvalidQuery
 from liftcore.query.terms import NOTATIONS, Example, Term, Vector, parse_example
-from liftcore.runtime.fields import Body, NoBoolean, takes
-from liftcore.runtime.one_line import one_line, value_text
+from liftcore.runtime.fields import Body, NoBoolean, Shown, takes
 from liftcore.scene.compositing import MAX_SIDE
 
 if TYPE_CHECKING:
@@ -284,13 +283,10 @@ class Corners(BaseModel):
     high: Point
 
 
-class Value(BaseModel):
+class Value(Shown):
     """A part of an answer."""
 
     model_config = ConfigDict(frozen=True, defer_build=True)
-
-    def __repr__(self) -> str:
-        return one_line(self, *(f"{name}={value_text(value)}" for name, value in self))
 
     def __eq__(self, other: object) -> bool:
         """Compare what JSON has; a value a splat is not compared."""

@@ -16,6 +16,7 @@ from liftcore.query.objects import objects
 from liftcore.query.opened import OpenedLift
 from liftcore.query.question import Answer, Objects
 from liftcore.query.splat_colours import seen_colours
+from liftcore.runtime.one_line import one_line, value_text
 from liftcore.scene.cameras import Camera
 from liftcore.scene.compositing import CompositingParams
 
@@ -42,6 +43,10 @@ class ViewMask:
     """[H, W] bool, where at least half of a ray that meets the scene is of what was found"""
     explanation: str
     """one sentence on what the mask shows"""
+
+    def __repr__(self) -> str:
+        size = f"{list(self.mask.shape)} pixels, {self.mask.mean():.1%} of them in the mask"
+        return one_line(self, value_text(self.view), size, value_text(self.explanation))
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from liftcore.errors import SplatliftError
+from liftcore.runtime.one_line import one_line, value_text
 
 NAME_CHARACTERS = 80  # of a name or a value that came, told back
 
@@ -49,7 +50,18 @@ def _no_boolean(value: Any) -> Any:
 NoBoolean = BeforeValidator(_no_boolean)  # of a number: pydantic reads true as 1
 
 
-class Body(BaseModel):
+class Shown(BaseModel):
+    """A model that Python prints in a line: the fields that were given."""
+
+    def __repr__(self) -> str:
+        given = self.model_fields_set
+        return one_line(self, *(f"{name}={value_text(value)}" for name, value in self if name in given))
+
+    def __str__(self) -> str:
+        return repr(self)
+
+
+class Body(Shown):
     """What a body, or a part of one, may hold. A field that is not known is refused with those that are."""
 
     model_config = ConfigDict(extra="forbid", defer_build=True)  # help lists fields, and checks none

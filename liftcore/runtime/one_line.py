@@ -4,7 +4,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 MOST = 120  # characters, as wide as terminals and notebooks show without a break
-MOST_OF_TEXT = 40  # of a name or a sentence within
+MOST_OF_TEXT = 40  # of a name, a sentence or a list within
+MOST_OF_LIST = 3  # items that are shown
 
 
 def one_line(value: object, *parts: str) -> str:
@@ -19,11 +20,14 @@ def point_text(point: Sequence[float]) -> str:
 
 
 def value_text(value: Any) -> str:
-    """A field of a value: a number to three digits, a point, the beginning of a text, and of a list its length."""
+    """A field of a value: a number to three digits, a point, the beginning of a text, a short list, or its length."""
     if isinstance(value, float):
         return f"{value:.3g}"
     if isinstance(value, str):
         return repr(value[:MOST_OF_TEXT])
     if isinstance(value, tuple) and 0 < len(value) <= 3 and all(isinstance(one, float) for one in value):
         return point_text(value)
-    return f"[{len(value)}]" if isinstance(value, Mapping | list | tuple) else repr(value)[:MOST_OF_TEXT]
+    if isinstance(value, Mapping | list | tuple):
+        whole = repr(value) if len(value) <= MOST_OF_LIST else ""
+        return whole if 0 < len(whole) <= MOST_OF_TEXT else f"[{len(value)}]"
+    return repr(value)[:MOST_OF_TEXT]

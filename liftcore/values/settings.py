@@ -10,11 +10,12 @@ from collections.abc import Callable, Iterable, Mapping
 from enum import StrEnum
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
+from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
 from liftcore.errors import InvalidSettings
 from liftcore.runtime.device_name import device_name
+from liftcore.runtime.fields import Shown
 from liftcore.runtime.nearest import nearest
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.compositing import (
@@ -94,7 +95,7 @@ _SPEEDS: dict[Speed, dict[str, Any]] = {
 MOST_CERTIFICATE_RAYS = 1_000_000  # of a new lift: ten millions of one view took 8 GB
 
 
-class LiftSettings(BaseModel):
+class LiftSettings(Shown):
     """All that decides the result of a lift, and where it runs. Knobs left out take the preset's values."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")

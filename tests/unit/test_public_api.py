@@ -19,6 +19,7 @@ import pytest
 import torch
 
 import liftcore as lc
+from liftcore import models
 from liftcore.lifting.files import lift_files
 from tests.scenes import observed, random_splats, write_scene
 
@@ -473,10 +474,25 @@ def test_every_public_value_is_shown_in_a_line_that_says_its_size(scene):
         *catalogue.objects,
     ]
     others += [lc.CompositingParams(), lc.CompositingParams(stride=3), lc.LocalEngine(), lc.open_encoder("lvis")]
-    for value in (*sized, *others, lc.FeatureGrid(np.ones((3, 4, 5)))):
+    opened, box = made.scene(splats, cameras), ((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))
+    query = lc.Query(text=["a" * 99], like=["splat:1", (1.0,) * made.features.shape[1]], absent="keep")
+    found = opened.ask(lc.Query(like=["splat:1"]))
+    thing = {"splats": 1, "share": 0.5, "score": 0.5, "box": box}
+    others += [opened, query, found, opened.objects(found), opened.look(found, "v0")]
+    others += [lc.FeatureGrid(np.ones((3, 4, 5))), lc.Picture(camera=cameras["v0"])]
+    others += [models.OwnCamera.of(cameras["v0"])]
+    others += [lc.FoundObject(centre=box[0], **thing), lc.BestWord(word="a" * 99, score=0.5)]
+    others += [lc.NamedSplats(word="a" * 99, row=0, value=1, colour=(1, 2, 3), margin=0.1, threshold=0.2, **thing)]
+    others += [lc.SceneObject(id=0, name=None, centre=box[0], views=("v",) * 99, feature=(0.1,) * 512, **thing)]
+    others += [lc.CoveringRegion(example="region:v:0:1", view="v" * 99, level=0, region=1, share=0.5)]
+    classes = {value for name in lc.__all__ if isinstance(value := getattr(lc, name), type)}
+    no_values = [kind for kind in classes if issubclass(kind, Exception) or getattr(kind, "_is_protocol", False)]
+    classes -= {*no_values, lc.RayEngine, lc.Checkpoint, lc.Kernel}  # which needs Ray; a folder; a name
+    assert classes <= {kind for value in (*sized, *others) for kind in type(value).__mro__}
+    for value in (*sized, *others):
         line = repr(value)
         assert line.startswith(type(value).__name__ + "(") and line.endswith(")")
-        assert len(line) <= 120 and "\n" not in line
+        assert len(line) <= 120 and "\n" not in line and len(str(value)) <= 120
     assert all(str(splats.count) in repr(value) for value in sized)
     assert "[3, 4, 5]" in repr(lc.FeatureGrid(np.ones((3, 4, 5)))) and "stride=3" in repr(
         lc.CompositingParams(stride=3)
