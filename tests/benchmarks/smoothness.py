@@ -1,14 +1,18 @@
 """What the smoothness of features gains and costs: one lift of each pack, refined by several lambdas.
 
-    python -m tests.benchmarks.smoothness SCENE [--every N] [--packs NAME ...] [--lambdas L ...] [--json]
+    python -m tests.benchmarks.smoothness SCENE [--every N] [--packs NAME ...] [--lambdas L ...]
+        [--colours KIND] [--json]
+
+``auto`` among the lambdas is a lift of its own; ``chosen`` is its lambda. One colour, or a random one a splat, says
+nothing of the scene.
 
 With truth in the layout of ``tabletop``: splat accuracy, argmax mIoU and the worst class of each pack
 (`tests.benchmarks.tabletop`). With ``grids_test.safetensors`` instead: fidelity, the mean cosine about the maps' mean
 of rendered features with the maps of views that were not lifted.
 """
 
-import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +21,13 @@ from torch.nn.functional import cosine_similarity
 
 import liftcore as lc
 from liftcore.scene.cameras import Camera
+from liftcore.scene.harmonics import SH_C0
 from liftcore.values.views import FeatureGrid
 from tests.benchmarks.base import command_line, read_pack, read_scene, tell
 from tests.benchmarks.tabletop import tabletop
 
-LAMBDAS = (0.0, 0.3, 1.0, 4.0)
+LAMBDAS = ("0", "0.3", "1", "4", "auto")
+COLOURS = ("true", "one", "random")
 TEST_MAPS = "grids_test"
 FULL = 0.5  # of a ray that the scene takes, for its cell to be judged
 CHANNELS = 64  # rendered at a time
@@ -29,17 +35,31 @@ CHANNELS = 64  # rendered at a time
 Judge = Callable[[lc.LiftResult], dict[str, float]]
 
 
-def rows(folder: Path, pack: str, every: int, lambdas: list[float]) -> Iterator[dict[str, Any]]:
+def rows(folder: Path, pack: str, every: int, lambdas: list[str], colours: str) -> Iterator[dict[str, Any]]:
     """One lift of the preset ``default``, and what it becomes by each lambda; seconds are those of the step."""
     splats, cameras = read_scene(folder)
-    lifted = lc.lift(splats, cameras, read_pack(folder, pack, every), certificate_rays=0).cpu()
+    splats, views = coloured(splats, colours), read_pack(folder, pack, every)
+    lifted = lc.lift(splats, cameras, views, certificate_rays=0).cpu()
     judge = truth_judge(folder) if (folder / "truth.json").is_file() else fidelity_judge(folder, splats, cameras)
     for smoothness in lambdas:
-        begin = time.perf_counter()
-        result = lifted.refined(splats, smoothness=smoothness) if smoothness else lifted
-        seconds = time.perf_counter() - begin if smoothness else sum(lifted.metadata.timings.values())
-        head = {"pack": pack, "views": len(lifted.views), "smoothness": smoothness}
-        yield head | judge(result) | {"step s" if smoothness else "lift s": seconds}
+        if smoothness == "auto":
+            result = lc.lift(splats, cameras, views, certificate_rays=0, smoothness="auto").cpu()
+        else:
+            result = lifted.refined(splats, smoothness=float(smoothness)) if float(smoothness) else lifted
+        timings = result.metadata.timings
+        step = timings.get("smooth", 0.0) + timings.get("halves", 0.0)
+        facts = result.diagnostics.get("smoothing", {"smoothness": 0.0})
+        head = {"pack": pack, "views": len(lifted.views), "smoothness": smoothness, "chosen": facts["smoothness"]}
+        yield head | judge(result) | {"step s": step, "lift s": sum(timings.values()) - step}
+
+
+def coloured(splats: lc.Splats, kind: str) -> lc.Splats:
+    """The splats with their own colours, one colour, or a random colour each."""
+    if kind == "true":
+        return splats
+    shape, generator = (splats.count, 1, 3), torch.Generator().manual_seed(1)
+    colours = torch.zeros(shape) if kind == "one" else (torch.rand(shape, generator=generator) - 0.5) / SH_C0
+    return replace(splats, sh=colours)
 
 
 def truth_judge(folder: Path) -> Judge:
@@ -90,10 +110,12 @@ def main() -> None:
         ("folder", {"type": Path}),
         ("--every", {"type": int, "default": 1, "metavar": "N", "help": "take every n-th view"}),
         ("--packs", {"nargs": "+", "default": ["grids"], "metavar": "NAME"}),
-        ("--lambdas", {"nargs": "+", "type": float, "default": list(LAMBDAS), "metavar": "L"}),
+        ("--lambdas", {"nargs": "+", "default": list(LAMBDAS), "metavar": "L"}),
+        ("--colours", {"default": "true", "choices": COLOURS}),
     )
     options = parser.parse_args()
-    table = [row for pack in options.packs for row in rows(options.folder, pack, options.every, options.lambdas)]
+    given = options.every, options.lambdas, options.colours
+    table = [row for pack in options.packs for row in rows(options.folder, pack, *given)]
     tell(table, as_json=options.json)
 
 
