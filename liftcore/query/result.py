@@ -72,7 +72,7 @@ class LiftResult(Lift):
             encoder: of texts and of reference words, or the specification of one (`liftcore.open_encoder`), which is
                 opened once. None: the lift's own words (`table`), else the encoder of its text space, or the table of
                 it that ships, where its weights cannot be had.
-            fields: of `liftcore.Query`: threshold, instances, keep, absent, weigh.
+            fields: the others of `liftcore.Query`.
 
         Raises:
             InvalidQuery: a vector of another length, of zeros or not finite; a text that the encoder cannot read, or

@@ -188,7 +188,7 @@ class Scene(OpenedLift):
         top: int = 5,
         encoder: TextEncoder | str | Path | None = None,
     ) -> tuple[BestWord, ...]:
-        """The words that a pixel, a region, a splat or a vector is most like, the nearest first.
+        """The words that an example is most like, the nearest first.
 
         Args:
             example: or its notation, as in `Query.like`. words: None: all words of the encoder, which is a table.

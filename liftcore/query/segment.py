@@ -208,7 +208,7 @@ def _scores(scene: OpenedLift, vectors: np.ndarray, rows: Sequence[int]) -> Iter
 def best_words(
     scene: OpenedLift, example: Example, words: Sequence[str], vectors: Any, count: int = 5
 ) -> tuple[BestWord, ...]:
-    """What is this? The words that a pixel, a region, a splat or a vector is most like, the nearest first.
+    """The words that an example is most like, the nearest first.
 
     Args:
         scene: an opened lift. example: as in a query. words: n. vectors: [n, F], their text vectors.
