@@ -10,9 +10,10 @@ from liftcore.query.question import (
     OwnCamera,
     Seen,
 )
+from liftcore.query.terms import NOTATIONS
 from liftcore.runtime.fields import Body, NoBoolean, takes
 
 __all__ = [
-    "METHODS", "BestWords", "Body", "Found", "FoundWords", "ListedObjects", "NoBoolean", "Notation", "OwnCamera",
-    "Seen", "takes",
+    "METHODS", "NOTATIONS", "BestWords", "Body", "Found", "FoundWords", "ListedObjects", "NoBoolean", "Notation",
+    "OwnCamera", "Seen", "takes",
 ]  # fmt: skip

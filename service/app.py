@@ -10,6 +10,7 @@ import anyio
 from fastapi import FastAPI
 
 from liftcore import __version__
+from liftcore.files import PhotoIndexes
 from service import problems
 from service.auth import STRANGER, Gate
 from service.content import EventStreams
@@ -18,7 +19,6 @@ from service.jobs.process import JobLimits
 from service.jobs.supervisor import Supervisor
 from service.middleware import AnswerHead, RecordedApp, Turns
 from service.observe import Metrics, versions
-from service.photos import PhotoIndexes
 from service.queries.client import QueryClient, QueryLimits
 from service.requests import KnownParameters
 from service.routes import assets, jobs, lifts, operations, queries

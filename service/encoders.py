@@ -7,19 +7,11 @@ who can do nothing about it: so `require_encoder_files` looks before the service
 from __future__ import annotations
 
 import json
-from pathlib import Path
-from typing import Any
-
-from safetensors import SafetensorError, safe_open
 
 from liftcore.errors import InvalidInput
-from liftcore.io.kinds import wrong_kind
-from liftcore.io.safetensors_file import check_header
-from liftcore.text import BUILT_IN, ENCODER_SPECS, NO_WORDS, OWN_WORDS, without_templates
+from liftcore.text import BUILT_IN, NO_WORDS, OWN_WORDS, check_encoder, encoder_file
 from service.errors import InvalidRequest, Misconfigured
 from service.settings import ServiceSettings
-
-TABLE = "a text table: safetensors with embeddings [n, F] and metadata words, a JSON list of n strings"
 
 
 def encoder_spec(settings: ServiceSettings, text_space: str, asked: str | None) -> str:
@@ -77,15 +69,6 @@ def encoder_label(spec: str) -> str:
     return "table" if spec.startswith("table:") or spec.endswith(".safetensors") else spec.partition("@")[0]
 
 
-def encoder_file(spec: str) -> Path | None:
-    """The file that an encoder specification names, None when it names none."""
-    if spec.startswith("table:"):
-        return Path(spec.removeprefix("table:"))
-    if spec.startswith("open_clip:") and "@" in spec:
-        return Path(without_templates(spec)[0].partition("@")[2])
-    return Path(spec) if spec.endswith(".safetensors") else None
-
-
 def encoder_version(spec: str) -> list[int] | None:
     """What changes when the file of an encoder does: its time and size; None without a file."""
     file = encoder_file(spec)
@@ -106,38 +89,8 @@ def require_encoder_files(settings: ServiceSettings) -> None:
     named = {"encoder": settings.encoder}
     named |= {f"text_spaces, {space!r}": spec for space, spec in settings.text_spaces.items()}
     for argument, spec in named.items():
-        path = encoder_file(spec)
-        if path is None and spec not in BUILT_IN and not spec.startswith("open_clip:"):
-            raise Misconfigured(argument, expected=f"one of {', '.join(ENCODER_SPECS)}", got=repr(spec))
-        if path is not None:
-            _require_readable(argument, path)
-            if encoder_label(spec) == "table":
-                _require_table(argument, path)
-
-
-def _require_readable(argument: str, path: Path) -> None:
-    try:
-        with path.open("rb"):
-            return
-    except OSError as error:
-        got = f"{path} ({error.strerror})"
-        raise Misconfigured(argument, expected="a file that opens", got=got, hint="name one that is there") from None
-
-
-def _require_table(argument: str, path: Path) -> None:
-    """Look at the header alone: the values are read, and judged, where the table is opened."""
-    if error := wrong_kind(path, "table", InvalidInput, expected=TABLE):
-        raise Misconfigured(argument, expected=error.expected, got=f"{error.got} at {path}", hint=error.hint)
-    try:
-        check_header(path, str(path), InvalidInput, expected=TABLE)
-        handle: Any
-        with safe_open(str(path), framework="np") as handle:
-            shape = handle.get_slice("embeddings").get_shape()
-            words = json.loads((handle.metadata() or {}).get("words", "null"))
-    except InvalidInput as error:
-        raise Misconfigured(argument, expected=error.expected, got=f"{error.got} at {path}") from None
-    except (SafetensorError, OSError, ValueError, RecursionError) as error:
-        raise Misconfigured(argument, expected=TABLE, got=f"{str(error)[:120]} in {path}") from None
-    if len(shape) != 2 or not isinstance(words, list) or len(words) != shape[0]:
-        count = f"{len(words)} words" if isinstance(words, list) else "no words"
-        raise Misconfigured(argument, expected=TABLE, got=f"{path} with {count} and embeddings {shape}")
+        try:
+            check_encoder(spec)
+        except InvalidInput as error:
+            got, hint = error.got, error.hint
+            raise Misconfigured(argument, expected=error.expected, got=got, hint=hint) from None

@@ -19,9 +19,8 @@ from pydantic import (
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError
 
-from liftcore.runtime.fields import Body, NoBoolean, takes
-from liftcore.scene.origin import FILE_ORIGIN
-from liftcore.values.settings import LiftSettings
+from liftcore import LiftSettings
+from liftcore.models import Body, NoBoolean, takes
 
 # What one file or request may hold, beside the sizes that the operator sets (`service.settings`).
 # Texts, in characters
@@ -46,8 +45,6 @@ BODY_BRACKETS = 10_000
 BODY_COMMAS = 140_000
 
 # Zips
-PHOTOS = 10_000
-DIRECTORY_BYTES = 8 << 20  # of the list of what is in a zip of photos: of 20,000 files with long names
 
 
 def _once(texts: list[str]) -> list[str]:
@@ -295,7 +292,7 @@ class LiftResult(BaseModel):
     views: list[str] = Field(description="the views that were lifted; very many are at links.views alone")
     view_count: int = Field(description="how many these are")
     origin: list[float] = Field(
-        list(FILE_ORIGIN),
+        [0.0, 0.0, 0.0],
         min_length=3,
         max_length=3,
         description="of the positions of its `.splat` and `.spz`; zeros but in map coordinates",

@@ -16,12 +16,12 @@ from fastapi.routing import APIRoute
 from pydantic import BaseModel, ValidationError
 from starlette.exceptions import HTTPException
 
-from liftcore.runtime.fields import NAME_CHARACTERS, one_of
 from service import models
 from service.content import TAGGED
 from service.errors import InvalidRequest, UnreadableBody
 from service.problems import CLOSE
 
+NAME_CHARACTERS = 80  # of a name or a value that came, told back
 M = TypeVar("M", bound=BaseModel)
 F = TypeVar("F", bound=Callable[..., Any])
 BODY = "in the body of the request"
@@ -40,7 +40,7 @@ async def _known_only(request: Request) -> None:
     for name in given:
         if name not in known:
             raise InvalidRequest(
-                name[:NAME_CHARACTERS], expected=one_of(known) if known else "no parameters",
+                name[:NAME_CHARACTERS], expected=f"one of {', '.join(known)}" if known else "no parameters",
                 got=repr(name[:NAME_CHARACTERS]), hint="in the query of the request",
             )  # fmt: skip
 

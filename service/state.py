@@ -15,6 +15,7 @@ import anyio
 from fastapi import Depends, Request
 
 from liftcore.errors import SplatliftError
+from liftcore.files import PhotoIndexes
 from service import errand
 from service.auth import CALLER, Caller
 from service.content import EventStreams
@@ -23,7 +24,6 @@ from service.errors import NotReady
 from service.jobs.supervisor import Supervisor
 from service.models import Version
 from service.observe import Metrics
-from service.photos import PhotoIndexes
 from service.queries.client import QueryClient
 from service.settings import ServiceSettings
 from service.store.owners import Owner

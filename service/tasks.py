@@ -12,45 +12,35 @@ from typing import Any
 
 import numpy as np
 
-from liftcore.errors import InvalidFeatures, InvalidInput, InvalidLift, InvalidSplats, SplatliftError
-from liftcore.evaluate.class_masks import describe_masks
-from liftcore.evaluate.inspect import describe_camera_file, describe_packs, describe_splat_file, describe_table
-from liftcore.io.json_file import finite
-from liftcore.io.kinds import EXPORT_PLY, SUFFIX, SplatFormat, identify, wrong_kind
-from liftcore.io.safetensors_file import with_metadata
-from liftcore.io.splats import format_of
-from liftcore.lifting import pipeline
-from liftcore.lifting.files import open_files
-from liftcore.runtime.plugins import Plugin
+from liftcore import LiftSettings, load_lift, plan_files, read_features
+from liftcore.errors import InvalidFeatures, InvalidInput, InvalidLift, SplatliftError
+from liftcore.evaluate import inspect_file
+from liftcore.files import finite, identify, with_metadata, wrong_kind
 from liftcore.text.table import TableEncoder
-from liftcore.values.lift_file import has_poses, parse_metadata, read_lift
-from liftcore.values.pack import read_features
-from liftcore.values.settings import LiftSettings
 from service import models
 from service.child import fault_of
 from service.jobs.work import plan_document
 from service.models import AssetKind, UploadKind
-from service.photos import describe_photos
 from service.store.lifts import LONG, SHOWN_BYTES
 from service.uploads import INVALID, LIFT
 
 BLOCK_ROWS = 1 << 14  # of a lift, looked at together
 
 
+def _described(path: Path, kind: AssetKind) -> dict[str, Any]:
+    """What a file of that kind holds, read whole; of none that may run code as it is read."""
+    found = inspect_file(path, kind, trusted=False)
+    return {name: value for name, value in found.items() if name not in ("kind", "bytes")}
+
+
 def check_splats(path: Path) -> dict[str, Any]:
     """Read and describe every splat; checkpoints are pickles, and are not opened here."""
-    found = format_of(path)
-    if found is SplatFormat.CHECKPOINT:
-        got = "a checkpoint of a trainer, which is a Python pickle"
-        raise InvalidSplats("splats", expected="a format that holds no code", got=got, hint=EXPORT_PLY)
-    if isinstance(found, Plugin):  # an upload has no suffix of its user's, so that none is found here
-        raise InvalidSplats("splats", expected="a format of splatlift's own", got=found.value, hint=EXPORT_PLY)
-    return {"suffix": SUFFIX[found], "found": describe_splat_file(path)}
+    return {"found": _described(path, AssetKind.SPLATS), "suffix": identify(path).suffix}
 
 
 def check_cameras(path: Path) -> dict[str, Any]:
     """Read and describe every camera."""
-    found = describe_camera_file(path)
+    found = _described(path, AssetKind.CAMERAS)
     return {"suffix": ".zip" if zipfile.is_zipfile(path) else ".json", "found": found}
 
 
@@ -76,23 +66,23 @@ def check_features(path: Path) -> dict[str, Any]:
         if len(told := getattr(packs, name)) > models.WORD_CHARACTERS:
             expected = f"at most {models.WORD_CHARACTERS} characters"
             raise InvalidFeatures(name, expected=expected, got=f"{len(told)}: {told[:40]!r}...")
-    return {"suffix": ".safetensors", "found": describe_packs(packs)}
+    return {"suffix": ".safetensors", "found": _described(path, AssetKind.FEATURES)}
 
 
 def check_masks(path: Path) -> dict[str, Any]:
     """Read and describe every mask."""
-    return {"suffix": ".safetensors", "found": describe_masks(path)}
+    return {"suffix": ".safetensors", "found": _described(path, AssetKind.MASKS)}
 
 
 def check_table(path: Path) -> dict[str, Any]:
     """Read every row, and keep all words: orders are held to them."""
     words = list(TableEncoder.open(path).words)
-    return {"suffix": ".safetensors", "found": describe_table(path) | {"words": words}}
+    return {"suffix": ".safetensors", "found": _described(path, AssetKind.TABLE) | {"words": words}}
 
 
 def check_photos(path: Path) -> dict[str, Any]:
     """Read every photo."""
-    return {"suffix": ".zip", "found": describe_photos(path)}
+    return {"suffix": ".zip", "found": _described(path, AssetKind.PHOTOS)}
 
 
 def check_lift(path: Path, cameras: Path | None = None) -> dict[str, Any]:
@@ -100,10 +90,10 @@ def check_lift(path: Path, cameras: Path | None = None) -> dict[str, Any]:
 
     ``cameras`` are an asset that stands for those that it was made with: they must see what these saw.
     """
-    arrays, told = read_lift(path)
-    parsed = parse_metadata(told, path)
+    lift = load_lift(path)
+    arrays, parsed = lift.arrays(), lift.metadata
     metadata = finite(json.loads(parsed.model_dump_json()))
-    if cameras is not None and not has_poses(cameras, parsed):
+    if cameras is not None and not lift.has_cameras(cameras):
         got = "others" if parsed.poses else "a lift that does not tell what its cameras saw"
         hint = "bring the folder or file that was lifted with; a zip of the folder will do"
         if not parsed.poses:
@@ -173,7 +163,7 @@ def _of_another_kind(kind: UploadKind, path: Path) -> InvalidInput | None:
     """What to say of a file that belongs elsewhere; None where it looks like what it was sent as, or like nothing."""
     looks = identify(path)
     found = looks.kind
-    if looks.format is SplatFormat.SOG and not zipfile.is_zipfile(path):
+    if looks.suffix == ".sog" and not zipfile.is_zipfile(path):
         got, hint = "the meta.json of a SOG without its pictures", "zip it with them as one .sog file, and send that"
         return INVALID[kind](kind, expected=f"a file of {kind}", got=got, hint=hint)
     if found is None:
@@ -203,9 +193,8 @@ def plan(file: str) -> dict[str, Any]:
     order = json.loads(Path(file).read_bytes())
     try:
         settings = LiftSettings.of(**order["settings"])
-        packs = [Path(path) for path in order["features"]]
-        sources = open_files(Path(order["splats"]), Path(order["cameras"]), packs, settings)
-        found = pipeline.plan(*sources, settings, in_blocks=order["engine"] is not None)
+        files = order["splats"], order["cameras"], order["features"]
+        found = plan_files(*files, settings, in_blocks=order["engine"] is not None)
         return {"event": "valid", "plan": plan_document(found, order["names"])}
     except SplatliftError as error:
         return {"event": "invalid", "fault": fault_of(error, order["names"])}

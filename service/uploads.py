@@ -12,7 +12,7 @@ from typing import Any, BinaryIO, Generic, TypeVar
 
 from liftcore import errors
 from liftcore.errors import InvalidInput, InvalidLift, NotFound
-from liftcore.scene.views import require_pairs
+from liftcore.files import require_pairs
 from service.child import error_of
 from service.errand import ErrandLimits, run_errand
 from service.errors import Busy, Crashed, DigestMismatch, TooLarge, UnsupportedEncoding

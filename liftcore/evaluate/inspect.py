@@ -11,15 +11,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from liftcore.errors import InvalidInput, InvalidTable
+from liftcore.errors import InvalidInput, InvalidSplats, InvalidTable
 from liftcore.evaluate.class_masks import describe_masks
 from liftcore.features.smoothness import some_grids, unlike_maps
 from liftcore.io.cameras import TRANSFORMS, camera_source, has_nerfstudio_beside, other_models, read_cameras
-from liftcore.io.kinds import SplatFormat, identify
+from liftcore.io.kinds import EXPORT_PLY, SplatFormat, identify
+from liftcore.io.photo_zip import describe_photos
 from liftcore.io.ply import nearest_dialect
 from liftcore.io.remote import local_path
 from liftcore.io.splats import format_of, read_splats, splat_files
 from liftcore.io.transforms import FRAME_FILE
+from liftcore.runtime.plugins import Plugin
 from liftcore.scene.cameras import Cameras, distortion_warning
 from liftcore.scene.compositing import ALPHA_FLOOR
 from liftcore.scene.splats import Kernel, Splats
@@ -51,12 +53,13 @@ NARROW = 4  # times longer than wide, or wider: photos are not
 UNIT_TOLERANCE = 0.01  # a float16 unit vector of 512 channels is within it
 
 
-def inspect_file(path: Path | str, kind: str = "") -> dict[str, Any]:
+def inspect_file(path: Path | str, kind: str = "", *, trusted: bool = True) -> dict[str, Any]:
     """Describe a file of splats, cameras, features, masks, a lift or a table of text embeddings.
 
     Args:
-        path: of the file or folder; it may lie elsewhere (`io.remote`). kind: what it is described as, one of
-            DESCRIPTIONS; empty: what it looks like.
+        path: of the file or folder; it may lie elsewhere (`io.remote`).
+        kind: what it is described as, one of DESCRIPTIONS, or ``photos`` of a zip; empty: what it looks like.
+        trusted: False refuses splats in formats that may hold code, and what plugins read.
 
     Returns:
         ``kind``, ``bytes``, counts and ranges of the kind, and ``warnings``: what looks wrong.
@@ -68,12 +71,17 @@ def inspect_file(path: Path | str, kind: str = "") -> dict[str, Any]:
     if not path.exists():
         raise InvalidInput(str(path), expected="a file or a folder", got="nothing of that name")
     found = identify(path)
-    kind = kind or found.kind or ""
+    kind = kind or ("" if found.kind == "photos" else found.kind or "")
     describe, files_of = DESCRIPTIONS.get(kind, (None, None))
     if describe is None or files_of is None:
         if not found.recognised and (path.is_dir() or path.suffix.lower() == ".json"):
             describe_camera_file(path)  # raises with what cameras lack
+        if found.kind == "photos":
+            hint = "'splatlift encode' and 'splatlift pack masks' make features of photos"
+            raise InvalidInput(str(path), expected=ANY_KIND, got="photos", hint=hint)
         raise InvalidInput(str(path), expected=ANY_KIND, got=found.name, hint=found.hint)
+    if kind == "splats" and not trusted:
+        _refuse_code(path)
     description = describe(path)  # first: a reader says better which of its files is not there
     size = sum(file.stat().st_size for file in files_of(path))
     return {"kind": kind, "bytes": size, **description}
@@ -94,9 +102,13 @@ def _files_of_lift(path: Path) -> list[Path]:
     return sorted(path.iterdir()) if path.is_dir() else [path]
 
 
-def _refuse_photos(path: Path) -> dict[str, Any]:
-    hint = "'splatlift encode' and 'splatlift pack masks' make features of photos"
-    raise InvalidInput(str(path), expected=ANY_KIND, got="photos", hint=hint)
+def _refuse_code(path: Path) -> None:
+    found = format_of(path)
+    if found is SplatFormat.CHECKPOINT:
+        got = "a checkpoint of a trainer, which is a Python pickle"
+        raise InvalidSplats("splats", expected="a format that holds no code", got=got, hint=EXPORT_PLY)
+    if isinstance(found, Plugin):
+        raise InvalidSplats("splats", expected="a format of splatlift's own", got=found.value, hint=EXPORT_PLY)
 
 
 def describe_splat_file(path: Path) -> dict[str, Any]:
@@ -382,5 +394,5 @@ DESCRIPTIONS: dict[str, tuple[Callable[[Path], dict[str, Any]], Callable[[Path],
     "masks": (describe_masks, lambda path: [path]),
     "table": (describe_table, lambda path: [path]),
     "lift": (describe_lift_file, _files_of_lift),
-    "photos": (_refuse_photos, lambda path: [path]),
+    "photos": (describe_photos, lambda path: [path]),
 }

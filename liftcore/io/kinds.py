@@ -96,6 +96,11 @@ class FileKind:
     splats: tuple[str, ...] = ()  # splat files in a folder or zip, the one (or the folder of all ranks) to give first
     recognised: bool = True  # False: nothing is known of it but its first bytes
 
+    @property
+    def suffix(self) -> str:
+        """Of splats, the usual suffix of their format; empty of others."""
+        return "" if self.format is None else SUFFIX[self.format]
+
 
 _WEB_PAGE = FileKind(None, "a web page", DOWNLOAD)
 _VIEWER = FileKind(

@@ -48,6 +48,11 @@ class ViewMask:
         size = f"{list(self.mask.shape)} pixels, {self.mask.mean():.1%} of them in the mask"
         return one_line(self, value_text(self.view), size, value_text(self.explanation))
 
+    @staticmethod
+    def overlay(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+        """[H, W, 3] u8: an image [H, W, 3] u8 with a mask [H, W] bool tinted and outlined, and the rest dimmed."""
+        return overlay(image, mask)
+
 
 @dataclass(frozen=True)
 class ShownDepth:

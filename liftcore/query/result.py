@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+import json
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
+from liftcore.errors import InvalidInput
 from liftcore.values.lift import Lift
-from liftcore.values.lift_file import open_lift, save_lift
+from liftcore.values.lift_file import has_poses, open_lift, save_lift, tensors_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+
+    import numpy as np
 
     from liftcore.query.ask import VectorAnswer
     from liftcore.query.catalogue import Catalogue
@@ -20,6 +24,7 @@ if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
     from liftcore.text import TextEncoder
+    from liftcore.values.lift import InputFile, LiftMetadata
 
 
 @dataclass(frozen=True, repr=False)
@@ -155,6 +160,20 @@ class LiftResult(Lift):
         with shown_progress(progress) as reporter:
             return refine(self, splats, smoothness, reporter, threads)
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Its tensors as arrays by their names, in the order of its file; those of a file are mapped, not read."""
+        return {name: tensor.cpu().numpy() for name, tensor in tensors_of(self).items()}
+
+    def has_cameras(self, path: Path | str) -> bool:
+        """Return whether a file or folder has the cameras of the lifted views as they were, whatever others it has.
+
+        Lifts from before poses were kept have none to compare: then it has not.
+
+        Raises:
+            InvalidCameras: it does not read.
+        """
+        return has_poses(Path(path), self.metadata)
+
     def save(self, path: Path | str, *, progress: Progress | bool | None = False) -> None:
         """Write a lift file (`liftcore.values.lift_file`), whole or not at all.
 
@@ -169,6 +188,26 @@ class LiftResult(Lift):
 
         with shown_progress(progress) as reporter, one_step(reporter, "save"):
             save_lift(self, path)
+
+    def save_scene(
+        self, folder: Path, splats: Splats | None = None, cameras: Mapping[str, Camera] | None = None
+    ) -> Path:
+        """Write ``lift.safetensors`` in a folder, and beside it what the lift has in memory alone; its path.
+
+        Args:
+            splats: that were lifted; None: where the lift remembers them. cameras: likewise, of its views; of files
+                that are there these count.
+
+        Raises:
+            InvalidInput: splats or cameras that it needs are not given, or not those of the lift.
+        """
+        inputs = {
+            "splats": _splats_file(self, splats, folder),
+            "cameras": _cameras_file(self.metadata, cameras, folder),
+        }
+        path = folder / "lift.safetensors"
+        save_lift(replace(self.cpu(), metadata=self.metadata.model_copy(update=inputs)), path)
+        return path
 
     def show(
         self,
@@ -201,3 +240,36 @@ def load_lift(path: Path | str) -> LiftResult:
         InvalidLift: the file is missing, is not a safetensors file, or is not a lift with a row a splat.
     """
     return LiftResult.of(open_lift(path))
+
+
+def _splats_file(lift: Lift, splats: Splats | None, folder: Path) -> InputFile:
+    if splats is None:
+        return _remembered("splats", lift.metadata)
+    from liftcore.io.splats import write_splats
+    from liftcore.values.lift_file import input_file
+
+    lift.require_splats(splats)
+    write_splats(folder / "splats.ply", splats)
+    return input_file(folder / "splats.ply")
+
+
+def _cameras_file(metadata: LiftMetadata, cameras: Mapping[str, Camera] | None, folder: Path) -> InputFile:
+    from liftcore.io.transforms import transforms_of
+    from liftcore.values.lift_file import camera_input, found_input
+
+    there = found_input("cameras", metadata.cameras, metadata, None) if metadata.cameras.path else None
+    if cameras is None or there is not None:  # a file knows lenses and panoramas, too
+        return _remembered("cameras", metadata)
+    (folder / "cameras.json").write_text(json.dumps(transforms_of(cameras)), encoding="utf-8")
+    return camera_input(folder / "cameras.json")
+
+
+def _remembered(role: str, metadata: LiftMetadata) -> InputFile:
+    from liftcore.values.lift_file import found_input
+
+    remembered: InputFile = getattr(metadata, role)
+    found = found_input(role, remembered, metadata, None) if remembered.path else None
+    if found is None:
+        got = f"nothing, and they are not at {remembered.path}" if remembered.path else "nothing, of a lift in memory"
+        raise InvalidInput(role, expected=f"the {role} of the lift", got=got, hint=f"give show({role}=...)")
+    return remembered

@@ -8,10 +8,10 @@ from typing import Protocol
 
 import numpy as np
 
-from liftcore.errors import InvalidQuery, Unavailable
+from liftcore.errors import InvalidInput, InvalidQuery, Unavailable
 from liftcore.runtime.plugins import find_plugin, plugin_names
 
-__all__ = ["BUILT_IN", "NO_WORDS", "OWN_WORDS", "TextEncoder", "open_encoder"]
+__all__ = ["BUILT_IN", "NO_WORDS", "OWN_WORDS", "TextEncoder", "check_encoder", "encoder_file", "open_encoder"]
 ENCODER_SPECS = (
     "table:FILE.safetensors",
     "lvis",
@@ -59,6 +59,39 @@ def without_templates(spec: str) -> tuple[str, int]:
     bare, mark, count = spec.rpartition("#")
     known = mark and spec.startswith("open_clip:") and count in map(str, TEMPLATES)
     return (bare, int(count)) if known else (spec, 1)
+
+
+def encoder_file(spec: str) -> Path | None:
+    """The file that an encoder specification names, None when it names none."""
+    if spec.startswith("table:"):
+        return Path(spec.removeprefix("table:"))
+    if spec.startswith("open_clip:") and "@" in spec:
+        return Path(without_templates(spec)[0].partition("@")[2])
+    return Path(spec) if spec.endswith(".safetensors") else None
+
+
+def check_encoder(spec: str) -> None:
+    """See that a specification is one of an encoder, that its file opens, and that a table looks like one.
+
+    Values are read, and judged, where the encoder is opened.
+
+    Raises:
+        InvalidInput: there is no such encoder, its file is missing or does not open, or a table is none.
+    """
+    file = encoder_file(spec)
+    if file is None:
+        if spec not in BUILT_IN and not spec.startswith("open_clip:"):
+            raise InvalidInput("encoder", expected=f"one of {', '.join(ENCODER_SPECS)}", got=repr(spec))
+        return
+    try:
+        file.open("rb").close()
+    except OSError as error:
+        got, hint = f"{file} ({error.strerror})", "name one that is there"
+        raise InvalidInput("encoder", expected="a file that opens", got=got, hint=hint) from None
+    if not spec.startswith("open_clip:"):
+        from liftcore.text.table import check_table
+
+        check_table(file)
 
 
 def open_encoder(spec: str | Path) -> TextEncoder:

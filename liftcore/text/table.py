@@ -1,22 +1,24 @@
-"""A table of precomputed text embeddings: queries without weights, for the words that it holds."""
+"""Public: a table of precomputed text embeddings, for queries in its words without weights."""
 
 import json
 import re
 import unicodedata
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
-from liftcore.errors import InvalidQuery, InvalidTable
+from liftcore.errors import InvalidInput, InvalidQuery, InvalidTable
 from liftcore.io.safetensors_file import check_header, map_tensors
 from liftcore.runtime import nearest
 from liftcore.runtime.one_line import one_line
 from liftcore.text import check_texts
 
+__all__ = ["TableEncoder", "nearest_words", "plain"]
 _HALF = re.compile("[\ud800-\udfff]")  # half a surrogate pair, which UTF-8 cannot carry
 _ARTICLES = frozenset({"a", "an", "the"})
+TABLE = "a text table: safetensors with embeddings [n, F] and metadata words, a JSON list of n strings"
 EXPECTED = "a safetensors file with embeddings and words"
 _NEAREST = 5  # words named when one is unknown
 
@@ -33,6 +35,33 @@ def plain(text: str) -> str:
 def nearest_words(text: str, words: Iterable[str]) -> str:
     """A hint that names the words most like the text, of the first thousands; the words are `plain`."""
     return nearest.nearest(plain(text), words, _NEAREST)
+
+
+def check_table(path: Path) -> None:
+    """Look at the header of a table, and at nothing else of it.
+
+    Raises:
+        InvalidInput: it is none.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    from liftcore.io.kinds import wrong_kind
+
+    if error := wrong_kind(path, "table", InvalidInput, expected=TABLE):
+        raise InvalidInput("encoder", expected=error.expected, got=f"{error.got} at {path}", hint=error.hint)
+    try:
+        check_header(path, str(path), InvalidInput, expected=TABLE)
+        handle: Any
+        with safe_open(str(path), framework="np") as handle:
+            shape = handle.get_slice("embeddings").get_shape()
+            words = json.loads((handle.metadata() or {}).get("words", "null"))
+    except InvalidInput as error:
+        raise InvalidInput("encoder", expected=error.expected, got=f"{error.got} at {path}") from None
+    except (SafetensorError, OSError, ValueError, RecursionError) as error:
+        raise InvalidInput("encoder", expected=TABLE, got=f"{str(error)[:120]} in {path}") from None
+    if len(shape) != 2 or not isinstance(words, list) or len(words) != shape[0]:
+        count = f"{len(words)} words" if isinstance(words, list) else "no words"
+        raise InvalidInput("encoder", expected=TABLE, got=f"{path} with {count} and embeddings {shape}")
 
 
 class TableEncoder:

@@ -30,6 +30,8 @@ from liftcore.io.shards import INDEX, SUFFIX, map_shards, write_shards
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
 
+    from torch import Tensor
+
     from liftcore.scene.cameras import Camera
     from liftcore.values.lift import InputFile, Lift, LiftMetadata
 
@@ -55,12 +57,17 @@ def save_lift(lift: Lift, path: Path | str) -> None:
     from liftcore.io.safetensors_file import write_tensors
 
     metadata = lift.metadata.model_dump_json()
-    tensors = {name: getattr(lift, name) for name in ALL if getattr(lift, name) is not None}
+    tensors = tensors_of(lift)
     with landing(path) as place:
         if place.suffix == SUFFIX:
             write_shards(place, tensors, metadata)
         else:
             write_tensors(place, tensors, {"splatlift": metadata})
+
+
+def tensors_of(lift: Lift) -> dict[str, Tensor]:
+    """The tensors of a lift by their names, in the order of its file."""
+    return {name: getattr(lift, name) for name in ALL if getattr(lift, name) is not None}
 
 
 def open_lift(path: Path | str) -> Lift:

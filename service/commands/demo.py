@@ -20,12 +20,11 @@ import httpx
 import numpy as np
 from PIL import Image
 
+from liftcore import read_features
 from liftcore.cli import Parser
 from liftcore.errors import InvalidInput, SplatliftError, Unavailable
-from liftcore.io.files import visible_files
-from liftcore.io.kinds import SPLATS_SENT, identify, kind_of
+from liftcore.files import identify, visible_files
 from liftcore.text import BUILT_IN, NO_WORDS, OWN_WORDS
-from liftcore.values.pack import read_features
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -289,14 +288,14 @@ def _find(client: Client, lift: str, kind: str, phrase: str, subject: DemoScene,
     answered = time.perf_counter()
     masks = {view: _pixels(client.picture("/query/mask", view=view, **asked)) > 0 for view in subject.views}
     mask_seconds = (time.perf_counter() - answered) / len(masks)
-    from liftcore.query.render import overlay
+    from liftcore import ViewMask
 
     view, best, truth = subject.views[0], answer["top"], subject.truth
     slug = "-".join("".join(c if c.isalnum() else " " for c in phrase.casefold()).split())
     names = {what: f"{slug}-{what}-{view}.png" for what in ("mask", "heat", "found")}
     Image.fromarray(masks[view].astype(np.uint8) * 255).save(out / names["mask"])
     (out / names["heat"]).write_bytes(client.picture("/query/attention", view=view, **asked))
-    seen = overlay(_pixels((out / f"render-{view}.png").read_bytes()), masks[view])
+    seen = ViewMask.overlay(_pixels((out / f"render-{view}.png").read_bytes()), masks[view])
     Image.fromarray(seen).save(out / names["found"])
     return Finding(
         phrase=phrase,
@@ -343,6 +342,7 @@ def _lines(found: Finding) -> list[str]:
 
 SHIPPED = Path(__file__).with_name("tabletop")
 _CAMERA_FILES = ("cameras.json", "transforms.json", "cameras.zip")
+SPLATS_SENT = (".ply", ".splat", ".spz", ".sog")  # over HTTP, where no pickle is opened
 _TABLE = "text_table.safetensors"
 _ENCODERS = {space: encoder for encoder, space in BUILT_IN.items()}
 _PHRASES = 3  # asked when nobody says which
@@ -468,10 +468,10 @@ def _splats(folder: Path) -> Path:
 
 def _cameras(folder: Path, scratch: Path) -> Path:
     """The one file of the cameras; of several, such as a COLMAP model's, a zip in ``scratch``."""
-    from liftcore.io.cameras import camera_source
+    from liftcore.files import camera_files
 
     named = [folder / name for name in _CAMERA_FILES if (folder / name).is_file()]
-    files = [file for file in camera_source(named[0] if named else folder).files if file.is_file()]
+    files = [file for file in camera_files(named[0] if named else folder) if file.is_file()]
     if not files:
         wanted = ", ".join([*_CAMERA_FILES, "sparse/0"])
         raise InvalidInput(f"cameras of {folder.name}", expected=f"one of {wanted}", got="none")
@@ -487,7 +487,7 @@ def _cameras(folder: Path, scratch: Path) -> Path:
 
 def _packs(folder: Path) -> list[Path]:
     """The feature packs of a folder, ``features.safetensors`` first."""
-    found = [path for path in visible_files(folder, "*.safetensors") if kind_of(path) == "features"]
+    found = [path for path in visible_files(folder, "*.safetensors") if identify(path).kind == "features"]
     if not found:
         raise InvalidInput(f"features of {folder.name}", expected="a feature pack (.safetensors)", got="none")
     return sorted(found, key=lambda path: path.name != "features.safetensors")
@@ -526,7 +526,7 @@ def _in_view(names: Sequence[str], masks: Mapping[str, np.ndarray], document: Ma
 
 
 def _some_views(cameras: Path) -> tuple[str, ...]:
-    from liftcore.io.cameras import read_cameras
+    from liftcore import read_cameras
 
     views = [camera.name for camera in read_cameras(cameras).values()]
     return (views[len(views) // 2],)

@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import logging
 import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from liftcore.io.json_file import finite
-from liftcore.lifting.checkpoint import Checkpoint
-from liftcore.lifting.engines import open_engine
-from liftcore.lifting.files import lift_files
-from liftcore.lifting.pipeline import log_warnings
-from liftcore.lifting.planning.plan import Plan
-from liftcore.runtime.device import choose_device
-from liftcore.runtime.progress import Progress, one_step
-from liftcore.scene.kernel import Kernel
-from liftcore.values.lift import InputFile, LiftMetadata
-from liftcore.values.lift_file import save_lift, sha256_of
-from liftcore.values.settings import LiftSettings
+from liftcore import Checkpoint, Kernel, LiftResult, LiftSettings, Plan, lift_files, open_engine
+from liftcore.files import finite
 from service.child import renamed
 from service.jobs.child import Reporter
 
+log = logging.getLogger(__name__)
 SHOWN_DIGITS = 12  # of the splats' digest, by which the chart names the scene
 
 
@@ -38,7 +31,8 @@ def lift_as_ordered(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
     """
 
     def planned(plan: Plan) -> None:
-        log_warnings(plan)  # the operator's log has them too
+        for warning in plan.warnings:  # the operator's log has them too
+            log.warning(warning)
         report.plan(plan_document(plan, order["names"]))
 
     settings = LiftSettings.of(**order["settings"])
@@ -55,11 +49,11 @@ def lift_as_ordered(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
         checkpoint=Checkpoint(Path(order["work"]), order["checkpoint_seconds"]),
         engine=engine,
     )
-    made = replace(made, metadata=_as_clients_know(made.metadata, order["file_names"]))
+    made = _as_clients_know(made, order["file_names"])
     output = Path(order["output"])
-    with one_step(report, "save"):
-        save_lift(made, output)
-        digest = sha256_of(output)
+    made.save(output, progress=report)
+    with output.open("rb") as handle:
+        digest = hashlib.file_digest(handle, "sha256").hexdigest()
     return {
         "sha256": digest,
         "count": made.features.shape[0],
@@ -75,33 +69,30 @@ def plan_document(plan: Plan, names: Mapping[str, str]) -> dict[str, Any]:
     return finite({"summary": list(plan.summary()), "warnings": warnings, **plan.facts()})
 
 
-def _as_clients_know(metadata: LiftMetadata, names: Mapping[str, str]) -> LiftMetadata:
+def _as_clients_know(made: LiftResult, names: Mapping[str, str]) -> LiftResult:
     """The inputs by the names under which clients download them: whoever has the lift may have them beside it, and
     paths of this machine are nobody's business.
     """
+    metadata = made.metadata
+    resolved = {str(Path(path).resolve()): name for path, name in names.items()}  # data may lie behind a link
+    inputs = metadata.splats, metadata.cameras, *metadata.features
+    splats, cameras, *features = (
+        file.model_copy(update={"path": resolved[str(Path(file.path).resolve())]}) for file in inputs
+    )
+    update = {"splats": splats, "cameras": cameras, "features": tuple(features)}
+    return replace(made, metadata=metadata.model_copy(update=update))
 
-    def named(file: InputFile) -> InputFile:
-        return file.model_copy(update={"path": resolved[str(Path(file.path).resolve())]})
 
-    resolved = {
-        str(Path(path).resolve()): name for path, name in names.items()
-    }  # a data directory may be behind a link
-    inputs = {"splats": named(metadata.splats), "cameras": named(metadata.cameras)}
-    return metadata.model_copy(update={**inputs, "features": tuple(map(named, metadata.features))})
-
-
-def compare_as_ordered(order: dict[str, Any], progress: Progress) -> dict[str, Any]:
+def compare_as_ordered(order: dict[str, Any], progress: Reporter) -> dict[str, Any]:
     """Compare, and draw the chart at ``output``. Each run is a process of our group, with our environment.
 
     Returns:
         What the job's last message tells of it: ``document`` and ``page``.
 
     Raises:
-        SplatliftError: as `liftcore.evaluate.tradeoff.compare` has it.
+        SplatliftError: as `liftcore.evaluate.compare_speeds` has it.
     """
-    from liftcore.evaluate.tradeoff import SceneFiles, candidates_of, compare
-    from liftcore.evaluate.tradeoff_report import page_of, save  # with matplotlib, which no lift needs
-    from liftcore.lifting.warm_up import warm_up_lift
+    from liftcore.evaluate import SceneFiles, compare_speeds  # with matplotlib, which no lift needs
 
     settings, parameters, labels = order["settings"], order["parameters"], order["labels"]
     files = Path(order["splats"]), Path(order["cameras"]), tuple(Path(path) for path in order["features"])
@@ -109,19 +100,17 @@ def compare_as_ordered(order: dict[str, Any], progress: Progress) -> dict[str, A
     if labels:
         classes = tuple(parameters["labels"]["classes"])
         scene = SceneFiles(*files, Path(labels["masks"]), Path(labels["table"]), classes)
-    device = choose_device(settings.get("device", "auto"))
-    with one_step(progress, "compile"):  # what the runs load: else the first of a kind eats up the budget
-        for candidate in candidates_of(settings):
-            warm_up_lift(Kernel(order["kernel"]), device, LiftSettings.of(**settings | candidate.settings))
-    progress("tradeoff", 0, len(candidates_of(settings)), "runs")
-    found = compare(scene, parameters["budget_s"], settings, order["threads"], progress)
-    named = {
-        "title": "Speed against accuracy",
-        "scene": f"splats {scene.splats.stem[:SHOWN_DIGITS]}",  # a blob is named by its digest
-        "command": f"POST /tradeoff {json.dumps(parameters | {'settings': settings})}",
-    }
-    document = finite(named | found)
+    found = compare_speeds(
+        scene,
+        budget=parameters["budget_s"],
+        settings=settings,
+        kernel=Kernel(order["kernel"]),
+        threads=order["threads"],
+        progress=progress,
+        scene=f"splats {scene.splats.stem[:SHOWN_DIGITS]}",  # a blob is named by its digest
+        command=f"POST /tradeoff {json.dumps(parameters | {'settings': settings})}",
+    )
     with tempfile.TemporaryDirectory(prefix="splatlift-chart-") as folder:
-        chart = next(file for file in save(document, Path(folder)) if file.suffix == ".png")
+        chart = next(file for file in found.save(Path(folder)) if file.suffix == ".png")
         Path(order["output"]).write_bytes(chart.read_bytes())
-    return {"document": document, "page": "\n".join(page_of(document)) + "\n"}
+    return {"document": found.document, "page": "\n".join(found.lines()) + "\n"}

@@ -28,6 +28,7 @@ from liftcore import (
     Answer,
     Camera,
     Catalogue,
+    Kernel,
     Objects,
     Query,
     Scene,
@@ -35,21 +36,20 @@ from liftcore import (
     SplatliftError,
     TextEncoder,
     ViewMask,
+    choose_device,
     open_encoder,
 )
+from liftcore.files import cameras_of_views
+from liftcore.models import Found, OwnCamera, Seen
 from liftcore.query.ask import Question, answers, located, question
 from liftcore.query.export import layer_colours, npy
 from liftcore.query.objects import objects
-from liftcore.query.question import Found, OwnCamera, Seen
 from liftcore.query.regions import region_mask
 from liftcore.query.render import mask_png, view_mask
 from liftcore.query.scores import warm_up as warm_up_scores
 from liftcore.query.segment import words_of
 from liftcore.query.terms import Example, Region, Vector, parse_example
 from liftcore.raster.cpu.warm_up import warm_up
-from liftcore.runtime.device import choose_device
-from liftcore.scene.splats import Kernel
-from liftcore.scene.views import cameras_of_views
 from liftcore.text import OWN_WORDS, RememberingEncoder
 from service.child import end_with_parent, fault_of
 from service.encoders import encoder_version

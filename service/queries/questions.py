@@ -7,21 +7,19 @@ from typing import Annotated, Any, ClassVar
 from pydantic import AfterValidator, BaseModel, Field
 from pydantic_core import PydanticCustomError
 
-from liftcore.query.question import (
-    Answer,
+from liftcore import Answer, CoveringRegion, Objects, Picture, Query
+from liftcore.models import (
+    NOTATIONS,
     BestWords,
-    CoveringRegion,
+    Body,
     Found,
     FoundWords,
     ListedObjects,
+    NoBoolean,
     Notation,
-    Objects,
-    Picture,
-    Query,
     Seen,
+    takes,
 )
-from liftcore.query.terms import NOTATIONS
-from liftcore.runtime.fields import Body, NoBoolean, takes
 from service import models
 from service.models import BUILT, AssetId, JobId, Text
 

@@ -12,9 +12,10 @@ from typing import Annotated, Any
 from fastapi import Depends, Request, Response
 
 from liftcore import Query, __version__
+from liftcore.text import encoder_file
 from service import models
 from service.content import BINARY, Draft, kept, unchanged
-from service.encoders import encoder_file, encoder_spec, encoder_version
+from service.encoders import encoder_spec, encoder_version
 from service.errors import InvalidRequest
 from service.queries import questions
 from service.queries.client import PIPE_BYTES, Frame, Waiter

@@ -11,14 +11,10 @@ import anyio
 from fastapi import APIRouter, Header, Query, Response
 from fastapi.responses import JSONResponse
 
+from liftcore import Kernel, LiftSettings
 from liftcore.errors import InvalidFeatures, InvalidSettings, InvalidSplats
-from liftcore.io.splats import require_kernel
-from liftcore.scene.compositing import check_antialiased
-from liftcore.scene.kernel import Kernel
-from liftcore.scene.panorama import with_panoramas
-from liftcore.scene.views import cameras_of_views, require_pairs, some_of
+from liftcore.files import cameras_of_views, require_pairs, with_panoramas
 from liftcore.text.table import nearest_words, plain
-from liftcore.values.settings import LiftSettings
 from service import models
 from service.child import error_of
 from service.content import Cursor, Limit, listed
@@ -288,11 +284,12 @@ def check_kernel(splats: AssetRecord, settings: Mapping[str, Any]) -> None:
         InvalidSettings: ``kernel`` or ``antialiased`` does not fit the file, of which the header is read.
     """
     own, kernel = kernel_of(splats, {}), kernel_of(splats, settings)
-    check_antialiased(Kernel(kernel), LiftSettings.of(**settings).antialiased is True)
+    chosen = LiftSettings.of(**settings)
+    chosen.check_kernel(Kernel(kernel))
     if kernel == own:
         return
     try:
-        require_kernel(splats.path, Kernel(kernel), splats.id)
+        chosen.check_kernel(Kernel(kernel), splats.path, splats.id)
     except InvalidSplats as error:
         got, hint = f"{kernel} for {splats.id}, which has {error.got}", f"leave it out: the file speaks of {own}"
         raise InvalidSettings("kernel", expected=f"a kernel with {error.expected}", got=got, hint=hint) from None
@@ -331,7 +328,7 @@ def check_labels(
         raise InvalidRequest(
             "labels.masks",
             expected="masks of views named like the cameras",
-            got=f"masks of {some_of(masks.counts['names'])} and cameras {some_of(known)}, none in common",
+            got=f"masks of {_some(masks.counts['names'])} and cameras {_some(known)}, none in common",
         )
     named = [view for pack in features for view in pack.counts["names"]]
     views = sorted(cameras_of_views(named, known).values())
@@ -345,3 +342,8 @@ def scratch_bytes(kind: models.JobKind, splats: AssetRecord, features: Sequence[
     if kind is not models.JobKind.TRADEOFF:
         return 0
     return splats.counts.get("splats", 0) * (1 + features[0].counts["channels"]) * FLOAT_BYTES
+
+
+def _some(names: Sequence[str]) -> str:
+    """The first few names, for an error."""
+    return ", ".join(map(repr, sorted(names)[:3]))

@@ -10,11 +10,10 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 
 from liftcore.errors import NotFound
-from liftcore.scene.origin import FILE_ORIGIN
+from liftcore.files import in_camera_orientation
 from service import models
 from service.content import FILE, TAGGED, Cursor, Limit, StoredFile, file_answer, kept, listed, unchanged
 from service.encoders import encoder_label
-from service.photos import in_camera_orientation
 from service.queries import questions
 from service.queries.requests import NO_ENCODER, Ask, made, scene_request, tagged_answer, with_encoder, with_packs
 from service.requests import JsonRoute
@@ -228,7 +227,7 @@ def shape_lift(lift: LiftRecord) -> models.LiftResult:
     own = f"/lifts/{lift.id}"
     links = {"self": own, "job": f"/jobs/{lift.id}", "features": f"{own}/features"}
     links |= {"views": f"{own}/views", "objects": f"{own}/objects", "query": f"/query?lift={lift.id}&text="}
-    told = {"views": [], "words": [], "origin": FILE_ORIGIN, **lift.metadata, **vars(lift), "links": links}
+    told = {"views": [], "words": [], "origin": (0.0, 0.0, 0.0), **lift.metadata, **vars(lift), "links": links}
     return models.LiftResult(**{name: told[name] for name in models.LiftResult.model_fields})
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
-from liftcore.io.files import whole_file
+from liftcore.files import whole_file
 from service.errors import InvalidRequest, Misconfigured, StaleDatabase
 from service.store.files import remove, sync_directory
 from service.store.schema import MIGRATING_RELEASE, SCHEMA, VERSION

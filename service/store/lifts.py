@@ -15,13 +15,14 @@ from pathlib import Path
 from typing import Any
 
 from liftcore.errors import NotFound
-from liftcore.scene.render_mode import BY_HAND
 from service.errors import InvalidRequest
 from service.store.assets import own
 from service.store.database import Database, Page, insert, page_of, parsed, record_of
 from service.store.files import DataDirectory
 from service.store.jobs import JobOrder, succeed, told
 from service.store.owners import SEEN, Owner, require_quota
+
+BY_HAND = "set by hand"  # of the rendering that a lift's plan tells: the setting was not auto
 
 
 @dataclass(frozen=True)

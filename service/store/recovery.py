@@ -24,7 +24,7 @@ from typing import Any
 from safetensors import SafetensorError, safe_open
 
 from liftcore.errors import InvalidInput, InvalidLift, NotFound, SplatliftError
-from liftcore.io.kinds import identify
+from liftcore.files import identify
 from service.errand import ErrandLimits
 from service.errors import Misconfigured
 from service.models import JOB_ID, AssetKind, UploadKind

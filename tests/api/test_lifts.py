@@ -18,11 +18,11 @@ from safetensors import safe_open
 from safetensors.numpy import load, save
 
 from liftcore.cli import main
+from liftcore.files import PhotoIndexes
 from liftcore.io.splat import ROW
 from liftcore.lifting.files import lift_files
 from liftcore.query.scene import Scene
 from liftcore.values.settings import LiftSettings
-from service.photos import PhotoIndexes
 from service.store.database import DATABASE
 
 from .conftest import serving

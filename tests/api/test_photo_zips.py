@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 
 from liftcore.errors import InvalidInput, InvalidPhotos, NotFound
+from liftcore.io.photo_zip import PhotoIndexes, describe_photos
 from liftcore.io.photos import PhotosBeside
-from service.photos import PhotoIndexes, describe_photos
 
 METHODS = {
     "stored": zipfile.ZIP_STORED, "deflate": zipfile.ZIP_DEFLATED, "bzip2": zipfile.ZIP_BZIP2,

@@ -16,9 +16,9 @@ from liftcore.errors import InvalidFeatures
 from liftcore.features.folders import Layout, array_views, files_below, langsplat_views
 from liftcore.features.masks import mask_views
 from liftcore.io.npy import open_npy
+from liftcore.io.photo_zip import describe_photos
 from liftcore.values.pack import read_features, write_pack
 from liftcore.values.views import FeatureGrid, Regions
-from service.photos import describe_photos
 
 if TYPE_CHECKING:
     from pathlib import Path

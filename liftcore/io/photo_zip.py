@@ -18,9 +18,9 @@ from liftcore.errors import InvalidCameras, InvalidPhotos, NotFound
 from liftcore.io.files import BROKEN_ZIP, is_system_file, open_zip
 from liftcore.io.photos import LARGEST_TAG, ORIENTATION, UPRIGHT, PhotoHeader
 from liftcore.scene.views import cameras_of_views, view_names
-from service import models
 
-MOST = models.PHOTOS
+MOST = 10_000  # photos
+DIRECTORY_BYTES = 8 << 20  # of the list of what is in a zip: of 20,000 files with long names
 KEPT_ZIPS = 4  # whose directories stay in memory
 LOCAL_HEADER = struct.Struct("<26x2H")  # before a member: the lengths of its name and its extra field
 LARGEST_BYTES = 64 << 20  # of a photo: 100 million pixels as a good JPEG
@@ -41,8 +41,8 @@ def describe_photos(path: Path) -> dict[str, Any]:
     """
     try:
         with open_zip(path) as archive:
-            if (size := path.stat().st_size - archive.start_dir) > models.DIRECTORY_BYTES:
-                expected = f"a zip with a directory of at most {models.DIRECTORY_BYTES} bytes"
+            if (size := path.stat().st_size - archive.start_dir) > DIRECTORY_BYTES:
+                expected = f"a zip with a directory of at most {DIRECTORY_BYTES} bytes"
                 raise InvalidPhotos("photos", expected=expected, got=f"{size}", hint="shorter names, and no comments")
             entries = archive.infolist()
             members = _members(entries)
