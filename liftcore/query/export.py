@@ -171,6 +171,13 @@ def npy(values: np.ndarray) -> bytes:
     return content.getvalue()
 
 
+def array_blocks(values: np.ndarray, what: str = "") -> list[bytes]:
+    """An array as ``npy``, or a mask [H, W] of booleans as PNG: ``mask``."""
+    from liftcore.query.render import mask_png
+
+    return [mask_png(values) if what == "mask" else npy(values)]
+
+
 def viewer_splats(scene: OpenedLift) -> Iterator[bytes]:
     """The scene in the ``.splat`` format of web viewers, in the lift's order, in blocks.
 

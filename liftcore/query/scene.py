@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -15,15 +15,17 @@ if TYPE_CHECKING:  # these load torch
     import numpy as np
     from PIL.Image import Image
 
+    from liftcore.query.ask import Question
     from liftcore.query.catalogue import Catalogue
     from liftcore.query.question import Answer, BestWord, CoveringRegion, Objects, Query
     from liftcore.query.render import ViewMask
     from liftcore.query.segment import Segmentation
     from liftcore.query.terms import Example
     from liftcore.scene.cameras import Camera
+    from liftcore.scene.kernel import Kernel
     from liftcore.text import TextEncoder
 
-Source: TypeAlias = "Query | str | Answer | Segmentation | Catalogue | int | None"  # of a file
+Source: TypeAlias = "Query | str | Answer | Segmentation | Catalogue | np.ndarray | int | None"  # of a file
 
 
 class Scene(OpenedLift):
@@ -81,18 +83,38 @@ class Scene(OpenedLift):
             return located(self, answer)
         return answer
 
+    def prepare(self, query: Query, encoder: TextEncoder | None = None) -> Question:
+        """Find the directions of a query's terms, and all that can be wrong with it; arguments as in `ask`."""
+        from liftcore.query.ask import question
+
+        return question(self, query, encoder, query.places)
+
+    def answer(self, questions: Sequence[Question]) -> list[Answer]:
+        """Answer prepared questions in one pass over the features; each to the same bits as alone (`ask`)."""
+        from liftcore.query.ask import answers
+
+        return answers(self, questions)
+
+    def locate(self, answer: Answer, count: int | None = None) -> Answer:
+        """An answer with its best splats and the box of what is selected (`liftcore.query.ask.located`)."""
+        from liftcore.query.ask import located
+
+        return located(self, answer, count)
+
     def look(
         self,
         query: Query | str | Answer,
         view: str | Camera | None = None,
         *,
         encoder: TextEncoder | str | Path | None = None,
+        find_objects: Callable[[], Objects] | None = None,
     ) -> ViewMask:
         """See an answer from a camera: its attention, and a mask of the objects that were found.
 
         Args:
             query: as in `ask`, or the answer to it. view: the name of a camera of the scene, or any camera in the
                 frame of the splats; None: the query's own.
+            find_objects: gives the answer's objects, where they may be known; None: `objects`.
 
         Raises:
             InvalidQuery, NotFound, InvalidLift, Unavailable: as `ask` and `liftcore.query.render.view_mask`.
@@ -100,7 +122,8 @@ class Scene(OpenedLift):
         from liftcore.query.render import view_mask
 
         answer = self._answer(query, encoder)
-        return view_mask(self, answer, answer.query.seen_from() if view is None else view)
+        group = (lambda *_: self.objects(answer)) if find_objects is None else lambda *_: find_objects()
+        return view_mask(self, answer, answer.query.seen_from() if view is None else view, group)
 
     def mask(
         self,
@@ -182,7 +205,7 @@ class Scene(OpenedLift):
 
     def what(
         self,
-        example: Example | str,
+        example: Example | str | Sequence[float],
         words: Sequence[str] | None = None,
         *,
         top: int = 5,
@@ -191,14 +214,18 @@ class Scene(OpenedLift):
         """The words that an example is most like, the nearest first.
 
         Args:
-            example: or its notation, as in `Query.like`. words: None: all words of the encoder, which is a table.
+            example: or its notation, as in `Query.like`, or a vector [F].
+            words: None: all words of the encoder, which is a table.
         """
         from liftcore.query.segment import best_words
-        from liftcore.query.terms import parse_example
+        from liftcore.query.terms import Vector, parse_example
 
         reader = self.encoder(encoder)
         words = self.words(reader) if words is None else words
-        example = parse_example(example, "example") if isinstance(example, str) else example
+        if isinstance(example, str):
+            example = parse_example(example, "example")
+        elif isinstance(example, Sequence):
+            example = Vector(tuple(example))
         return best_words(self, example, words, reader.encode(words), top)
 
     def words(self, encoder: TextEncoder | str | Path | None = None) -> list[str]:
@@ -212,6 +239,39 @@ class Scene(OpenedLift):
         from liftcore.query.regions import regions_at
 
         return regions_at(self, view, x, y)
+
+    def region_mask(self, view: str, level: int, region: int) -> np.ndarray:
+        """[H, W] bool, the pixels of a view's photo that a region of its feature pack covers.
+
+        Raises:
+            NotFound: there is no such view, level or region.
+            InvalidQuery, InvalidLift: the view has a grid, or the packs moved or changed since the lift.
+        """
+        from liftcore.query.regions import region_mask
+        from liftcore.query.terms import Region
+
+        return region_mask(self, Region(view, level, region))
+
+    def colours(self, what: str) -> np.ndarray:
+        """[P, 3] u8 sRGB, of splats by ``pca``, ``cluster``, ``evidence``, ``agreement`` or ``confidence``.
+
+        Raises:
+            InvalidQuery: the lift has no such thing.
+        """
+        from liftcore.query.export import layer_colours
+
+        return layer_colours(self, what)
+
+    @staticmethod
+    def warm_up(kernel: Kernel | None = None) -> None:
+        """Load the compiled code of questions, or compile it; with a kernel that of pictures of such splats."""
+        from liftcore.query.scores import warm_up
+
+        if kernel is None:
+            return warm_up()
+        from liftcore.raster.cpu.warm_up import warm_up as warm_up_kernel
+
+        return warm_up_kernel(kernel)
 
     def export(self, path: Path | str, source: Source = None, what: str = "", **how: Any) -> None:
         """Write a file, whole or not at all; arguments and errors as in `blocks_of`, which takes its suffix."""
@@ -236,10 +296,11 @@ class Scene(OpenedLift):
         """Make a file, in blocks.
 
         Args:
-            source: a question or its answer, a segmentation, a catalogue, the id of an object of it; None: the scene.
+            source: a question or its answer, a segmentation, a catalogue, the id of an object of it, or an array;
+                None: the scene.
             what: of an answer object, coloured, scores, selection, mask, attention or overlay; of a segmentation
                 coloured, labels, picture, splat_labels, labelled or names; of the scene what `render` draws, or
-                splats; of a catalogue csv. Empty: the first of these.
+                splats; of a catalogue csv; of an array npy, or mask of booleans [H, W]. Empty: the first of these.
             view: of pictures, as in `look`. suffix: of its name, where there are several formats.
             seen: the answer as the view shows it, where that is known. photo: of the view, for an overlay.
 
@@ -247,9 +308,13 @@ class Scene(OpenedLift):
             InvalidQuery: there is no such file of it, or nothing was found that it could hold.
             NotFound, InvalidLift, Unavailable: as the question, or as pictures.
         """
-        from liftcore.query.export import blocks_of
+        import numpy as np
+
+        from liftcore.query.export import array_blocks, blocks_of
         from liftcore.query.question import Query
 
+        if isinstance(source, np.ndarray):
+            return array_blocks(source, what)
         source = self._answer(source, encoder) if isinstance(source, str | Query) else source
         return blocks_of(self, source, what, view=view, suffix=suffix, seen=seen, photo=photo)
 

@@ -94,7 +94,7 @@ def check_encoder(spec: str) -> None:
         check_table(file)
 
 
-def open_encoder(spec: str | Path) -> TextEncoder:
+def open_encoder(spec: str | Path, *, remembers: bool = False) -> TextEncoder:
     """Open a text encoder by its specification: ``open_encoder("lvis").encode(["mug"])`` is what lifts are asked by.
 
     Args:
@@ -103,11 +103,14 @@ def open_encoder(spec: str | Path) -> TextEncoder:
             ``open_clip:MODEL/TAG`` or ``open_clip:MODEL@FILE``, with ``#7`` or ``#80`` behind for the mean over as
             many of CLIP's sentences for ImageNet ("a photo of the small mug."); or ``NAME`` or ``NAME:REST`` of a
             plugin (`liftcore.runtime.plugins`), which is called with the rest.
+        remembers: whether the vectors of the last texts are kept.
 
     Raises:
         InvalidQuery: the specification is none of these, or a table is malformed.
         Unavailable: the encoder's weights are not on this machine, or a plugin fails.
     """
+    if remembers:
+        return RememberingEncoder(open_encoder(spec))
     spec, templates = without_templates(str(spec))
     kind, _, rest = spec.partition(":")
     # A bare path may hold a colon itself, so the suffix is asked first.

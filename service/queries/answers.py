@@ -41,16 +41,7 @@ from liftcore import (
 )
 from liftcore.files import cameras_of_views
 from liftcore.models import Found, OwnCamera, Seen
-from liftcore.query.ask import Question, answers, located, question
-from liftcore.query.export import layer_colours, npy
-from liftcore.query.objects import objects
-from liftcore.query.regions import region_mask
-from liftcore.query.render import mask_png, view_mask
-from liftcore.query.scores import warm_up as warm_up_scores
-from liftcore.query.segment import words_of
-from liftcore.query.terms import Example, Region, Vector, parse_example
-from liftcore.raster.cpu.warm_up import warm_up
-from liftcore.text import OWN_WORDS, RememberingEncoder
+from liftcore.text import OWN_WORDS
 from service.child import end_with_parent, fault_of
 from service.encoders import encoder_version
 from service.errors import NoSpace
@@ -107,7 +98,7 @@ class Answers:
         """
         with contextlib.suppress(SplatliftError), self._opening:
             self._encoder(encoder, version).encode([WARM_UP_TEXT])
-        warm_up_scores()
+        Scene.warm_up()
         self._warm_kernel(Kernel.GAUSSIAN_3D)
 
     def reply(self, request: dict[str, Any], ahead: Sequence[dict[str, Any]] = ()) -> Frame:
@@ -132,7 +123,7 @@ class Answers:
         room = min(
             PRODUCT_BYTES // (COSINE_BYTES * splats), self._cache.maxsize // (ANSWER_BYTES * splats + ENTRY_BYTES)
         )
-        asked: dict[str, Question] = {}
+        asked: dict[str, Any] = {}
         for request in requests:
             if request["lift"] != requests[0]["lift"] or "query" not in request or _key(request) in self._cache:
                 continue
@@ -142,7 +133,7 @@ class Answers:
                     asked[_key(request)] = found
                     room -= len(found.rows)
         if asked:
-            for key, answer in zip(asked, answers(scene, list(asked.values())), strict=True):
+            for key, answer in zip(asked, scene.answer(list(asked.values())), strict=True):
                 self._cache[key] = answer
 
     def _kept(self, key: object, make: Callable[[], Kept]) -> Kept:
@@ -169,23 +160,23 @@ class Answers:
     def _warm_kernel(self, kernel: Kernel) -> None:
         if kernel not in self._warm:
             self._warm.add(kernel)
-            warm_up(kernel)
+            Scene.warm_up(kernel)
 
     def _encoder(self, spec: str, version: object) -> TextEncoder:
         with self._opening:
             known = self._encoders.get(spec)
             if known is None or known[0] != version:  # a table that the operator replaced is another table
-                known = self._encoders[spec] = (version, RememberingEncoder(open_encoder(spec)))
+                known = self._encoders[spec] = (version, open_encoder(spec, remembers=True))
             return known[1]
 
-    def _question(self, request: dict[str, Any]) -> Question:
+    def _question(self, request: dict[str, Any]) -> Any:
         spec = request["encoder"]
         encoder = None if spec in (None, OWN_WORDS) else self._encoder(spec, request["encoder_version"])
         query = Query(**request["query"])
-        return question(self._scene(request), query, encoder, query.places)
+        return self._scene(request).prepare(query, encoder)
 
     def _answer(self, request: dict[str, Any]) -> Answer:
-        made = self._kept(_key(request), lambda: answers(self._scene(request), [self._question(request)])[0])
+        made = self._kept(_key(request), lambda: self._scene(request).answer([self._question(request)])[0])
         assert isinstance(made, Answer)
         return made
 
@@ -193,7 +184,8 @@ class Answers:
         answer = self._answer(request)
 
         def make() -> ViewMask:
-            return view_mask(self._scene(request), answer, view_of(request), group=lambda *_: self._grouped(request))
+            scene, view = self._scene(request), view_of(request)
+            return scene.look(answer, view, find_objects=lambda: self._grouped(request))
 
         seen_from = json.dumps(request.get("camera", request.get("view")))
         made = self._kept((_key(request), "view", seen_from), make)
@@ -202,7 +194,7 @@ class Answers:
 
     def _grouped(self, request: dict[str, Any]) -> Objects:
         answer = self._answer(request)
-        made = self._kept((_key(request), "objects"), lambda: objects(self._scene(request), answer))
+        made = self._kept((_key(request), "objects"), lambda: self._scene(request).objects(answer))
         assert isinstance(made, Objects)
         return made
 
@@ -210,7 +202,7 @@ class Answers:
         scene, answer = self._scene(request), self._answer(request)
         if request["view"] is not None:
             scene.cameras[request["view"]]  # links to pictures of a view that is not there help nobody
-        return Frame(located(scene, answer, request["top"]).model_dump(mode="json"))
+        return Frame(scene.locate(answer, request["top"]).model_dump(mode="json"))
 
     def _objects(self, request: dict[str, Any]) -> Frame:
         found = self._answer(request).model_dump(mode="json", include=set(Found.model_fields))
@@ -221,9 +213,10 @@ class Answers:
         scene, operation, what = self._scene(request), request["operation"], request.get("what", "")
         view = view_of(request) if "view" in request or "camera" in request else None
         if operation == "layer":
-            blocks: Iterable[bytes] = [npy(layer_colours(scene, what))]
+            blocks = scene.blocks_of(scene.colours(what))
         elif operation == "region_mask":
-            blocks = [mask_png(region_mask(scene, Region(request["view"], request["level"], request["region"])))]
+            mask = scene.region_mask(request["view"], request["level"], request["region"])
+            blocks = scene.blocks_of(mask, "mask")
         elif operation in WORD_FILES:
             blocks = scene.blocks_of(self._named(request), WORD_FILES[operation], view=view)
         elif "query" in request:
@@ -253,7 +246,7 @@ class Answers:
         """The words of a request, all of its table where it names none."""
         own = self._scene(request).table if request["encoder"] == OWN_WORDS else None
         encoder = own or self._encoder(request["encoder"], request["encoder_version"])
-        return words_of(encoder) if request["words"] is None else request["words"], encoder
+        return self._scene(request).words(encoder) if request["words"] is None else request["words"], encoder
 
     def _named(self, request: dict[str, Any]) -> Segmentation:
         def make() -> Segmentation:
@@ -269,8 +262,8 @@ class Answers:
         return _json(request, told, "found", told.pop("found"))
 
     def _what(self, request: dict[str, Any]) -> Frame:
-        (words, encoder), example = self._words(request), _example(request["example"], "example")
-        best = self._scene(request).what(example, words, top=request["top"], encoder=encoder)
+        words, encoder = self._words(request)
+        best = self._scene(request).what(request["example"], words, top=request["top"], encoder=encoder)
         return Frame({"words": [word.model_dump(mode="json") for word in best]})
 
     def _catalogue(self, request: dict[str, Any]) -> Frame:
@@ -360,12 +353,8 @@ def bytes_of(made: Answer | Objects | ViewMask | Segmentation | Catalogue) -> in
     return ENTRY_BYTES + made.attention.nbytes + made.row_sums.nbytes + made.mask.nbytes
 
 
-def _term_bytes(term: str | Example) -> int:
-    return NUMBER_BYTES * len(term.values) if isinstance(term, Vector) else len(str(term).encode())
-
-
-def _example(example: str | list[float], argument: str) -> Example:
-    return parse_example(example, argument) if isinstance(example, str) else Vector(tuple(example))
+def _term_bytes(term: Any) -> int:
+    return NUMBER_BYTES * len(term.values) if hasattr(term, "values") else len(str(term).encode())
 
 
 def view_of(request: dict[str, Any]) -> str | Camera:
