@@ -337,7 +337,7 @@ def test_objects_of_an_answer_are_made_once_for_all_its_masks(
     request_of: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[int] = []
-    monkeypatch.setattr(answers, "objects", lambda *both: made.append(0) or objects(*both))
+    monkeypatch.setattr("liftcore.query.objects.objects", lambda *both: made.append(0) or objects(*both))
     kept = Answers(scenes=1, cache_bytes=1 << 20)
     reply_to([request_of("scores", text=["apple"])], kept)
     before = kept.kept_bytes
