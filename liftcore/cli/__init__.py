@@ -1,6 +1,6 @@
 """Public: ``splatlift``, the command line.
 
-Each command is a file, here or in another package: ``add_arguments`` and ``run``.
+Each command is a file, here or in the service's package: ``add_arguments`` and ``run``.
 
 Exit status: 0; 2 for input that is the user's to mend, with one line on stderr that says what; 1 for our own
 fault. With ``--json`` stdout holds one JSON object and nothing else.

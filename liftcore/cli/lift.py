@@ -206,6 +206,8 @@ def _verdict(document: dict[str, Any], cameras: Path) -> Iterable[str]:
     if filled is not None:
         usual = "as of a scene without holes" if filled >= FILLED else "the rest of a ray meets nothing"
         yield f"splats fill {filled:.1%} of a ray, {usual}"
+    if "candidates" in certificate.get("smoothing", {}):
+        yield smoothing_line(certificate["smoothing"])
     if certificate["warnings"]:
         yield "look at the warnings: splatlift check says whether photos, cameras and splats belong together"
     space = document["text_space"]

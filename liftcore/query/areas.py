@@ -70,7 +70,7 @@ def _pixels(area: Area, width: int, height: int) -> tuple[np.ndarray, np.ndarray
 def _grid(left: int, top: int, right: int, bottom: int, most: int) -> np.ndarray:
     """[n, 2] i64, evenly spaced pixels of a box, about as far apart across as down."""
     width, height = right - left, bottom - top
-    across = min(width, max(1, round(math.sqrt(most * width / height))))
+    across = min(width, most, max(1, round(math.sqrt(most * width / height))))
     down = min(height, max(1, most // across))
     columns = left + (np.arange(across) * 2 + 1) * width // (2 * across)
     rows = top + (np.arange(down) * 2 + 1) * height // (2 * down)

@@ -64,11 +64,14 @@ def _camera(given: Any) -> Any:
     return OwnCamera.of(given) if hasattr(given, "K") else given
 
 
-Notation = Annotated[str, Field(min_length=1, max_length=600, description=NOTATIONS)]
+MOST_CHARACTERS = 4096  # of an example: a stroke of some hundred corners
+EXAMPLES = f"{NOTATIONS}, of at most {MOST_CHARACTERS} characters, or a vector"
+Notation = Annotated[str, Field(min_length=1, max_length=MOST_CHARACTERS, description=NOTATIONS)]
 Numbers = Annotated[tuple[float, ...], Field(min_length=1)]
 Texts = Annotated[list[str], BeforeValidator(_several)]
 Examples = Annotated[
-    list[Annotated[Notation | Numbers, takes(f"{NOTATIONS}, or a vector")]], BeforeValidator(_examples)
+    list[Annotated[Notation | Numbers, takes(EXAMPLES)]],
+    BeforeValidator(_examples),
 ]
 Method = Literal["auto", "valley", "paper", "otsu", "stability"]
 METHODS: tuple[str, ...] = get_args(Method)

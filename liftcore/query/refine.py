@@ -51,9 +51,11 @@ def refine(
         raise InvalidSettings("smoothness", expected="a number above 0", got="0", hint="1 is a good first try")
     lift.require_splats(splats)
     settings = lift.settings
-    if settings.smoothness:
+    before = lift.diagnostics.get("smoothing", {}).get("smoothness") if settings.smoothness == "auto" else None
+    if settings.smoothness and before != 0:
+        hint = "lift again with smoothness=0" if settings.smoothness == "auto" else "refine the lift it came from"
         got = f"one of smoothness={settings.smoothness}"
-        raise InvalidLift("lift", expected="a lift without smoothness", got=got, hint="refine the lift it came from")
+        raise InvalidLift("lift", expected="a lift without smoothness", got=got, hint=hint)
     if settings.aggregation:
         hint = f"lift again with smoothness={strength:g} beside aggregation: clusters are made of smooth features"
         raise InvalidLift("lift", expected="each splat's own features", got="a lift with aggregation", hint=hint)

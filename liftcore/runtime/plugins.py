@@ -1,4 +1,4 @@
-"""Formats, encoders and commands of other packages, announced as entry points of their distribution.
+"""Formats and encoders of other packages and commands of the service, announced as entry points of a distribution.
 
     [project.entry-points."splatlift.text_encoders"]
     mine = "my_package:open_encoder"
@@ -93,7 +93,8 @@ def load_plugin(group: Group, name: str) -> Any:
     if plugin is None:
         expected = f"a package with an entry point of that name in {group}"
         hint = "splatlift's package 'service' has it: pip install splatlift, or make setup in a checkout"
-        raise Unavailable(repr(name), expected=expected, got="none installed", hint=hint)
+        own = group in ("splatlift.commands", "splatlift.viewers")
+        raise Unavailable(repr(name), expected=expected, got="none installed", hint=hint if own else "")
     return plugin.load()
 
 
@@ -122,10 +123,12 @@ def plugin_names(group: Group) -> list[str]:
 
 
 def _entries(group: Group) -> tuple[EntryPoint, ...]:
-    found = [*entry_points(group=group)]
-    names = {(entry.name, entry.value) for entry in found}
-    found += [entry for entry in _of_checkout() if entry.group == group and (entry.name, entry.value) not in names]
-    return tuple(sorted(found, key=lambda entry: (entry.name, entry.dist.name if entry.dist else "")))
+    found = entry_points(group=group)
+    own = [entry for entry in _of_checkout() if entry.group == group]
+    own = own or [entry for entry in found if entry.dist is not None and entry.dist.name == "splatlift"]
+    names = {entry.name for entry in own}  # which no other package takes
+    others = [entry for entry in found if entry.name not in names]
+    return tuple(sorted([*own, *others], key=lambda entry: (entry.name, entry.dist.name if entry.dist else "")))
 
 
 @cache

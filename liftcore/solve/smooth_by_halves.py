@@ -126,6 +126,7 @@ def choose_smoothness(
             if bits[strength] <= best:
                 break
             best, error = bits[strength], next_error
+    progress("halves", len(STRENGTHS), len(STRENGTHS), "lambdas")
     return SmoothnessChoice(min(one for one, value in bits.items() if value >= best - error), bits)
 
 

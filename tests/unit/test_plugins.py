@@ -100,3 +100,9 @@ def test_two_packages_of_one_name_are_refused_and_built_in_names_stay(install, c
         lc.open_encoder("mine")
     assert "'lvis' of the package ours is ignored" in caplog.text
     assert lc.open_encoder("lvis").channels == 512
+
+
+def test_a_command_of_the_service_stays_its_own(install) -> None:
+    install("theirs", commands={"serve": "other", "mine": "other"})
+    assert lc.load_plugin("splatlift.commands", "serve").__name__ == "service.commands.serve"
+    assert lc.load_plugin("splatlift.commands", "mine")() == 7

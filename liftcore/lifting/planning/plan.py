@@ -38,6 +38,7 @@ from liftcore.scene.splats import Splats
 from liftcore.solve.codebook import TABLE_BYTES
 from liftcore.solve.consensus import BLOCK_ENTRIES
 from liftcore.solve.diagnostics import shape_warnings
+from liftcore.solve.smooth_by_halves import CHANNELS
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.pack import Views
 from liftcore.values.region_weights import MEMORY_LIMIT
@@ -350,6 +351,9 @@ def memory_parts(
         parts["refinement"] = 4 * (splats.count * (CG_VECTORS * CG_CHANNELS) + 3 * largest * CG_CHANNELS)
     if settings.smoothness:
         parts["smoothing"] = SMOOTHING_BYTES * splats.count
+        if settings.smoothness == "auto":  # a factor an entry of W, and two lifts in few channels before and after
+            entries = min(_entries(seen, features, names, settings), MEMORY_LIMIT / ENTRY_BYTES)
+            parts["smoothing"] += int(4 * entries) + 4 * 4 * CHANNELS * splats.count
     if settings.aggregation:
         parts["aggregation"] = CLUSTERING + 24 * channels * min(splats.count, settings.aggregation_sample)
         if settings.aggregation_clusters in ("auto", "touching"):  # afterwards, and of one cluster at a time

@@ -21,7 +21,7 @@ const PRESETS = {
 };
 const SPEEDS = { exact: "every pixel", balanced: "every 4th pixel", fast: "fewer views too", draft: "a first look" };
 const STAGES = { read: "Reading files", digest: "Reading files", compile: "Compiling kernels", plan: "Planning", geometry: "Looking through the views",
-  solve: "Solving", robust: "Comparing views", certify: "Checking the result", save: "Saving" };
+  solve: "Solving", robust: "Comparing views", halves: "Comparing halves of the views", smooth: "Smoothing", certify: "Checking the result", save: "Saving" };
 
 export class Bring {
   // opened: with a lift that is to be shown; gone: after lifts were deleted.

@@ -15,6 +15,7 @@ from torch import Tensor
 
 import liftcore as lc
 from liftcore.cli.reply import smoothing_line
+from liftcore.lifting import in_memory
 from liftcore.lifting.files import lift_files
 from liftcore.scene.neighbours import SplatGraph
 from liftcore.scene.splats import Splats
@@ -133,16 +134,20 @@ def test_features_that_are_one_stay_as_they_are() -> None:
     assert "not at all" in smoothing_line(facts)
 
 
+MANY = 17_000  # splats: more than are told apart or solved at once
 PLACES = np.random.default_rng(2).random((900, 2))  # of splats on a square
 THINGS = (4 * PLACES[:, 0]).astype(int)  # four stripes
 STRIPES = np.random.default_rng(4).normal(size=(4, 6))[THINGS]
 
 
-def chosen(truth: np.ndarray, noise: float, views: int = 6, **how: Any) -> SmoothnessChoice:
-    """The choice for splats at PLACES, a colour a stripe, each with a noisy copy of its truth [P, F] in each view."""
-    rng, count = np.random.default_rng(3), len(PLACES)
-    means = torch.from_numpy(np.column_stack([PLACES, np.zeros(count)])).float()
-    colours = torch.from_numpy(THINGS - 1.5).float()[:, None, None].expand(-1, 1, 3)
+def chosen(
+    truth: np.ndarray, noise: float, views: int = 6, places: np.ndarray = PLACES, **how: Any
+) -> SmoothnessChoice:
+    """The choice for splats at places, a colour a stripe, each with a noisy copy of its truth [P, F] in each view."""
+    rng, count = np.random.default_rng(3), len(places)
+    means = torch.from_numpy(np.column_stack([places, np.zeros(count)])).float()
+    stripes = torch.from_numpy((4 * places[:, 0]).astype(int) - 1.5).float()
+    colours = stripes[:, None, None].expand(-1, 1, 3)
     graph = SplatGraph.of(replace(random_splats(3, count), means=means, sh=colours))
     rows = truth + noise * rng.normal(size=(views, *truth.shape))
     regions = (torch.arange(views)[None] * count + torch.arange(count)[:, None]).reshape(-1).int()
@@ -164,7 +169,11 @@ def test_strength_is_large_for_noise_and_small_for_what_differs_from_splat_to_sp
 
 
 def test_strength_is_the_same_for_any_number_of_threads() -> None:
-    assert chosen(STRIPES, 1.0, threads=1) == chosen(STRIPES, 1.0, threads=3)
+    places = np.random.default_rng(8).random((MANY, 2))
+    truth = np.random.default_rng(4).normal(size=(4, 3))[(4 * places[:, 0]).astype(int)]
+    one, three = (chosen(truth, 2.0, 2, places, threads=threads) for threads in (1, 3))
+    assert one == three
+    assert one.smoothness > 0
 
 
 @pytest.mark.parametrize("views", [1, 2])
@@ -203,7 +212,14 @@ def test_refined_lift_is_the_lift_with_that_smoothness(files: tuple[Path, Path, 
     assert "smooth" in refined.metadata.timings
 
 
-def test_lift_with_auto_is_the_lift_with_the_chosen_strength(files: tuple[Path, Path, Path]) -> None:
+@pytest.mark.parametrize("choice", [None, SmoothnessChoice(0.3, {0.0: 1.0, 0.1: 1.2, 0.3: 1.3, 1.0: 1.1})])
+def test_lift_with_auto_is_the_lift_with_the_chosen_strength(
+    files: tuple[Path, Path, Path], choice: SmoothnessChoice | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the scene's own choice, which is none, and of another."""
+    if choice is not None:
+        monkeypatch.setattr(in_memory, "choose_smoothness", lambda *_, **__: choice)
+
     def lifted(smoothness: float | str) -> lc.LiftResult:
         return lift_files(files[0], files[1], files[2:], LiftSettings.of(smoothness=smoothness))
 
@@ -213,10 +229,15 @@ def test_lift_with_auto_is_the_lift_with_the_chosen_strength(files: tuple[Path, 
     assert facts["smoothness"] in [one["smoothness"] for one in candidates]
     fixed = lifted(facts["smoothness"])
     assert torch.equal(auto.features, fixed.features)
-    assert facts["smoothness"] == 0 or facts == fixed.diagnostics["smoothing"]
+    if choice is None:
+        assert facts["smoothness"] == 0
+        assert auto.refined(lc.read_splats(files[0]), smoothness=1).settings.smoothness == 1
+        return
+    assert facts == fixed.diagnostics["smoothing"]
+    assert facts["smoothness"] == 0.3
     assert "of the views" in smoothing_line(auto.diagnostics["smoothing"])
     assert auto.settings.smoothness == "auto"
-    with pytest.raises(lc.InvalidLift, match="smoothness=auto"):
+    with pytest.raises(lc.InvalidLift, match="smoothness=auto; lift again with smoothness=0"):
         auto.refined(lc.read_splats(files[0]), smoothness=1)
 
 
