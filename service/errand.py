@@ -7,16 +7,16 @@ seconds, and a fork begins at once. The template computes nothing, and ends once
 from __future__ import annotations
 
 import importlib
+import logging
 import multiprocessing
 import os
 import resource
 import signal
-import sys
 import tempfile
 import threading
 import time
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import forkserver, util
 from multiprocessing.connection import Connection, wait
@@ -28,20 +28,27 @@ from service.child import Messages, children_of, end_with_parent, is_stopped, li
 from service.errors import Busy
 
 CONTEXT = multiprocessing.get_context("forkserver")
-CONTEXT.set_forkserver_preload(
-    [
-        "service.one_thread",
-        "service.errand",
-        "service.tasks",
-        "liftcore.cli.__main__",  # a task imports anew what the server's process began with
-    ]
-)
+IMPORTED = [
+    "service.one_thread",
+    "service.errand",
+    "service.tasks",
+    "liftcore.cli.__main__",  # a task imports anew what the server's process began with
+]
+CONTEXT.set_forkserver_preload(IMPORTED)
 TICK_SECONDS = 0.5  # how soon the end of the server is seen by who waits
-GONE_SECONDS = 5.0  # for a task to end once it has said its result
+GONE_SECONDS = 5.0  # for a task to end once it has said its result, and for its template to tell of the end
+IMPORT_SECONDS = 300.0  # for the first fork of a template, which makes its imports before
+FORK_SECONDS = 30.0  # for each later one
+DYING_SECONDS = 1.0  # until a template that no longer answers is one that has ended
 LONGEST_FOLDER = 70  # characters of the temporary folder, in which the template has its socket: a path has 107
 PRINTED = "printed"  # the file for what a task prints, beside its temporary ones
+TRACE_BYTES = 4000  # of its end, for the log
+CHILDREN = Path("/proc/thread-self/children")  # which not every Linux has
 TEMPLATE_DIED = 255  # what multiprocessing tells in place of an exit status that nobody has
 _TURN = threading.Lock()  # of starts and ends of tasks: multiprocessing looks at all tasks at each start
+_FORKED = set[int]()  # the templates that have forked once, by process id
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -59,11 +66,15 @@ class TaskResult:
 
     last: dict[str, Any]  # its result; {"event": "ready"} of one that began, {"event": "nothing"} of one that did not
     returncode: int | None  # negative for a signal; None when nobody knows, as the template ended meanwhile
-    trace: str  # what it printed
+    trace: str  # the end of what it printed
 
 
 def get_ready() -> None:
     """Have the template import what tasks need, so that the first waits less."""
+    try:
+        Path.cwd()
+    except FileNotFoundError:
+        os.chdir("/")  # somebody removed the directory, which multiprocessing asks for, and tasks begin in
     if len(tempfile.gettempdir()) > LONGEST_FOLDER:
         own, tempfile.tempdir = tempfile.tempdir, "/tmp"
         try:
@@ -78,10 +89,9 @@ def revive() -> bool:
     template = _template()
     if template is not None and not is_stopped(template):
         return True
-    if template is not None:
-        os.kill(template, signal.SIGKILL)  # whoever waits for it, and has the turn, then sees its end
+    _kill_template()
     get_ready()
-    return sys.platform != "linux"
+    return not CHILDREN.exists()
 
 
 def _template() -> int | None:
@@ -91,6 +101,13 @@ def _template() -> int | None:
             if b"multiprocessing.forkserver" in Path(f"/proc/{child}/cmdline").read_bytes():
                 return child
     return None
+
+
+def _kill_template() -> None:
+    """Kill the template: whoever waits for it then sees its end, and tasks go on."""
+    if (template := _template()) is not None:
+        with suppress(ProcessLookupError):
+            os.kill(template, signal.SIGKILL)
 
 
 def run_errand(task: str, arguments: Sequence[str], scratch: Path, limits: ErrandLimits) -> TaskResult | None:
@@ -106,46 +123,92 @@ def run_errand(task: str, arguments: Sequence[str], scratch: Path, limits: Erran
         What it said; None when it took longer than it may, and was ended.
 
     Raises:
-        Busy: the server ended meanwhile, or there is no process.
+        Busy: the server ended meanwhile, there is no process, or it was ended with its template, twice.
     """
-    process, pipe = _start(task, list(arguments), str(scratch), limits.memory_bytes)
+    for _ in range(2):
+        result = _run_once(task, arguments, scratch, limits)
+        if result is None or result.returncode is not None or result.last["event"] not in ("nothing", "ready"):
+            return result
+    raise Busy("server", expected="a process that works on it", got="one that was ended", hint="try again soon")
+
+
+def _run_once(task: str, arguments: Sequence[str], scratch: Path, limits: ErrandLimits) -> TaskResult | None:
+    process, pipe = _start(limits.ending, task, list(arguments), str(scratch), limits.memory_bytes)
     with pipe:
         last = _read_last_message(pipe, limits)
-    if last is not None:
-        wait([process.sentinel], GONE_SECONDS)
+    if not wait([process.sentinel], 0 if last is None else GONE_SECONDS):
+        process.kill()
+    while not wait([process.sentinel], GONE_SECONDS):
+        _kill_template()  # which hangs: it would have told of the end
     with _TURN:
-        if process.is_alive():
-            process.kill()
         process.join()
         status = process.exitcode
         process.close()  # with its lifeline, which ends one whose template is gone
-    if limits.ending.is_set() and last is None:
-        raise Busy("upload", expected="a running server", got="one that stops", hint="send it again")
     if last is None:
+        _require_running(limits.ending)
         return None
-    printed = scratch / PRINTED
-    trace = printed.read_text(errors="replace") if printed.exists() else ""
-    return TaskResult(last, None if status == TEMPLATE_DIED else status, trace)
+    return TaskResult(last, None if status == TEMPLATE_DIED else status, _end_of(scratch / PRINTED))
 
 
-def _start(*given: Any) -> tuple[ForkServerProcess, Connection]:
+def _require_running(ending: threading.Event) -> None:
+    if ending.is_set():
+        raise Busy("server", expected="a running server", got="one that stops", hint="send it again")
+
+
+def _end_of(printed: Path) -> str:
+    """The last of what a task printed, which may be without end."""
+    if not printed.exists():
+        return ""
+    with printed.open("rb") as file:
+        file.seek(max(0, printed.stat().st_size - TRACE_BYTES))
+        return file.read(TRACE_BYTES).decode(errors="replace")
+
+
+def _start(ending: threading.Event, *given: Any) -> tuple[ForkServerProcess, Connection]:
     """A new task, and the pipe through which it says what comes of it.
 
     Raises:
-        Busy: the system has no room for a process, or the template does not start.
+        Busy: the server ends, the system has no room for a process, or the template does not start.
     """
-    for _ in range(2):  # the template may have died while idle
-        read, write = os.pipe()
-        ours, theirs = Connection(read, writable=False), Connection(write, readable=False)
-        task = CONTEXT.Process(target=_child_main, args=(theirs, *given), daemon=True)
-        try:
-            with theirs, _TURN:
-                get_ready()
-                task.start()
-            return task, ours
-        except (OSError, EOFError):
-            ours.close()
-    raise Busy("upload", expected="room for a process", got="none", hint="try again soon")
+    reason = ""
+    for pause in (0.0, DYING_SECONDS):  # the template may die over it
+        time.sleep(pause)
+        with ExitStack() as opened:
+            try:
+                read, write = os.pipe()
+                ours = opened.enter_context(Connection(read, writable=False))
+                theirs = Connection(write, readable=False)
+                task = CONTEXT.Process(target=_child_main, args=(theirs, *given), daemon=True)
+                with theirs, _TURN:
+                    _require_running(ending)
+                    get_ready()
+                    with _bounded(ending):
+                        task.start()
+                    _FORKED.update(filter(None, [_template()]))
+                opened.pop_all()
+                return task, ours
+            except (OSError, EOFError, RuntimeError) as error:  # the last: no room for a thread
+                log.warning("a process for %s does not start", given[0], exc_info=True)
+                reason = getattr(error, "strerror", None) or "one that ended"
+    raise Busy("server", expected="a process that starts", got=reason, hint="try again soon")
+
+
+@contextmanager
+def _bounded(ending: threading.Event) -> Iterator[None]:
+    """Kill the template where it takes too long over a fork, or the server ends meanwhile."""
+    done = threading.Event()
+    deadline = time.monotonic() + (FORK_SECONDS if _template() in _FORKED else IMPORT_SECONDS)
+
+    def watch() -> None:
+        while not done.wait(TICK_SECONDS):
+            if ending.is_set() or time.monotonic() > deadline:
+                _kill_template()
+
+    threading.Thread(target=watch, daemon=True).start()
+    try:
+        yield
+    finally:
+        done.set()
 
 
 def _read_last_message(pipe: Connection, limits: ErrandLimits) -> dict[str, Any] | None:
@@ -165,7 +228,7 @@ def _child_main(pipe: Connection, task: str, arguments: list[str], scratch: str,
     parent = multiprocessing.parent_process()
     assert parent is not None
     end_with_parent(parent.sentinel)
-    printed = os.open(Path(scratch) / PRINTED, os.O_WRONLY | os.O_CREAT, 0o600)
+    printed = os.open(Path(scratch) / PRINTED, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
     for stream in (1, 2):
         os.dup2(printed, stream)
     os.environ["TMPDIR"] = tempfile.tempdir = scratch
