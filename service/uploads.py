@@ -15,7 +15,7 @@ from liftcore.errors import InvalidInput, InvalidLift, NotFound
 from liftcore.files import require_pairs
 from service.child import error_of
 from service.errand import ErrandLimits, run_errand
-from service.errors import Busy, Crashed, DigestMismatch, TooLarge, UnsupportedEncoding
+from service.errors import Crashed, DigestMismatch, TooLarge, UnsupportedEncoding
 from service.models import AssetKind, UploadKind
 from service.store.assets import ALL, SHOWN_CHARACTERS, AssetRecord, CheckedUpload
 from service.store.files import is_whole
@@ -32,7 +32,6 @@ INVALID: dict[UploadKind, type[InvalidInput]] = {
 
 STEP = 4 << 20  # bytes of content between two looks at what may still be stored
 CHECK_BASE_BYTES, CHECK_FACTOR = 1 << 30, 16  # private memory of a check: a reader holds several copies of a file
-TRACE_CHARACTERS = 4000  # of a check that died, in the log
 HINTS: dict[UploadKind, str] = {AssetKind.FEATURES: "several feature packs may make one lift, so features can be cut"}
 
 log = logging.getLogger(__name__)
@@ -235,29 +234,32 @@ def check(kind: UploadKind, path: Path, scratch: Path, limits: ErrandLimits, *be
     Raises:
         InvalidInput: the file is malformed, or it takes more time or memory than it may.
         Crashed: the process did not get as far as opening the file.
-        Busy: the server ended meanwhile, or what makes processes was ended, twice.
+        Busy: as `run_errand` has it.
     """
     memory = min(limits.memory_bytes, CHECK_BASE_BYTES + CHECK_FACTOR * sum(map(_size, (path, *beside))))
     given = [kind, str(path), *map(str, beside)]
     heard = run_errand("service.tasks.check", given, scratch, replace(limits, memory_bytes=memory))
     if heard is None:
-        raise INVALID[kind](
-            kind, expected=f"a file that is read within {limits.seconds:g} s", got="one that takes longer"
-        )
+        raise too_slow(kind, limits)
     if heard.last["event"] == "valid":
         return Report(suffix=heard.last["suffix"], counts=heard.last["counts"], warnings=heard.last["warnings"])
     if heard.last["event"] == "invalid":
         raise error_of(heard.last["fault"])
-    log.error("the check of %s ended with %s: %s", kind, heard.returncode, heard.trace[-TRACE_CHARACTERS:])
+    log.error("the check of %s ended with %s: %s", kind, heard.returncode, heard.trace)
     if heard.last["event"] == "ready":
         # It had started to read: whatever ended it, this file did.
         raise INVALID[kind](
             kind, expected="a file that its reader can take", got=f"one that ended it with {heard.returncode}",
             hint="it may be broken, or need more memory than an upload may take",
         )  # fmt: skip
-    if heard.returncode is None:
-        raise Busy("upload", expected="a process that checks it", got="one that was ended", hint="try again soon")
     raise Crashed("check", expected="a process that starts", got=f"one that ended with {heard.returncode}")
+
+
+def too_slow(kind: UploadKind, limits: ErrandLimits) -> InvalidInput:
+    """What to say of a file that takes longer to read than it may."""
+    return INVALID[kind](
+        kind, expected=f"a file that is read within {limits.seconds:g} s", got="one that takes longer"
+    )
 
 
 def _size(path: Path) -> int:

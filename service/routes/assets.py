@@ -17,7 +17,7 @@ from service.errors import Crashed
 from service.requests import JsonRoute
 from service.state import AppState, Deps
 from service.store.assets import SHOWN_CHARACTERS, AssetRecord
-from service.uploads import AssetIntake, Intake, Taken, require_plain, require_size
+from service.uploads import AssetIntake, Intake, Taken, require_plain, require_size, too_slow
 
 T = TypeVar("T")
 BATCH = 1 << 20  # bytes gathered before a thread writes them
@@ -148,7 +148,9 @@ def _retagged(asset: str, change: models.PackChange, deps: AppState) -> tuple[As
             header = scratch / "header"
             given = [str(found.path), change.model_dump_json(exclude_none=True), str(header)]
             heard = run_errand("service.tasks.rename", given, scratch, deps.check_limits)
-            if heard is None or heard.last["event"] != "valid":
+            if heard is None:
+                raise too_slow(models.AssetKind.FEATURES, deps.check_limits)
+            if heard.last["event"] != "valid":
                 raise Crashed(
                     "asset", expected="a pack whose header is read", got="one that is not", hint="try again"
                 )

@@ -13,6 +13,7 @@ from fastapi.testclient import TestClient
 
 from liftcore.evaluate.inspect import inspect_file
 from liftcore.io import safetensors_file
+from service.routes import assets
 from service.store.files import DataDirectory
 from service.store.keys import Quota
 from service.store.owners import parse_scopes
@@ -52,6 +53,15 @@ def test_packs_are_named_anew_as_assets_of_their_own(client: TestClient, uploade
     assert_problem(client.patch(f"/assets/{uploaded.splats}", json={"encoder": "x"}))
     for wrong in ({"encoder": ""}, {"text_space": "a\nb"}, {"words": "x"}):
         assert assert_problem(client.patch(at, json=wrong))["status"] == 422
+
+
+def test_pack_that_takes_too_long_to_name_anew_is_told_as_a_slow_upload_is(
+    client: TestClient, uploaded: Uploaded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(assets, "run_errand", lambda *given: None)
+    told = assert_problem(client.patch(f"/assets/{uploaded.features}", json={"encoder": "slow"}))
+    assert (told["status"], told["type"]) == (422, "/problems/invalid-features")
+    assert "takes longer" in told["got"]
 
 
 def test_long_header_of_a_pack_is_changed_outside_of_the_server(
