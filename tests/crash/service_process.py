@@ -16,6 +16,7 @@ from typing import Any, Self
 import httpx
 from safetensors.numpy import load
 
+from service.child import children_of
 from service.jobs.process import MARK
 
 ROOT = Path(__file__).parents[2]
@@ -123,8 +124,8 @@ def processes_of(job: str) -> list[int]:
 
 def template_of(server: int) -> int:
     """The process that a server's checks are forked from."""
-    for tasks in Path(f"/proc/{server}/task").iterdir():
-        for child in map(int, (tasks / "children").read_text().split()):
+    for child in children_of(server):
+        with contextlib.suppress(OSError):
             if b"multiprocessing.forkserver" in Path(f"/proc/{child}/cmdline").read_bytes():
                 return child
     raise AssertionError("none runs")
