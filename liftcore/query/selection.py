@@ -17,6 +17,8 @@ any other thing, in features; and where less than `MOST` is selected, no other t
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -117,10 +119,14 @@ def nearer_than_rivals(scene: OpenedLift, selected: np.ndarray, rivals: Rivals) 
     """[P] bool: the selected splats [P] bool to which no rival is nearer than the query's words."""
     kept = np.zeros_like(selected)
     rows = np.flatnonzero(selected)
-    for first in range(0, len(rows), _AT_ONCE):
+
+    def compare(first: int) -> None:
         some = rows[first : first + _AT_ONCE]
         own, others = products(scene.features[some], scene.norms[some], rivals.directions, rivals.vectors)
         kept[some] = others.max(axis=1) <= own.max(axis=1)
+
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        list(pool.map(compare, range(0, len(rows), _AT_ONCE)))
     return kept
 
 
