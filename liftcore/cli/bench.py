@@ -31,5 +31,7 @@ def run(options: argparse.Namespace) -> int:
     """Measure, and print the figures with the hardware they were taken on."""
     from liftcore.evaluate import run_bench
 
-    reply(run_bench(vars(options)), as_json=options.json)
+    names = ("scene", "splats", "size", "channels", "levels", "views", "threads", "preset", "device")
+    values = {name: value for name in names if (value := getattr(options, name))}
+    reply(run_bench(**values), as_json=options.json)
     return 0

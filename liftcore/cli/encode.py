@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from liftcore.cli.options import Parser, count
+from liftcore.cli.options import Parser, count, renamed
 from liftcore.cli.reply import reply, told_folders
 from liftcore.errors import InvalidInput
 
@@ -45,8 +45,9 @@ def run(options: argparse.Namespace) -> int:
             raise InvalidInput("--encoder", expected=expected, got=repr(spec), hint=f"{kind}:MODEL, or no --weights")
         spec = f"{spec}@{options.weights}"
     names = ("device", "cameras", "size", "batch", "normalised")
-    given = {name: getattr(options, name) for name in names}
-    document = encode_images(options.images, options.output, spec, **given, progress=True)
+    values = {name: getattr(options, name) for name in names}
+    with renamed({name: f"--{name}" for name in ("encoder", "device", "size")}):
+        document = encode_images(options.images, options.output, spec, **values, progress=True)
     line = f"{document['out']}: {document['views']} views, {document['channels']} channels, {document['bytes']} bytes"
     lines = [line, *told_folders(document["folders"]), *(f"warning: {text}" for text in document["warnings"])]
     reply(document, as_json=options.json, lines=lines)

@@ -5,8 +5,15 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from liftcore.cli.options import Parser, add_encoder
+from liftcore.cli.options import Parser, add_encoder, renamed
 from liftcore.cli.reply import reply
+
+NAMES = {
+    "data": "--data",
+    "held_out": "--held-out",
+    "give encoder=": "--table FILE or --encoder NAME",
+    "negatives=": "--negative words",
+}  # of arguments
 
 
 def add_arguments(parser: Parser) -> None:
@@ -36,16 +43,17 @@ def run(options: argparse.Namespace) -> int:
         threshold = float(options.threshold)
     except ValueError:
         threshold = options.threshold
-    found = evaluate_lifts(
-        options.dataset,
-        options.lifts,
-        options.data,
-        encoder=f"table:{options.table}" if options.table else options.encoder,
-        threshold=threshold,
-        negatives=options.negative,
-        held_out=options.held_out,
-        progress=True,
-        **({"protocols": options.protocol} if options.protocol else {}),
-    )
-    reply(found.document(), as_json=options.json, lines=found.lines())
+    with renamed(NAMES):
+        evaluation = evaluate_lifts(
+            options.dataset,
+            options.lifts,
+            options.data,
+            encoder=f"table:{options.table}" if options.table else options.encoder or None,
+            threshold=threshold,
+            negatives=options.negative,
+            held_out=options.held_out,
+            progress=True,
+            **({"protocols": options.protocol} if options.protocol else {}),
+        )
+    reply(evaluation.document(), as_json=options.json, lines=evaluation.lines())
     return 0

@@ -30,9 +30,9 @@ def add_arguments(parser: Parser) -> None:
     goes_on = "a killed lift goes on from there, and one of the same regions with other features walks none again"
     parser.add_argument("--checkpoint", type=Path, metavar="DIR", help=f"keep walked views there: {goes_on}")
     parser.add_argument("--threads", type=count, metavar="N", help="else as many as there are cores")
-    blocks = "lift in blocks, whose memory is bounded: in this process, or by the workers of a Ray cluster"
+    blocks = "lift in blocks, whose memory is bounded: local, in this process; ray, by the workers of a Ray cluster"
     shards = "X.shards as LIFT is a folder of shards"
-    parser.add_argument("--engine", choices=("local", "ray"), help=f"{blocks}; {shards}")
+    parser.add_argument("--engine", metavar="NAME", help=f"{blocks}; {shards}")
     parser.add_argument("--address", metavar="HOST:PORT", help="of the Ray cluster, or auto; else of this machine")
 
 

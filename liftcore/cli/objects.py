@@ -45,7 +45,11 @@ def run(options: argparse.Namespace) -> int:
     document: dict[str, Any] = {"encoder": None if encoder is None else encoder.name}
     document["answer"] = answer.model_dump(mode="json")
     # The keys of before, which go with the next release.
-    document |= {"explanation": found.explanation, "objects": [vars(one) for one in answer.objects]}
+    objects = [
+        {key: value for key, value in vars(one).items() if (key, value) != ("feature", None)}
+        for one in answer.objects
+    ]
+    document |= {"explanation": found.explanation, "objects": objects}
     exports: dict[str, Any] = {"csv": partial(scene.export, source=found)}
     if options.splats:
         from liftcore.files import check_output

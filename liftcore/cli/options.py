@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import contextmanager
 from pathlib import Path
 from types import UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, Self, Union, get_args, get_origin
 
-from liftcore.errors import InvalidInput, InvalidQuery
+from liftcore.errors import InvalidInput, InvalidQuery, SplatliftError
 from liftcore.files import is_remote
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from pydantic import BaseModel
 
@@ -24,6 +25,19 @@ ROLES = {  # of arguments that name files: what belongs there
 ORDER = ("splats", "cameras", "features")
 ORDERED = ("lift", "plan", "check", "tradeoff")  # commands that take splats, cameras and features
 PRESETS = "default, row-sum, tikhonov, argmax, top-k, front-mass, centre or mean"
+
+
+@contextmanager
+def renamed(names: Mapping[str, str]) -> Iterator[None]:
+    """Errors of the library in the command's words: arguments by their options; in hints ``NAME=`` by its option."""
+    try:
+        yield
+    except SplatliftError as error:
+        hint = error.hint
+        for name, option in names.items():
+            hint = hint.replace(name, option) if name.endswith("=") else hint
+        argument = names.get(error.argument, error.argument)
+        raise type(error)(argument, expected=error.expected, got=error.got, hint=hint) from None
 
 
 class Elsewhere(str):

@@ -6,16 +6,20 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import Parser
+from liftcore.cli.options import Parser, renamed
 from liftcore.cli.reply import reply, shown, told_folders
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-GIVEN = (
+OPTIONS = (
     "layout", "unlabelled", "encoder", "photos", "device", "names", "folders", "unannotated", "encoder_name",
     "text_space", "normalised",
 )  # options that `pack_folder` takes  # fmt: skip
+NAMES = {
+    "normalised": "--no-normalised",
+    **{name: f"--{name}" for name in ("device", "encoder", "names", "photos", "unlabelled")},
+}  # of arguments
 LARGEST_GREY = 65_535  # of a picture of 16 bits
 
 
@@ -89,18 +93,19 @@ def run(options: argparse.Namespace) -> int:
     from liftcore import pack_folder
     from liftcore.evaluate import inspect_file
 
-    given = {name: value for name, value in vars(options).items() if name in GIVEN}
-    made = pack_folder(options.folder, options.output, options.format, **given, progress=True)
+    values = {name: value for name, value in vars(options).items() if name in OPTIONS}
+    with renamed(NAMES):
+        facts = pack_folder(options.folder, options.output, options.format, **values, progress=True)
     described = inspect_file(options.output, "features")
     names = ("bytes", "views", "channels", "encoder", "text_space", "normalised")
     document = {
         "out": str(options.output),
         **{name: described[name] for name in names},
-        "folders": made["folders"],
+        "folders": facts["folders"],
         "sizes": described["sizes"],
-        "renamed": made["renamed"],
-        "words": made["words"],
-        "warnings": [*made["warnings"], *described["warnings"]],
+        "renamed": facts["renamed"],
+        "words": facts["words"],
+        "warnings": [*facts["warnings"], *described["warnings"]],
     }
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
@@ -110,12 +115,13 @@ def _retag(options: argparse.Namespace) -> int:
     """Write the pack under its new names, and say them."""
     from liftcore import read_features, retag_pack
 
-    given = {"encoder": options.encoder_name, "text_space": options.text_space}
-    retag_pack(options.pack, options.output, {name: value for name, value in given.items() if value})
+    names = {"encoder": options.encoder_name, "text_space": options.text_space}
+    with renamed({"names": "--text-space or --encoder-name"}):
+        retag_pack(options.pack, options.output, {name: value for name, value in names.items() if value})
     packs = read_features(options.output)
     document = {"out": str(options.output), "encoder": packs.encoder, "text_space": packs.text_space}
-    said = f"{options.output}: encoder {packs.encoder or 'not named'}, text space {packs.text_space or 'not named'}"
-    reply(document, as_json=options.json, lines=[said])
+    line = f"{options.output}: encoder {packs.encoder or 'not named'}, text space {packs.text_space or 'not named'}"
+    reply(document, as_json=options.json, lines=[line])
     return 0
 
 

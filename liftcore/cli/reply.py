@@ -10,9 +10,8 @@ from liftcore.errors import InvalidInput
 
 SHOWN_ITEMS = 6  # of a list, for people
 SHOWN_FOLDERS = 8
-LARGE = 1e5  # from here on numbers show about three decimals: places in map coordinates begin alike
+LARGE = 1e4  # from here on numbers show about three decimals: places in map coordinates begin alike
 MOST_DIGITS = 15
-MAP_REACH = 1e4  # scene units from the origin: so far, positions need more digits than elsewhere
 
 
 def reply(document: Mapping[str, Any], *, as_json: bool, lines: Iterable[str] | None = None) -> None:
@@ -86,7 +85,7 @@ def _nested(value: Any) -> str:
 def place_of(point: tuple[float, ...]) -> str:
     """A point for people, with four digits; of map coordinates, which all begin alike, with about three decimals."""
     reach = max(map(abs, point))
-    digits = 4 if reach < MAP_REACH else 4 + int(math.log10(reach))
+    digits = 4 if reach < LARGE else 4 + int(math.log10(reach))
     return f"({', '.join(f'{value:.{digits}g}' for value in point)})"
 
 

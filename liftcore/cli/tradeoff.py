@@ -7,9 +7,8 @@ import shlex
 from pathlib import Path
 
 from liftcore.cli.lift import pairs_of
-from liftcore.cli.options import Parser, add_sources, count
+from liftcore.cli.options import Parser, add_sources, count, renamed
 from liftcore.cli.reply import reply
-from liftcore.errors import InvalidSettings
 
 
 def add_arguments(parser: Parser) -> None:
@@ -38,30 +37,26 @@ def _seconds(text: str) -> float:
 
 def run(options: argparse.Namespace) -> int:
     """Compare, write the chart, the table and the JSON, and say what to take."""
-    from liftcore import LiftSettings
-
     settings = pairs_of(options.set)
-    LiftSettings.of(**settings)
-    if "speed" in settings:
-        raise InvalidSettings("--set", expected="settings that are the same in all runs", got="speed")
     from liftcore.evaluate import SceneFiles, compare_speeds
     from liftcore.files import check_output, writing
 
     check_output(options.out / "tradeoff.json", [], "json")
     sources = options.splats, options.cameras, tuple(options.features)
-    found = compare_speeds(
-        SceneFiles(*sources, options.labels, options.table, tuple(options.classes)),
-        budget=options.budget,
-        settings=settings,
-        threads=options.threads,
-        progress=True,
-        scene=options.splats.resolve().parent.name,
-        command=_command(options),
-    )
+    with renamed({"settings": "--set"}):
+        comparison = compare_speeds(
+            SceneFiles(*sources, options.labels, options.table, tuple(options.classes)),
+            budget=options.budget,
+            settings=settings,
+            threads=options.threads,
+            progress=True,
+            scene=options.splats.resolve().parent.name,
+            command=_command(options),
+        )
     with writing(options.out):
-        files = found.save(options.out)
-    document = found.document | {"files": [str(file) for file in files]}
-    reply(document, as_json=options.json, lines=[*found.lines(), "", *document["files"]])
+        files = comparison.save(options.out)
+    document = comparison.document | {"files": [str(file) for file in files]}
+    reply(document, as_json=options.json, lines=[*comparison.lines(), "", *document["files"]])
     return 0
 
 

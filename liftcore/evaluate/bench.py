@@ -2,7 +2,7 @@
 
 import statistics
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,11 @@ import torch
 from liftcore.errors import InvalidInput
 from liftcore.evaluate.hardware import hardware, peak_memory
 from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
+from liftcore.io.remote import local_path
 from liftcore.lifting.warm_up import warm_up_lift
 from liftcore.raster import open_raster
 from liftcore.raster.base import Raster, ViewRequest
+from liftcore.runtime.arguments import check_count
 from liftcore.runtime.device import Device, choose_device
 from liftcore.runtime.one_thread import one_thread
 from liftcore.scene.cameras import Camera
@@ -39,24 +41,44 @@ class Workload:
     views: Sequence[tuple[Camera, ViewFeatures]]
 
 
-def run_bench(options: Mapping[str, Any]) -> dict[str, Any]:
+def run_bench(
+    scene: Path | str | None = None,
+    *,
+    splats: int = 1_000_000,
+    size: str = "986x728",
+    channels: int = 512,
+    levels: int = 4,
+    views: int = 8,
+    threads: int | None = None,
+    preset: str | None = None,
+    device: str = "auto",
+) -> dict[str, Any]:
     """Time the lift of a real scene or of a synthetic room, by all presets or by one.
 
     Args:
-        options: as `workload` takes them; ``threads``, ``preset``, and ``device`` ("auto", "cpu" or "cuda"). What is
-            not named or None has its default.
+        scene: a folder with point_cloud.ply, cameras and region maps; None: a synthetic room.
+        splats: of the room. size: of its images, WIDTHxHEIGHT in pixels.
+        channels: of features. levels: of labels. views: at most.
+        threads: None takes the cores that this process may use. preset: None: all. device: auto, cpu or cuda.
 
     Returns:
         Plain numbers, ready for JSON: hardware, versions, seconds a view by stage (medians), peak memory.
 
     Raises:
-        InvalidInput: a size or a folder that makes no workload. InvalidSettings: an unknown preset or device.
+        InvalidInput: a size or a folder that makes no workload. InvalidSettings: a count that is none, or an unknown
+            preset or device.
     """
-    device = choose_device(LiftSettings.of(device=options.get("device") or "auto").device)
-    presets = [LiftSettings.of(preset=options["preset"]).preset] if options.get("preset") else list(Preset)
-    work = workload(options)
+    place = choose_device(LiftSettings.of(device=device).device)
+    presets = [LiftSettings.of(preset=preset).preset] if preset else list(Preset)
+    for name, count in {"splats": splats, "channels": channels, "levels": levels, "views": views}.items():
+        check_count(name, count)
+    check_count("threads", threads, "all cores")
+    if scene:
+        work = _scene(local_path(scene, "scene"), channels, levels, views)
+    else:
+        work = _room(splats, size, channels, levels, views)
     start = time.perf_counter()
-    warm_up_lift(work.splats.kernel, device, LiftSettings.of(preset=Preset.ROW_SUM))
+    warm_up_lift(work.splats.kernel, place, LiftSettings.of(preset=Preset.ROW_SUM))
     compile_seconds = time.perf_counter() - start
     camera, observed = work.views[0]
     return {
@@ -66,11 +88,11 @@ def run_bench(options: Mapping[str, Any]) -> dict[str, Any]:
         "width": camera.width,
         "height": camera.height,
         "channels": observed.codebook.shape[1],
-        "levels": options.get("levels") or 4,
+        "levels": levels,
         "compile_or_load_s": compile_seconds,
-        "presets": {str(preset): time_lift(work, preset, device, options.get("threads")) for preset in presets},
+        "presets": {str(one): time_lift(work, one, place, threads) for one in presets},
         "peak_memory_bytes": peak_memory(),
-        "hardware": hardware() | ({} if device.kind == "cpu" else {"device": device.facts()}),
+        "hardware": hardware() | ({} if place.kind == "cpu" else {"device": place.facts()}),
     }
 
 
@@ -127,30 +149,16 @@ def weigh_regions(
     return stacked(parts, count, threads), Codebook(tuple(codebooks))
 
 
-def workload(options: Mapping[str, Any]) -> Workload:
-    """What to lift.
-
-    Args:
-        options: ``scene``, a folder with point_cloud.ply, cameras and region maps; without it a synthetic room of
-            ``splats`` and of images of ``size`` ("WxH"). ``channels``, ``levels`` of labels, and at most ``views``.
-
-    Raises:
-        InvalidInput: the size is none, or the folder lacks something.
-    """
-    channels, levels = options.get("channels") or 512, options.get("levels") or 4
-    count, folder = options.get("views") or 8, options.get("scene")
-    if folder:
-        return _real(Path(folder), channels, levels, count)
-    size = options.get("size") or "986x728"
-    width, times, height = size.lower().partition("x")
-    if not (times and width.isdigit() and height.isdigit()):
-        raise InvalidInput("size", expected="WIDTHxHEIGHT in pixels", got=repr(size))
-    cameras = room_cameras(count, int(width), int(height))
-    views = [(camera, room_regions(camera, k, levels, channels)) for k, camera in enumerate(cameras)]
-    return Workload("synthetic room", room_splats(options.get("splats") or 1_000_000), views)
+def _room(splats: int, size: str, channels: int, levels: int, views: int) -> Workload:
+    width, times, height = str(size).lower().partition("x")
+    if not (times and width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise InvalidInput("size", expected="WIDTHxHEIGHT in pixels", got=repr(size)[:80])
+    cameras = room_cameras(views, int(width), int(height))
+    observed = [(camera, room_regions(camera, k, levels, channels)) for k, camera in enumerate(cameras)]
+    return Workload("synthetic room", room_splats(splats), observed)
 
 
-def _real(folder: Path, channels: int, levels: int, count: int) -> Workload:
+def _scene(folder: Path, channels: int, levels: int, count: int) -> Workload:
     from liftcore.io.cameras import read_cameras
     from liftcore.io.splats import read_splats
     from liftcore.values.pack import pair, read_features

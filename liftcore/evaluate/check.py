@@ -24,6 +24,7 @@ from liftcore.features.encoders.encode import TURNS, find_images, read_image, re
 from liftcore.features.smoothness import smoothness, unlike_maps
 from liftcore.io.cameras import read_cameras
 from liftcore.io.photos import PhotoHeader, orientation_warnings, read_header
+from liftcore.io.remote import local_path
 from liftcore.io.splats import read_splats
 from liftcore.lifting.planning.contradictions import (
     FAR_SCALES,
@@ -39,6 +40,7 @@ from liftcore.lifting.planning.views import visibility
 from liftcore.query.splat_colours import seen_colours
 from liftcore.raster import open_raster
 from liftcore.raster.base import Raster
+from liftcore.runtime.arguments import as_list
 from liftcore.runtime.device import CPU
 from liftcore.runtime.progress import Progress, shown_progress
 from liftcore.scene.cameras import Camera, Cameras
@@ -94,8 +96,8 @@ class CheckReport:
 def check_scene(
     splats: Splats | Path | str,
     cameras: Cameras | Path | str,
-    photos: Mapping[str, Path] | Sequence[Path] | None = None,
-    features: Views | Sequence[Path | str] | None = None,
+    photos: Mapping[str, Path | str] | Path | str | Sequence[Path | str] | None = None,
+    features: Views | Path | str | Sequence[Path | str] | None = None,
     progress: Progress | bool | None = False,
     settings: LiftSettings | None = None,
 ) -> CheckReport:
@@ -111,9 +113,12 @@ def check_scene(
         InvalidInput: an image that cannot be read. InvalidFeatures: features that cannot be read.
         InvalidSplats, InvalidCameras: as readers of splats and cameras have it.
     """
-    settings = settings or LiftSettings.of()
-    features = features if features is None or isinstance(features, Views) else read_features(*features)
-    images = photos if isinstance(photos, Mapping) else find_images(photos or ())
+    settings = LiftSettings.or_default(settings)
+    features = features if features is None or isinstance(features, Views) else read_features(*as_list(features))
+    if isinstance(photos, Mapping):
+        images = {view: local_path(file, "photos") for view, file in photos.items()}
+    else:
+        images = find_images(photos or ())
     splats = splats if isinstance(splats, Splats) else read_splats(splats, settings.kernel)
     if not isinstance(cameras, Cameras):
         cameras = read_cameras(cameras, views=features.views if features is not None else list(images))

@@ -21,6 +21,7 @@ from liftcore.io.ply import nearest_dialect
 from liftcore.io.remote import local_path
 from liftcore.io.splats import format_of, read_splats, splat_files
 from liftcore.io.transforms import FRAME_FILE
+from liftcore.runtime.arguments import check_choice
 from liftcore.runtime.plugins import Plugin
 from liftcore.scene.cameras import Cameras, distortion_warning
 from liftcore.scene.compositing import ALPHA_FLOOR
@@ -65,9 +66,11 @@ def inspect_file(path: Path | str, kind: str = "", *, trusted: bool = True) -> d
         ``kind``, ``bytes``, counts and ranges of the kind, and ``warnings``: what looks wrong.
 
     Raises:
-        InvalidInput: the file is missing, malformed or none of these.
+        InvalidInput: the file is missing, malformed or none of these, or there is no such kind.
     """
     path = local_path(path)
+    if kind:
+        check_choice("kind", kind, DESCRIPTIONS)
     if not path.exists():
         raise InvalidInput(str(path), expected="a file or a folder", got="nothing of that name")
     found = identify(path)

@@ -233,7 +233,7 @@ def _measurable(settings: EvaluationSettings, encoder: TextEncoder) -> tuple[lis
     if len(protocols) == len(settings.protocols):
         return protocols, []
     expected = f"an encoder that reads its negatives ({', '.join(DEFAULT_NEGATIVES)})"
-    got, hint = f"{encoder.name} without {_named(lacking)}", "give --negative words that it has, or another encoder"
+    got, hint = f"{encoder.name} without {_named(lacking)}", "give negatives= that it has, or another encoder"
     if not protocols:
         raise InvalidQuery("encoder of P1", expected=expected, got=got, hint=hint)
     return protocols, [f"P1 is left out: it needs {expected}, got {got}; {hint}"]

@@ -107,7 +107,7 @@ def lerf_scenes(data: Path) -> dict[str, LerfScene]:
         if files:
             found[folder.name] = LerfScene(folder.name, files)
     if not found:
-        raise InvalidInput("--data", expected="LeRF-OVS with label/SCENE/frame_*.json", got=f"none in {data}")
+        raise InvalidInput("data", expected="LeRF-OVS with label/SCENE/frame_*.json", got=f"none in {data}")
     return found
 
 
@@ -209,7 +209,7 @@ def three_d_ovs_scenes(data: Path) -> dict[str, ThreeDOvsScene]:
             found[name] = ThreeDOvsScene(name, _classes(labels / _CLASSES), views)
     if not found:
         expected = f"3D-OVS with SCENE/segmentations/{_CLASSES}"
-        raise InvalidInput("--data", expected=expected, got=f"none in {data}")
+        raise InvalidInput("data", expected=expected, got=f"none in {data}")
     return found
 
 

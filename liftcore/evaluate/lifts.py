@@ -13,11 +13,14 @@ from liftcore.evaluate.labels import lerf_scenes, three_d_ovs_scenes
 from liftcore.evaluate.protocols import EvaluationProtocol
 from liftcore.evaluate.published import Published, published
 from liftcore.io.files import visible_files
+from liftcore.io.remote import check_path, local_path
 from liftcore.query.scene import Scene
+from liftcore.runtime.arguments import as_list, check_choice
 from liftcore.runtime.progress import Progress, shown_progress
 from liftcore.scene.views import view_names
 from liftcore.text import TextEncoder
 
+_DATASETS = {"lerf-ovs": lerf_scenes, "3d-ovs": three_d_ovs_scenes}
 _LIFT_SUFFIX = ".safetensors"
 _IOUS = {"object_micro": "mIoU, objects", "frame_macro": "mIoU, frames", "class_pooled": "IoU, classes"}
 _SHOWN = {  # the means of a protocol that a table shows, and their names there
@@ -78,14 +81,14 @@ class Evaluation:
 
 def evaluate_lifts(
     dataset: Literal["lerf-ovs", "3d-ovs"],
-    lifts: Sequence[str],
-    data: Path,
+    lifts: Path | str | Sequence[Path | str],
+    data: Path | str,
     *,
     encoder: TextEncoder | str | None = None,
-    protocols: Sequence[str] = tuple(EvaluationProtocol),
+    protocols: str | Sequence[str] = tuple(EvaluationProtocol),
     threshold: str | float = "auto",
-    negatives: Sequence[str] = (),
-    held_out: Path | None = None,
+    negatives: str | Sequence[str] = (),
+    held_out: Path | str | None = None,
     progress: Progress | bool | None = None,
 ) -> Evaluation:
     """Judge every lift whose scene is labelled.
@@ -100,49 +103,54 @@ def evaluate_lifts(
         progress: as `liftcore.lift` has it.
 
     Raises:
-        InvalidInput: a lift belongs to no labelled scene, or two to one; or as `evaluate_scene` has it.
+        InvalidInput: a lift belongs to no labelled scene, or two to one; there is no such dataset or protocol; or as
+            `evaluate_scene` has it.
         InvalidQuery, InvalidLift, Unavailable: as `evaluate_scene` and `Scene.encoder` have it.
     """
-    labelled = lerf_scenes(data) if dataset == "lerf-ovs" else three_d_ovs_scenes(data)
-    named = find_lifts(lifts, labelled)
-    names = _names(held_out) if held_out else None
-    chosen = tuple(EvaluationProtocol(name) for name in dict.fromkeys(protocols))
-    settings = EvaluationSettings(chosen, threshold, tuple(negatives), names)
+    check_choice("dataset", dataset, _DATASETS)
+    labels = _DATASETS[dataset](local_path(data, "data"))
+    files = find_lifts(as_list(lifts), labels)
+    names = _names(local_path(held_out, "held_out")) if held_out else None
+    for name in as_list(protocols):
+        check_choice("protocols", name, EvaluationProtocol)
+    ways = tuple(EvaluationProtocol(name) for name in dict.fromkeys(as_list(protocols)))
+    settings = EvaluationSettings(ways, threshold, tuple(as_list(negatives)), names)
     results: list[SceneResult] = []
     warnings: list[str] = []
     with shown_progress(progress) as reporter:
-        for name, path in named.items():
+        for name, path in files.items():
             scene = Scene(path)
-            reader = scene.encoder(encoder, hint="--table FILE or --encoder NAME", stand_in=False)
-            found, said = evaluate_scene(labelled[name], scene, reader, settings, reporter)
-            results += found
-            warnings += said
-    rows = published(dataset, named)
-    return Evaluation(dataset, named, settings, tuple(results), tuple(rows), tuple(warnings))
+            reader = scene.encoder(encoder, hint="give encoder=", stand_in=False)
+            scene_results, notes = evaluate_scene(labels[name], scene, reader, settings, reporter)
+            results += scene_results
+            warnings += notes
+    rows = published(dataset, files)
+    return Evaluation(dataset, files, settings, tuple(results), tuple(rows), tuple(warnings))
 
 
-def find_lifts(given: Sequence[str], scenes: Collection[str]) -> dict[str, Path]:
+def find_lifts(lifts: Iterable[Path | str], scenes: Collection[str]) -> dict[str, Path]:
     """Scene -> its lift, of ``SCENE=LIFT``, of files named after their scenes, and of folders of those.
 
     Raises:
         InvalidInput: a lift belongs to no labelled scene, or two belong to one.
     """
-    found: dict[str, Path] = {}
-    for text in given:
+    by_scene: dict[str, Path] = {}
+    for lift in lifts:
+        check_path(lift, "lifts")
+        text = str(lift)
         scene, equals, rest = text.partition("=")
         path = Path(rest if equals and scene in scenes else text)
         pairs = [(scene, path)] if equals and scene in scenes else _named_lifts(path, scenes)
-        for name, lift in pairs:
-            if name in found:
-                raise InvalidInput("lifts", expected="one lift a scene", got=f"{found[name]} and {lift} of {name}")
-            found[name] = lift
-    return found
+        for name, file in pairs:
+            if name in by_scene:
+                raise InvalidInput("lifts", expected="one lift a scene", got=f"{by_scene[name]} and {file} of {name}")
+            by_scene[name] = file
+    return by_scene
 
 
 def _named_lifts(path: Path, scenes: Collection[str]) -> list[tuple[str, Path]]:
     files = visible_files(path, f"*{_LIFT_SUFFIX}") if path.is_dir() else [path]
-    named = [(file.name.partition(".")[0], file) for file in files]
-    pairs = [(name, file) for name, file in named if name in scenes]
+    pairs = [(name, file) for file in files if (name := file.name.partition(".")[0]) in scenes]
     if not pairs and len(scenes) == 1 and path.is_file():
         return [(next(iter(scenes)), path)]
     if not pairs:
@@ -161,10 +169,10 @@ def _names(path: Path) -> frozenset[str]:
     try:
         lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
     except (OSError, UnicodeDecodeError) as error:
-        raise InvalidInput("--held-out", expected="a file of view names, one a line", got=str(error)) from None
+        raise InvalidInput("held_out", expected="a file of view names, one a line", got=str(error)) from None
     names = frozenset(view_names([line])[0] for line in lines if line)
     if not names:
-        raise InvalidInput("--held-out", expected="a file of view names, one a line", got=f"none in {path}")
+        raise InvalidInput("held_out", expected="a file of view names, one a line", got=f"none in {path}")
     return names
 
 
@@ -187,9 +195,9 @@ def _table(results: Sequence[SceneResult], rows: Sequence[Published]) -> Iterabl
     for row in rows:
         cells = [f"{row.scenes[name]:.1f}" if name in row.scenes else "" for name in scenes]
         mean = f"{row.mean:.1f}" if row.scenes.keys() <= set(scenes) else ""  # over the paper's scenes
-        known = row.protocol if row.protocol in _SHOWN else "unknown"
+        protocol = row.protocol if row.protocol in _SHOWN else "unknown"
         source = f"{row.source}, {row.note}" if row.note else row.source
-        lines.append(("published", known, row.metric, "", *cells, mean, row.method, source))
+        lines.append(("published", protocol, row.metric, "", *cells, mean, row.method, source))
     widths = [max(len(line[k]) for line in lines) for k in range(len(head))]
     for line in lines:
         yield "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()

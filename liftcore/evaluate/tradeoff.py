@@ -28,6 +28,7 @@ from liftcore.evaluate.class_masks import read_masks
 from liftcore.evaluate.hardware import hardware, peak_memory
 from liftcore.evaluate.ranking import accuracy_of, choose
 from liftcore.io.cameras import read_cameras
+from liftcore.io.remote import local_path, local_paths
 from liftcore.lifting.files import open_files
 from liftcore.lifting.pipeline import lift
 from liftcore.lifting.planning.views import spread
@@ -39,6 +40,7 @@ from liftcore.query.render import view_mask
 from liftcore.query.result import LiftResult
 from liftcore.query.scene import Scene
 from liftcore.raster import open_raster
+from liftcore.runtime.arguments import as_list
 from liftcore.runtime.device import CPU, choose_device
 from liftcore.runtime.progress import Progress, one_step
 from liftcore.scene.cameras import Cameras
@@ -119,7 +121,7 @@ class SceneFiles:
         InvalidInput: labels without the words of their classes.
     """
 
-    splats: Path
+    splats: Path  # any may be given as text
     cameras: Path
     features: tuple[Path, ...]
     labels: Path | None = None  # masks of views, VIEW/mask [h, w] int: numbers of classes, -1 none
@@ -127,6 +129,11 @@ class SceneFiles:
     classes: tuple[str, ...] = ()  # the words of the classes, in the order of their numbers
 
     def __post_init__(self) -> None:
+        for name in ("splats", "cameras", "labels", "table"):
+            path = getattr(self, name)
+            object.__setattr__(self, name, None if path is None else local_path(path, name))
+        object.__setattr__(self, "features", tuple(local_paths(self.features, "features")))
+        object.__setattr__(self, "classes", tuple(as_list(self.classes)))
         if self.labels is not None and (self.table is None or not self.classes):
             raise InvalidInput("labels", expected="a table and the classes' words beside them", got="no words")
 

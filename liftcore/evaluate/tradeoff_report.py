@@ -11,6 +11,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from liftcore.errors import InvalidSettings
 from liftcore.evaluate.hardware import machine_line
 from liftcore.evaluate.ranking import NAMES
 from liftcore.evaluate.tradeoff import SceneFiles, compare
@@ -73,12 +74,15 @@ def compare_speeds(
         scene, command: that the report names.
 
     Raises:
-        InvalidInput: the scene lacks what is needed; or whatever a lift refuses.
+        InvalidSettings: ``speed`` among the settings. InvalidInput: the scene lacks what is needed; or whatever a
+            lift refuses.
         Unavailable: a run did not end within a day.
     """
+    if "speed" in settings:
+        raise InvalidSettings("settings", expected="settings that are the same in all runs", got="speed")
     with shown_progress(progress) as reporter:
-        found = compare(files, budget, settings, threads, reporter, kernel)
-    return SpeedComparison(finite({"title": TITLE, "scene": scene, "command": command} | found))
+        facts = compare(files, budget, settings, threads, reporter, kernel)
+    return SpeedComparison(finite({"title": TITLE, "scene": scene, "command": command} | facts))
 
 
 def save(document: Mapping[str, Any], out: Path) -> list[Path]:

@@ -200,7 +200,7 @@ def prompt_views(
                 hint=f"name the file of names with --names, {hint}",
             )
         if unlabelled is not None:
-            raise InvalidFeatures("--unlabelled", expected="pictures, whose values it is of", got=documents[0].name)
+            raise InvalidFeatures("unlabelled", expected="pictures, whose values it is of", got=documents[0].name)
         warnings += _add_documents(index, read, folder, [*arrays, *pictures])
     elif (arrays and not pictures and names is not None) or (
         pictures and (names is not None or LEGEND in label_texts(pictures[0]))
@@ -376,16 +376,16 @@ def _names(path: Path) -> dict[int, str]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise InvalidFeatures("--names", expected="a file of names", got=str(error)[:120]) from None
+        raise InvalidFeatures("names", expected="a file of names", got=str(error)[:120]) from None
     suffix = path.suffix.lower()
     if suffix in (".yml", ".yaml"):
         hint = 'write its values and names as JSON, {"1": "red mug"}; 0 is what no mask covers'
-        raise InvalidFeatures("--names", expected="JSON, a table (.csv, .tsv) or a text", got=path.name, hint=hint)
+        raise InvalidFeatures("names", expected="JSON, a table (.csv, .tsv) or a text", got=path.name, hint=hint)
     if suffix == ".json":
         return _numbered(_parsed(text), str(path))
     found = _tabled(text, TABLES[suffix], path) if suffix in TABLES else _listed(text.splitlines())
     if not found:
-        raise InvalidFeatures("--names", expected="a file of names", got=f"none in {path.name}")
+        raise InvalidFeatures("names", expected="a file of names", got=f"none in {path.name}")
     return found
 
 

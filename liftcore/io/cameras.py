@@ -184,9 +184,9 @@ def camera_source(path: Path, views: Collection[str] = ()) -> CameraSource:
     return _of_model(path.parent) if path.name in MODEL_FILES and has_model(path.parent) else _of_document(path)
 
 
-def camera_files(path: Path) -> list[Path]:
+def camera_files(path: Path | str) -> list[Path]:
     """The files that `read_cameras` reads of a path, whether they are there or not."""
-    return camera_source(path).files
+    return camera_source(Path(path)).files
 
 
 def _source_in_folder(path: Path, views: Collection[str]) -> CameraSource:

@@ -43,8 +43,9 @@ def is_system_file(path: PurePath) -> bool:
     return any(part.startswith((".", "~$")) or part.lower() in SYSTEM_FILES for part in inner)
 
 
-def visible_files(folder: Path, pattern: str = "*") -> list[Path]:
+def visible_files(folder: Path | str, pattern: str = "*") -> list[Path]:
     """The files of a folder that match a pattern, sorted, without those of `is_system_file`."""
+    folder = Path(folder)
     files = (path for path in sorted(folder.glob(pattern)) if path.is_file())
     return [path for path in files if not is_system_file(path.relative_to(folder))]
 
@@ -107,12 +108,13 @@ def _directory_bytes(handle: IO[bytes]) -> int:
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[IO[bytes]]:
+def whole_file(path: Path | str) -> Iterator[IO[bytes]]:
     """Write ``path`` through a draft beside it: synced and renamed at the end, removed after an error.
 
     Raises:
         InvalidInput: a folder lies there.
     """
+    path = Path(path)
     if path.is_dir():
         hint = "name a file within it"
         raise InvalidInput(str(path), expected="the path of a file to write", got="a folder there", hint=hint)

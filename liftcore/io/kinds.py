@@ -26,6 +26,7 @@ from liftcore.io.colmap import MODEL_FILES
 from liftcore.io.files import BROKEN_ZIP, LFS_HINT, LFS_POINTER, is_system_file, open_regular, open_zip
 from liftcore.io.ply import MAX_HEADER_BYTES, cloud_without_splats
 from liftcore.io.ranks import rank_files
+from liftcore.io.remote import check_path
 from liftcore.io.shards import INDEX
 from liftcore.io.sog import META, is_sog_document, sog_folder
 from liftcore.io.splat import looks_like_splat
@@ -243,7 +244,7 @@ def kind_of(path: Path) -> str | None:
 
 
 def wrong_kind(
-    path: Path, wanted: str, fault: type[Fault], *, argument: str = "", expected: str = ""
+    path: Path | str, wanted: str, fault: type[Fault], *, argument: str = "", expected: str = ""
 ) -> Fault | None:
     """The error for a file or folder in the place of one of another kind; None where it may be of the wanted kind.
 
@@ -256,7 +257,7 @@ def wrong_kind(
         return None
     hint = found.hint
     if found.kind is not None or (wanted == "splats" and found.splats):
-        hint = _replacement_hint(path, found, wanted) or hint
+        hint = _replacement_hint(Path(path), found, wanted) or hint
     return fault(argument or str(path), expected=expected or wanted, got=found.name, hint=hint)
 
 
@@ -285,8 +286,14 @@ def _replacement_hint(path: Path, found: FileKind, wanted: str) -> str:
     return hints.get((wanted, found.kind or ""), "")
 
 
-def identify(path: Path) -> FileKind:
-    """Find what a file or folder is, without an error: what does not open says so in its name."""
+def identify(path: Path | str) -> FileKind:
+    """Find what a file or folder is, without an error: what does not open says so in its name.
+
+    Raises:
+        InvalidInput: it is no path.
+    """
+    check_path(path)
+    path = Path(path)
     try:
         mode = path.stat().st_mode
         if stat.S_ISDIR(mode):

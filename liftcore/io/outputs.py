@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from liftcore.errors import InvalidInput
-from liftcore.io.remote import is_remote, require_storage
+from liftcore.io.remote import check_path, is_remote, require_storage
+from liftcore.runtime.arguments import as_list, check_choice
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ OUTPUT_TYPES = {
 CONVERTED = (".sog", ".glb", ".html", ".csv", ".compressed.ply", ".splat", ".spz")  # which splat-transform writes
 
 
-def check_output(path: Path | str, inputs: Sequence[Path], kind: str) -> Path | str:
+def check_output(path: Path | str, inputs: Path | str | Iterable[Path | str], kind: str) -> Path | str:
     """An output path that can be written, and is no folder, none of the inputs and no file of another kind.
 
     A file of the kind that is written is replaced. Of a lift that lies elsewhere (`liftcore.io.remote`) the storage
@@ -49,32 +50,34 @@ def check_output(path: Path | str, inputs: Sequence[Path], kind: str) -> Path | 
         The file: the path itself, or the index of a folder of shards.
 
     Raises:
-        InvalidInput: it is one of these, its suffix is not written, no file can be made there, or its storage does
-            not open.
+        InvalidInput: it is one of these, its suffix is not written, no file can be made there, its storage does not
+            open, or there is no such kind.
     """
     from liftcore.io.shards import INDEX, SUFFIX
 
+    check_choice("kind", kind, OUTPUT_TYPES)
+    check_path(path, "output")
     if is_remote(path):
         require_storage(str(path))
         return path
     path = Path(path)
     if kind == "lift" and path.suffix == SUFFIX:
         path, kind = path / INDEX, "json"
-    written = OUTPUT_TYPES[kind]
+    output = OUTPUT_TYPES[kind]
     with writing(path):
         if path.is_dir():
             raise InvalidInput("output", expected="a file to write", got=f"the folder {path}")
-        if path.exists() and any(map(path.samefile, _files_of(inputs))):
+        if path.exists() and any(map(path.samefile, _files_of(map(Path, as_list(inputs))))):
             raise InvalidInput("output", expected="another file than the inputs", got=str(path))
-        _require_suffix(path, written)
-        _require_same_kind(path, written)
+        _require_suffix(path, output)
+        _require_same_kind(path, output)
         folder = next(parent for parent in path.absolute().parents if os.path.lexists(parent))
         if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
             raise InvalidInput("output", expected="a folder that can be written", got=str(folder))
     return path
 
 
-def _files_of(inputs: Sequence[Path]) -> list[Path]:
+def _files_of(inputs: Iterable[Path]) -> list[Path]:
     """The files of inputs that are there; of a folder of cameras those that are read."""
     from liftcore.io.cameras import camera_source
 
@@ -82,29 +85,29 @@ def _files_of(inputs: Sequence[Path]) -> list[Path]:
     return [file for file in files if file.exists()]
 
 
-def _require_suffix(path: Path, written: OutputType) -> None:
+def _require_suffix(path: Path, output: OutputType) -> None:
     name = path.name.lower()
-    if name.endswith(written.suffixes) and not name.endswith(".compressed.ply"):
+    if name.endswith(output.suffixes) and not name.endswith(".compressed.ply"):
         return
     hint = ""
-    if ".ply" in written.suffixes and name.endswith(CONVERTED):
+    if ".ply" in output.suffixes and name.endswith(CONVERTED):
         stem = path.name[: -len(next(suffix for suffix in CONVERTED if name.endswith(suffix)))]
         hint = f"write {stem}.ply, and convert it: npx @playcanvas/splat-transform {stem}.ply {path.name}"
-    ends = " or ".join(written.suffixes)
-    raise InvalidInput("output", expected=f"a name of {written.name}, ending in {ends}", got=str(path), hint=hint)
+    ends = " or ".join(output.suffixes)
+    raise InvalidInput("output", expected=f"a name of {output.name}, ending in {ends}", got=str(path), hint=hint)
 
 
-def _require_same_kind(path: Path, written: OutputType) -> None:
+def _require_same_kind(path: Path, output: OutputType) -> None:
     from liftcore.io.kinds import identify
 
     if not path.is_file() or path.stat().st_size == 0:
         return
-    found = identify(path)
-    is_unnamed = found.kind is None and found.name.startswith(written.kind_name)
-    if not (found.kind == written.kind if written.kind else is_unnamed):
-        expected = f"a new file, or one of {written.name} to replace"
+    present = identify(path)
+    is_unnamed = present.kind is None and present.name.startswith(output.kind_name)
+    if not (present.kind == output.kind if output.kind else is_unnamed):
+        expected = f"a new file, or one of {output.name} to replace"
         hint = "name another file, or remove that one first"
-        raise InvalidInput("output", expected=expected, got=f"{path}, which is {found.name}", hint=hint)
+        raise InvalidInput("output", expected=expected, got=f"{path}, which is {present.name}", hint=hint)
 
 
 @contextmanager

@@ -11,12 +11,13 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from liftcore.errors import InvalidInput
+from liftcore.runtime.arguments import as_list
 from liftcore.runtime.folders import cache_folder
 
 REMOTE = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+(::[^:]+)*://")
@@ -40,15 +41,18 @@ def check_path(path: object, argument: str = "path") -> None:
         raise InvalidInput(argument, expected="the path of a file or folder", got=got, hint=hint)
 
 
-def local_path(path: Path | str) -> Path:
+def local_path(path: Path | str, argument: str = "path") -> Path:
     """The path of a file or folder of this machine: the given one, or that of a copy of what lies elsewhere.
 
     Copies lie in ``splatlift/remote`` of the user's cache folder (XDG_CACHE_HOME), which may be emptied at any time.
 
+    Args:
+        argument: that errors name.
+
     Raises:
         InvalidInput: nothing is there, or it cannot be opened or copied; the error says why.
     """
-    check_path(path)
+    check_path(path, argument)
     if not is_remote(path):
         return Path(path)
     url = str(path)
@@ -80,6 +84,11 @@ def local_path(path: Path | str) -> Path:
         finally:
             shutil.rmtree(draft, ignore_errors=True)
         return copy
+
+
+def local_paths(paths: Path | str | Iterable[Path | str], argument: str = "path") -> list[Path]:
+    """`local_path` of each; one path alone is a list of it."""
+    return [local_path(path, argument) for path in as_list(paths)]
 
 
 def require_storage(url: str) -> None:

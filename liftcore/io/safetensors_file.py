@@ -128,9 +128,9 @@ def header_bytes(header: Mapping[str, object]) -> bytes:
     return len(text).to_bytes(8, "little") + text
 
 
-def with_metadata(path: Path, changes: Mapping[str, str]) -> Iterator[bytes]:
+def with_metadata(path: Path | str, changes: Mapping[str, str]) -> Iterator[bytes]:
     """The bytes of a safetensors file with other metadata, in blocks; all else of it stays to the byte."""
-    with path.open("rb") as handle:
+    with Path(path).open("rb") as handle:
         header = json.loads(handle.read(int.from_bytes(handle.read(8), "little")))
         header["__metadata__"] = (header.get("__metadata__") or {}) | dict(changes)
         yield header_bytes(header)

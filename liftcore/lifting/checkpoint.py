@@ -27,6 +27,7 @@ import torch
 from llvmlite.binding import get_host_cpu_name
 
 from liftcore.errors import InvalidInput
+from liftcore.io.remote import check_path
 from liftcore.io.safetensors_file import tensor_bytes
 from liftcore.raster.base import RayRows, ViewWeights
 from liftcore.runtime.version import __version__
@@ -55,6 +56,10 @@ class Checkpoint:
     folder: Path
     seconds: float = 2.0  # between writes, of work that is lost with the process; views in work may be lost too
     identity: str = ""  # of the splats, the code and the device that all answers are of (`of`)
+
+    def __post_init__(self) -> None:
+        check_path(self.folder, "folder")
+        object.__setattr__(self, "folder", Path(self.folder))
 
     def of(
         self, splats: Splats, device: Mapping[str, Any], packages: Iterable[str] = ("raster", "scene")

@@ -44,10 +44,10 @@ def lift_files(
         settings: None: the default ones. The others are as `liftcore.lift` has them.
 
     Raises:
-        InvalidInput: a file is malformed, or the packs do not fit the cameras.
+        InvalidInput: a file is malformed, or the packs do not fit the cameras. InvalidSettings: settings are none.
         Unavailable: there is no such device as asked for.
     """
-    settings = settings or LiftSettings.of()
+    settings = LiftSettings.or_default(settings)
     choose_device(settings.device)  # told before gigabytes are read
     paths = local_path(splats), local_path(cameras), _checked(features)
     with shown_progress(progress) as reporter:
@@ -73,7 +73,7 @@ def plan_files(
     in_blocks: bool = False,
 ) -> Plan:
     """What `lift_files` with the same arguments would do, as `liftcore.plan` has it."""
-    settings = settings or LiftSettings.of()
+    settings = LiftSettings.or_default(settings)
     sources = open_files(local_path(splats), local_path(cameras), features, settings)
     return plan(*sources, settings, threads=threads, in_blocks=in_blocks)
 

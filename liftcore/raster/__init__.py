@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from numbers import Integral
 from typing import TYPE_CHECKING
 
-from liftcore.errors import InvalidSettings, InvalidSplats
+from liftcore.errors import InvalidSplats
+from liftcore.runtime.arguments import check_count
 
 if TYPE_CHECKING:
     from liftcore.raster.base import Raster
@@ -41,16 +41,5 @@ def check_given(splats: Splats, threads: int | None) -> Splats:
     if not isinstance(splats, Splats):
         got, hint = f"{type(splats).__name__} {splats!r}"[:80], "read_splats(path) makes them of a file"
         raise InvalidSplats("splats", expected="Splats", got=got, hint=hint)
-    check_threads(threads)
+    check_count("threads", threads, "all cores")
     return splats.cpu()
-
-
-def check_threads(threads: object) -> None:
-    """Refuse a number of threads that is none.
-
-    Raises:
-        InvalidSettings: it is no whole number of one or more, and not None.
-    """
-    if threads is not None and (isinstance(threads, bool) or not isinstance(threads, Integral) or threads < 1):
-        got = repr(threads)[:80]
-        raise InvalidSettings("threads", expected="a whole number of one or more, or None for all cores", got=got)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 from typing import Any, ClassVar
 
 from pydantic import (
@@ -19,14 +18,10 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from liftcore.errors import SplatliftError
+from liftcore.runtime.arguments import one_of
 from liftcore.runtime.one_line import one_line, value_text
 
 NAME_CHARACTERS = 80  # of a name or a value that came, told back
-
-
-def one_of(names: Iterable[str]) -> str:
-    """What is expected where one of these names is."""
-    return f"one of {', '.join(names)}"
 
 
 def takes(expected: str) -> WrapValidator:

@@ -26,11 +26,11 @@ def lazy_names(package: str, file: str) -> "tuple[Callable[[str], Any], Callable
         import sys
         from importlib import import_module
 
-        known = read_stub()
+        homes = read_stub()
         if name == "__all__":
-            value = sorted(known.keys() - {"__version__"})
-        elif name in known:
-            value = getattr(import_module(known[name]), name)
+            value = sorted(homes.keys() - {"__version__"})
+        elif name in homes:
+            value = getattr(import_module(homes[name]), name)
         else:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         vars(sys.modules[package])[name] = value

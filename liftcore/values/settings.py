@@ -361,6 +361,18 @@ class LiftSettings(Shown):
         return cls._checked(lambda: cls(**values))
 
     @classmethod
+    def or_default(cls, settings: Self | None) -> Self:
+        """Settings as they are; the default ones for None.
+
+        Raises:
+            InvalidSettings: they are something else.
+        """
+        if settings is not None and not isinstance(settings, cls):
+            expected, hint = "LiftSettings, or None", "LiftSettings.of(**values) makes them"
+            raise InvalidSettings("settings", expected=expected, got=repr(settings)[:80], hint=hint)
+        return cls.of() if settings is None else settings
+
+    @classmethod
     def chosen(cls, preset: Preset | str | Self, others: Mapping[str, Any]) -> Self:
         """A preset by its name, or settings as they are, with others in place of some.
 

@@ -77,8 +77,12 @@ def views_of(device: Device, shared: Path) -> Iterator[dict[str, Any]]:
     """What ``splatlift bench --device cuda`` says of the room and of plush."""
     for scene in (None, shared / "plush"):
         if scene is None or scene.is_dir():
-            size = {"splats": LARGE.splats, "size": "x".join(map(str, LARGE.size)), "channels": LARGE.channels}
-            found = run_bench({"device": device.kind, "scene": scene, "views": 12, **size})
+            size: dict[str, Any] = {
+                "splats": LARGE.splats,
+                "size": "x".join(map(str, LARGE.size)),
+                "channels": LARGE.channels,
+            }
+            found = run_bench(scene, device=device.kind, views=12, **size)
             for preset, row in found["presets"].items():
                 head = {"scene": found["workload"], "splats": found["splats"], "preset": preset}
                 yield head | {f"{key}, ms a view": 1e3 * row[f"{key}_s_per_view"] for key in ("geometry", "solve")}

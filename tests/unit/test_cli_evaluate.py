@@ -11,6 +11,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from liftcore.evaluate import evaluate_lifts
 from tests.labelled_scene import (
     FRAMES,
     LIFTED,
@@ -62,6 +63,19 @@ def test_a_right_lift_scores_near_one_in_every_protocol_of_lerf_ovs(
         assert mean["all labelled"]["object_micro"] == found["object_micro"]
     assert document["warnings"] == [f"kitchen: 1 of 2 judged frames were lifted: {LIFTED}"]
     assert document["settings"]["threshold"] == "auto"
+
+
+def test_call_judges_as_the_command_does_whatever_form_its_paths_have(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lift, data, names = folder / "kitchen.lift.safetensors", folder / "lerf_ovs", folder / "held_out.txt"
+    names.write_text("frame_00002\n")
+    options = ["--data", data, "--protocol", "P2", "--held-out", names, "--encoder", ""]
+    document = evaluate(capsys, "lerf-ovs", lift, *options)
+    for lifts, form in ((lift, Path), ([lift], str), (f"kitchen={lift}", str)):
+        evaluation = evaluate_lifts("lerf-ovs", lifts, form(data), protocols="P2", held_out=form(names))
+        assert json.loads(json.dumps(evaluation.document())) == document
+        assert any("measured" in line for line in evaluation.lines())
 
 
 def test_3d_ovs_pools_the_pixels_of_a_class(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -87,7 +87,7 @@ def open_image_encoder(spec: str, device: str = "cpu") -> ImageEncoder:
     if not rest or kind not in KINDS:
         specs = [*IMAGE_ENCODERS, *(f"{name}:..." for name in plugin_names(PLUGINS) if name not in KINDS)]
         hint = "SigLIP, MobileCLIP and the like are maskclip:MODEL/TAG; maps of FeatUp and others come by pack npy"
-        raise InvalidInput("--encoder", expected=f"one of {', '.join(specs)}", got=repr(spec), hint=hint)
+        raise InvalidInput("encoder", expected=f"one of {', '.join(specs)}", got=repr(spec), hint=hint)
     where = device_named(device)
     if kind == "timm":
         from liftcore.features.encoders.timm_backbone import TimmEncoder
@@ -109,5 +109,5 @@ def device_named(name: str) -> torch.device:
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError, NotImplementedError) as error:  # torch's kinds for a device it lacks
         got = f"{name!r} ({str(error).splitlines()[0][:120]})"
-        raise Unavailable("--device", expected="a device that torch has here, as cpu", got=got) from None
+        raise Unavailable("device", expected="a device that torch has here, as cpu", got=got) from None
     return device

@@ -77,7 +77,7 @@ def _dense(kind: str, model_name: str, tower: Any) -> Callable[[Any, Tensor], Te
     if isinstance(tower, ModifiedResNet):
         if kind == "clip":
             raise InvalidInput(
-                "--encoder",
+                "encoder",
                 expected="a ViT for clip:, whose patches have tokens",
                 got=model_name,
                 hint=f"maskclip:{model_name}... gives a ResNet's dense features",
@@ -87,7 +87,7 @@ def _dense(kind: str, model_name: str, tower: Any) -> Callable[[Any, Tensor], Te
     plain = type(tower) is VisionTransformer and tower.attn_pool is None
     if not plain or any(type(block) is not ResidualAttentionBlock for block in tower.transformer.resblocks):
         raise InvalidInput(
-            "--encoder",
+            "encoder",
             expected="a CLIP model with open_clip's own ViT or ResNet as image tower, without an attention pooler",
             got=f"{model_name} with {type(tower).__name__}",
         )
@@ -99,7 +99,7 @@ def _trunk(kind: str, model_name: str, tower: Any) -> Callable[[Any, Tensor], Te
     if kind == "maskclip" and getattr(tower.trunk, "global_pool", "") == "token":
         hint = f"clip:{model_name}... takes the patches' tokens through the class token's layers"
         expected, got = "a tower that pools its cells for maskclip:", f"{model_name}, which reads its class token"
-        raise InvalidInput("--encoder", expected=expected, got=got, hint=hint)
+        raise InvalidInput("encoder", expected=expected, got=got, hint=hint)
     if getattr(tower.trunk, "dynamic_img_size", True) is False:  # positions are then resampled to an image's grid
         tower.trunk.dynamic_img_size, tower.trunk.patch_embed.strict_img_size = True, False
         tower.trunk.patch_embed.flatten, tower.trunk.patch_embed.output_fmt = False, "NHWC"
@@ -113,7 +113,7 @@ def _trunk(kind: str, model_name: str, tower: Any) -> Callable[[Any, Tensor], Te
     except (AssertionError, RuntimeError, ValueError, AttributeError, IndexError, TypeError) as error:
         got = str(error)
     raise InvalidInput(
-        "--encoder",
+        "encoder",
         expected="a tower that gives a cell a patch of images of any size",
         got=f"{model_name} ({got[:120]})",
         hint="encode crops of masks with it, and pack them: 'splatlift pack masks'",

@@ -53,7 +53,7 @@ class CropEncoder:
         """
         kind, _, rest = spec.partition(":")
         if kind != "open_clip" or not rest:
-            raise InvalidInput("--encoder", expected=SPEC, got=repr(spec))
+            raise InvalidInput("encoder", expected=SPEC, got=repr(spec))
         opened = open_model(kind, rest)
         return cls(opened, space_of(opened, rest), device)
 
@@ -82,7 +82,7 @@ def crop_vectors(
     lost = [view for view in masks if view not in photos]
     if lost:
         got = f"none of {len(lost)} views with masks, such as {lost[0]!r}"
-        raise InvalidInput("--photos", expected="a photo of each view that has masks, named like it", got=got)
+        raise InvalidInput("photos", expected="a photo of each view that has masks, named like it", got=got)
     found, readings = {}, {}
     for done, (view, path) in enumerate(masks.items(), start=1):
         labels, rows = labels_alone(path, unlabelled)

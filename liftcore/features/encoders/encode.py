@@ -21,6 +21,7 @@ from liftcore.features.folders import files_below, folders_of, grids_of
 from liftcore.io.cameras import read_cameras
 from liftcore.io.outputs import check_output, writing
 from liftcore.io.photos import ORIENTATION, UNREAD, UPRIGHT, PhotoHeader, Reading, header_of, orientation_warnings
+from liftcore.io.remote import landing, local_paths
 from liftcore.runtime.progress import Progress, shown_progress, silent
 from liftcore.scene.cameras import Cameras, photo_sizes
 from liftcore.scene.views import IMAGE_SUFFIXES, require_name, without_image_suffix
@@ -88,7 +89,7 @@ def write_encoded(
     patch = encoder.pixels.patch
     if settings.size is not None and settings.size < patch:
         got = f"{settings.size} pixels"
-        raise InvalidInput("--size", expected=f"at least a patch, {patch} pixels", got=got)
+        raise InvalidInput("size", expected=f"at least a patch, {patch} pixels", got=got)
     readings: dict[str, Reading] = {}
     wide: list[str] = []
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -143,8 +144,8 @@ def _stored(grid: Tensor, name: str, settings: EncodeSettings) -> Tensor:
 
 
 def encode_images(
-    images: Sequence[Path],
-    out: Path,
+    images: Path | str | Sequence[Path | str],
+    out: Path | str,
     encoder: ImageEncoder | str,
     *,
     device: str = "cpu",
@@ -175,51 +176,54 @@ def encode_images(
         Unavailable: the weights, or the device, are not on this machine.
     """
     photos = find_images(images)
+    if not photos:
+        raise InvalidInput("images", expected="images or folders of images", got="none")
     check_output(out, list(photos.values()), "pack")
-    opened = open_image_encoder(encoder, device) if isinstance(encoder, str) else encoder
+    model = open_image_encoder(encoder, device) if isinstance(encoder, str) else encoder
     if isinstance(cameras, Path | str):
         cameras = read_cameras(cameras, views=list(photos))
     sizes = {} if cameras is None else photo_sizes(photos, cameras)
-    with shown_progress(progress) as reporter, writing(out):
-        encoded = write_encoded(photos, opened, out, EncodeSettings(size, batch, normalised), reporter, sizes)
-    warnings = orientation_warnings(encoded.readings, "their cameras")
-    if encoded.wide:
-        warnings.append(f"{len(encoded.wide)} views have features beyond float16 and are stored as float32")
-    if opened.text_space == "none":
+    with shown_progress(progress) as reporter, writing(out), landing(out) as file:
+        pack = write_encoded(photos, model, file, EncodeSettings(size, batch, normalised), reporter, sizes)
+        size_bytes = file.stat().st_size
+    warnings = orientation_warnings(pack.readings, "their cameras")
+    if pack.wide:
+        warnings.append(f"{len(pack.wide)} views have features beyond float16 and are stored as float32")
+    if model.text_space == "none":
         warnings.append("these features have no words: a lift of them is asked by example")
     return {
         "out": str(out),
-        "bytes": out.stat().st_size,
-        "views": encoded.views,
+        "bytes": size_bytes,
+        "views": pack.views,
         "folders": folders_of(photos),
-        "channels": opened.channels,
-        "patch": opened.pixels.patch,
-        "size": size or opened.pixels.shorter,
-        "encoder": opened.name,
-        "text_space": opened.text_space,
+        "channels": model.channels,
+        "patch": model.pixels.patch,
+        "size": size or model.pixels.shorter,
+        "encoder": model.name,
+        "text_space": model.text_space,
         "normalised": normalised,
         "warnings": warnings,
     }
 
 
-def find_images(paths: Sequence[Path]) -> dict[str, Path]:
+def find_images(paths: Path | str | Sequence[Path | str]) -> dict[str, Path]:
     """View name -> image, of files and folders, sorted by name; an image of a sub-folder is of the view ``camA/000``.
 
     Raises:
         InvalidInput: nothing is there, a folder has no image, or two images would be the same view.
     """
-    found: dict[str, Path] = {}
-    for path in paths:
+    images: dict[str, Path] = {}
+    for path in local_paths(paths, "images"):
         for file in _images_of(path):
             name = without_image_suffix(file.relative_to(path).as_posix() if path.is_dir() else file.name)
             require_name(name, "images", InvalidInput)
-            if found.get(name, file) != file:
-                got = f"{found[name]} and {file}"
+            if images.get(name, file) != file:
+                got = f"{images[name]} and {file}"
                 raise InvalidInput(
                     "images", expected="one image a view", got=got, hint="a view is named after its image"
                 )
-            found[name] = file
-    return dict(sorted(found.items()))
+            images[name] = file
+    return dict(sorted(images.items()))
 
 
 def _images_of(path: Path) -> list[Path]:
@@ -235,7 +239,7 @@ def _images_of(path: Path) -> list[Path]:
     return images
 
 
-def read_image(path: Path, size: tuple[int, int] | None = None) -> tuple[Image.Image, Reading]:
+def read_image(path: Path | str, size: tuple[int, int] | None = None) -> tuple[Image.Image, Reading]:
     """An image in red, green and blue, as it is stored or as its EXIF turns it (`liftcore.io.photos`), and which.
 
     Grey images have three equal colours, of 16 bits the upper 8 count, and transparent pixels show white.
@@ -246,6 +250,7 @@ def read_image(path: Path, size: tuple[int, int] | None = None) -> tuple[Image.I
     Raises:
         InvalidInput: the file is no image, is cut off, or has more pixels than Pillow opens.
     """
+    path = Path(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of images between one and two times Pillow's limit, and of odd EXIF
@@ -313,7 +318,7 @@ def grid_size(width: int, height: int, shorter: int, patch: int) -> tuple[int, i
     columns, rows = (max(1, round(side * scale)) for side in (width, height))
     if columns * rows > MAX_CELLS:
         got = f"{columns}x{rows} for an image of {width}x{height} pixels"
-        raise InvalidInput("--size", expected=f"a grid of at most {MAX_CELLS} cells", got=got)
+        raise InvalidInput("size", expected=f"a grid of at most {MAX_CELLS} cells", got=got)
     return columns, rows
 
 

@@ -96,7 +96,7 @@ class TimmEncoder:
         except (AssertionError, RuntimeError, ValueError, AttributeError) as error:
             got = str(error)
         raise InvalidInput(
-            "--encoder",
+            "encoder",
             expected="a backbone that takes images of any size and gives a map of features",
             got=f"{self.name} ({got[:120]})",
             hint="ViT, DINO, DINOv2, ResNet, ConvNeXt and EfficientNet do",

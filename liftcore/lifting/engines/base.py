@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Protocol
 
-from liftcore.raster import check_threads
+from liftcore.runtime.arguments import check_count
 from liftcore.runtime.one_line import one_line
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ class LocalEngine:
     scratch: Path | None = None
 
     def __init__(self, threads: int | None = None) -> None:
-        check_threads(threads)
+        check_count("threads", threads, "all cores")
         self.threads = threads
 
     def __repr__(self) -> str:

@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from liftcore.errors import InvalidSettings
 from liftcore.lifting.geometry import strided
 from liftcore.lifting.planning.contradictions import LEAST_IN_VIEW, LEAST_ROW_SUM, empty, unseen
 from liftcore.lifting.planning.plan import PlannedScene, first_names, planned_scene, scene_warnings
@@ -118,9 +117,7 @@ def plan_photos(
         InvalidCameras: there is no camera.
         InvalidSettings: ``antialiased`` does not suit the splats' kernel.
     """
-    settings = LiftSettings.of() if settings is None else settings
-    if not isinstance(settings, LiftSettings):
-        raise InvalidSettings("settings", expected="LiftSettings, or None", got=repr(settings)[:80])
+    settings = LiftSettings.or_default(settings)
     splats = check_given(splats, threads)
     settings = settings.for_splats(splats)
     known = cameras if isinstance(cameras, Cameras) else Cameras(cameras)

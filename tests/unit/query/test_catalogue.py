@@ -65,3 +65,6 @@ def test_the_command_lists_names_and_writes_them(
     assert (tmp_path / "things.csv").read_text().count("\n") == 4
     assert sorted(path.name for path in (tmp_path / "things").iterdir()) == [f"object-{k}.ply" for k in range(3)]
     assert main(["objects", str(tiny_lift)]) == 0 and "3 objects" in capsys.readouterr().out
+    assert main(["objects", str(tiny_lift), "--json"]) == 0
+    plain = json.loads(capsys.readouterr().out)
+    assert [one.keys() for one in plain["objects"]] == [one.keys() - {"feature"} for one in told["objects"]]
