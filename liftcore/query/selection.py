@@ -36,7 +36,7 @@ MOST = 2 / 3  # of a thing: it is mostly selected
 SOME = 1 / 3  # of a thing, below which its mean says nothing of what was asked
 LEAST_FIRST = 0.1  # of the evidence at which the word is the nearest of all, that a clear answer selects
 SAME_WORD = 1 - 1e-4  # cosine from which two words of a table are one
-_AT_ONCE = 1 << 13  # splats that are compared with a pack's words at once
+_AT_ONCE = 1 << 10  # splats that are compared with a pack's words at once: what stays in a cache
 
 
 @dataclass(frozen=True)
