@@ -14,7 +14,7 @@ from liftcore.files import PhotoIndexes
 from service import problems
 from service.auth import STRANGER, Gate
 from service.content import EventStreams
-from service.errand import get_ready
+from service.errand import revive
 from service.jobs.process import JobLimits
 from service.jobs.supervisor import Supervisor
 from service.middleware import AnswerHead, RecordedApp, Turns
@@ -52,7 +52,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
             ordering=threads(2),  # orders, which are compared with all names in their assets: these take memory
             scrapes=threads(1),  # the metrics
         )  # fmt: skip
-        await anyio.to_thread.run_sync(get_ready)
+        await anyio.to_thread.run_sync(revive)
         await anyio.to_thread.run_sync(worker.start)
         await anyio.to_thread.run_sync(runner.start)
         collector.start()

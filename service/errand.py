@@ -90,7 +90,11 @@ def revive() -> bool:
     if template is not None and not is_stopped(template):
         return True
     _kill_template()
-    get_ready()
+    try:
+        get_ready()
+    except OSError:  # whoever has a task tries again
+        log.warning("what checks uploads does not start", exc_info=True)
+        return False
     return not CHILDREN.exists()
 
 

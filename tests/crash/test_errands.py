@@ -125,6 +125,8 @@ def test_process_that_does_not_start_is_told_by_its_reason(run: Run, monkeypatch
 
     monkeypatch.setattr(errand, "get_ready", full)
     monkeypatch.setattr(errand, "DYING_SECONDS", 0.0)
+    kill_template()
+    assert not errand.revive()  # nor does the server fail at its start, or a probe
     with pytest.raises(Busy, match="Too many open files"):
         run("answer")
 
