@@ -13,7 +13,6 @@ possible threshold of each mask, which needs the truth.
 """
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -55,7 +54,7 @@ def measure(scene: Scene, cases: Iterable[Case]) -> dict[str, float]:
             continue
         auto = answers["auto"]
         cut = find_threshold(auto.scores[auto.seen], "auto", scene.weights).value
-        answers["anywhere"] = replace(auto, threshold=cut, selected=auto.seen & (auto.scores >= cut))
+        answers["anywhere"] = ask(scene, Query.of((example,), threshold=cut))
         for name, values in judged(scene, answers, truths).items():
             rows[name] += values
     return {"asked": asked, "refused": refused} | {name: float(np.mean(values)) for name, values in rows.items()}
