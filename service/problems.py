@@ -65,9 +65,7 @@ FRAMEWORK: dict[int, tuple[str, str]] = {
     400: ("malformed-request", MALFORMED),
     404: ("no-such-route", "There is no such route"),
     405: ("method-not-allowed", "The route does not take this method"),
-    408: ("too-slow", "The request came too slowly"),
     413: ("too-large", "The body is too large"),
-    431: ("headers-too-large", "The request's line and headers are too large"),
     503: ("busy", BUSY),
 }
 
@@ -144,6 +142,9 @@ def _of_system(what: str, error: Exception) -> JSONResponse:
         log.error("%s: the data directory cannot be used", what, exc_info=error)
         got = f"another: {error.strerror}"  # without its file, which is the server's
         return answer_to(errors.NotReady("disk", expected="a disk that can be read and written", got=got))
+    if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
+        log.error("%s: no file can be opened any more", what)
+        return answer_to(errors.Busy("files", expected="a file to open", got="as many open files as there may be"))
     if code is not None and code & 0xFF in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
         log.error("%s: another process holds the database", what)
         return answer_to(errors.Busy("database", expected="a turn at it", got="one that another process holds"))

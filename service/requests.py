@@ -98,7 +98,7 @@ class _BoundedRequest(Request):
         if received > limit:
             raise HTTPException(413, f"the body has more than {limit} bytes")
         self._begin, self._value = bytes(content[:NAME_CHARACTERS]), None
-        if "json" in self.headers.get("content-type", ""):  # else the framework refuses it unread
+        if "json" in self.headers.get("content-type", "").lower():  # else the framework refuses it unread
             self._value = await anyio.to_thread.run_sync(_parsed, bytes(content), limiter=deps.parsing)
 
     async def body(self) -> bytes:

@@ -13,12 +13,14 @@ import signal
 import socket
 import sqlite3
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from textwrap import fill
 from types import FrameType
+from typing import Any
 
 import uvicorn
 from fastapi import FastAPI
@@ -38,18 +40,43 @@ from service.store.store import Store
 FILES_A_CONNECTION = 2  # itself, and what it is sent
 SWITCH_SECONDS = 0.0005  # that a thread may compute on while the event loop waits; Python's own is ten times that
 MARGIN = " " * 6  # of what --help says of a variable
+IDLE_SECONDS = 1.0  # without a request in progress; then a connection may be closed for one that comes
 FILES_BESIDE = 128  # of the database, checks, jobs and the query worker
 
 log = logging.getLogger(__name__)
 
 
 class AnnouncingServer(uvicorn.Server):
-    """Says on stdout where it listens, once it does, and stops in order: what it is told to stop by is no failure."""
+    """Says on stdout where it listens, once it does, and stops in order: what it is told to stop by is no failure.
 
-    def __init__(self, config: uvicorn.Config, stopping: Stopping, announce: Callable[[str], None]) -> None:
+    Connections without a request in progress make room for others: uvicorn's own limit looks at requests alone, and
+    waits for ever for who sends nothing.
+    """
+
+    def __init__(
+        self, config: uvicorn.Config, stopping: Stopping, max_connections: int, announce: Callable[[str], None]
+    ) -> None:
         super().__init__(config)
+        self._max_connections = max_connections
         self._stopping = stopping
         self._announce = announce
+        self._idle_since: dict[Any, float] = {}  # connection -> seconds of the monotonic clock
+
+    async def on_tick(self, counter: int) -> bool:
+        """Close the connections that are idle the longest where the next one would be too many. uvicorn calls this
+        ten times a second.
+        """
+        now, connections = time.monotonic(), self.server_state.connections
+        self._idle_since = {
+            each: self._idle_since.get(each, now)
+            for each in connections
+            if (cycle := getattr(each, "cycle", None)) is None or cycle.response_complete
+        }
+        surplus = len(connections) - self._max_connections + 1  # with the next one
+        for each in sorted(self._idle_since, key=self._idle_since.__getitem__)[: max(0, surplus)]:
+            if now - self._idle_since[each] >= IDLE_SECONDS and not each.transport.is_closing():
+                each.shutdown()
+        return await super().on_tick(counter)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Stop at the first signal; at a second SIGINT at once. uvicorn would die of the signal after the stop."""
@@ -181,20 +208,22 @@ def require_keys(settings: ServiceSettings) -> None:
 
 
 def require_files(settings: ServiceSettings) -> None:
-    """See that every connection can have its files, as far as the machine lets us raise what we may have.
+    """Raise the number of files that we may open as far as we may, and see that every connection can have its own.
 
     Raises:
         Misconfigured: there would be too few of them.
     """
     needed = FILES_A_CONNECTION * settings.max_connections + FILES_BESIDE
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if 0 <= soft < needed:
-        if 0 <= hard < needed:
-            raise Misconfigured(
-                "max_connections", expected=f"at most {max(0, (hard - FILES_BESIDE) // FILES_A_CONNECTION)}, as a"
-                f" process may open {hard} files here", got=f"{settings.max_connections}", hint="or raise ulimit -n",
-            )  # fmt: skip
-        resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
+    if 0 <= hard < needed:
+        raise Misconfigured(
+            "max_connections", expected=f"at most {max(0, (hard - FILES_BESIDE) // FILES_A_CONNECTION)}, as a"
+            f" process may open {hard} files here", got=f"{settings.max_connections}", hint="or raise ulimit -n",
+        )  # fmt: skip
+    try:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    except (ValueError, OSError):  # a kernel that has a limit of its own below the one it tells
+        resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, needed) if soft >= 0 else soft, hard))
 
 
 def bind(host: str, port: int) -> socket.socket:
@@ -204,7 +233,8 @@ def bind(host: str, port: int) -> socket.socket:
         Misconfigured: the address is not of this machine, or it is taken.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    listener = socket.socket(family, socket.SOCK_STREAM)
+    # Only where TCP is named does asyncio send at once; else answers on kept connections wait 40 ms for the client.
+    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((host, port))
@@ -224,7 +254,7 @@ def server_of(app: FastAPI, settings: ServiceSettings, announce: Callable[[str],
         timeout_graceful_shutdown=math.ceil(settings.stop_seconds),
         proxy_headers=bool(proxies), forwarded_allow_ips=proxies,
     )  # fmt: skip
-    return AnnouncingServer(config, app.state.stopping, announce)
+    return AnnouncingServer(config, app.state.stopping, settings.max_connections, announce)
 
 
 def keep_pauses_short() -> None:

@@ -33,7 +33,7 @@ from service.encoders import require_encoder_files
 from service.errors import Misconfigured
 from service.models import AssetKind
 from service.observe import logging_to_stderr
-from service.settings import ServiceSettings
+from service.settings import ServiceSettings, read_settings
 from service.store.assets import CheckedUpload
 from service.store.lifts import FinishedLift, order_of
 from service.store.owners import SERVICE
@@ -47,6 +47,8 @@ if TYPE_CHECKING:
 
 LAST_PORT = 65_535
 ENDING_SECONDS = 10.0  # for a server that was interrupted
+FOLDER_PREFIX = "splatlift-show-"
+FOLDER_VARIABLE = "SPLATLIFT_SHOW_FOLDER"  # from `show` to the process that removes it; no option reaches it
 
 
 def add_arguments(parser: Parser) -> None:
@@ -56,20 +58,27 @@ def add_arguments(parser: Parser) -> None:
     )
     parser.add_argument("--port", type=int, default=0, help="the port of this machine; 0 picks a free one")
     parser.add_argument("--no-browser", action="store_true", help="print the address, and open nothing")
-    parser.add_argument("--lent", type=Path, help=argparse.SUPPRESS)  # by `show`
 
 
 def run(options: argparse.Namespace) -> int:
-    """Show the lift until Ctrl-C; a folder that is lent goes with whoever holds the other end of stdin."""
-    if options.lent is None:
+    """Show the lift until Ctrl-C; a folder of `show` goes with whoever holds the other end of stdin.
+
+    Raises:
+        InvalidInput: the environment names a folder that `show` did not make for this lift.
+    """
+    folder = os.environ.pop(FOLDER_VARIABLE, "")
+    if not folder:
         _serve(options.lift, options.port, browser=not options.no_browser)
         return 0
+    if not (options.lift.parent == Path(folder) and options.lift.parent.name.startswith(FOLDER_PREFIX)):
+        expected = f"the folder {FOLDER_PREFIX}... of the lift"
+        raise InvalidInput(FOLDER_VARIABLE, expected=expected, got=repr(folder)[:80], hint="unset it")
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # in order, until the server takes signals itself
     threading.Thread(target=stop_when_stdin_closes, daemon=True).start()
     try:
         _serve(options.lift, options.port, browser=not options.no_browser)
     finally:
-        shutil.rmtree(options.lent, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)
     return 0
 
 
@@ -80,11 +89,12 @@ def show(
     if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port <= LAST_PORT:
         expected = f"a whole number in 0..{LAST_PORT}, 0 for a free one"
         raise InvalidInput("port", expected=expected, got=repr(port)[:80])
-    with tempfile.TemporaryDirectory(prefix="splatlift-show-", ignore_cleanup_errors=True) as folder:
+    with tempfile.TemporaryDirectory(prefix=FOLDER_PREFIX, ignore_cleanup_errors=True) as folder:
         path = lift.save_scene(Path(folder), splats, cameras)
         command = [sys.executable, "-m", "liftcore.cli", "view", str(path), "--port", str(port)]
-        command += ["--lent", folder, *["--no-browser"] * (not browser)]  # a notebook's kernel may be killed
-        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
+        command += ["--no-browser"] * (not browser)
+        lent = os.environ | {FOLDER_VARIABLE: folder}  # to the server: a notebook's kernel may be killed
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=lent) as server:
             assert server.stdout is not None
             try:
                 for line in server.stdout:
@@ -132,6 +142,8 @@ def metadata_of(path: Path) -> tuple[dict[str, Any], list[int]]:
     Raises:
         InvalidLift: it is none.
     """
+    if path.is_dir():
+        raise InvalidLift(str(path), expected="a lift file (.safetensors)", got="a folder")
     _, metadata, shape = header_of(path)
     if "splatlift" not in metadata or len(shape) != 2:
         raise InvalidLift(str(path), expected="a lift file", got="a file without a lift's metadata")
@@ -158,7 +170,7 @@ def settings_of(folder: Path, port: int, text_space: str) -> ServiceSettings:
     Spaces of encoders that ship, and those that the environment names, are answered as by any server.
     """
     own: dict[str, Any] = {"data": folder, "host": "127.0.0.1", "port": port}
-    settings = ServiceSettings(**own)
+    settings = read_settings(**own)
     if text_space in ("", NO_WORDS, OWN_WORDS, *BUILT_IN.values(), *settings.text_spaces):
         return settings
     known = settings.model_copy(update={"text_spaces": {**settings.text_spaces, text_space: text_space}})

@@ -99,6 +99,7 @@ FULL.sqlite_errorcode = sqlite3.SQLITE_FULL
     [
         (RuntimeError("the secret"), 500, "internal"),
         (OSError(errno.ENOSPC, "the secret"), 507, "no-space"),
+        (OSError(errno.EMFILE, "the secret"), 503, "busy"),
         (FULL, 507, "no-space"),
     ],
 )
@@ -128,6 +129,13 @@ def test_every_error_has_a_row_and_crosses_processes() -> None:
 
 
 JSON = {"Content-Type": "application/json"}
+
+
+def test_media_type_of_json_may_be_in_capitals(client: TestClient) -> None:
+    told = assert_problem(client.post("/lift", content=b"{}", headers={"Content-Type": "Application/JSON"}))
+    assert told["argument"] == "splats"
+
+
 THRESHOLD = "auto, valley, paper, otsu, stability, or a number from -1 to 1"
 EXAMPLE = f"{NOTATIONS}, or a vector of 1 to 65536 finite numbers"
 

@@ -369,6 +369,27 @@ def test_lift_whose_files_moved_is_told(folder: Path, capsys: pytest.CaptureFixt
         assert told in capsys.readouterr().err
 
 
+def test_view_removes_no_folder_that_show_did_not_make(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for folder in (tmp_path / "data", tmp_path / "splatlift-show-mine"):
+        folder.mkdir()
+        lift = str(tmp_path / "l.safetensors")
+        for option in ("--lent", "--len", "--le"):
+            assert main(["view", lift, "--no-browser", option, str(folder)]) == 2
+        monkeypatch.setenv("SPLATLIFT_SHOW_FOLDER", str(folder))
+        assert main(["view", lift, "--no-browser"]) == 2
+        assert "SPLATLIFT_SHOW_FOLDER" in capsys.readouterr().err and folder.is_dir()
+
+
+def test_view_tells_of_a_port_or_a_folder_that_cannot_be(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lift = str(folder / "l.safetensors")
+    for arguments, told in (([lift, "--port", "99999"], "port"), ([str(folder)], "a folder")):
+        assert main(["view", *arguments, "--no-browser"]) == 2
+        said = capsys.readouterr().err
+        assert told in said and said.count("\n") == 1
+
+
 def _answers(host: str, port: int) -> bool:
     try:
         socket.create_connection((host, port)).close()

@@ -116,13 +116,39 @@ def test_upload_that_breaks_off_leaves_nothing(live: tuple[str, int], data: Path
 
 
 def test_requests_over_more_connections_than_allowed_are_503_until_one_ends(tmp_path: Path) -> None:
-    with running(tmp_path / "data", max_connections=2) as server:
+    with running(tmp_path / "data", max_connections=2) as server, contextlib.ExitStack() as stack:
         address = address_of(server)
-        with client_of(address), client_of(address), client_of(address) as third:
-            until(lambda: len(server.server_state.connections) == 3)
+        with client_of(address) as first, client_of(address) as second:
+            first.sendall(HEAD)
+            second.sendall(JSON_HEAD)
+            until(lambda: len(server.server_state.tasks) == 2)
+            third = stack.enter_context(client_of(address))
             third.sendall(HEALTH)
             assert third.recv(1 << 16).startswith(b"HTTP/1.1 503 ")
         until(lambda: httpx.get(f"http://127.0.0.1:{address[1]}/healthz").status_code == 200)
+
+
+def test_connections_without_a_request_make_room_for_others(tmp_path: Path) -> None:
+    with contextlib.ExitStack() as stack, running(tmp_path / "data", max_connections=3) as server:
+        address = address_of(server)
+        busy = stack.enter_context(client_of(address))
+        busy.sendall(JSON_HEAD)
+        until(lambda: server.server_state.tasks)
+        idle = [stack.enter_context(client_of(address)) for _ in range(20)]
+        for client in idle[::2]:
+            client.sendall(b"GET / HTTP/1.1\r\nX: ")
+        until(lambda: len(server.server_state.connections) < 3)
+        assert httpx.get(f"http://127.0.0.1:{address[1]}/healthz").status_code == 200
+        busy.sendall(b"{}".ljust(5000))
+        assert busy.recv(1 << 16).startswith(b"HTTP/1.1 422 ")
+
+
+def test_no_answer_waits_for_the_client_to_confirm_the_one_before(tmp_path: Path) -> None:
+    with running(tmp_path / "data") as server, client_of(address_of(server)):
+        until(lambda: server.server_state.connections)
+        [connection] = server.server_state.connections
+        served_by = cast("Any", connection).transport.get_extra_info("socket")
+        assert served_by.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
 
 
 def test_two_lengths_of_a_body_are_refused_and_the_connection_is_closed(live: tuple[str, int]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import socket
 import sys
 import threading
 import time
@@ -17,7 +16,7 @@ import pytest
 import uvicorn
 from fastapi import FastAPI
 
-from service.commands.serve import server_of
+from service.commands.serve import bind, server_of
 from service.jobs.process import JobLimits
 from service.jobs.supervisor import Clock, Supervisor
 from service.models import ENDED, AssetKind
@@ -73,7 +72,7 @@ def until(condition: Callable[[], Any], seconds: float = 600.0) -> None:
 @contextmanager
 def listening(app: FastAPI, settings: ServiceSettings) -> Iterator[uvicorn.Server]:
     """The service's server of an application, in a thread and on a free port: see `address_of`."""
-    listener = socket.create_server(("127.0.0.1", 0))
+    listener = bind("127.0.0.1", 0)
     server = server_of(app, settings)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     thread.start()
