@@ -111,7 +111,7 @@ def evaluate_lifts(
     labels = _DATASETS[dataset](local_path(data, "data"))
     files = find_lifts(as_list(lifts), labels)
     names = _names(local_path(held_out, "held_out")) if held_out else None
-    for name in as_list(protocols):
+    for name in as_list(protocols) or [None]:
         check_choice("protocols", name, EvaluationProtocol)
     ways = tuple(EvaluationProtocol(name) for name in dict.fromkeys(as_list(protocols)))
     settings = EvaluationSettings(ways, threshold, tuple(as_list(negatives)), names)

@@ -131,7 +131,8 @@ class SceneFiles:
     def __post_init__(self) -> None:
         for name in ("splats", "cameras", "labels", "table"):
             path = getattr(self, name)
-            object.__setattr__(self, name, None if path is None else local_path(path, name))
+            if path is not None or name in ("splats", "cameras"):
+                object.__setattr__(self, name, local_path(path, name))  # pyright: ignore[reportArgumentType]: None too
         object.__setattr__(self, "features", tuple(local_paths(self.features, "features")))
         object.__setattr__(self, "classes", tuple(as_list(self.classes)))
         if self.labels is not None and (self.table is None or not self.classes):

@@ -11,7 +11,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from liftcore.errors import InvalidSettings
+from liftcore.errors import InvalidInput, InvalidSettings
 from liftcore.evaluate.hardware import machine_line
 from liftcore.evaluate.ranking import NAMES
 from liftcore.evaluate.tradeoff import SceneFiles, compare
@@ -78,8 +78,11 @@ def compare_speeds(
             lift refuses.
         Unavailable: a run did not end within a day.
     """
-    if "speed" in settings:
-        raise InvalidSettings("settings", expected="settings that are the same in all runs", got="speed")
+    if not isinstance(files, SceneFiles):
+        raise InvalidInput("files", expected="SceneFiles", got=repr(files)[:80])
+    if not isinstance(settings, Mapping) or "speed" in settings:
+        got = "speed" if isinstance(settings, Mapping) else repr(settings)[:80]
+        raise InvalidSettings("settings", expected="settings that are the same in all runs", got=got)
     with shown_progress(progress) as reporter:
         facts = compare(files, budget, settings, threads, reporter, kernel)
     return SpeedComparison(finite({"title": TITLE, "scene": scene, "command": command} | facts))

@@ -183,11 +183,11 @@ def prompt_views(
     """
     if not folder.is_dir():
         raise InvalidFeatures(str(folder), expected="a folder of masks", got="no such folder")
+    named = {} if names is None else _names(names)
     files = [path for path in files_below(folder) if names is None or not path.samefile(names)]
     documents = [path for path in files if path.suffix.lower() == ".json"]
     pictures = [path for path in files if path.suffix.lower() == PICTURE]
     arrays = [path for path in files if path.suffix.lower() in ARRAYS]
-    named = {} if names is None else _names(names)
     index, warnings = _MaskIndex(), list[str]()
     if documents:
         read = _documents(documents, pictures, named, negative=unannotated == "negative")

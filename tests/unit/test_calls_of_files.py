@@ -97,11 +97,13 @@ CHOICES: list[tuple[str, Call]] = [
         r"^normalised: expected unit",
         lambda: pack("masks", encoder="open_clip:a/b", photos="photos", normalised=False),
     ),
+    (r"^names: expected a file of names", lambda: pack("prompts", names="nowhere.txt")),
     (r"folder: expected the path", lambda: lc.pack_folder(None, "x.safetensors", "npy")),  # pyright: ignore
     (r"images: expected images", lambda: lc.encode_images([], "x.safetensors", "timm:resnet18")),
     (r"^encoder: expected one of maskclip", lambda: lc.encode_images("photos", "x.safetensors", "magic")),
     (r"^dataset: expected one of lerf-ovs, 3d-ovs, got 'lerf'", lambda: judge("lerf")),
     (r"^protocols: expected one of P1, P2, P3, own, got 'P9'", lambda: judge(protocols=["P9"])),
+    (r"^protocols: expected one of P1", lambda: judge(protocols=[])),
     (r"^held_out: expected a file of view names", lambda: judge(held_out="nowhere.txt")),
     (r"^data: expected LeRF-OVS", lambda: judge(data="maps")),
     (r"kind: expected one of splats, ply", lambda: files.check_output("new.npy", [], "foo")),
@@ -109,6 +111,8 @@ CHOICES: list[tuple[str, Call]] = [
     (r"settings: expected LiftSettings, or None", lambda: lift({"speed": "fast"})),
     (r"splats: expected a whole number of one or more, got -1", lambda: evaluate.run_bench(splats=-1)),
     (r"threads: .* or None for all cores", lambda: evaluate.run_bench(threads=0)),
+    (r"files: expected SceneFiles", lambda: evaluate.compare_speeds("splats.ply")),  # pyright: ignore
+    (r"splats: expected the path", lambda: evaluate.SceneFiles(None, "cameras.json", ())),  # pyright: ignore
     (r"size: expected WIDTHxHEIGHT", lambda: evaluate.run_bench(size="0x9")),
     (
         r"settings: expected settings that are the same in all runs, got speed",
