@@ -26,12 +26,13 @@ from service.errors import Busy, RangeNotSatisfiable, require_share
 from service.models import ENDED
 from service.problems import PROBLEM
 from service.store.database import CURSOR, Page
-from service.store.files import is_whole
+from service.store.files import whole_status
 from service.store.jobs import Event, EventKind
 
 BLOCK_BYTES = 256 << 10  # of a draft that is read and sent at a time
 STREAMED = 50  # records of a list that are in memory at a time: of a job of 10,000 packs there are 700 KB
 FAR_BEGINNING = re.compile(r"(=\s*)0*[1-9]\d{19,}(?=\s*-)", re.ASCII)  # int() takes no number of thousands of digits
+RANGE = re.compile(r"\s*bytes\s*=[\d\s,-]*", re.ASCII | re.IGNORECASE)
 BINARY = "application/octet-stream"
 BYTES = {BINARY: {"schema": {"type": "string", "format": "binary"}}}
 
@@ -86,14 +87,15 @@ def file_answer(request: Request, file: StoredFile) -> Response:
         NotFound: the file is not there, or no longer what was stored.
     """
     etag = f'"{file.sha256}"'
-    if not is_whole(file.path, file.bytes):
+    status = whole_status(file.path, file.bytes)
+    if status is None:
         there = "one of another size" if file.path.exists() else "none"
         raise NotFound(
             "content", expected=f"a file of {file.bytes} bytes in the data directory", got=there,
             hint="it was deleted a moment ago, or something else wrote there: upload it again, or lift again",
         )  # fmt: skip
     return unchanged(request, etag) or _FileAnswer(
-        file.path, headers=kept(etag), filename=file.name, media_type=BINARY
+        file.path, headers=kept(etag), filename=file.name, media_type=BINARY, stat_result=status
     )
 
 
@@ -102,6 +104,8 @@ class _FileAnswer(FileResponse):
 
     @classmethod
     def _parse_range_header(cls, http_range: str, file_size: int) -> list[tuple[int, int]]:
+        if RANGE.fullmatch(http_range) is None:  # int() takes signs and underscores too
+            return []
         try:
             ranges = super()._parse_range_header(FAR_BEGINNING.sub(r"\g<1>" + "9" * 19, http_range), file_size)
         except responses.MalformedRangeHeader:

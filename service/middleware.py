@@ -155,7 +155,8 @@ class AnswerHead:
         if scope["type"] != "http" or scope["method"] != "HEAD":
             await self._app(scope, receive, send)
             return
-        asked = {**scope, "method": "GET"}
+        headers = [(name, value) for name, value in scope["headers"] if name != b"range"]  # which is for GET alone
+        asked = {**scope, "method": "GET", "headers": headers}
         with anyio.CancelScope() as rest:
 
             async def told(message: Message) -> None:

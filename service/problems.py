@@ -65,7 +65,6 @@ FRAMEWORK: dict[int, tuple[str, str]] = {
     400: ("malformed-request", MALFORMED),
     404: ("no-such-route", "There is no such route"),
     405: ("method-not-allowed", "The route does not take this method"),
-    413: ("too-large", "The body is too large"),
     503: ("busy", BUSY),
 }
 
@@ -207,6 +206,8 @@ def refusal(request: Request, error: RequestValidationError) -> errors.InvalidRe
 def _expected(told: dict[str, Any]) -> str:
     if told["type"] == "missing":
         return "a value"
+    if told["type"] == "int_parsing_size":
+        return "an integer of fewer digits"
     words = PYDANTIC.sub("", told["msg"]).replace("String should match pattern", "text that matches pattern")
     return told.get("ctx", {}).get("expected") or words[:1].lower() + words[1:]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, wraps
 from typing import Annotated, Any, Generic, TypeVar
@@ -14,11 +14,10 @@ from fastapi import APIRouter, Body, Depends, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import APIRoute
 from pydantic import BaseModel, ValidationError
-from starlette.exceptions import HTTPException
 
 from service import models
 from service.content import TAGGED
-from service.errors import InvalidRequest, UnreadableBody
+from service.errors import InvalidRequest, TooLarge, UnreadableBody, UnsupportedEncoding
 from service.problems import CLOSE
 
 NAME_CHARACTERS = 80  # of a name or a value that came, told back
@@ -35,14 +34,19 @@ async def _known_only(request: Request) -> None:
     if not given:
         return
     route: APIRoute = request.scope["route"]
-    described = [parameter["name"] for parameter in (route.openapi_extra or {}).get("parameters", ())]
+    described = {parameter["name"]: parameter for parameter in (route.openapi_extra or {}).get("parameters", ())}
     known = [*_names(route), *described]
+    lists = {name for name, parameter in described.items() if parameter["schema"].get("type") == "array"}
     for name in given:
         if name not in known:
             raise InvalidRequest(
                 name[:NAME_CHARACTERS], expected=f"one of {', '.join(known)}" if known else "no parameters",
                 got=repr(name[:NAME_CHARACTERS]), hint="in the query of the request",
             )  # fmt: skip
+        if len(values := given.getlist(name)) > 1 and name not in lists:  # the last would win
+            raise InvalidRequest(
+                name, expected="one value", got=f"{len(values)} of them", hint="in the query of the request"
+            )
 
 
 KnownParameters = Depends(_known_only)
@@ -82,11 +86,13 @@ class _BoundedRequest(Request):
         """Read and parse it.
 
         Raises:
-            HTTPException: it is too long. A client that is still sending when its connection closes never reads the
+            UnsupportedEncoding: it is compressed.
+            TooLarge: it is too long. A client that is still sending when its connection closes never reads the
                 answer: what is a few times too long is read to its end and let go.
             InvalidRequest: it holds too many values.
             UnreadableBody: it cannot be parsed.
         """
+        require_plain(self.headers.getlist("content-encoding"))
         deps, content, received = self.app.state.deps, bytearray(), 0
         limit = deps.settings.max_body_bytes
         async for chunk in self.stream():
@@ -94,9 +100,9 @@ class _BoundedRequest(Request):
             if received <= limit:
                 content += chunk
             elif received > LET_GO * limit:
-                raise HTTPException(413, f"the body has more than {limit} bytes", CLOSE)
+                raise _too_large(limit, CLOSE)
         if received > limit:
-            raise HTTPException(413, f"the body has more than {limit} bytes")
+            raise _too_large(limit)
         self._begin, self._value = bytes(content[:NAME_CHARACTERS]), None
         if "json" in self.headers.get("content-type", "").lower():  # else the framework refuses it unread
             self._value = await anyio.to_thread.run_sync(_parsed, bytes(content), limiter=deps.parsing)
@@ -111,6 +117,24 @@ class _BoundedRequest(Request):
         if isinstance(value, json.JSONDecodeError):
             raise value
         return value
+
+
+def _too_large(limit: int, headers: Mapping[str, str] | None = None) -> TooLarge:
+    return TooLarge("body", expected=f"at most {limit} bytes", got="more", hint=BODY, headers=headers)
+
+
+def require_plain(content_encodings: Sequence[str]) -> None:
+    """See that a body comes as it is.
+
+    Raises:
+        UnsupportedEncoding: its Content-Encoding says that it is compressed.
+    """
+    encodings = ", ".join(content_encodings)
+    if encodings.strip().lower() not in ("", "identity"):
+        raise UnsupportedEncoding(
+            "Content-Encoding", expected="a body that is not compressed", got=encodings[:40],
+            hint="send it as it is; .spz and .sog are compressed already",
+        )  # fmt: skip
 
 
 def _parsed(content: bytes) -> Any:

@@ -15,7 +15,7 @@ from liftcore.errors import InvalidInput, InvalidLift, NotFound
 from liftcore.files import require_pairs
 from service.child import error_of
 from service.errand import ErrandLimits, run_errand
-from service.errors import Crashed, DigestMismatch, TooLarge, UnsupportedEncoding
+from service.errors import Crashed, DigestMismatch, TooLarge
 from service.models import AssetKind, UploadKind
 from service.store.assets import ALL, SHOWN_CHARACTERS, AssetRecord, CheckedUpload
 from service.store.files import is_whole
@@ -35,19 +35,6 @@ CHECK_BASE_BYTES, CHECK_FACTOR = 1 << 30, 16  # private memory of a check: a rea
 HINTS: dict[UploadKind, str] = {AssetKind.FEATURES: "several feature packs may make one lift, so features can be cut"}
 
 log = logging.getLogger(__name__)
-
-
-def require_plain(content_encoding: str) -> None:
-    """See that a body comes as it is.
-
-    Raises:
-        UnsupportedEncoding: its Content-Encoding says that it is compressed.
-    """
-    if content_encoding.strip().lower() not in ("", "identity"):
-        raise UnsupportedEncoding(
-            "Content-Encoding", expected="a body that is not compressed", got=content_encoding[:40],
-            hint="send the file as it is; .spz and .sog are compressed already",
-        )  # fmt: skip
 
 
 def require_size(kind: UploadKind, count: int, limit: int) -> None:

@@ -14,10 +14,10 @@ from service import models
 from service.content import FILE, Cursor, Limit, StoredFile, file_answer, listed
 from service.errand import run_errand
 from service.errors import Crashed
-from service.requests import JsonRoute
+from service.requests import JsonRoute, require_plain
 from service.state import AppState, Deps
 from service.store.assets import SHOWN_CHARACTERS, AssetRecord
-from service.uploads import AssetIntake, Intake, Taken, require_plain, require_size, too_slow
+from service.uploads import AssetIntake, Intake, Taken, require_size, too_slow
 
 T = TypeVar("T")
 BATCH = 1 << 20  # bytes gathered before a thread writes them
@@ -61,7 +61,7 @@ async def taken(
     into: Callable[..., Intake[Taken]], kind: models.UploadKind, request: Request, deps: AppState, sha256: str | None
 ) -> tuple[Taken, bool]:
     """Take the body of an upload in, check it whole and keep it; whether its owner did not have it before."""
-    require_plain(", ".join(request.headers.getlist("content-encoding")))
+    require_plain(request.headers.getlist("content-encoding"))
     limit = deps.settings.max_upload_bytes(kind)
     require_size(kind, _announced(request), limit)  # before a byte of it is asked for with 100 Continue
     intake = into(deps.store, deps.owner, kind, limit)

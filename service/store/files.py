@@ -210,11 +210,16 @@ def remove(path: Path) -> None:
 
 def is_whole(path: Path, size: int) -> bool:
     """Whether a regular file still has the bytes that it was stored with; a pipe in its place would be waited for."""
+    return whole_status(path, size) is not None
+
+
+def whole_status(path: Path, size: int) -> os.stat_result | None:
+    """What the system says of such a file, or None."""
     try:
         status = path.stat()
     except OSError:
-        return False
-    return stat.S_ISREG(status.st_mode) and status.st_size == size
+        return None
+    return status if stat.S_ISREG(status.st_mode) and status.st_size == size else None
 
 
 def _locked(lock: TextIO) -> bool:

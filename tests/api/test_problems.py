@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import gzip
 import json
 import math
 import re
@@ -129,6 +130,32 @@ def test_every_error_has_a_row_and_crosses_processes() -> None:
 
 
 JSON = {"Content-Type": "application/json"}
+
+
+def test_bodies_of_json_come_plain_and_bounded(client: TestClient) -> None:
+    told = assert_problem(
+        client.post("/lift", content=gzip.compress(b"{}"), headers=JSON | {"Content-Encoding": "gzip"})
+    )
+    assert (told["status"], told["argument"]) == (415, "Content-Encoding")
+    told = assert_problem(client.post("/lift", content=b" " * 2_000_000, headers=JSON))
+    assert (told["status"], told["argument"], told["expected"]) == (413, "body", "at most 1048576 bytes")
+
+
+@pytest.mark.parametrize(
+    ("query", "argument", "expected"),
+    [
+        ("top=" + "9" * 5000, "top", "an integer of fewer digits"),
+        ("view=left&view=right", "view", "one value"),
+        ("threshold=0.1&threshold=0.2", "threshold", "one value"),
+    ],
+)
+def test_parameters_are_single_and_of_bounded_size(
+    client: TestClient, query: str, argument: str, expected: str
+) -> None:
+    told = assert_problem(client.get(f"/query?text=apple&{query}"))
+    assert (told["status"], told["argument"], told["expected"]) == (422, argument, expected)
+    told = assert_problem(client.get("/assets?limit=1&limit=2"))
+    assert (told["status"], told["argument"]) == (422, "limit")
 
 
 def test_media_type_of_json_may_be_in_capitals(client: TestClient) -> None:
