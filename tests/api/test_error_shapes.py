@@ -218,9 +218,9 @@ def test_head_is_the_head_of_get(client: TestClient, lift: dict[str, Any], uploa
         if path == "/metrics" or head.status_code >= 400:  # counts come to have more digits, and ids are other ones
             names -= {"content-length"}
         assert all(head.headers.get(name) == whole.headers.get(name) for name in names), path
-    part = client.head(content, headers={"Range": "bytes=0-3"})
-    assert (part.status_code, part.headers["content-length"], part.content) == (206, "4", b"")
-    assert client.head(content, headers={"If-None-Match": part.headers["etag"]}).status_code == 304
+    whole = client.head(content, headers={"Range": "bytes=0-3"})  # ranges are for GET alone
+    assert (whole.status_code, int(whole.headers["content-length"])) == (200, len(client.get(content).content))
+    assert client.head(content, headers={"If-None-Match": whole.headers["etag"]}).status_code == 304
     refused = client.head("/lift")
     assert (refused.status_code, refused.headers["allow"]) == (405, "POST")
 

@@ -131,11 +131,6 @@ def test_content_is_sent_whole_in_parts_or_not_again(
         assert (reply.content, reply.headers["etag"]) == (scene.splats[part], tag)
 
 
-def test_head_has_no_range(client: TestClient, uploaded: Uploaded, scene: TinyScene) -> None:
-    reply = client.head(f"/assets/{uploaded.splats}/content", headers={"Range": "bytes=0-3"})
-    assert (reply.status_code, reply.headers["content-length"]) == (200, str(len(scene.splats)))
-
-
 def test_asset_in_use_stays(client: TestClient, uploaded: Uploaded, lift: dict[str, object]) -> None:
     for asset in (uploaded.splats, uploaded.cameras, uploaded.features):
         reply = client.delete(f"/assets/{asset}")
