@@ -304,7 +304,7 @@ async def nothing(*_: Any) -> None:
 
 def test_second_sigint_ends_the_notice() -> None:
     stopping = Stopping(EventStreams(1, 1), cast("Supervisor", Idle()), notice_seconds=600)
-    server = AnnouncingServer(uvicorn.Config(nothing, lifespan="off"), stopping, print)
+    server = AnnouncingServer(uvicorn.Config(nothing, lifespan="off"), stopping, 1, print)
     server.handle_exit(signal.SIGINT, None)
     again = threading.Timer(0.3, server.handle_exit, (signal.SIGINT, None))
 
