@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import json
+import shutil
+import textwrap
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, Self, Union, get_args, get_origin
@@ -54,6 +58,7 @@ class Parser(argparse.ArgumentParser):
 
     last = ""  # the argument that may be left out, and then come after options
     fill: Callable[[], None] | None = None  # adds the options, when they are needed first
+    appendix: Callable[[], str] | None = None  # what stands below the options, made when it is shown
 
     def filled(self) -> Self:
         """The parser with all of its options."""
@@ -64,6 +69,8 @@ class Parser(argparse.ArgumentParser):
 
     def format_help(self) -> str:
         self.filled()
+        if self.appendix is not None:
+            self.formatter_class, self.epilog = argparse.RawDescriptionHelpFormatter, self.appendix()
         return super().format_help()
 
     def parse_known_args(  # pyright: ignore[reportIncompatibleMethodOverride]: it has overloads
@@ -129,12 +136,29 @@ def add_sources(parser: argparse.ArgumentParser, features: str = "+", without: s
     parser.add_argument("features", type=place, nargs=features, help=f"feature packs (.safetensors){without}")
 
 
-def add_settings(parser: argparse.ArgumentParser) -> None:
+def add_settings(parser: Parser) -> None:
     """The settings of a lift."""
+    parser.appendix = settings_help
     parser.add_argument("--preset", metavar="NAME", help=f"a choice of weights: {PRESETS}")
     parser.add_argument("--speed", metavar="NAME", help="the dial: exact, balanced, fast or draft")
     add_device(parser)
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="one setting")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="one setting of those below")
+
+
+def settings_help() -> str:
+    """All settings of a lift in groups, with their defaults and meanings, as wide as the terminal."""
+    from liftcore import LiftSettings
+
+    wrap = partial(textwrap.fill, width=shutil.get_terminal_size().columns - 2, subsequent_indent=" " * 6)
+    lines = ["settings of a lift, for --set:"]
+    for group, names in LiftSettings.groups().items():
+        lines += ["", f"  {group}"]
+        for name in names:
+            field = LiftSettings.model_fields[name]
+            meaning = (field.description or "").replace("`", "")
+            default = json.dumps(LiftSettings.of().model_dump(mode="json")[name]).strip('"')
+            lines.append(wrap(f"{name}={default}: {meaning}", initial_indent=" " * 4))
+    return "\n".join(lines)
 
 
 def add_device(parser: argparse.ArgumentParser) -> None:

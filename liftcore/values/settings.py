@@ -98,109 +98,209 @@ _SPEEDS: dict[Speed, dict[str, Any]] = {
 MOST_CERTIFICATE_RAYS = 1_000_000  # of a new lift: ten millions of one view took 8 GB
 
 
+GROUPS = {  # of the settings, for people who read all of them
+    "a choice of many": ("preset", "speed"),
+    "weights of a ray that count": ("selection", "k", "mass", "weight_floor", "power"),
+    "pixels, views and levels": ("stride", "view_stride", "coverage", "view_cosine", "levels", "grid_reading"),
+    "the rasterizer": ("kernel", "antialiased", "lift_gain", "render_gain", "alpha_cap", "transmittance_stop"),
+    "wrong masks": ("robust_steps", "reliability", "consensus", "loss"),
+    "objects and clusters": (
+        "objects", "aggregation", "aggregation_clusters", "aggregation_guard", "aggregation_iou",
+        "aggregation_cluster_size", "aggregation_neighbours", "aggregation_sample", "aggregation_channels",
+        "aggregation_resolve",
+    ),
+    "neighbours": ("smoothness",),
+    "least squares": ("cg_steps", "damping", "cg_basis", "reference_channels"),
+    "the result, and where it is made": ("dtype", "certificate_rays", "seed", "device"),
+}  # fmt: skip
+
+
 class LiftSettings(Shown):
     """All that decides the result of a lift, and where it runs. Knobs left out take the preset's values."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    preset: Preset = Preset.DEFAULT
-    speed: Speed = Field(Speed.EXACT, description="the dial: sets stride, cut-off, views and certificate rays")
-    selection: Selection = Field(Selection.ALL, description="which of a ray's weights count")
-    k: int = Field(40, ge=1, le=MOST_OF_A_RAY, description="how many weights of a ray top-k keeps")
-    mass: float = Field(0.75, gt=0, le=1, description="the share of the light within which front-mass keeps weights")
-    weight_floor: float = Field(0.0, ge=0, lt=1, description="smaller weights count none, in every selection")
-    power: int = Field(1, ge=0, le=2, description="a kept weight's exponent: 1, w or w^2")
-    lift_gain: float = Field(1.0, gt=0, le=16, description="lambda on the opacity logits, lifting")
-    render_gain: float = Field(1.0, gt=0, le=16, description="lambda on the opacity logits, rendering")
-    alpha_cap: float = Field(0.99, gt=0, le=LARGEST_ALPHA, description="the largest alpha of a splat on a ray")
-    transmittance_stop: float = Field(1e-4, ge=0, lt=1, description="a ray ends before T falls to this")
+    preset: Preset = Field(
+        Preset.DEFAULT,
+        description="sets `selection`, `k`, `mass`, `weight_floor`, `power`, `lift_gain` and `render_gain`; "
+        "`default` also `robust_steps`, `reliability`, `consensus`, `aggregation_clusters` and "
+        "`aggregation_guard`",
+    )
+    speed: Speed = Field(
+        Speed.EXACT,
+        description="the dial: `exact`, `balanced`, `fast` or `draft` set five others; what you set yourself wins",
+    )
+    selection: Selection = Field(
+        Selection.ALL, description="which weights of a ray count: `all`, `top-k`, `front-mass` or `centre`"
+    )
+    k: int = Field(
+        40,
+        ge=1,
+        le=MOST_OF_A_RAY,
+        description="how many weights of a ray `top-k` keeps, 1 to 64; of equal ones the nearest to the camera",
+    )
+    mass: float = Field(
+        0.75,
+        gt=0,
+        le=1,
+        description="`front-mass` keeps a weight while less than this share of the light was taken before it",
+    )
+    weight_floor: float = Field(0.0, ge=0, lt=1, description="smaller weights do not count, whatever the selection")
+    power: int = Field(1, ge=0, le=2, description="exponent of the weights that count: 0 (each counts one), 1 or 2")
+    lift_gain: float = Field(1.0, gt=0, le=16, description="gain on the opacity logits when lifting")
+    render_gain: float = Field(1.0, gt=0, le=16, description="the same when rendering scores")
+    alpha_cap: float = Field(0.99, gt=0, le=LARGEST_ALPHA, description="largest alpha of a splat on a ray")
+    transmittance_stop: float = Field(
+        1e-4, ge=0, lt=1, description="a ray ends before its transmittance falls to this"
+    )
     antialiased: bool | Literal["auto"] = Field(
         "auto",
-        description="opacities compensated for the low-pass (mip filter), 3DGS only; auto: where the file of the "
-        "splats says that they were trained so",
+        description="true: `alpha~ = sigmoid(gain theta) sqrt(det(cov) / det(cov + low-pass))`, for 3DGS scenes "
+        "that were trained so; refused for 2DGS and DBS. `auto`: true where the file says so, else "
+        "false. The lift's metadata have what was used, and every answer uses the same",
     )
-    stride: int = Field(1, ge=1, le=64, description="lift from every n-th pixel in x and in y")
-    view_stride: int = Field(1, ge=1, description="lift from every n-th view, from the first on")
+    stride: int = Field(
+        1, ge=1, le=64, description="lift from every n-th pixel in x and in y; the evidence is scaled to all pixels"
+    )
+    view_stride: int = Field(1, ge=1, description="lift from every n-th view by name, from the first on")
     coverage: int = Field(
-        0, ge=0, description="views are chosen until they show a splat so often; with view_cosine, so often at least"
+        0,
+        ge=0,
+        description="choose views until each splat is shown this many times on average (before occlusion); 0 "
+        "takes all. With `view_cosine` it is the minimum",
     )
     view_cosine: float = Field(
-        0.0, ge=0, lt=1, description="the fewest views whose features should come this near to those of all, 0 = all"
+        0.0,
+        ge=0,
+        lt=1,
+        description="choose the fewest views from which features are expected to have this mean cosine to those "
+        "from all views (before reweighting); for 33 views and more. 0 takes all",
     )
     levels: Literal["rows", "composite"] | Annotated[int, Field(strict=True, ge=0)] = Field(
-        "rows", description="levels as rows of their own, summed in composite regions, or one level by its number"
+        "rows",
+        description="levels of a region map: `rows` of their own, `composite` (one region for each distinct set "
+        "of labels, with the normalised sum of their embeddings), or the number of the one to take",
     )
     grid_reading: Literal["bilinear", "nearest"] = Field(
-        "bilinear", description="what a pixel reads of a feature grid: four cells by distance, or the nearest alone"
+        "bilinear", description="what a pixel reads of a feature grid: four cells by distance, or the `nearest` alone"
     )
-    robust_steps: int = Field(0, ge=0, le=100, description="times that regions are reweighted by their agreement")
+    robust_steps: int = Field(
+        0,
+        ge=0,
+        le=100,
+        description="how often each region's weight at a splat is multiplied by its agreement with the other "
+        "views; 1 is enough. 0 turns off the next two and `aggregation_guard` as well",
+    )
     reliability: bool | Literal["auto"] = Field(
         False,
-        description="regions are weighted as a whole too, by what other views say of all their splats; auto: those "
-        "of masks, and grids stay as they are",
+        description="with a robust step: weigh regions as a whole too; `auto` does not for grids",
     )
     consensus: bool | Literal["auto"] = Field(
         False,
-        description="regions are weighted by whether masks of other views keep their splats together; auto: where "
-        "there are masks, and grids stay as they are",
+        description="with a robust step: weigh regions by what masks of other views keep together; `auto` does "
+        "not for grids, `true` refuses features that are grids alone",
     )
     objects: bool | Literal["auto"] = Field(
         "auto",
-        description="find objects without words, by what masks of many views keep together; auto: where the lift "
-        "has a region for each mask",
+        description="find objects without words: `auto` where there are masks (with several levels only beside a "
+        "robust step), `true` always (region weights of several levels then take twice as long), "
+        "`false` never",
     )
     loss: Literal["l2", "huber"] = Field(
-        "l2", description="what features are nearest by: squares, or Huber's loss, by a few reweighted closed forms"
+        "l2",
+        description="the loss that features minimise: squares, or `huber` by three reweighted closed forms after "
+        "any robust step; it gains nothing where masks are wrong",
     )
     dtype: Literal["float16", "float32"] = Field(
-        "float16", description="how features are stored, if it can hold them"
+        "float16", description="how features are stored, or `float32`; what float16 cannot hold is stored as float32"
     )
     aggregation: bool = Field(False, description="Post-Lifting Aggregation: one feature a cluster of splats")
     aggregation_clusters: Literal["hdbscan", "touching", "graph", "auto"] = Field(
         "hdbscan",
-        description="what makes clusters: HDBSCAN on features; touching, its clusters parted in space; the graph of "
-        "regions, which other views keep together; auto: the graph where there are masks, else touching",
+        description="what makes clusters: `hdbscan` on features, as published; `touching`, its clusters parted "
+        "where splats do not touch; `graph`, the objects of masks; `auto` is `graph` where there are "
+        "masks and no `aggregation_resolve`, else `touching`",
     )
     aggregation_guard: bool = Field(
         False,
-        description="splats take their cluster's feature only where it explains what views say of them as well as "
-        "their own",
+        description="with a robust step: a splat takes its cluster's feature only where that explains what views "
+        "say of it as well as its own",
     )
-    aggregation_iou: float = Field(0.75, gt=0, le=1, description="from which IoU with its cluster a region is kept")
+    aggregation_iou: float = Field(
+        0.75,
+        gt=0,
+        le=1,
+        description="from which IoU with the silhouette of its cluster a region is kept; rays with a row sum "
+        "below a half are in no silhouette",
+    )
     aggregation_cluster_size: int = Field(500, ge=2, le=10_000_000, description="splats at least in a cluster")
-    aggregation_neighbours: int = Field(10, ge=1, le=1_000, description="neighbours that a splat's density reaches")
-    aggregation_sample: int = Field(10_000, ge=2, le=50_000, description="splats that HDBSCAN sees")
+    aggregation_neighbours: int = Field(
+        10, ge=1, le=1_000, description="neighbours that the density at a splat looks at (HDBSCAN's `min_samples`)"
+    )
+    aggregation_sample: int = Field(
+        10_000, ge=2, le=50_000, description="splats that HDBSCAN sees; the others join the nearest cluster"
+    )
     aggregation_resolve: bool = Field(
         False,
-        description="splats without a cluster's feature are solved for again from the kept regions alone, if these "
+        description="splats that take no cluster's feature are solved again from the kept regions, where these "
         "have most of their weight",
     )
-    aggregation_channels: int = Field(50, ge=1, le=1_024, description="principal components that it sees")
+    aggregation_channels: int = Field(50, ge=1, le=1_024, description="principal components that HDBSCAN sees")
     certificate_rays: int = Field(
         10_000,
         ge=0,
         le=10_000_000,
-        description="rays sampled for the certificate",
+        description="rays sampled for the certificate, a million at most",
         json_schema_extra={"maximum": MOST_CERTIFICATE_RAYS},  # of a new lift
     )
-    seed: int = Field(0, ge=0, lt=2**31, description="of samples, random projections and strides")
+    seed: int = Field(
+        0,
+        ge=0,
+        lt=2**31,
+        description="of all samples, of a stride's first pixel in each view, and of random projections",
+    )
     smoothness: Annotated[float, Field(ge=0, le=1e6)] | Literal["auto"] = Field(
         0.0,
-        description="lambda of the term that draws splats near in place and colour together, 0 = off; auto: the one "
-        "with which half of the views tells most of the other half",
+        description="lambda of the term that draws the features of splats near in place and colour together: 0 is "
+        "off; `auto` takes the strength that halves of the views ask for, off among them. A strength "
+        "of your own loses on maps that vary within things. `splatlift refine` does it to a lift that "
+        "is there, with a number. On a card it runs on the processor. Refused with an `engine`, and "
+        "with `aggregation_resolve`",
     )
-    cg_steps: int = Field(0, ge=0, le=10_000, description="least-squares steps from the closed form on, 0 = none")
-    damping: float = Field(1.0, ge=0, le=1e6, description="mu, pulls least squares towards the closed form")
-    cg_basis: int = Field(0, ge=0, le=65_536, description="principal feature directions refined, 0 = all channels")
+    cg_steps: int = Field(
+        0,
+        ge=0,
+        le=10_000,
+        description="conjugate gradient steps at most, from the closed form towards the smallest `|A x - b|^2`. "
+        "Each step renders all views, forth and back, for every 32 channels",
+    )
+    damping: float = Field(
+        1.0,
+        ge=0,
+        le=1e6,
+        description="how strongly these steps are held at the closed form; 0 is plain least squares, which "
+        "believes wrong masks",
+    )
+    cg_basis: int = Field(
+        0,
+        ge=0,
+        le=65_536,
+        description="refine this many principal directions of the features only; 0 refines all channels",
+    )
     reference_channels: int = Field(
-        0, ge=0, le=1_024, description="random projections in which the certificate finds L(x^), 0 = off"
+        0,
+        ge=0,
+        le=1_024,
+        description="let the certificate look for that optimum, in this many random projections of the channels: "
+        "up to 100 such steps for every 32",
     )
     kernel: Literal["auto", "3dgs", "2dgs", "dbs"] = Field(
         "auto",
-        description="what the splats are; auto: by their properties, else by what the file says of its training",
+        description="`3dgs`, `2dgs` or `dbs`; `auto` tells by the file's properties, or by what the file says. A "
+        "2DGS scene with three scales that says nothing looks like 3DGS: name `2dgs`",
     )
     device: Literal["auto", "cpu", "cuda"] = Field(
-        "auto", description="what walks and solves: auto takes a card where torch and Triton can use one"
+        "auto", description="`cpu`, `cuda`, or `auto` for a card where one can be used"
     )
 
     @model_validator(mode="wrap")
@@ -350,6 +450,11 @@ class LiftSettings(Shown):
     def _compositing(self, opacity_logit_scale: float) -> CompositingParams:
         antialiased = self.antialiased is True  # auto stands for splats that say nothing, before `for_splats`
         return CompositingParams(opacity_logit_scale, self.alpha_cap, self.transmittance_stop, antialiased)
+
+    @staticmethod
+    def groups() -> Mapping[str, tuple[str, ...]]:
+        """The names of all settings by what they are about, as the command line's help lists them."""
+        return GROUPS
 
     @classmethod
     def of(cls, /, **values: Any) -> Self:

@@ -49,6 +49,11 @@ def field_table(model: type[BaseModel]) -> str:
     return "\n".join(rows) + "\n"
 
 
+def without_links(line: str) -> str:
+    """A line whose links are their text, but for those in brackets, which are gone: ``([figures](results.md))``."""
+    return re.sub(r"\[([^\]]+)\]\([^)]*\)", r"\1", re.sub(r" \(\[[^\]]+\]\([^)]*\)\)", "", line))
+
+
 def table_heads(name: str) -> list[str]:
     """The first cell of every table row."""
     return re.findall(r"^\| (.*?) \|", text(name), flags=re.MULTILINE)

@@ -33,6 +33,7 @@ from .readme import (
     shell_commands,
     table_heads,
     text,
+    without_links,
 )
 
 
@@ -135,9 +136,27 @@ def test_every_command_is_told_and_every_option_has_help() -> None:
 def test_every_setting_of_a_lift_is_told_with_its_default() -> None:
     section = text(SETTINGS).partition("## All settings")[2].partition("\n## ")[0]
     rows = dict(re.findall(r"^\| `([a-z_]+)` \| (.*?) \|", section, flags=re.MULTILINE))
+    meanings = {
+        name: without_links(meaning).replace(r"\|", "|")
+        for name, meaning in re.findall(r"^\| `([a-z_]+)` \| .*? \| (.*) \|$", section, flags=re.MULTILINE)
+    }
     for name, default in LiftSettings.of().model_dump(mode="json").items():
         shown = rows[name].split(" (")[0].strip("`")
         assert shown in (str(default), json.dumps(default)) or float(shown) == default, name
+        assert meanings[name] == LiftSettings.model_fields[name].description, name
+
+
+def test_help_of_a_lift_lists_every_setting_in_a_group(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    names = [name for group in LiftSettings.groups().values() for name in group]
+    assert sorted(names) == sorted(LiftSettings.model_fields)
+    with pytest.raises(SystemExit, match="0"):
+        build_parser().parse_args(["lift", "--help"])
+    lines = capsys.readouterr().out.partition("settings of a lift")[2]
+    assert re.findall(r"^    ([a-z_]+)=", lines, flags=re.MULTILINE) == names
+    assert max(map(len, lines.splitlines())) <= 80
 
 
 def test_every_field_of_a_question_is_in_the_table() -> None:
