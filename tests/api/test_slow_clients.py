@@ -125,7 +125,14 @@ def test_requests_over_more_connections_than_allowed_are_503_until_one_ends(tmp_
             third = stack.enter_context(client_of(address))
             third.sendall(HEALTH)
             assert third.recv(1 << 16).startswith(b"HTTP/1.1 503 ")
-        until(lambda: httpx.get(f"http://127.0.0.1:{address[1]}/healthz").status_code == 200)
+        until(lambda: answers(address))
+
+
+def answers(address: tuple[str, int]) -> bool:
+    """Whether the service answers one that comes now."""
+    with contextlib.suppress(httpx.TransportError):  # its connection may be one of those that are closed
+        return httpx.get(f"http://{address[0]}:{address[1]}/healthz").status_code == 200
+    return False
 
 
 def test_connections_without_a_request_make_room_for_others(tmp_path: Path) -> None:
@@ -137,8 +144,8 @@ def test_connections_without_a_request_make_room_for_others(tmp_path: Path) -> N
         idle = [stack.enter_context(client_of(address)) for _ in range(20)]
         for client in idle[::2]:
             client.sendall(b"GET / HTTP/1.1\r\nX: ")
-        until(lambda: len(server.server_state.connections) < 3)
-        assert httpx.get(f"http://127.0.0.1:{address[1]}/healthz").status_code == 200
+        # Not all may have been accepted yet, so that the first answers may be 503.
+        until(lambda: answers(address))
         busy.sendall(b"{}".ljust(5000))
         assert busy.recv(1 << 16).startswith(b"HTTP/1.1 422 ")
 
