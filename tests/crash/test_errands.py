@@ -50,8 +50,11 @@ Run = Callable[..., TaskResult | None]
 
 
 def kill_template() -> None:
-    with suppress(AssertionError):
-        os.kill(template_of(os.getpid()), signal.SIGKILL)
+    """Kill the template, if there is one, and wait until the system has it as dead: without a command line."""
+    with suppress(AssertionError, OSError):
+        os.kill(template := template_of(os.getpid()), signal.SIGKILL)
+        while Path(f"/proc/{template}/cmdline").read_bytes():
+            time.sleep(0.01)
 
 
 @pytest.fixture
