@@ -36,7 +36,7 @@ LEAST_CONFIDENCE = 0.02  # that a splat counts by: one view alone says something
 LEAST_WEIGHT = 1e-30  # of the largest; a splat below it has no evidence
 BLOCK = 32  # channels solved at a time: four [P, 32] f32
 ROWS = 1 << 13  # splats of one piece of work
-TOLERANCE = 3e-3  # of each channel's gradient, relative to that at X0, over sqrt(1 + lambda): what varies slowly
+TOLERANCE = 1e-3  # of each channel's gradient, relative to that at X0, over sqrt(1 + lambda): what varies slowly
 # over the scene has little of the gradient, the less the larger lambda
 ROUGHLY = 2e-2  # a tolerance by which features are compared, not delivered
 STEPS = 200  # of conjugate gradients at most; with lambda 4 about 20 are enough
