@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from difflib import get_close_matches
+from difflib import SequenceMatcher
 from itertools import islice
 from typing import TYPE_CHECKING
 
@@ -22,5 +22,11 @@ def nearest(text: str, names: Iterable[str], count: int) -> str:
     text, cut = text[:_SHOWN], [name[:_SHOWN] for name in islice(names, _COMPARED)]
     begin = [name for name in cut if text and name.startswith(f"{text} ")]
     most = _COMPARED_CHARACTERS // max(1, *map(len, cut), 1)
-    alike = get_close_matches(text, cut[:most], count, cutoff=0.0)
+    matcher = SequenceMatcher(b=text)
+
+    def likeness(name: str) -> float:
+        matcher.set_seq1(name)
+        return matcher.ratio()
+
+    alike = sorted(cut[:most], key=likeness, reverse=True)  # of names as near the first, as they were listed
     return f"nearest: {', '.join(list(dict.fromkeys([*begin, *alike]))[:count])}"

@@ -66,7 +66,7 @@ CALLS: list[tuple[str, Call]] = [
     (r"'focal': expected one of viewmat, .*fx, fy", lambda s: s.cameras["v0"].replace(focal=3)),
     (r"fx: expected a number of pixels, got 'wide'", lambda s: s.cameras["v0"].replace(fx="wide")),
     (r"view: expected the name of a camera, got int 0; list\(cameras\)", lambda s: s.cameras[0]),
-    (r"view: .* got 'v9'; nearest: v", lambda s: s.cameras["v9"]),
+    (r"view: .* got 'v9'; nearest: v0", lambda s: s.cameras["v9"]),
     # views
     (r"labels: expected integers \[L, h, w\].* got float64", lambda s: lc.Regions(np.ones((4, 4)), np.eye(2))),
     (r"labels: .* rows of its codebook \(0\.\.1\) or -1", lambda s: lc.Regions(np.full((4, 4), 7), np.eye(2))),
