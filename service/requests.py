@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import re
 from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, wraps
@@ -13,17 +14,18 @@ import anyio
 from fastapi import APIRouter, Body, Depends, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import APIRoute
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from service import models
 from service.content import TAGGED
-from service.errors import InvalidRequest, TooLarge, UnreadableBody, UnsupportedEncoding
-from service.problems import CLOSE
+from service.errors import InvalidRequest, ServiceError, TooLarge, UnreadableBody, UnsupportedEncoding
+from service.problems import CLOSE, refusal
 
 NAME_CHARACTERS = 80  # of a name or a value that came, told back
 M = TypeVar("M", bound=BaseModel)
 F = TypeVar("F", bound=Callable[..., Any])
 BODY = "in the body of the request"
+JSON = re.compile(r"\s*application/([^;\s]+\+)?json\s*(;|$)", re.IGNORECASE)  # what the framework takes for it
 LET_GO = 16  # times the limit of a body: an upload sent to the wrong route ends there
 
 
@@ -63,33 +65,36 @@ def _names(route: APIRoute) -> Iterator[str]:
 
 
 class JsonRoute(APIRoute):
-    """A route whose body is bounded, and parsed in a thread: on the event loop a megabyte of odd JSON would keep
-    everybody waiting. The framework validates what comes of it.
+    """A route whose body is bounded, and parsed and validated in a thread: on the event loop a megabyte of odd JSON
+    would keep everybody waiting. What comes of it is all that is kept of a body while its request waits.
     """
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         """The framework's, after the body."""
-        handle = super().get_route_handler()
+        handle, body = super().get_route_handler(), self.body_field
+        if body is None:
+            return handle
+        model = TypeAdapter[Any](body.field_info.annotation)
 
         async def with_body(request: Request) -> Response:
             bounded = _BoundedRequest(request.scope, request.receive)
-            await bounded.read()
+            await bounded.read(model)
             return await handle(bounded)
 
-        return with_body if self.body_field is not None else handle
+        return with_body
 
 
 class _BoundedRequest(Request):
-    """A request with its body read within the limit, and parsed where that is JSON."""
+    """A request with its body read within the limit, and as a model where it is JSON."""
 
-    async def read(self) -> None:
-        """Read and parse it.
+    async def read(self, model: TypeAdapter[Any]) -> None:
+        """Read and validate it.
 
         Raises:
             UnsupportedEncoding: it is compressed.
             TooLarge: it is too long. A client that is still sending when its connection closes never reads the
                 answer: what is a few times too long is read to its end and let go.
-            InvalidRequest: it holds too many values.
+            InvalidRequest: it holds too many values, is no JSON, or not what the route takes.
             UnreadableBody: it cannot be parsed.
         """
         require_plain(self.headers.getlist("content-encoding"))
@@ -104,19 +109,18 @@ class _BoundedRequest(Request):
         if received > limit:
             raise _too_large(limit)
         self._begin, self._value = bytes(content[:NAME_CHARACTERS]), None
-        if "json" in self.headers.get("content-type", "").lower():  # else the framework refuses it unread
-            self._value = await anyio.to_thread.run_sync(_parsed, bytes(content), limiter=deps.parsing)
+        if content and JSON.match(self.headers.get("content-type", "")):  # else the framework refuses it unread
+            self._value = await anyio.to_thread.run_sync(_validated, self, model, content, limiter=deps.parsing)
+            if isinstance(self._value, ServiceError):
+                raise self._value
 
     async def body(self) -> bytes:
         """What it begins with: the framework asks whether there is one, and shows what is no JSON."""
         return self._begin
 
     async def json(self) -> Any:
-        """The values, once."""
-        value, self._value = self._value, None
-        if isinstance(value, json.JSONDecodeError):
-            raise value
-        return value
+        """The model, which the framework takes as it is."""
+        return self._value
 
 
 def _too_large(limit: int, headers: Mapping[str, str] | None = None) -> TooLarge:
@@ -137,20 +141,25 @@ def require_plain(content_encodings: Sequence[str]) -> None:
         )  # fmt: skip
 
 
-def _parsed(content: bytes) -> Any:
+def _validated(request: Request, model: TypeAdapter[Any], content: bytearray) -> Any:
+    """A body as a model, or what is wrong with it: raised here, an error would hold the body for a while."""
     # To parse them takes a tenth of a second of everybody's time, whatever they are.
     if content.count(b"[") + content.count(b"{") > models.BODY_BRACKETS or content.count(b",") > models.BODY_COMMAS:
         expected = f"JSON of at most {models.BODY_COMMAS} values and {models.BODY_BRACKETS} lists and objects"
-        raise InvalidRequest("body", expected=expected, got="more", hint=BODY)
+        return InvalidRequest("body", expected=expected, got="more", hint=BODY)
     try:
-        return json.loads(content)
+        return model.validate_python(json.loads(content))
     except json.JSONDecodeError as error:
-        return error  # the framework tells of it
+        first = {"type": "json_invalid", "loc": ("body", error.pos), "ctx": {"error": error.msg}}
+        return refusal(request, RequestValidationError([first], body=error.doc))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        return refusal(request, RequestValidationError([{**first, "loc": ("body", *first["loc"])}]))
     except UnicodeDecodeError:
-        raise UnreadableBody("body", expected="JSON in UTF-8", got="bytes that are none", hint=BODY) from None
+        return UnreadableBody("body", expected="JSON in UTF-8", got="bytes that are none", hint=BODY)
     except (ValueError, RecursionError):
         got = "a number of thousands of digits, or brackets within brackets without end"
-        raise UnreadableBody("body", expected="JSON that can be read", got=got, hint=BODY) from None
+        return UnreadableBody("body", expected="JSON that can be read", got=got, hint=BODY)
 
 
 @dataclass(frozen=True)

@@ -113,6 +113,20 @@ def of_a_megabyte(client: httpx.Client, number: int) -> None:
     client.post("/lift", content=body, headers={"Content-Type": "application/json"})
 
 
+def wrong_and_large(client: httpx.Client, number: int) -> None:
+    """Bodies of up to a megabyte, each to another route: of vectors, settings, words, or no JSON."""
+    settings = {f"name{k}": "x" * 9 for k in range(40_000)}
+    bodies = [
+        json.dumps({"text": ["a"], "like": [[0.123456] * 4096] * 28}), json.dumps({"words": ["a word"] * 90_000}),
+        json.dumps({"splats": "s", "cameras": "c", "features": ["f"], "settings": settings}), "[" * 900_000,
+        f"[{'1,' * 60_000}1]", "\xff" * 500_000, "x" * (4 << 20),
+    ]  # fmt: skip
+    routes = ("/query", "/lift", "/query/segment", "/query/what", "/render", "/lift/plan", "/tradeoff", "/query/mask")
+    for place, body in enumerate(bodies):
+        route = routes[(number + place) % len(routes)]
+        client.post(route, content=body, headers={"Content-Type": "application/json"})
+
+
 def loads(asset: str, lift: str) -> dict[str, Load]:
     """The loads by name."""
     scores = f"/query/scores?like=splat:0&lift={lift.removeprefix('/lifts/')}"
@@ -124,6 +138,7 @@ def loads(asset: str, lift: str) -> dict[str, Load]:
         "80 clients that do not read": never_read(("/jobs", asset, f"{asset}/names", lift, "/lifts")),
         "80 that do not read 32 MB of scores": never_read((scores,), pipelined=1),
         "32 orders with settings of 1 MB": many(32, of_a_megabyte),
+        "8 at once: wrong and large bodies": many(8, wrong_and_large),
         "8 at once: GET /jobs whole": many(8, lambda client, _: client.get("/jobs")),
     }
 
