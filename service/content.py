@@ -17,7 +17,6 @@ from fastapi import Query, Request
 from fastapi.responses import FileResponse, Response, StreamingResponse
 from fastapi.sse import EventSourceResponse, format_sse_event
 from pydantic import BaseModel
-from starlette import responses
 from starlette.types import Receive, Scope, Send
 
 from liftcore.errors import NotFound
@@ -31,8 +30,8 @@ from service.store.jobs import Event, EventKind
 
 BLOCK_BYTES = 256 << 10  # of a draft that is read and sent at a time
 STREAMED = 50  # records of a list that are in memory at a time: of a job of 10,000 packs there are 700 KB
-FAR_BEGINNING = re.compile(r"(=\s*)0*[1-9]\d{19,}(?=\s*-)", re.ASCII)  # int() takes no number of thousands of digits
-RANGE = re.compile(r"\s*bytes\s*=[\d\s,-]*", re.ASCII | re.IGNORECASE)
+FAR_DIGITS = 20  # of a number beyond every file; int() takes no number of thousands of digits
+RANGE = re.compile(r"\s*bytes\s*=\s*(\d*)\s*-\s*(\d{0,19})\s*", re.ASCII | re.IGNORECASE)
 BINARY = "application/octet-stream"
 BYTES = {BINARY: {"schema": {"type": "string", "format": "binary"}}}
 
@@ -94,26 +93,44 @@ def file_answer(request: Request, file: StoredFile) -> Response:
             "content", expected=f"a file of {file.bytes} bytes in the data directory", got=there,
             hint="it was deleted a moment ago, or something else wrote there: upload it again, or lift again",
         )  # fmt: skip
-    return unchanged(request, etag) or _FileAnswer(
-        file.path, headers=kept(etag), filename=file.name, media_type=BINARY, stat_result=status
-    )
+    if (same := unchanged(request, etag)) is not None:
+        return same
+    asked, condition = request.headers.get("range"), request.headers.get("if-range", etag)
+    part = _range_of(asked, file.bytes) if asked is not None and condition == etag else None
+    return _FileAnswer(part, file.path, headers=kept(etag), filename=file.name, stat_result=status)
+
+
+def _range_of(header: str, size: int) -> tuple[int, int] | None:
+    """The first and the last byte that a Range header asks for; None for what is as none: several ranges, malformed
+    ones (RFC 9110, 14.2).
+
+    Raises:
+        RangeNotSatisfiable: it begins beyond the end.
+    """
+    match = RANGE.fullmatch(header)
+    if match is None or not any(match.groups()):
+        return None
+    first, last = match[1].lstrip("0") or match[1][:1], int(match[2] or size)
+    begin = max(0, size - last) if not first else int(first) if len(first) < FAR_DIGITS else size
+    if begin >= size:
+        expected, told = f"a range within {size} bytes", {"Content-Range": f"bytes */{size}"}
+        raise RangeNotSatisfiable("Range", expected=expected, got=header[:80], headers=told)
+    last = min(last, size - 1) if first else size - 1
+    return (begin, last) if begin <= last else None
 
 
 class _FileAnswer(FileResponse):
-    """Starlette's, but that a range which it does not understand is as none, as RFC 9110 has it."""
+    """Starlette's, of the part that `_range_of` found, or of the whole file."""
 
-    @classmethod
-    def _parse_range_header(cls, http_range: str, file_size: int) -> list[tuple[int, int]]:
-        if RANGE.fullmatch(http_range) is None:  # int() takes signs and underscores too
-            return []
-        try:
-            ranges = super()._parse_range_header(FAR_BEGINNING.sub(r"\g<1>" + "9" * 19, http_range), file_size)
-        except responses.MalformedRangeHeader:
-            return []
-        except responses.RangeNotSatisfiable:
-            expected, told = f"a range within {file_size} bytes", {"Content-Range": f"bytes */{file_size}"}
-            raise RangeNotSatisfiable("Range", expected=expected, got=http_range[:80], headers=told) from None
-        return ranges if len(ranges) == 1 else []
+    def __init__(self, part: tuple[int, int] | None, *file: Any, **answer: Any) -> None:
+        super().__init__(*file, media_type=BINARY, **answer)
+        self._part = part
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        headers = [header for header in scope["headers"] if header[0] not in (b"range", b"if-range")]
+        if self._part is not None:
+            headers.append((b"range", b"bytes=%d-%d" % self._part))
+        await super().__call__({**scope, "headers": headers}, receive, send)
 
 
 class Draft(StreamingResponse):

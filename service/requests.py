@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, wraps
-from typing import Annotated, Any, Generic, TypeVar
+from typing import Annotated, Any, Generic, TypeVar, cast
 
 import anyio
 from fastapi import APIRouter, Body, Depends, Request, Response
@@ -74,7 +74,7 @@ class JsonRoute(APIRoute):
         handle, body = super().get_route_handler(), self.body_field
         if body is None:
             return handle
-        model = TypeAdapter[Any](body.field_info.annotation)
+        model = TypeAdapter(cast("type[Any]", body.field_info.annotation))
 
         async def with_body(request: Request) -> Response:
             bounded = _BoundedRequest(request.scope, request.receive)
