@@ -12,7 +12,9 @@ from starlette.datastructures import MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.auth import CALLER
+from service.errors import Busy
 from service.observe import Metrics, access, chosen_id, working_for
+from service.problems import CLOSE, answer_to
 
 PLACES = 4  # of requests that are begun at the same time
 TURN_SECONDS = 0.05  # many times what the event loop needs for a request
@@ -77,6 +79,11 @@ class Recorder:
         with working_for(made):
             try:
                 await self._app(scope, counted, marked)
+            except asyncio.CancelledError:  # by the server, whose stop has no more time for it
+                if status:
+                    raise
+                why = Busy("server", expected="a running server", got="one that stops", hint="send it again")
+                await answer_to(why, CLOSE)(scope, counted, marked)
             except Exception:
                 if (
                     not complete

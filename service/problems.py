@@ -104,9 +104,10 @@ def answer(problem: Problem, headers: Mapping[str, str] | None = None) -> JSONRe
     return JSONResponse(told, problem.status, headers=headers, media_type=MEDIA_TYPE)
 
 
-def answer_to(error: SplatliftError) -> JSONResponse:
-    """The error as a response, with the headers that belong to it."""
-    return answer(problem_of(error), error.headers if isinstance(error, errors.ServiceError) else None)
+def answer_to(error: SplatliftError, more: Mapping[str, str] | None = None) -> JSONResponse:
+    """The error as a response, with the headers that belong to it, and more."""
+    own = error.headers if isinstance(error, errors.ServiceError) else {}
+    return answer(problem_of(error), {**own, **(more or {})})
 
 
 def install(app: FastAPI) -> None:

@@ -192,3 +192,11 @@ def test_answer_does_not_wait_for_the_rest_of_a_body_that_nobody_reads(live: tup
     with client_of(live) as client:
         client.sendall(begin)
         assert client.recv(1 << 16).startswith(b"HTTP/1.1 200 ")
+
+
+def test_request_that_outlasts_the_time_of_a_stop_is_refused_as_a_problem(tmp_path: Path) -> None:
+    with running(tmp_path, stop_seconds=0.1) as server, client_of(address_of(server)) as client:
+        client.sendall(HEAD + b"ply\n")
+        until(lambda: server.server_state.tasks)
+        server.should_exit = True
+        assert_problem(answer(client), 503, "busy")
