@@ -28,6 +28,7 @@ COMMANDS = {
     "query": "find words and examples in a lift",
     "segment": "name every splat of a lift by the best of many words",
     "objects": "the things in a lift, found without a word",
+    "export": "a lifted scene with its labels, for other programs",
     "render": "a picture of a lift from any camera",
     "pack": "make a feature pack of the field's formats",
     "encode": "make a feature pack of images",

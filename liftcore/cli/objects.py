@@ -15,7 +15,7 @@ from liftcore.cli.segment import read_words
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from liftcore import Scene, TextEncoder
+    from liftcore import Catalogue, Scene, TextEncoder
 
 
 def add_arguments(parser: Parser) -> None:
@@ -39,8 +39,7 @@ def run(options: argparse.Namespace) -> int:
     scene = Scene(options.lift)
     if files or options.splats:
         free_outputs(files, made_from(scene))
-    encoder, words = _vocabulary(options, scene)
-    found = scene.catalogue(words, encoder=encoder)
+    encoder, found = named_catalogue(options, scene)
     answer = found.summary(features=options.features)
     document: dict[str, Any] = {"encoder": None if encoder is None else encoder.name}
     document["answer"] = answer.model_dump(mode="json")
@@ -61,6 +60,12 @@ def run(options: argparse.Namespace) -> int:
     document["files"] = write_files(files, exports)
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
+
+
+def named_catalogue(options: argparse.Namespace, scene: Scene) -> tuple[TextEncoder | None, Catalogue]:
+    """The objects of a lift, named by ``--vocabulary`` or the words of the encoder, and that encoder."""
+    encoder, words = _vocabulary(options, scene)
+    return encoder, scene.catalogue(words, encoder=encoder)
 
 
 def _vocabulary(options: argparse.Namespace, scene: Scene) -> tuple[TextEncoder | None, list[str]]:

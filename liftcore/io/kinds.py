@@ -71,6 +71,7 @@ class SplatFormat(StrEnum):
     SPLAT = ".splat"
     SPZ = ".spz"
     SOG = ".sog"
+    GLTF = ".glb"  # or .gltf, with KHR_gaussian_splatting
     CHECKPOINT = "checkpoint"  # of gsplat or nerfstudio: a pickle, if only of tensors
 
 
@@ -80,10 +81,11 @@ SUFFIX = {
     SplatFormat.SPLAT: ".splat",
     SplatFormat.SPZ: ".spz",
     SplatFormat.SOG: ".sog",
+    SplatFormat.GLTF: ".glb",
     SplatFormat.CHECKPOINT: ".pt",
 }
 PICKLED = (".pt", ".pth", ".ckpt", ".pkl")
-SPLATS_SENT = (".ply", ".splat", ".spz", ".sog")  # over HTTP, where no pickle is opened
+SPLATS_SENT = (".ply", ".splat", ".spz", ".sog", ".glb", ".gltf")  # over HTTP, where no pickle is opened
 
 
 @dataclass(frozen=True)
@@ -109,8 +111,7 @@ _VIEWER = FileKind(
     "a web page that shows splats",
     "export them from SuperSplat's editor as .ply or .sog in place of the viewer",
 )
-_GLTF = FileKind(None, "a glTF model", f"if it holds splats, {NOT_CONVERTED}; a mesh has none")
-_GLTF_SPLATS = FileKind(None, "splats as glTF (KHR_gaussian_splatting)", NOT_CONVERTED)
+_GLTF = FileKind(None, "a glTF model without splats (KHR_gaussian_splatting)", f"a mesh has none: {NOT_CONVERTED}")
 _USD = FileKind(None, "a USD scene", f"if it holds splats, {NOT_CONVERTED}; a mesh has none")
 _PICTURE = FileKind(None, "a picture")
 _VIDEO = FileKind(
@@ -203,8 +204,6 @@ _BY_SUFFIX: dict[str, FileKind] = {
         "export the splats from SuperSplat as .ply, or unzip it: splat_0.ply is in it",
     ),
     ".vkgs": FileKind(None, "a project of vk_gaussian_splatting", "give the .ply, .spz or .splat that it names"),
-    ".glb": _GLTF,
-    ".gltf": _GLTF,
     **dict.fromkeys((".usdz", ".usdc", ".usda", ".usd"), _USD),
     ".rad": _RAD,
     ".spx": _SPX,
@@ -412,7 +411,7 @@ def _by_magic(head: bytes) -> FileKind | None:
     if found is None and head[:1] == b"\x80" and head[1:2] in b"\x02\x03\x04\x05":
         found = FileKind(None, "a Python pickle, which may run code when it is opened", EXPORT_PLY)
     if found is _GLTF and b"KHR_gaussian_splatting" in head:
-        return _GLTF_SPLATS
+        return _splats_as(SplatFormat.GLTF)
     return found
 
 
@@ -508,7 +507,7 @@ def _object_rules(document: dict[str, Any], path: Path) -> Iterator[FileKind | N
     yield frame if keys >= {"transform", "scale"} else None
     is_gltf = "asset" in keys and keys & {"buffers", "accessors", "scenes", "meshes"}
     has_splats = "KHR_gaussian_splatting" in str(document.get("extensionsUsed", ""))
-    yield (_GLTF_SPLATS if has_splats else _GLTF) if is_gltf else None
+    yield (_splats_as(SplatFormat.GLTF) if has_splats else _GLTF) if is_gltf else None
     hint = "'splatlift pack prompts' makes a feature pack of its folder"
     yield FileKind(None, "masks as JSON (COCO)", hint) if keys >= {"annotations", "images"} else None
     is_project = keys >= {"splats", "camera"} or keys >= {"view", "poseSets"} or keys >= {"timeline", "version"}

@@ -24,7 +24,7 @@ class OutputType:
 
 
 OUTPUT_TYPES = {
-    "splats": OutputType("splats", (".ply", ".splat", ".spz"), "splats"),
+    "splats": OutputType("splats", (".ply", ".splat", ".spz", ".glb"), "splats"),
     "ply": OutputType("a PLY", (".ply",), "splats"),
     "png": OutputType("a picture", (".png",), None, "a picture"),
     "npy": OutputType("an array", (".npy",), None, "a NumPy array"),
@@ -32,8 +32,9 @@ OUTPUT_TYPES = {
     "pack": OutputType("a feature pack", (".safetensors",), "features"),
     "csv": OutputType("a table", (".csv",), None),
     "json": OutputType("JSON", (".json",), None),
+    "jsonl": OutputType("JSON Lines", (".jsonl",), None),
 }
-CONVERTED = (".sog", ".glb", ".html", ".csv", ".compressed.ply", ".splat", ".spz")  # which splat-transform writes
+CONVERTED = (".sog", ".html", ".csv", ".compressed.ply", ".splat", ".spz")  # which splat-transform writes
 
 
 def check_output(path: Path | str, inputs: Path | str | Iterable[Path | str], kind: str) -> Path | str:

@@ -6,7 +6,6 @@ what it is and what to do.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -20,7 +19,10 @@ from liftcore.io import ply
 from liftcore.io.checkpoint import read_checkpoint
 from liftcore.io.compressed_ply import read_compressed_ply
 from liftcore.io.files import whole_file
+from liftcore.io.gltf import read_gltf, read_gltf_document
+from liftcore.io.gltf_writer import gltf_blocks
 from liftcore.io.kinds import CONVERT, SplatFormat, identify, wrong_kind
+from liftcore.io.labels import COLUMN, IDS, Labels, read_document
 from liftcore.io.quantised import Fields
 from liftcore.io.ranks import rank_files
 from liftcore.io.remote import landing, local_path
@@ -39,22 +41,25 @@ if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
 
 
-COLUMN = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]{0,63}")  # a name that readers of PLY take
 PLUGINS = "splatlift.splat_formats"  # the entry points of other packages' readers, by suffix
-OWN_SUFFIXES = ("ply", "splat", "spz", "sog", "ckpt", "pt")
-EXPECTED = "splats as PLY, compressed PLY, .splat, .spz, .sog or a checkpoint"
+OWN_SUFFIXES = ("ply", "splat", "spz", "sog", "glb", "gltf", "ckpt", "pt")
+EXPECTED = "splats as PLY, compressed PLY, .splat, .spz, .sog, .glb or a checkpoint"
 _READERS: dict[SplatFormat, Callable[..., Fields]] = {
     SplatFormat.COMPRESSED_PLY: read_compressed_ply,
     SplatFormat.SPLAT: read_splat,
     SplatFormat.SPZ: read_spz,
     SplatFormat.SOG: read_sog,
     SplatFormat.CHECKPOINT: read_checkpoint,
+    SplatFormat.GLTF: read_gltf,
 }
-_WRITERS: dict[str, Callable[[Splats], Iterator[bytes]]] = {
-    ".ply": ply.ply_blocks,
-    ".splat": splat_blocks,
-    ".spz": spz_blocks,
+Document = Mapping[str, Any]  # of `liftcore.io.labels`
+_WRITERS: dict[str, Callable[[Splats, Document | None], Iterator[bytes]]] = {
+    ".ply": lambda splats, _: ply.ply_blocks(splats),
+    ".splat": lambda splats, _: splat_blocks(splats),
+    ".spz": lambda splats, _: spz_blocks(splats),
+    ".glb": gltf_blocks,
 }
+WITH_COLUMNS = (".ply", ".glb")  # formats that hold further numbers a splat
 
 
 def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool = True) -> Splats:
@@ -94,14 +99,14 @@ def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool
 
 
 def write_splats(path: Path | str, splats: Splats, columns: Mapping[str, Any] | None = None) -> None:
-    """Write splats whole or not at all, as a PLY, or as a ``.splat`` or ``.spz`` where the path ends so.
+    """Write splats whole or not at all, as a PLY, or as a ``.splat``, ``.spz`` or ``.glb`` where the path ends so.
 
     A PLY keeps the layout and the further columns that the splats were read with.
 
     Args:
         path: a file; it may lie elsewhere (`io.remote`). A name without a suffix is a PLY.
-        columns: of a PLY, further properties a splat: name -> [P] booleans or numbers of numpy or torch, such as
-            ``{"object": result.object, "score": answer.scores}``; one that the splats have is replaced.
+        columns: of a PLY or ``.glb``, further properties a splat: name -> [P] booleans or numbers of numpy or torch,
+            such as ``{"object": result.object, "score": answer.scores}``; one that the splats have is replaced.
 
     Raises:
         InvalidSplats: ``splats`` are something else; columns have another number of rows, a name that PLY does not
@@ -113,15 +118,17 @@ def write_splats(path: Path | str, splats: Splats, columns: Mapping[str, Any] | 
         got = f"{type(splats).__name__} {splats!r}"[:80]
         raise InvalidSplats("splats", expected="Splats, behind the path", got=got, hint="write_splats(path, splats)")
     suffix = Path(str(path)).suffix.lower()
-    write = _writer_of(suffix or ".ply", "path")
-    if columns and write is not ply.ply_blocks:
-        raise InvalidSplats("columns", expected="a path that ends in .ply, which holds columns", got=repr(suffix))
+    suffix = suffix or ".ply"
+    write = _writer_of(suffix, "path")
+    if columns and suffix not in WITH_COLUMNS:
+        expected = f"a path that ends in {' or '.join(WITH_COLUMNS)}, which hold columns"
+        raise InvalidSplats("columns", expected=expected, got=repr(suffix))
     if columns:
         own = {str(name): _column(name, values, splats.count) for name, values in columns.items()}
         layout = (*splats.layout, *(name for name in own if name not in splats.layout)) if splats.layout else ()
         splats = replace(splats, extras={**splats.extras, **own}, layout=layout)
     with landing(path) as place, whole_file(place) as handle:
-        for block in write(splats):
+        for block in write(splats, None):
             handle.write(block)
 
 
@@ -159,7 +166,16 @@ def _column(name: Any, values: Any, count: int) -> Tensor:
     return found
 
 
-def _writer_of(suffix: str, argument: str) -> Callable[[Splats], Iterator[bytes]]:
+def blocks_as(splats: Splats, suffix: str) -> Iterator[bytes]:
+    """Splats as the bytes of a format that is written, in blocks, with what they were read with where it holds that.
+
+    Raises:
+        InvalidSplats: the format is not written.
+    """
+    return _writer_of(suffix, "suffix")(splats, None)
+
+
+def _writer_of(suffix: str, argument: str) -> Callable[[Splats, Document | None], Iterator[bytes]]:
     """What writes files that end so.
 
     Raises:
@@ -256,7 +272,7 @@ def require_kernel(path: Path, kernel: Kernel, source: str) -> None:
 
 
 def some_rows(path: Path, kept: np.ndarray, suffix: str = ".ply") -> Iterator[bytes]:
-    """Some rows of a file, in its order, as the bytes of a PLY, a ``.splat`` or an ``.spz`` in blocks.
+    """Some rows of a file, in its order, as the bytes of a PLY or of another format that is written, in blocks.
 
     A PLY gives its own bytes to one (`liftcore.io.ply.some_rows`); of another format comes a PLY of 3DGS.
 
@@ -267,10 +283,10 @@ def some_rows(path: Path, kept: np.ndarray, suffix: str = ".ply") -> Iterator[by
         InvalidSplats: the file is malformed, or has another number of splats.
     """
     write = _writer_of(suffix, "suffix")
-    if write is ply.ply_blocks and format_of(path) is SplatFormat.PLY:
+    if suffix == ".ply" and format_of(path) is SplatFormat.PLY:
         return ply.some_rows(path, kept)
     splats = _of_count(path, len(kept))
-    return write(replace(splats[kept], extras={}, layout=(), header=()))
+    return write(replace(splats[kept], extras={}, layout=(), header=()), None)
 
 
 def with_columns(path: Path, columns: Mapping[str, np.ndarray]) -> Iterator[bytes]:
@@ -282,12 +298,63 @@ def with_columns(path: Path, columns: Mapping[str, np.ndarray]) -> Iterator[byte
     Raises:
         InvalidSplats: the file is malformed, or has another number of splats.
     """
-    if format_of(path) is SplatFormat.PLY:
-        return ply.with_columns(path, columns)
+    return labelled(path, Labels(dict(columns), {}))
+
+
+def labelled(path: Path, labels: Labels, suffix: str = ".ply", kept: np.ndarray | None = None) -> Iterator[bytes]:
+    """A file with labels a splat, as the bytes of a PLY or of another format that holds columns, in blocks.
+
+    A PLY of a PLY has all else of its own bytes; one of another format is of its kernel.
+
+    Args:
+        path: the file. labels: of its splats; columns that it has are replaced. suffix: of what is written.
+        kept: [P] bool, the rows to keep; None: all.
+
+    Raises:
+        InvalidSplats: the file is malformed or has another number of splats, or the format holds no columns.
+    """
+    write = _writer_of(suffix, "suffix")
+    if suffix not in WITH_COLUMNS:
+        raise InvalidSplats("suffix", expected=" or ".join(WITH_COLUMNS) + ", which hold labels", got=repr(suffix))
+    if suffix == ".ply" and kept is None and format_of(path) is SplatFormat.PLY:
+        return ply.with_columns(path, labels.columns)
     import torch
 
-    splats = _of_count(path, len(next(iter(columns.values()))))
-    return ply.ply_blocks(replace(splats, extras={name: torch.from_numpy(told) for name, told in columns.items()}))
+    splats = _of_count(path, len(next(iter(labels.columns.values()))))
+    if kept is not None:
+        splats, labels = splats[kept], labels.chosen(kept)
+    own = {name: torch.from_numpy(values) for name, values in labels.columns.items()}
+    layout = (*splats.layout, *(name for name in own if name not in splats.layout)) if splats.layout else ()
+    splats = replace(splats, extras={**splats.extras, **own}, layout=layout)
+    return write(splats, labels.document)
+
+
+def read_labels(path: Path | str) -> Labels:
+    """The labels that a splat file keeps: columns of ``instance_id`` and ``class_id``, and what their numbers mean.
+
+    A PLY has its document beside it (``NAME.ply.json``), if anywhere.
+
+    Raises:
+        InvalidSplats: the file is malformed, or has no such column.
+    """
+    path = local_path(path)
+    splats = read_splats(path)
+    columns = {name: column.cpu().numpy() for name, column in splats.extras.items()}
+    if not set(IDS) & columns.keys():
+        hint = "splatlift export writes such files"
+        raise InvalidSplats(str(path), expected=f"a column {' or '.join(IDS)}", got="none", hint=hint)
+    columns = {name: values.astype(np.int32) if name in IDS else values for name, values in columns.items()}
+    return Labels(columns, _document_of(path))
+
+
+def _document_of(path: Path) -> dict[str, Any]:
+    match format_of(path):
+        case SplatFormat.GLTF:
+            return read_gltf_document(path)
+        case SplatFormat.PLY:
+            return read_document(path.with_name(f"{path.name}.json"))
+        case _:
+            return {}
 
 
 def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:

@@ -157,8 +157,8 @@ def table_csv(found: Catalogue) -> bytes:
     return content.getvalue().encode()
 
 
-def one_object_ply(scene: OpenedLift, number: int) -> Iterable[bytes]:
-    """The splats of one object, as a file in blocks; every property of theirs to the byte.
+def one_object_splats(scene: OpenedLift, number: int, suffix: str = ".ply") -> Iterable[bytes]:
+    """The splats of one object, as a file in blocks; of a PLY every property of theirs to the byte.
 
     Raises:
         NotFound: the lift has no object of that number.
@@ -170,4 +170,4 @@ def one_object_ply(scene: OpenedLift, number: int) -> Iterable[bytes]:
     if scene.object is None or not 0 <= number < count:
         expected = f"a number from 0 to {count - 1}" if count else "a lift with objects"
         raise NotFound("object", expected=expected, got=str(number), hint="the list of the lift's objects has them")
-    return some_rows(scene.splat_file, scene.object == number)
+    return some_rows(scene.splat_file, scene.object == number, suffix)

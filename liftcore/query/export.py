@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.catalogue import Catalogue, one_object_ply, table_csv
+from liftcore.query.catalogue import Catalogue, one_object_splats, table_csv
 from liftcore.query.colours import NOT_SEEN_COLOUR, cluster_colours, heat_colours
 from liftcore.query.objects import MOST_SPLATS, objects
 from liftcore.query.opened import OpenedLift, as_numpy
@@ -26,13 +26,16 @@ if TYPE_CHECKING:  # these load torch
     from liftcore.query.segment import Segmentation
     from liftcore.scene.cameras import Camera
 
+OF_LABELS = ("labelled", "names", "lines", "masks")  # files of what every splat is
 FILES = {  # of what a file is made -> the files that there are of it
-    "answer": ("object", "coloured", "scores", "selection", "mask", "attention", "overlay"),
-    "segmentation": ("coloured", "labels", "picture", "splat_labels", "labelled", "names"),
+    "answer": ("object", "coloured", "scores", "selection", "mask", "attention", "overlay", *OF_LABELS),
+    "segmentation": ("coloured", "labels", "picture", "splat_labels", *OF_LABELS),
     "object": ("object",),
-    "catalogue": ("csv",),
+    "catalogue": ("csv", *OF_LABELS),
     "scene": ("rgb", "depth", "pca", "cluster", "confidence", "splats"),
 }
+
+BY_SUFFIX = {".glb": "labelled", ".json": "masks", ".jsonl": "lines"}  # what a name asks for of many things
 
 
 def blocks_of(
@@ -50,19 +53,26 @@ def blocks_of(
     Arguments and errors are those of `Scene.blocks_of`; ``what`` is one of FILES.
     """
     kind = "object" if isinstance(source, int) else "scene" if source is None else type(source).__name__.lower()
-    what = what or FILES[kind][0]
+    usual = BY_SUFFIX.get(suffix) if kind in ("segmentation", "catalogue") else None
+    what = what or usual or FILES[kind][0]
     if what not in FILES[kind]:
         raise InvalidQuery("what", expected=f"one of {', '.join(FILES[kind])}", got=repr(what))
     if isinstance(source, int):
-        return one_object_ply(scene, source)
+        return one_object_splats(scene, source, suffix or ".ply")
+    if source is not None and what in OF_LABELS:
+        return _of_labels(scene, source, what, suffix)
+    if source is None:
+        return _of_scene(scene, what, view, suffix)
     if isinstance(source, Catalogue):
         return [table_csv(source)]
     if isinstance(source, Answer):
         return _of_answer(scene, source, what, view, suffix, seen, photo)
-    if source is not None:
-        return _of_words(scene, source, what, view)
+    return _of_words(scene, source, what, view)
+
+
+def _of_scene(scene: OpenedLift, what: str, view: str | Camera | None, suffix: str) -> Iterable[bytes]:
     if what == "splats":
-        return viewer_splats(scene)
+        return splats_as(scene, suffix or ".splat")
     from liftcore.query.render import render_png
 
     return [render_png(scene, _needed(view), what)]
@@ -94,24 +104,35 @@ def _of_answer(
 
 
 def _of_words(scene: OpenedLift, found: Segmentation, what: str, view: str | Camera | None) -> Iterable[bytes]:
-    from liftcore.query.labels import document_bytes, labelled_ply, labels
     from liftcore.query.segment import map_png, named_ply, picture_png, word_map
 
     if what == "coloured":
         return named_ply(scene, found)
     if what == "splat_labels":
         return [npy(found.values)]
-    if what in ("labelled", "names"):
-        if scene.labelled is None or scene.labelled[0] is not found:
-            scene.labelled = found, labels(scene, found)
-        made = scene.labelled[1]
-        return labelled_ply(scene, made) if what == "labelled" else [document_bytes(made)]
     values = word_map(scene, found, _needed(view))
     if what == "labels":
         return [map_png(values, found)]
     from liftcore.query.render import render
 
     return [picture_png(render(scene, _needed(view)), values, found)]
+
+
+def _of_labels(
+    scene: OpenedLift, source: Answer | Segmentation | Catalogue, what: str, suffix: str
+) -> Iterable[bytes]:
+    from liftcore.io.labels import document_bytes, document_lines
+    from liftcore.io.splats import labelled
+    from liftcore.query.labels import labels
+
+    made = labels(scene, source)
+    if what == "labelled":
+        return labelled(scene.splat_file, made, suffix or ".ply")
+    if what == "masks":
+        from liftcore.query.coco import masks_json
+
+        return masks_json(scene, made)
+    return [document_bytes(made) if what == "names" else document_lines(made)]
 
 
 def _needed(view: str | Camera | None) -> str | Camera:
@@ -121,16 +142,18 @@ def _needed(view: str | Camera | None) -> str | Camera:
 
 
 def object_splats(scene: OpenedLift, answer: Answer, suffix: str = ".ply") -> Iterable[bytes]:
-    """The splats of an answer's objects, as a file in blocks: a PLY with every property to the byte, .splat or .spz.
+    """The splats of an answer's objects, as a file in blocks: a PLY with every property to the byte, or another.
 
     They are those that `objects` and masks show, without strays; of more than are grouped, all that were selected.
+    A ``.glb`` has their labels, too.
 
     Raises:
         InvalidQuery: none was selected, or nothing asked for is there: most viewers open no file without splats; or
             some objects are to be kept, and more were selected than objects are made of.
         InvalidLift: the splats moved or changed since the lift.
     """
-    from liftcore.io.splats import some_rows
+    from liftcore.io.splats import labelled, some_rows
+    from liftcore.query.labels import labels
 
     if answer.dropped:
         hint = "absent=keep takes what is most like it; or ask in other words or by example"
@@ -143,7 +166,10 @@ def object_splats(scene: OpenedLift, answer: Answer, suffix: str = ".ply") -> It
             hint="name a lower threshold, or ask in other words or by example",
         )
     whole = answer.count > MOST_SPLATS and not answer.query.keeps_some
-    return some_rows(scene.splat_file, answer.selected if whole else objects(scene, answer).numbers >= 0, suffix)
+    kept = answer.selected if whole else objects(scene, answer).numbers >= 0
+    if suffix == ".glb" and not whole:
+        return labelled(scene.splat_file, labels(scene, answer), suffix, kept)
+    return some_rows(scene.splat_file, kept, suffix)
 
 
 def coloured_ply(scene: OpenedLift, answer: Answer) -> Iterable[bytes]:
@@ -178,15 +204,16 @@ def array_blocks(values: np.ndarray, what: str = "") -> list[bytes]:
     return [mask_png(values) if what == "mask" else npy(values)]
 
 
-def viewer_splats(scene: OpenedLift) -> Iterator[bytes]:
-    """The scene in the ``.splat`` format of web viewers, in the lift's order, in blocks.
+def splats_as(scene: OpenedLift, suffix: str) -> Iterator[bytes]:
+    """The splats of the scene in another format, in the lift's order, in blocks; ``.splat`` is that of web viewers.
 
     Raises:
         InvalidLift: the splats moved or changed since the lift.
+        InvalidSplats: the format is not written.
     """
-    from liftcore.io.splat import splat_blocks
+    from liftcore.io.splats import blocks_as
 
-    return splat_blocks(scene.splats)
+    return blocks_as(scene.splats, suffix)
 
 
 def layer_colours(scene: OpenedLift, what: str) -> np.ndarray:

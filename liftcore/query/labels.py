@@ -1,109 +1,174 @@
-"""What every splat is, for other programs: a PLY with labels a splat, and a JSON document of what they mean."""
+"""What every splat is, for other programs: numbers a splat, and a document of what they mean.
+
+Every source gives the same: a segmentation has words as classes and groups of splats that touch as instances, an
+answer its texts as the one class and its objects as instances, a catalogue the things of the lift.
+"""
 
 from __future__ import annotations
 
-import json
 import zipfile
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from liftcore.errors import InvalidLift
-from liftcore.query.objects import LEAST_EVIDENCE, trimmed_box
+from liftcore.errors import InvalidLift, InvalidQuery
+from liftcore.io.labels import FORMAT, Labels
+from liftcore.query.catalogue import Catalogue
+from liftcore.query.colours import cluster_colours
+from liftcore.query.objects import LEAST_EVIDENCE, objects, trimmed_box
 from liftcore.query.opened import OpenedLift, as_numpy
+from liftcore.query.question import Answer
 from liftcore.runtime.version import __version__
 from liftcore.scene.touching import touching
 
 if TYPE_CHECKING:
     from liftcore.query.segment import Segmentation
 
-FORMAT = "splatlift-labels/1"
 FRAMES = {
     "colmap": "that of the COLMAP model that was lifted: right-handed, its unit",
     "file": "that of the splat file that was lifted, with x, y and z as its PLY has them",
 }
 
 
-@dataclass(frozen=True)
-class Labels:
-    """Columns of a PLY, and the document that says what their numbers mean."""
+def labels(scene: OpenedLift, source: Segmentation | Answer | Catalogue) -> Labels:
+    """The labels of a segmentation, of an answer, or of the objects of a lift.
 
-    columns: dict[str, np.ndarray]  # name -> [P] i32 or f32
-    document: dict[str, Any]
-
-
-def labels(scene: OpenedLift, segmentation: Segmentation) -> Labels:
-    """The labels of a segmentation.
-
-    ``class_id`` is the value of a splat's word (`Segmentation.values`), ``instance_id`` counts groups of splats of
-    one word that touch (`liftcore.scene.touching`), with the most evidence first; 0 is none of both. Groups
-    with less than a twentieth of the evidence of their word's largest have a class alone. ``score`` is the cosine to
-    the word. ``confidence`` is the lift's, where it was reweighted; other lifts have none.
+    Of a segmentation ``class_id`` is the value of a splat's word (`Segmentation.values`), ``instance_id`` counts
+    groups of splats of one word that touch (`liftcore.scene.touching`), with the most evidence first; groups with
+    less than a twentieth of the evidence of their word's largest have a class alone. Of an answer every selected
+    splat has class 1, and the instances are its objects. Of a catalogue the instances are its objects, and the
+    classes their names; without names there are none. 0 is none of both. ``score`` is the cosine to the word, or the
+    answer's score. ``confidence`` is the lift's, where it was reweighted; other lifts have none.
 
     Raises:
+        InvalidQuery: nothing was found, or more splats than objects are made of.
         InvalidLift: the splats moved or changed since the lift.
     """
-    values = segmentation.values
+    if scene.labelled is None or scene.labelled[0] is not source:
+        if isinstance(source, Answer):
+            made = _of_answer(scene, source)
+        else:
+            made = _of_catalogue(scene, source) if isinstance(source, Catalogue) else _of_words(scene, source)
+        scene.labelled = source, made
+    return scene.labelled[1]  # type: ignore[no-any-return]
+
+
+def _of_words(scene: OpenedLift, segmentation: Segmentation) -> Labels:
+    values, colours = segmentation.values, segmentation.colours.tolist()
     instances, told = np.zeros(len(values), np.int32), list[dict[str, Any]]()
-    evidence = scene.evidence.astype(np.float64)
     for value, named in enumerate(segmentation.found, 1):
         rows = np.flatnonzero(values == value)
-        weights = evidence[rows] if evidence[rows].any() else np.ones(len(rows))
+        weights = _weights(scene, rows)
         groups = touching(scene.splats, rows)
         sums = np.bincount(groups, weights)
         for group in np.argsort(-sums, kind="stable")[: int((sums >= LEAST_EVIDENCE * sums.max()).sum())].tolist():
-            inside = groups == group
-            own, mine = rows[inside], weights[inside]
+            own = rows[groups == group]
             instances[own] = len(told) + 1
-            one = {"instance_id": len(told) + 1, "class_id": value, "name": named.word, "splats": len(own)}
-            one |= {"score": float(np.average(segmentation.score[own], weights=mine))}
-            told.append(one | _boxes(scene.splats.positions(own).astype(np.float64), mine))
-    columns = {"class_id": values.astype(np.int32), "instance_id": instances, "score": segmentation.score}
+            one = {"instance_id": len(told) + 1, "class_id": value, "name": named.word, "question": named.word}
+            told.append(one | {"colour": colours[value]} | _facts(scene, own, segmentation.score))
+    classes = [
+        {
+            "class_id": value,
+            "name": named.word,
+            "colour": colours[value],
+            "splats": named.splats,
+            "score": named.score,
+            "margin": named.margin,
+            "box": {"low": named.box[0], "high": named.box[1]},
+        }
+        for value, named in enumerate(segmentation.found, 1)
+    ]
+    return _labels(scene, values, instances, segmentation.score, classes, told)
+
+
+def _of_answer(scene: OpenedLift, answer: Answer) -> Labels:
+    if answer.dropped or not answer.count:
+        got = answer.why.rstrip(".") if answer.dropped else "none above the threshold"
+        raise InvalidQuery("source", expected="an answer that found splats", got=got, hint="ask in other words")
+    found = objects(scene, answer)
+    name = ", ".join(map(str, answer.query.positives))
+    colours = cluster_colours(len(found.objects)).tolist()
+    told = []
+    for number in range(len(found.objects)):
+        one = {"instance_id": number + 1, "class_id": 1, "name": name, "question": name, "colour": colours[number]}
+        told.append(one | _facts(scene, np.flatnonzero(found.numbers == number), answer.scores))
+    classes = [{"class_id": 1, "name": name, "splats": answer.count, "question": name}]
+    chosen = answer.selected.astype(np.int32)
+    return _labels(scene, chosen, found.numbers + 1, np.where(answer.selected, answer.scores, 0), classes, told)
+
+
+def _of_catalogue(scene: OpenedLift, catalogue: Catalogue) -> Labels:
+    if not catalogue.objects or scene.object is None:
+        raise InvalidQuery("source", expected="a lift with objects", got=catalogue.explanation, hint="export words")
+    names = list(dict.fromkeys(one.name for one in catalogue.objects if one.name is not None))
+    colours = cluster_colours(len(catalogue.objects)).tolist()
+    numbers, told = np.zeros(len(catalogue.objects) + 1, np.int32), []  # the last is of -1
+    scores = np.zeros(len(catalogue.objects) + 1, np.float32)
+    for one in catalogue.objects:
+        numbers[one.id] = 0 if one.name is None else names.index(one.name) + 1
+        scores[one.id] = one.score or 0.0
+        entry: dict[str, Any] = {"instance_id": one.id + 1, "class_id": int(numbers[one.id]), "name": one.name}
+        entry |= {"colour": colours[one.id], "score": one.score, "share": one.share, "views": list(one.views)}
+        facts = _facts(scene, np.flatnonzero(scene.object == one.id), None)
+        told.append(entry | facts | {"box": {"low": one.box[0], "high": one.box[1]}})
+    values = numbers[scene.object]
+    classes = [
+        {"class_id": value, "name": name, "splats": int((values == value).sum())}
+        for value, name in enumerate(names, 1)
+    ]
+    return _labels(scene, values, scene.object + 1, scores[scene.object] if names else None, classes, told)
+
+
+def _labels(
+    scene: OpenedLift,
+    classes: np.ndarray,
+    instances: np.ndarray,
+    scores: np.ndarray | None,
+    class_rows: Sequence[dict[str, Any]],
+    instance_rows: Sequence[dict[str, Any]],
+) -> Labels:
+    columns: dict[str, np.ndarray] = {"class_id": classes.astype(np.int32)} if class_rows else {}
+    columns["instance_id"] = instances.astype(np.int32)
+    if scores is not None:
+        columns["score"] = scores.astype(np.float32)
     if scene.confidence is not None:
-        columns["confidence"] = np.where(values > 0, as_numpy(scene.confidence), 0).astype(np.float32)
-    frame = _frame(scene)
+        confidence = np.where((classes > 0) | (instances > 0), as_numpy(scene.confidence), 0)
+        columns["confidence"] = confidence.astype(np.float32)
+    frame, source = _frame(scene), f"splatlift {__version__}"
+    told = scene.metadata
+    provenance = ", ".join(filter(None, (source, told.encoder, told.text_space, f"{len(told.views)} views")))
+    members: dict[int, list[int]] = {}
+    for one in instance_rows:
+        members.setdefault(one["class_id"], []).append(one["instance_id"])
     document = {
         "format": FORMAT,
-        "made_by": f"splatlift {__version__}",
-        "splats": len(values),
+        "made_by": source,
+        "splats": len(classes),
         "columns": list(columns),
         "frame": frame,
         "frame_is": FRAMES[frame],
-        "classes": [
-            {
-                "class_id": value,
-                "name": named.word,
-                "colour": segmentation.colours[value].tolist(),
-                "splats": named.splats,
-                "score": named.score,
-                "margin": named.margin,
-                "box": {"low": named.box[0], "high": named.box[1]},
-                "instances": [one["instance_id"] for one in told if one["class_id"] == value],
-            }
-            for value, named in enumerate(segmentation.found, 1)
-        ],
-        "instances": told,
+        "classes": [one | {"instances": members.get(one["class_id"], [])} for one in class_rows],
+        "instances": [one | {"provenance": provenance} for one in instance_rows],
     }
     return Labels(columns, document)
 
 
-def labelled_ply(scene: OpenedLift, made: Labels) -> Iterator[bytes]:
-    """All splats with the columns, as a file in blocks; every other property to the byte.
-
-    Raises:
-        InvalidLift: the splats moved or changed since the lift.
-    """
-    from liftcore.io.splats import with_columns
-
-    return with_columns(scene.splat_file, made.columns)
+def _weights(scene: OpenedLift, rows: np.ndarray) -> np.ndarray:
+    weights = scene.evidence[rows].astype(np.float64)
+    return weights if weights.any() else np.ones(len(rows))
 
 
-def document_bytes(made: Labels) -> bytes:
-    """The document as a JSON file."""
-    return json.dumps(made.document, ensure_ascii=False, indent=1).encode() + b"\n"
+def _facts(scene: OpenedLift, rows: np.ndarray, scores: np.ndarray | None) -> dict[str, Any]:
+    """How many splats, their means of scores and confidence by evidence, and their boxes."""
+    weights = _weights(scene, rows)
+    facts: dict[str, Any] = {"splats": len(rows)}
+    if scores is not None:
+        facts["score"] = float(np.average(scores[rows], weights=weights))
+    if scene.confidence is not None:
+        facts["confidence"] = float(np.average(as_numpy(scene.confidence)[rows], weights=weights))
+    return facts | _boxes(scene.splats.positions(rows).astype(np.float64), weights)
 
 
 def _boxes(means: np.ndarray, weights: np.ndarray) -> dict[str, Any]:

@@ -68,7 +68,7 @@ class OpenedLift:
         device: str = "cpu",
     ) -> None:
         self.device = device
-        self.labelled: tuple[Any, Any] | None = None  # the last segmentation and its `Labels`, for two files of it
+        self.labelled: tuple[Any, Any] | None = None  # what was last exported, and its `Labels`, for two files of it
         self._encoders: dict[str | None, TextEncoder] = {}
         places = {"splats": splats, "cameras": cameras}
         self._moved = {role: Path(at) if isinstance(at, str | Path) else None for role, at in places.items()}

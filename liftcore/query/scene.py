@@ -15,6 +15,7 @@ if TYPE_CHECKING:  # these load torch
     import numpy as np
     from PIL.Image import Image
 
+    from liftcore.io.labels import Labels
     from liftcore.query.ask import Question
     from liftcore.query.catalogue import Catalogue
     from liftcore.query.question import Answer, BestWord, CoveringRegion, Objects, Query
@@ -262,6 +263,12 @@ class Scene(OpenedLift):
 
         return layer_colours(self, what)
 
+    def labels(self, source: Answer | Segmentation | Catalogue) -> Labels:
+        """Numbers a splat and what they mean, as files of labels have them (`liftcore.query.labels.labels`)."""
+        from liftcore.query.labels import labels
+
+        return labels(self, source)
+
     @staticmethod
     def warm_up(kernel: Kernel | None = None) -> None:
         """Load the compiled code of questions, or compile it; with a kernel that of pictures of such splats."""
@@ -299,8 +306,10 @@ class Scene(OpenedLift):
             source: a question or its answer, a segmentation, a catalogue, the id of an object of it, or an array;
                 None: the scene.
             what: of an answer object, coloured, scores, selection, mask, attention or overlay; of a segmentation
-                coloured, labels, picture, splat_labels, labelled or names; of the scene what `render` draws, or
-                splats; of a catalogue csv; of an array npy, or mask of booleans [H, W]. Empty: the first of these.
+                coloured, labels, picture or splat_labels; of a catalogue csv; of all three labelled (splats with
+                labels), names (what these mean), lines (an object a line, JSON) or masks (COCO's JSON, in the views);
+                of the scene what `render` draws, or splats; of an array npy, or mask of booleans [H, W]. Empty: the
+                first of these; of a segmentation or a catalogue as a .glb labelled, .json masks, .jsonl lines.
             view: of pictures, as in `look`. suffix: of its name, where there are several formats.
             seen: the answer as the view shows it, where that is known. photo: of the view, for an overlay.
 

@@ -241,10 +241,19 @@ def word_map(scene: OpenedLift, segmentation: Segmentation, view: str | Camera) 
     Raises:
         NotFound, InvalidQuery, InvalidLift: as `liftcore.query.render.view_mask`.
     """
+    return value_map(scene, segmentation.values, view)
+
+
+def value_map(scene: OpenedLift, values: np.ndarray, view: str | Camera) -> np.ndarray:
+    """[H, W] i32, which of the splats' values [P] i32 has the most weight on each ray; 0 where hardly a splat is.
+
+    Raises:
+        NotFound, InvalidQuery, InvalidLift: as `liftcore.query.render.view_mask`.
+    """
     import torch
 
-    values, params = torch.from_numpy(segmentation.values), scene.compositing
-    found = scene.image(view, lambda camera: scene.raster.strongest_labels(camera, values, params)).numpy()
+    labels, params = torch.from_numpy(values), scene.compositing
+    found = scene.image(view, lambda camera: scene.raster.strongest_labels(camera, labels, params)).numpy()
     sums = scene.image(view, lambda camera: scene.raster.row_sums(camera, params)).numpy()
     return np.where(sums >= MINIMUM_ROW_SUM, np.maximum(found, 0), 0)
 

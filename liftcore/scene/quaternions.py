@@ -26,3 +26,11 @@ def rotation_rows(w: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) ->
         (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
+
+
+def product_matrix(rotation: np.ndarray) -> np.ndarray:
+    """[4, 4] f64: what a quaternion w x y z is multiplied by to turn its splat by ``rotation`` [3, 3], too."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat().tolist()
+    return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])

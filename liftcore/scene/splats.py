@@ -20,6 +20,7 @@ from liftcore.runtime.one_line import one_line, point_text
 from liftcore.scene.harmonics import SH_C0, band_rotation
 from liftcore.scene.kernel import DARK_LOBE, LOBE_COLOURS, NORMALS, Kernel, kernel_named, scale_count
 from liftcore.scene.origin import FILE_ORIGIN, Origin, extent_of_most, float32_step, local_origin, usual_size
+from liftcore.scene.quaternions import product_matrix
 from liftcore.scene.render_mode import RenderMode, RenderModel, render_mode_of
 from liftcore.scene.rows import Rows, chosen_rows
 from liftcore.scene.similarity import Similarity
@@ -383,10 +384,7 @@ def joined_harmonics(first: Tensor, rest: Array | None, names: tuple[str, str]) 
 
 def _turned_quats(quats: Tensor, rotation: np.ndarray) -> Tensor:
     """[P, 4] f32, of splats that are turned: the product of a rotation's quaternion and theirs."""
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(rotation).as_quat().tolist()
-    product = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float64)
+    product = torch.from_numpy(product_matrix(rotation))
     own = quats.double()
     largest = own.abs().amax(dim=1, keepdim=True)
     identity = own.new_tensor([1.0, 0.0, 0.0, 0.0])

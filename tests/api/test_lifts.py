@@ -295,7 +295,7 @@ def test_objects_are_there_without_words_and_a_table_names_them(
 
 
 def test_other_kernels_are_shown_as_near_gaussians() -> None:
-    from liftcore.query.export import viewer_splats
+    from liftcore.query.export import splats_as
     from liftcore.scene.splats import Splats
 
     means, quats, logits = np.zeros((2, 3), "f4"), np.zeros((2, 4), "f4"), np.array([np.inf, -np.inf], "f4")
@@ -305,7 +305,7 @@ def test_other_kernels_are_shown_as_near_gaussians() -> None:
     for splats in (discs, betas):
         scene = Scene.__new__(Scene)
         scene.__dict__["splats"] = splats
-        shown.append(np.frombuffer(b"".join(viewer_splats(scene)), ROW))
+        shown.append(np.frombuffer(b"".join(splats_as(scene, ".splat")), ROW))
     np.testing.assert_allclose(shown[0]["scales"], [[0.5, 0.5, 0.005]] * 2, rtol=1e-5)
     np.testing.assert_allclose(shown[1]["scales"], np.sqrt(1 / 12), rtol=1e-5)  # (1 - r^2)^4 in the image
     assert shown[0]["colours"].tolist() == [[153, 153, 153, 255], [153, 153, 153, 0]]  # no colours: grey

@@ -12,7 +12,7 @@ const ENDED = ["succeeded", "failed", "canceled"];
 const KINDS = { splats: "Splats", cameras: "Cameras", features: "Features" };
 const OTHERS = { photos: "Photos", lift: "Lift", masks: "Masks", table: "Words" };
 const KNOWN = 1000; // assets among which those of a lift file are looked for
-const WANTED = { splats: ".ply, .splat, .spz or .sog", cameras: "cameras.json, transforms.json, or a COLMAP model: its folder or a .zip", features: ".safetensors packs" };
+const WANTED = { splats: ".ply, .splat, .spz, .sog or .glb", cameras: "cameras.json, transforms.json, or a COLMAP model: its folder or a .zip", features: ".safetensors packs" };
 const PRESETS = {
   default: ["Careful", "Masks that other views contradict count less; splats get a confidence."],
   tikhonov: ["Sharp", "The paper's best: strong weights count more."],

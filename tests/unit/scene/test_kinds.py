@@ -41,11 +41,6 @@ OTHERS = {  # content, a word of its name and of what to do
     "error.ply": (b'{"error": "not found"}', "not found", "download"),
     "pointer.ply": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "Git LFS", "git lfs pull"),
     "model": (b"glTF\x02\0\0\0" + bytes(100), "glTF", "export"),
-    "scene.glb": (
-        b"glTF\x02\0\0\0\x60\0\0\0JSON{'extensionsUsed':['KHR_gaussian_splatting']}",
-        "splats as glTF",
-        "export",
-    ),
     "scene.usdc": (b"PXR-USDC" + bytes(90), "USD", "export"),
     "scene.ksplat": (bytes(5000), "ksplat", "splat-transform"),
     "unnamed": (b"\0\1\0\0" + np.array([1, 1, 9, 9], "<u4").tobytes() + bytes(5000), "ksplat", "splat-transform"),

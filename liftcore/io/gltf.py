@@ -1,0 +1,443 @@
+"""glTF 2.0 with ``KHR_gaussian_splatting`` (release candidate of 2026): a point primitive with attributes a splat.
+
+Positions, linear scales, linear opacities, quaternions x y z w and spherical harmonics of degree 0 to 3, which are
+ordered and signed as 3DGS has them. The frame is +Y up, +Z forward, -X right (LUF); PLYs and cameras are in right,
+down, front (RDF): half a turn about z, which is baked in, as few readers turn harmonics by a node. Scenes in map
+coordinates keep their origin as the node's translation, in float64.
+
+Labels are feature ids (``EXT_mesh_features``): ``_FEATURE_ID_0`` is the instance, ``_FEATURE_ID_1`` the class, 0 is
+none, and a property table each (``EXT_structural_metadata``) has a row an id. Other columns of splats are attributes
+with an underscore before their name.
+
+What is read is in the file itself: a .glb, or a .gltf with its buffers in data URIs.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import struct
+from collections.abc import Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from liftcore.errors import InvalidInput, InvalidSplats
+from liftcore.io.files import open_regular
+from liftcore.io.labels import COLUMN, IDS, KINDS
+from liftcore.io.ply import MODEL
+from liftcore.io.quantised import MOST_GROWTH, Fields, logits
+from liftcore.scene.harmonics import band_rotation
+from liftcore.scene.quaternions import product_matrix, rotation_matrices
+from liftcore.scene.render_mode import mode_of_word
+from liftcore.scene.similarity import Similarity
+
+if TYPE_CHECKING:
+    pass
+
+EXTENSION = "KHR_gaussian_splatting"
+FEATURES, METADATA = "EXT_mesh_features", "EXT_structural_metadata"
+UNDERSTOOD = {EXTENSION, FEATURES, METADATA, "KHR_mesh_quantization"}
+MAGIC, JSON_CHUNK, BINARY_CHUNK = b"glTF", b"JSON", b"BIN\0"
+MAX_JSON_BYTES = 64 << 20
+MAX_DEGREE = 3  # of harmonics
+MAX_NODES = 100_000
+MAX_TABLE_CELLS = 1 << 22  # of a property table
+MAX_ATTRIBUTES = 256  # of a primitive
+SPLAT_BYTES = 56  # of a decoded splat without its colours
+COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+TO_FILE = np.diag([-1.0, -1.0, 1.0])  # RDF to LUF, and back
+RENDER_MODE = "SplatRenderMode"
+SRGB = "srgb_rec709_display"
+BOXES = ("box_low", "box_high", "oriented_box_centre", "oriented_box_axes", "oriented_box_half_sizes")
+TABLE_TYPES = {"UINT8": "<u1", "INT8": "<i1", "UINT16": "<u2", "INT16": "<i2", "UINT32": "<u4", "INT32": "<i4",
+               "UINT64": "<u8", "INT64": "<i8", "FLOAT32": "<f4", "FLOAT64": "<f8"}  # fmt: skip
+TABLE_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+HINT = "export it again, or as PLY"
+
+
+def read_gltf(path: Path, *, colour: bool = True) -> Fields:
+    """The fields of all splats in a ``.glb`` or ``.gltf``, node by node, in the frame of PLYs and cameras.
+
+    Feature ids come as ``instance_id`` and ``class_id`` with 0 for none, other attributes with an underscore by their
+    names, in lower case.
+
+    Raises:
+        InvalidSplats: the file is malformed, has no splats, another kernel or compressed ones, or refers to other
+            files; or a node has a scale for each axis.
+    """
+    asset = _Asset(path)
+    parts = [asset.fields(matrix, primitive, colour=colour) for matrix, primitive in asset.splats()]
+    fields: Fields = {}
+    degrees = [part["sh"].shape[1] for part in parts if "sh" in part]
+    for name in parts[0]:
+        if name not in ("extras", "warnings", "render_mode"):
+            own = [part[name] for part in parts]
+            if name == "sh":
+                own = [np.pad(sh, ((0, 0), (0, max(degrees) - sh.shape[1]), (0, 0))) for sh in own]
+            fields[name] = own[0] if len(own) == 1 else np.concatenate(own)
+    fields["warnings"] = tuple(dict.fromkeys(text for part in parts for text in part["warnings"]))
+    fields["render_mode"] = parts[0]["render_mode"]
+    names = dict.fromkeys(name for part in parts for name in part["extras"])
+    counts = [len(part["means"]) for part in parts]
+    fields["extras"] = {
+        name: np.concatenate(
+            [part["extras"].get(name, np.zeros(n, np.int32)) for part, n in zip(parts, counts, strict=True)]
+        )
+        for name in names
+    }
+    return fields
+
+
+def read_gltf_document(path: Path) -> dict[str, Any]:
+    """What the property tables of a file say of its feature ids: ``instances`` and ``classes``; empty without any.
+
+    Raises:
+        InvalidSplats: the file is malformed.
+    """
+    return _Asset(path).document()
+
+
+class _Asset:
+    """An open file: its JSON, and its bytes as they lie in the file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with open_regular(path) as handle:
+            head = handle.read(20)
+        self.size = path.stat().st_size
+        if head[:4] == MAGIC:
+            if len(head) < 20 or head[16:20] != JSON_CHUNK or struct.unpack_from("<I", head, 4)[0] != 2:
+                raise self._broken("a glTF 2.0 file that begins with JSON", repr(head[4:20]))
+            length = struct.unpack_from("<I", head, 12)[0]
+            if length > min(MAX_JSON_BYTES, self.size - 20):
+                raise self._broken(f"at most {MAX_JSON_BYTES} bytes of JSON in the file", str(length))
+            content = np.memmap(path, np.uint8, "r")
+            text, at = content[20 : 20 + length].tobytes(), 20 + length
+            self.binary = content[:0]
+            if at + 8 <= self.size and content[at + 4 : at + 8].tobytes() == BINARY_CHUNK:
+                (own,) = struct.unpack("<I", content[at : at + 4].tobytes())
+                self.binary = content[at + 8 : at + 8 + own]
+        else:
+            if self.size > MAX_JSON_BYTES:
+                raise self._broken(f"at most {MAX_JSON_BYTES} bytes of JSON", str(self.size), "make a .glb of it")
+            text, self.binary = path.read_bytes(), np.empty(0, np.uint8)
+        try:
+            self.json: Any = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise self._broken("JSON", str(error)[:120]) from None
+        if not isinstance(self.json, dict):
+            raise self._broken("a JSON object", repr(self.json)[:40])
+        others = [name for name in map(str, self._list(self.json, "extensionsRequired")) if name not in UNDERSTOOD]
+        if others:
+            raise self._broken("a file without extensions of others", f"one that requires {others[0][:80]}", HINT)
+        self._buffers: dict[int, np.ndarray] = {}
+
+    def splats(self) -> list[tuple[np.ndarray, dict[str, Any]]]:
+        """The primitives of splats with their nodes' matrices [4, 4] f64, as the scene has them."""
+        meshes, nodes = self._list(self.json, "meshes"), self._list(self.json, "nodes")
+        scenes = self._list(self.json, "scenes")
+        chosen = self.json.get("scene", 0)
+        inner = {
+            child
+            for node in nodes
+            if isinstance(node, dict)
+            for child in self._list(node, "children")
+            if type(child) is int
+        }
+        roots = [place for place in range(len(nodes)) if place not in inner]
+        if scenes:
+            roots = self._list(self._at(scenes, chosen, "scene"), "nodes")
+        found, queue, visited = [], [(root, np.eye(4)) for root in reversed(roots)], 0
+        while queue:
+            place, above = queue.pop()
+            node, visited = self._at(nodes, place, "node"), visited + 1
+            if visited > min(len(nodes), MAX_NODES):
+                raise self._broken(f"a tree of at most {MAX_NODES} nodes", "one that meets a node twice, or more")
+            matrix = above @ self._matrix(node, place)
+            queue += [(child, matrix) for child in reversed(self._list(node, "children"))]
+            if "mesh" in node:
+                mesh = self._at(meshes, node["mesh"], "mesh")
+                found += [(matrix, one) for one in self._list(mesh, "primitives") if _is_of_splats(one)]
+        if not found:
+            raise InvalidSplats(str(self.path), expected=f"splats ({EXTENSION})", got="a glTF model without any")
+        total = sum(self._count(primitive) for _, primitive in found)
+        if not 0 < total * SPLAT_BYTES <= MOST_GROWTH * self.size:
+            raise self._broken("as many splats as the file's size can be of", str(total))
+        return found
+
+    def fields(self, matrix: np.ndarray, primitive: dict[str, Any], *, colour: bool) -> Fields:
+        """The fields of one primitive, with its extras and warnings."""
+        attributes, warnings = primitive["attributes"], self._require_kernel(primitive)
+        count = self._count(primitive)
+        try:
+            move = Similarity.of(matrix)
+        except InvalidInput as error:
+            hint = "apply the node's transform to its splats in the program that made it"
+            argument = f"{self.path} transform of a node"
+            raise InvalidSplats(argument, expected=error.expected, got=error.got, hint=hint) from None
+        turn = TO_FILE @ move.rotation
+
+        def read(name: str, width: int) -> np.ndarray:
+            return self._attribute(attributes, name, width, count)
+
+        places = read("POSITION", 3).astype(np.float64) @ (move.scale * turn).T + TO_FILE @ move.translation
+        quats = np.roll(read(f"{EXTENSION}:ROTATION", 4).astype(np.float64), 1, axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scales = np.log(read(f"{EXTENSION}:SCALE", 3).astype(np.float64)) + np.log(move.scale)
+        fields: Fields = {
+            "means": places,
+            "quats": (quats @ product_matrix(turn).T).astype(np.float32),
+            "log_scales": scales.astype(np.float32),
+            "opacity_logits": logits(read(f"{EXTENSION}:OPACITY", 1)[:, 0]).astype(np.float32),
+        }
+        said = primitive.get("extras")
+        mode, odd = None, ()
+        if isinstance(said, dict) and RENDER_MODE in said:
+            mode, odd = mode_of_word(said[RENDER_MODE], f"{RENDER_MODE!r} of a primitive")
+        fields |= {"extras": {}, "warnings": (*warnings, *odd), "render_mode": mode}
+        if not colour:
+            return fields
+        degree = next(
+            (
+                band - 1
+                for band in (1, 2, 3)
+                if not any(harmonic_name(band, n) in attributes for n in range(2 * band + 1))
+            ),
+            3,
+        )
+        sh = np.empty((count, (degree + 1) ** 2, 3), np.float32)
+        for band in range(degree + 1):
+            own = np.stack([read(harmonic_name(band, place), 3) for place in range(2 * band + 1)], axis=1)
+            sh[:, band**2 : (band + 1) ** 2] = np.einsum("ij,njc->nic", band_rotation(band, turn), own)
+        return fields | {"sh": sh, "extras": self._extras(primitive, count)}
+
+    def document(self) -> dict[str, Any]:
+        """The rows of property tables that feature ids refer to, with their numbers."""
+        tables = self._list(self._extension(self.json, METADATA), "propertyTables")
+        found: dict[str, Any] = {}
+        for _, primitive in self.splats():
+            for name, one in self._feature_sets(primitive).items():
+                kind = KINDS[IDS.index(name)] if name in IDS else None
+                if kind is None or kind in found or "propertyTable" not in one:
+                    continue
+                table = self._at(tables, one["propertyTable"], "property table")
+                shift = 0 if one.get("nullFeatureId") == 0 else 1
+                rows = enumerate(self._table_rows(table), shift)
+                found[kind] = [{name: number, **_document_row(row)} for number, row in rows if number]
+        return found
+
+    def _table_rows(self, table: dict[str, Any]) -> list[dict[str, Any]]:
+        schema = self._extension(self.json, METADATA).get("schema", {})
+        count, members = table.get("count"), self._at_key(self._at_key(schema, "classes"), table.get("class"))
+        own = self._at_key(table, "properties")
+        if type(count) is not int or not 0 <= count * max(len(own), 1) <= MAX_TABLE_CELLS:
+            raise self._broken(f"at most {MAX_TABLE_CELLS} cells of a property table", repr(count)[:40])
+        rows: list[dict[str, Any]] = [{} for _ in range(count)]
+        for key in own:
+            member = self._at_key(self._at_key(members, "properties"), key)
+            if not member.get("array") and member.get("type") in ("STRING", *TABLE_WIDTHS):
+                column = self._table_column(self._at_key(own, key), member, count)
+                for row, value in zip(rows, column, strict=True):
+                    row[str(key)[:64]] = value
+        return rows
+
+    def _table_column(self, own: dict[str, Any], member: dict[str, Any], count: int) -> list[Any]:
+        values = self._view(own.get("values"))
+        if member["type"] == "STRING":
+            code = TABLE_TYPES.get(str(own.get("stringOffsetType", "UINT32")), "<u4")
+            ends = self._typed(self._view(own.get("stringOffsets")), code, count + 1).astype(np.int64)
+            if (np.diff(ends) < 0).any():
+                raise self._broken("texts one after the other", "offsets that go back")
+            text = values.tobytes()
+            return [text[low:high].decode("utf-8", "replace") for low, high in pairwise(ends.tolist())]
+        width, code = TABLE_WIDTHS[member["type"]], TABLE_TYPES.get(str(member.get("componentType")), "<f4")
+        numbers = self._typed(values, code, count * width).reshape(count, width)
+        return numbers[:, 0].tolist() if width == 1 else numbers.tolist()  # type: ignore[no-any-return]
+
+    def _typed(self, values: np.ndarray, code: str, count: int) -> np.ndarray:
+        needed = count * np.dtype(code).itemsize
+        if len(values) < needed:
+            raise self._broken(f"{needed} bytes of a property", str(len(values)))
+        return values[:needed].view(code)
+
+    def _extras(self, primitive: dict[str, Any], count: int) -> dict[str, np.ndarray]:
+        attributes = primitive["attributes"]
+        if len(attributes) > MAX_ATTRIBUTES:
+            raise self._broken(f"at most {MAX_ATTRIBUTES} attributes", str(len(attributes)))
+        extras = {}
+        for name, one in self._feature_sets(primitive).items():
+            ids = self._attribute(attributes, f"_FEATURE_ID_{one['attribute']}", 1, count)[:, 0].astype(np.int64)
+            none = one.get("nullFeatureId") if type(one.get("nullFeatureId")) is int else -1
+            extras[name] = (
+                np.where(ids == none, 0, ids + (none != 0)).clip(0, np.iinfo(np.int32).max).astype(np.int32)
+            )
+        for name, place in attributes.items():
+            plain = name[1:].lower() if name == name.upper() else name[1:]
+            is_column = COLUMN.fullmatch(plain) and not MODEL.fullmatch(plain) and plain not in extras
+            if name[:1] != "_" or name.startswith("_FEATURE_ID_") or not is_column:
+                continue
+            if self._at(self._list(self.json, "accessors"), place, "accessor").get("type") == "SCALAR":
+                values = self._attribute(attributes, name, 1, count)[:, 0]
+                extras[plain] = values.astype(np.float32 if values.dtype.kind == "f" else np.int32)
+        return extras
+
+    def _feature_sets(self, primitive: dict[str, Any]) -> dict[str, dict[str, Any]]:
+        """The feature ids of attributes by the names of their columns: by their label, else by their order."""
+        found: dict[str, dict[str, Any]] = {}
+        sets = self._list(self._extension(primitive, FEATURES), "featureIds")
+        of_attributes = [one for one in sets if isinstance(one, dict) and type(one.get("attribute")) is int]
+        named = {int(one["attribute"]) for one in of_attributes}
+        plain = (
+            int(name[12:])
+            for name in primitive["attributes"]
+            if name.startswith("_FEATURE_ID_") and name[12:].isdecimal()
+        )
+        for one in [*of_attributes, *({"attribute": place} for place in sorted(plain) if place not in named)]:
+            label, place = f"{one.get('label')}_id", one["attribute"]
+            usual = IDS[place] if 0 <= place < len(IDS) and IDS[place] not in found else f"feature_id_{place}"
+            found[label if label in IDS else usual] = one
+        return found
+
+    def _require_kernel(self, primitive: dict[str, Any]) -> tuple[str, ...]:
+        kind = self._extension(primitive, EXTENSION)
+        compressed = next(iter(self._at_key(kind, "extensions")), None) if "extensions" in kind else None
+        refused = f"the extension {compressed!r}" if compressed else None
+        if kind.get("kernel") != "ellipse" and refused is None:
+            refused = f"the kernel {kind.get('kernel')!r}"
+        if primitive.get("mode") != 0 or "indices" in primitive:
+            refused = refused or "a primitive that is no list of points"
+        if refused:
+            raise InvalidSplats(
+                str(self.path), expected="plain splats with the kernel 'ellipse'", got=refused[:100], hint=HINT
+            )
+        space = kind.get("colorSpace")
+        return () if space == SRGB else (f"colours are of {str(space)[:60]!r}, and are taken for sRGB",)
+
+    # -- parts of the file
+
+    def _attribute(self, attributes: dict[str, Any], name: str, width: int, count: int) -> np.ndarray:
+        """[P, width] of an attribute; normalized whole numbers as f32."""
+        accessor = self._at(self._list(self.json, "accessors"), attributes.get(name), f"accessor of {name}")
+        component, kind, normalized = (accessor.get(key) for key in ("componentType", "type", "normalized"))
+        code = COMPONENTS.get(component) if type(component) is int else None
+        fits = kind in [name for name, own in WIDTHS.items() if own == width] and accessor.get("count") == count
+        if code is None or not fits or "sparse" in accessor or "bufferView" not in accessor:
+            raise self._broken(f"{count} rows of {width} plain numbers as {name}", repr(accessor)[:80])
+        content = self._view(accessor["bufferView"])
+        view = self._at(self._list(self.json, "bufferViews"), accessor["bufferView"], "buffer view")
+        size = width * np.dtype(code).itemsize
+        stride, first = view.get("byteStride", size), accessor.get("byteOffset", 0)
+        if type(stride) is not int or type(first) is not int or stride < size or first < 0:
+            raise self._broken(f"rows of {size} bytes or more as {name}", f"{stride!r} from {first!r}"[:40])
+        if first + (count - 1) * stride + size > len(content):
+            raise self._broken(f"{count} rows of {name} in the file", f"{len(content)} bytes")
+        rows = np.lib.stride_tricks.as_strided(content[first:], (count, size), (stride, 1))
+        values = np.ascontiguousarray(rows).view(code)
+        if normalized and values.dtype.kind in "iu":
+            return np.maximum(values.astype(np.float32) / np.iinfo(values.dtype).max, -1)
+        return values
+
+    def _view(self, place: Any) -> np.ndarray:
+        """[n] u8, the bytes of a buffer view."""
+        view = self._at(self._list(self.json, "bufferViews"), place, "buffer view")
+        first, size, buffer = view.get("byteOffset", 0), view.get("byteLength"), view.get("buffer")
+        content = self._buffer(buffer)
+        if type(first) is not int or type(size) is not int or first < 0 or size < 0 or first + size > len(content):
+            raise self._broken("a buffer view that lies in the file", f"{size!r} bytes from {first!r}"[:60])
+        return content[first : first + size]
+
+    def _buffer(self, place: Any) -> np.ndarray:
+        buffer = self._at(self._list(self.json, "buffers"), place, "buffer")
+        uri = buffer.get("uri")
+        if uri is None and place == 0:
+            return self.binary
+        if not isinstance(uri, str) or not uri.startswith("data:") or ";base64," not in uri[:200]:
+            got = f"a buffer in {str(uri)[:60]!r}"
+            raise self._broken("buffers within the file", got, "make one .glb of it, with its buffers")
+        if place not in self._buffers:
+            try:
+                content = base64.b64decode(uri.partition(";base64,")[2], validate=True)
+            except (binascii.Error, ValueError) as error:
+                raise self._broken("base64 as a buffer", str(error)[:60]) from None
+            self._buffers[place] = np.frombuffer(content, np.uint8)
+        return self._buffers[place]
+
+    def _count(self, primitive: dict[str, Any]) -> int:
+        attributes = primitive.get("attributes")
+        if not isinstance(attributes, dict):
+            raise self._broken("attributes of a primitive", repr(attributes)[:40])
+        accessor = self._at(self._list(self.json, "accessors"), attributes.get("POSITION"), "accessor of POSITION")
+        count = accessor.get("count")
+        if type(count) is not int or count < 1:
+            raise self._broken("a number of splats", repr(count)[:40])
+        return count
+
+    def _matrix(self, node: dict[str, Any], place: Any) -> np.ndarray:
+        try:
+            if "matrix" in node:
+                return np.array(node["matrix"], np.float64).reshape(4, 4).T
+            matrix = np.eye(4)
+            turn = np.roll(np.array(node.get("rotation", (0, 0, 0, 1)), np.float64), 1)
+            matrix[:3, :3] = rotation_matrices(turn) * np.array(node.get("scale", (1, 1, 1)), np.float64)
+            matrix[:3, 3] = node.get("translation", (0, 0, 0))
+            return matrix
+        except (TypeError, ValueError, OverflowError):
+            raise self._broken("a transform of numbers", f"that of node {place}") from None
+
+    def _extension(self, owner: dict[str, Any], name: str) -> dict[str, Any]:
+        extensions = owner.get("extensions")
+        own = extensions.get(name) if isinstance(extensions, dict) else None
+        return own if isinstance(own, dict) else {}
+
+    def _list(self, owner: Any, key: str) -> list[Any]:
+        values = owner.get(key, []) if isinstance(owner, dict) else None
+        if not isinstance(values, list):
+            raise self._broken(f"a list of {key}", repr(values)[:40])
+        return values
+
+    def _at(self, values: list[Any], place: Any, what: str) -> dict[str, Any]:
+        if type(place) is not int or not 0 <= place < len(values) or not isinstance(values[place], dict):
+            raise self._broken(f"a {what}", f"the number {place!r}"[:60])
+        return values[place]  # type: ignore[no-any-return]
+
+    def _at_key(self, owner: Any, key: Any) -> dict[str, Any]:
+        own = owner.get(key) if isinstance(owner, dict) and isinstance(key, str) else None
+        if not isinstance(own, dict):
+            raise self._broken(f"{str(key)[:40]!r} as an object", repr(own)[:40])
+        return own
+
+    def _broken(
+        self, expected: str, got: str, hint: str = f"the file is truncated or damaged: {HINT}"
+    ) -> InvalidSplats:
+        return InvalidSplats(str(self.path), expected=expected, got=got, hint=hint)
+
+
+def _is_of_splats(primitive: Any) -> bool:
+    extensions = primitive.get("extensions") if isinstance(primitive, dict) else None
+    return isinstance(extensions, dict) and isinstance(extensions.get(EXTENSION), dict)
+
+
+def _document_row(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row of a property table as the document has it, with its boxes in the frame of PLYs."""
+    one = {key: value for key, value in row.items() if key not in BOXES}
+    if {"box_low", "box_high"} <= row.keys():
+        corners = np.array([row["box_low"], row["box_high"]]) @ TO_FILE
+        one["box"] = {"low": corners.min(axis=0).tolist(), "high": corners.max(axis=0).tolist()}
+    if {"oriented_box_centre", "oriented_box_axes", "oriented_box_half_sizes"} <= row.keys():
+        axes = np.array(row["oriented_box_axes"]).reshape(3, 3) @ TO_FILE
+        centre = TO_FILE @ row["oriented_box_centre"]
+        one["oriented_box"] = {
+            "centre": centre.tolist(),
+            "axes": axes.tolist(),
+            "half_sizes": row["oriented_box_half_sizes"],
+        }
+    return one
+
+
+def harmonic_name(band: int, place: int) -> str:
+    return f"{EXTENSION}:SH_DEGREE_{band}_COEF_{place}"

@@ -1,0 +1,234 @@
+"""A ``.glb`` of splats with labels, whose layout `liftcore.io.gltf` tells."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from liftcore.errors import InvalidSplats
+from liftcore.io.gltf import (
+    BINARY_CHUNK,
+    COMPONENTS,
+    EXTENSION,
+    FEATURES,
+    JSON_CHUNK,
+    MAGIC,
+    MAX_DEGREE,
+    METADATA,
+    RENDER_MODE,
+    SRGB,
+    TABLE_TYPES,
+    TABLE_WIDTHS,
+    TO_FILE,
+    WIDTHS,
+    harmonic_name,
+)
+from liftcore.io.labels import IDS, KINDS, rows_by_id
+from liftcore.io.quantised import gaussian_rows
+from liftcore.runtime.version import __version__
+from liftcore.scene.harmonics import band_rotation, constant_terms
+from liftcore.scene.kernel import NORMALS, Kernel
+from liftcore.scene.origin import FILE_ORIGIN
+from liftcore.scene.quaternions import product_matrix
+
+if TYPE_CHECKING:
+    from liftcore.scene.splats import Splats
+
+LARGEST_FILE = (1 << 32) - 1  # bytes, which a .glb counts with 32 bits
+CODES = {np.dtype(code): number for number, code in COMPONENTS.items()}
+NEAREST = "{kernel} splats as the nearest Gaussians: the format has the kernel 'ellipse' alone"
+MEMBERS = {  # of the rows of property tables: type, component type
+    "name": ("STRING", ""), "class_id": ("SCALAR", "UINT32"), "splats": ("SCALAR", "UINT32"),
+    "score": ("SCALAR", "FLOAT32"), "confidence": ("SCALAR", "FLOAT32"), "colour": ("VEC3", "UINT8"),
+    "box_low": ("VEC3", "FLOAT64"), "box_high": ("VEC3", "FLOAT64"),
+    "oriented_box_centre": ("VEC3", "FLOAT64"), "oriented_box_axes": ("MAT3", "FLOAT64"),
+    "oriented_box_half_sizes": ("VEC3", "FLOAT64"), "question": ("STRING", ""), "provenance": ("STRING", ""),
+}  # fmt: skip
+
+
+def gltf_blocks(splats: Splats, document: Mapping[str, Any] | None = None) -> Iterator[bytes]:
+    """The bytes of a ``.glb`` of any splats (`gaussian_rows`), in blocks, with their extras and what these mean.
+
+    Harmonics above degree 3 are left out; 2DGS and DBS become the nearest Gaussians, which ``asset.extras`` says.
+
+    Args:
+        splats: P. document: of `liftcore.io.labels`; None: splats without labels.
+
+    Raises:
+        InvalidSplats: the file would take more bytes than the format counts.
+    """
+    binary = _Binary()
+    sets = [name for name in IDS if name in splats.extras]
+    primitive = _primitive(binary, splats, sets)
+    node: dict[str, Any] = {"mesh": 0, "name": "splats"}
+    if splats.origin != FILE_ORIGIN:
+        node["translation"] = (TO_FILE @ splats.origin).tolist()
+    asset: dict[str, Any] = {"version": "2.0", "generator": f"splatlift {__version__}"}
+    if splats.kernel is not Kernel.GAUSSIAN_3D:
+        asset["extras"] = {"note": NEAREST.format(kernel=splats.kernel)}
+    gltf: dict[str, Any] = {"asset": asset, "extensionsUsed": [EXTENSION]}
+    if sets:
+        primitive["extensions"][FEATURES] = {"featureIds": [_feature_set(splats, name, sets) for name in sets]}
+        gltf["extensions"] = {METADATA: _add_tables(binary, splats, document or {}, sets)}
+        gltf["extensionsUsed"] += [FEATURES, METADATA]
+    gltf |= {"scene": 0, "scenes": [{"nodes": [0]}], "nodes": [node], "meshes": [{"primitives": [primitive]}]}
+    gltf |= {"accessors": binary.accessors, "bufferViews": binary.views, "buffers": [{"byteLength": binary.size}]}
+    text = json.dumps(gltf, ensure_ascii=False, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    size = 28 + len(text) + binary.size
+    if size > LARGEST_FILE:
+        expected, hint = f"a file of at most {LARGEST_FILE} bytes", "export parts of it"
+        raise InvalidSplats("splats", expected=expected, got=str(size), hint=hint)
+    yield struct.pack("<4sII", MAGIC, 2, size) + struct.pack("<I4s", len(text), JSON_CHUNK) + text
+    yield struct.pack("<I4s", binary.size, BINARY_CHUNK)
+    yield from binary.parts
+
+
+class _Binary:
+    """The buffer of a file that is written: arrays one after the other, each from a multiple of 8 bytes."""
+
+    def __init__(self) -> None:
+        self.parts: list[bytes] = []
+        self.size = 0
+        self.views: list[dict[str, Any]] = []
+        self.accessors: list[dict[str, Any]] = []
+
+    def view(self, content: bytes, **more: Any) -> int:
+        """The number of a new buffer view."""
+        self.views.append({"buffer": 0, "byteOffset": self.size, "byteLength": len(content), **more})
+        self.parts.append(content + b"\0" * (-len(content) % 8))
+        self.size += len(self.parts[-1])
+        return len(self.views) - 1
+
+    def attribute(self, values: np.ndarray, **more: Any) -> int:
+        """The number of a new accessor of values [P] or [P, n]; elements begin at multiples of 4 bytes."""
+        width = 1 if values.ndim == 1 else values.shape[1]
+        used = width * values.itemsize
+        stride = used + -used % 4
+        rows = np.zeros((len(values), stride), np.uint8)
+        rows[:, :used] = np.ascontiguousarray(values).view(np.uint8).reshape(len(values), used)
+        view = self.view(rows.tobytes(), target=34962, byteStride=stride)
+        kind = next(name for name, own in WIDTHS.items() if own == width)
+        accessor = {"bufferView": view, "componentType": CODES[values.dtype], "count": len(values), "type": kind}
+        self.accessors.append(accessor | more)
+        return len(self.accessors) - 1
+
+
+def _primitive(binary: _Binary, splats: Splats, sets: Sequence[str]) -> dict[str, Any]:
+    rows = list(gaussian_rows(splats))
+
+    def joined(name: str) -> np.ndarray:
+        return np.concatenate([getattr(some, name) for some in rows])
+
+    means, opacities, colours = (
+        (joined("means") * np.diag(TO_FILE)).astype("<f4"),
+        joined("opacities"),
+        joined("colours"),
+    )
+    sh = None if splats.sh is None else splats.sh.cpu().numpy()
+    sh = constant_terms(colours)[:, None] if sh is None else sh[:, : (MAX_DEGREE + 1) ** 2]
+    shown = colours.clip(0, 1)
+    linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+    extents = {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
+    quats = np.roll(joined("quats") @ product_matrix(TO_FILE).T, -1, axis=1)
+    attributes = {
+        "POSITION": binary.attribute(means, **extents),
+        "COLOR_0": binary.attribute(  # for viewers that know points alone
+            np.round(255 * np.column_stack([linear, opacities])).astype("<u1"), normalized=True
+        ),
+        f"{EXTENSION}:ROTATION": binary.attribute(quats.astype("<f4")),
+        f"{EXTENSION}:SCALE": binary.attribute(joined("scales").astype("<f4")),
+        f"{EXTENSION}:OPACITY": binary.attribute(opacities.astype("<f4")),
+    }
+    for band in range(round(sh.shape[1] ** 0.5)):
+        own = np.einsum("ij,njc->nic", band_rotation(band, TO_FILE), sh[:, band**2 : (band + 1) ** 2])
+        for place in range(2 * band + 1):
+            attributes[harmonic_name(band, place)] = binary.attribute(own[:, place].astype("<f4"))
+    for name, column in splats.extras.items():
+        if name not in NORMALS:
+            plain = f"_{name.upper() if name == name.lower() else name}"
+            attribute = f"_FEATURE_ID_{sets.index(name)}" if name in sets else plain
+            attributes[attribute] = binary.attribute(_attribute_values(name, column.cpu().numpy()))
+    kind = {"kernel": "ellipse", "colorSpace": SRGB, "projection": "perspective", "sortingMethod": "cameraDistance"}
+    primitive: dict[str, Any] = {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: kind}}
+    if splats.antialiased:
+        primitive["extras"] = {RENDER_MODE: "mip"}  # as PLYs say it; the format has no word for it
+    return primitive
+
+
+def _attribute_values(name: str, column: np.ndarray) -> np.ndarray:
+    """A column [P] of a type that attributes have: whole numbers of 16 bits at most, or f32.
+
+    Raises:
+        InvalidSplats: whole numbers too large for float32.
+    """
+    if column.dtype.kind == "f":
+        return column.astype("<f4")
+    low, high = int(column.min()), int(column.max())
+    for code in ("<u1", "<u2", "<i2"):
+        if np.iinfo(code).min <= low and high <= np.iinfo(code).max:
+            return column.astype(code)
+    if max(-low, high) > 1 << 24:
+        expected = "whole numbers below 2^24, as attributes of glTF have them"
+        raise InvalidSplats(f"columns[{name!r}]", expected=expected, got=f"{low}..{high}")
+    return column.astype("<f4")
+
+
+def _feature_set(splats: Splats, name: str, sets: Sequence[str]) -> dict[str, Any]:
+    count = int((splats.extras[name].unique() != 0).sum())
+    place = sets.index(name)
+    ids = {"featureCount": max(count, 1), "nullFeatureId": 0, "attribute": place, "propertyTable": place}
+    return ids | {"label": name.removesuffix("_id")}
+
+
+def _add_tables(binary: _Binary, splats: Splats, document: Mapping[str, Any], sets: Sequence[str]) -> dict[str, Any]:
+    """The property tables of instances and classes: a row an id, the first of which is that of none."""
+    tables, classes = [], {}
+    for name, kind in zip(IDS, KINDS, strict=True):
+        if name not in sets:
+            continue
+        count = int(splats.extras[name].max()) + 1
+        rows = [_table_row(one) for one in rows_by_id(dict(document), kind)]
+        rows += [{}] * (count - len(rows))
+        label, present = name.removesuffix("_id"), {key for row in rows for key in row}
+        whole = {
+            key for key in present if all(key in row for row in rows[1:] if row)
+        }  # scores that some lack are left out
+        members = {key: own for key, own in MEMBERS.items() if key in whole}
+        properties = {key: _add_property(binary, key, rows) for key in members}
+        tables.append({"name": kind, "class": label, "count": len(rows), "properties": properties})
+        described = {
+            key: {"type": kind} | ({"componentType": component} if component else {})
+            for key, (kind, component) in members.items()
+        }
+        classes[label] = {"name": label, "properties": described}
+    return {"schema": {"id": "splatlift", "classes": classes}, "propertyTables": tables}
+
+
+def _table_row(one: Mapping[str, Any]) -> dict[str, Any]:
+    """A row of the document as one of a property table, with its boxes in the file's frame."""
+    row = {key: value for key, value in one.items() if key in MEMBERS and value is not None}
+    if box := one.get("box"):
+        corners = np.array([box["low"], box["high"]]) @ TO_FILE
+        row |= {"box_low": corners.min(axis=0), "box_high": corners.max(axis=0)}
+    if box := one.get("oriented_box"):
+        axes = np.array(box["axes"]) @ TO_FILE  # rows; of MAT3 they are columns
+        row |= {"oriented_box_centre": TO_FILE @ box["centre"], "oriented_box_axes": axes.ravel()}
+        row |= {"oriented_box_half_sizes": box["half_sizes"]}
+    return row
+
+
+def _add_property(binary: _Binary, key: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
+    kind, component = MEMBERS[key]
+    if kind == "STRING":
+        texts = [str(row.get(key, "")).encode() for row in rows]
+        offsets = np.cumsum([0, *map(len, texts)]).astype("<u4")
+        return {"values": binary.view(b"".join(texts) or b"\0"), "stringOffsets": binary.view(offsets.tobytes())}
+    values = np.zeros((len(rows), TABLE_WIDTHS[kind]), TABLE_TYPES[component])
+    for place, row in enumerate(rows):
+        values[place] = row.get(key, 0)
+    return {"values": binary.view(values.tobytes())}

@@ -1,0 +1,72 @@
+"""What every splat is, as files keep it: a number or two a splat, and a document of what these mean.
+
+The columns of a splat are ``class_id`` and ``instance_id``, from 1 with 0 for none, ``score`` and ``confidence``; a
+file may have others. They are `Splats.extras` of splats that are read or written. The document has ``classes`` and
+``instances``, each a list of objects whose ``class_id`` or ``instance_id`` is that of the columns, with their names,
+scores, colours, boxes and questions (docs/formats.md).
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from liftcore.io.files import open_regular
+
+FORMAT = "splatlift-labels/1"
+COLUMN = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]{0,63}")  # a name that readers of PLY take
+IDS = ("instance_id", "class_id")  # columns of whole numbers, 0 for none
+MAX_DOCUMENT_BYTES = 64 << 20
+KINDS = ("instances", "classes")  # of the document, by the columns above
+
+
+@dataclass(frozen=True)
+class Labels:
+    """Columns of splats, and the document that says what their numbers mean."""
+
+    columns: dict[str, np.ndarray]  # name -> [P] i32 or f32
+    document: dict[str, Any]
+
+    def chosen(self, rows: np.ndarray) -> Labels:
+        """The labels of the rows that a mask [P] chooses, with what the document says of those alone."""
+        columns = {name: values[rows] for name, values in self.columns.items()}
+        left = {name: set(np.unique(columns[name]).tolist()) for name in IDS if name in columns}
+        document = self.document | {"splats": int(np.count_nonzero(rows))}
+        for name, kind in zip(IDS, KINDS, strict=True):
+            if name in left:
+                document[kind] = [one for one in self.document.get(kind, []) if one.get(name) in left[name]]
+        return Labels(columns, document)
+
+
+def document_bytes(labels: Labels) -> bytes:
+    """The document as a JSON file."""
+    return json.dumps(labels.document, ensure_ascii=False, indent=1).encode() + b"\n"
+
+
+def document_lines(labels: Labels) -> bytes:
+    """The instances as JSON Lines: an object a line, with all that the document says of it."""
+    whole = {name: labels.document[name] for name in ("format", "made_by", "frame") if name in labels.document}
+    rows = (json.dumps(one | whole, ensure_ascii=False) for one in labels.document.get("instances", []))
+    return "".join(f"{row}\n" for row in rows).encode()
+
+
+def rows_by_id(document: dict[str, Any], kind: str) -> list[dict[str, Any]]:
+    """The rows of ``classes`` or ``instances`` where their numbers are their places; an empty one where is none."""
+    name = IDS[KINDS.index(kind)]
+    rows = {one[name]: one for one in document.get(kind, [])}
+    return [rows.get(place, {}) for place in range(max(rows, default=0) + 1)]
+
+
+def read_document(path: Path) -> dict[str, Any]:
+    """The document of a JSON file; empty where there is none of its format, or no such file."""
+    try:
+        with open_regular(path) as handle:
+            document = json.loads(handle.read(MAX_DOCUMENT_BYTES))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return document if isinstance(document, dict) and document.get("format") == FORMAT else {}

@@ -1,0 +1,77 @@
+"""COCO's JSON of masks: where each instance of some labels shows in each view."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from liftcore.errors import InvalidQuery
+from liftcore.query.opened import OpenedLift
+from liftcore.query.segment import value_map
+
+if TYPE_CHECKING:
+    from liftcore.io.labels import Labels
+
+
+def masks_json(scene: OpenedLift, labels: Labels) -> Iterator[bytes]:
+    """The masks of all instances in the views that were lifted, in blocks, a view at a time.
+
+    A pixel is of the instance with the most weight on its ray, in the photo's own pixels. Masks are uncompressed run
+    lengths, column by column. ``image_id`` counts from 1, ``category_id`` is the class, 0 without a name.
+
+    Raises:
+        InvalidQuery: the labels have no instances.
+        InvalidLift: the cameras or splats moved or changed since the lift.
+    """
+    instances = {one["instance_id"]: one for one in labels.document["instances"]}
+    if not instances:
+        raise InvalidQuery("source", expected="labels with instances", got="none", hint="export other words")
+    kinds = {one["class_id"]: one["name"] for one in labels.document["classes"]}
+    if any(one["class_id"] not in kinds for one in instances.values()):
+        kinds[0] = "object"
+    head = {
+        "info": {"description": "instances of a lift in its views", "contributor": labels.document["made_by"]},
+        "categories": [{"id": number, "name": name} for number, name in sorted(kinds.items())],
+    }
+    return _blocks(scene, labels.columns["instance_id"], instances, head)
+
+
+def _blocks(
+    scene: OpenedLift, numbers: np.ndarray, instances: dict[int, dict[str, Any]], head: dict[str, Any]
+) -> Iterator[bytes]:
+    images, count = [], 0
+    yield json.dumps(head, ensure_ascii=False)[:-1].encode() + b', "annotations": ['
+    for place, view in enumerate(scene.metadata.views, 1):
+        shown = value_map(scene, numbers, view)
+        height, width = shown.shape
+        images.append({"id": place, "file_name": view, "width": width, "height": height})
+        for number in np.unique(shown[shown > 0]).tolist():
+            one, mask = instances[number], shown == number
+            rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+            box = [columns[0], rows[0], columns[-1] - columns[0] + 1, rows[-1] - rows[0] + 1]
+            count += 1
+            annotation = {
+                "id": count,
+                "image_id": place,
+                "category_id": one["class_id"],
+                "instance_id": number,
+                "segmentation": {"size": [height, width], "counts": run_lengths(mask)},
+                "area": int(mask.sum()),
+                "bbox": [int(side) for side in box],
+                "iscrowd": 0,
+            }
+            if one.get("score") is not None:
+                annotation["score"] = one["score"]
+            yield (", " if count > 1 else "").encode() + json.dumps(annotation).encode()
+    yield b'], "images": ' + json.dumps(images, ensure_ascii=False).encode() + b"}\n"
+
+
+def run_lengths(mask: np.ndarray) -> list[int]:
+    """COCO's uncompressed run lengths of a mask [H, W] bool: column by column, the first run is of zeros."""
+    flat = mask.ravel(order="F")
+    ends = np.flatnonzero(np.diff(flat)) + 1
+    runs = np.diff([0, *ends.tolist(), flat.size]).tolist()
+    return [0, *runs] if flat[0] else runs

@@ -1,0 +1,114 @@
+"""What every splat is, in files: the same labels from words, an answer and the objects of a lift."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from liftcore.cli import main
+from liftcore.errors import InvalidQuery
+from liftcore.io.labels import Labels
+from liftcore.io.splats import read_labels, read_splats
+from liftcore.query.coco import run_lengths
+from liftcore.query.question import Query
+from liftcore.query.scene import Scene
+from liftcore.query.terms import Region, Vector
+from tests.api.tiny_scene import CHANNELS, SPLATS_A_CLUSTER, VIEWS, WORDS, text_table
+
+EYE = np.eye(3, CHANNELS, dtype=np.float32)
+CLUSTER = np.repeat(np.arange(3), SPLATS_A_CLUSTER)
+
+
+def of_words(scene: Scene) -> Labels:
+    return scene.labels(scene.segment(WORDS, EYE))
+
+
+def test_every_source_gives_instances_that_lie_in_their_boxes(scene: Scene) -> None:
+    answer = scene.ask(Query.of((Region("left", 0, 2),), threshold=0.5))
+    sources = scene.segment(WORDS, EYE), answer, scene.catalogue(WORDS, EYE), scene.catalogue()
+    for source, classes, instances in zip(sources, (3, 1, 3, 0), (3, 1, 3, 3), strict=True):
+        found = scene.labels(source)
+        assert [len(found.document[kind]) for kind in ("classes", "instances")] == [classes, instances]
+        for one in found.document["instances"]:
+            inside = found.columns["instance_id"] == one["instance_id"]
+            assert inside.sum() == one["splats"] and one["provenance"].endswith(f"{len(VIEWS)} views")
+            if classes:
+                assert set(found.columns["class_id"][inside]) == {one["class_id"]}
+            places = scene.splats.positions()[inside]
+            low, high = one["box"]["low"], one["box"]["high"]
+            assert (places >= np.array(low) - 1e-6).all() and (places <= np.array(high) + 1e-6).all()
+    with pytest.raises(InvalidQuery, match="an answer that found splats"):
+        scene.labels(scene.ask(Query.of((Vector((1.0,) * CHANNELS),), threshold=1.0)))
+
+
+def test_masks_in_views_are_those_of_the_instances(scene: Scene, tmp_path: Path) -> None:
+    found = scene.segment(WORDS, EYE)
+    scene.export(tmp_path / "m.json", found)
+    document = json.loads((tmp_path / "m.json").read_text(encoding="utf-8"))
+    assert [one["file_name"] for one in document["images"]] == list(scene.metadata.views)
+    names = {one["id"]: one["name"] for one in document["categories"]}
+    assert sorted(names.values()) == sorted(WORDS)
+    view = next(one for one in document["images"] if one["file_name"] == "middle")
+    own = [one for one in document["annotations"] if one["image_id"] == view["id"]]
+    assert len(own) == 3
+    for one in own:
+        assert sum(one["segmentation"]["counts"]) == view["width"] * view["height"]
+        assert sum(one["segmentation"]["counts"][1::2]) == one["area"] > 0
+        centre = one["bbox"][0] + one["bbox"][2] / 2
+        assert WORDS.index(names[one["category_id"]]) == int(3 * centre / view["width"])
+
+
+def test_run_lengths_are_columns_and_begin_with_zeros() -> None:
+    assert run_lengths(np.array([[1, 0], [1, 0], [0, 1]], bool)) == [0, 2, 3, 1]
+    assert run_lengths(np.array([[0, 1], [1, 1]], bool)) == [1, 3] and run_lengths(np.zeros((2, 2), bool)) == [4]
+
+
+def test_objects_are_lines_of_json(scene: Scene, tmp_path: Path) -> None:
+    scene.export(tmp_path / "o.jsonl", scene.catalogue(WORDS, EYE))
+    lines = [json.loads(line) for line in (tmp_path / "o.jsonl").read_text(encoding="utf-8").splitlines()]
+    assert sorted(one["name"] for one in lines) == sorted(WORDS)
+    assert all({"box", "oriented_box", "score", "views", "frame"} <= one.keys() for one in lines)
+
+
+def test_the_command_writes_what_the_suffix_says(
+    tiny_lift: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "words.safetensors").write_bytes(text_table())
+    words = ["--all-words", "--table", str(tmp_path / "words.safetensors")]
+
+    def export(name: str, *options: str) -> Path:
+        assert main(["export", str(tiny_lift), "-o", str(tmp_path / name), *options]) == 0
+        return tmp_path / name
+
+    labelled = read_labels(export("scene.glb", *words))
+    assert sorted(one["name"] for one in labelled.document["classes"]) == sorted(WORDS)
+    for value in range(3):
+        assert len(set(labelled.columns["class_id"][value == CLUSTER])) == 1
+    ply = read_labels(export("scene.ply", *words))
+    for one, other in zip(ply.document["instances"], labelled.document["instances"], strict=True):
+        exact = (
+            "instance_id",
+            "class_id",
+            "name",
+            "splats",
+            "colour",
+            "box",
+            "oriented_box",
+            "question",
+            "provenance",
+        )
+        assert [one[key] for key in exact] == [other[key] for key in exact]
+        assert one["score"] == pytest.approx(other["score"], abs=1e-6)
+    assert all(np.array_equal(ply.columns[name], values) for name, values in labelled.columns.items())
+    assert read_splats(export("object.glb", "--object", "1")).count == SPLATS_A_CLUSTER
+    assert read_splats(export("scene.spz")).count == 3 * SPLATS_A_CLUSTER
+    assert len(export("objects.jsonl").read_text().splitlines()) == 3
+    found = read_labels(export("lamp.glb", "--text", "lamp", "--only", *words[1:]))
+    assert {one["name"] for one in found.document["instances"]} == {"lamp"} and (found.columns["class_id"] == 1).all()
+    capsys.readouterr()
+    for wrong in (["-o", "s.obj"], ["-o", "s.glb", "--only"], ["-o", "s.glb", "--object", "9"]):
+        assert main(["export", str(tiny_lift), *wrong]) == 2
+    assert not Path("s.glb").exists()

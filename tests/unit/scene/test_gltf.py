@@ -1,0 +1,216 @@
+"""glTF with KHR_gaussian_splatting: read as splat-transform writes it, written and read back, and bounded.
+
+``tests/data/splats/degree3.glb`` is what splat-transform 3.7.0 makes of ``degree3.sog.decoded.ply``.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from liftcore.errors import InvalidSplats
+from liftcore.io.gltf import TO_FILE
+from liftcore.io.gltf_writer import gltf_blocks
+from liftcore.io.kinds import SplatFormat
+from liftcore.io.labels import Labels
+from liftcore.io.quantised import gaussian_rows
+from liftcore.io.splats import format_of, labelled, read_labels, read_places, read_splats, write_splats
+from liftcore.scene.kernel import Kernel
+from liftcore.scene.splats import Splats
+from tests.scenes import random_splats
+
+FILES = Path(__file__).parents[2] / "data" / "splats"
+P = 40
+
+
+def some_splats(kernel: Kernel = Kernel.GAUSSIAN_3D, degree: int = 3) -> Splats:
+    generator = np.random.default_rng(7)
+    sh = generator.normal(size=(P, (degree + 1) ** 2, 3)).astype("f4")
+    return replace(random_splats(3, kernel=kernel, count=P), sh=torch.from_numpy(sh))
+
+
+def activated(splats: Splats) -> dict[str, np.ndarray]:
+    """The splats as the format has them, with quaternions as the matrices that they mean."""
+    (rows,) = gaussian_rows(splats)
+    w, x, y, z = rows.quats.T
+    turns = np.stack([w * w + x * x - 0.5, x * y - w * z, x * z + w * y, w * w + y * y - 0.5, y * z - w * x])
+    assert splats.sh is not None
+    fields = {"means": splats.positions(), "scales": rows.scales, "opacities": rows.opacities, "turns": turns}
+    return fields | {"sh": splats.sh.numpy()}
+
+
+def assert_same(found: Splats, expected: Splats) -> None:
+    one, other = activated(found), activated(expected)
+    for name, values in other.items():
+        np.testing.assert_allclose(one[name], values, atol=1e-6 * max(1.0, np.abs(values).max()), err_msg=name)
+
+
+def write(path: Path, splats: Splats) -> Path:
+    path.write_bytes(b"".join(gltf_blocks(splats)))
+    return path
+
+
+def parts_of(path: Path) -> tuple[dict[str, Any], bytes]:
+    content = path.read_bytes()
+    (length,) = struct.unpack_from("<I", content, 12)
+    return json.loads(content[20 : 20 + length]), content[28 + length :]
+
+
+def join(path: Path, document: dict[str, Any], binary: bytes) -> Path:
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary)) + struct.pack("<I4s", len(text), b"JSON")
+    path.write_bytes(head + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary)
+    return path
+
+
+def test_a_file_of_another_program_is_read_as_the_ply_that_it_was_made_of(tmp_path: Path) -> None:
+    expected = read_splats(FILES / "degree3.sog.decoded.ply")
+    assert format_of(FILES / "degree3.glb") is SplatFormat.GLTF
+    assert_same(read_splats(FILES / "degree3.glb"), expected)
+    np.testing.assert_allclose(read_places(FILES / "degree3.glb"), expected.means, atol=1e-6)
+    document, binary = parts_of(FILES / "degree3.glb")
+    document["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
+    (tmp_path / "s.gltf").write_text(json.dumps(document), encoding="utf-8")
+    assert_same(read_splats(tmp_path / "s.gltf"), expected)
+
+
+@pytest.mark.parametrize("kernel", Kernel)
+@pytest.mark.parametrize("degree", [0, 3])
+def test_every_kernel_comes_back_as_the_gaussians_that_were_written(
+    kernel: Kernel, degree: int, tmp_path: Path
+) -> None:
+    splats = some_splats(kernel, degree)
+    found = read_splats(write(tmp_path / "s.glb", splats))
+    assert found.kernel is Kernel.GAUSSIAN_3D and not found.warnings
+    assert_same(found, splats)
+    note = parts_of(tmp_path / "s.glb")[0]["asset"].get("extras", {}).get("note", "")
+    assert (kernel in note) is (kernel is not Kernel.GAUSSIAN_3D)
+
+
+def test_what_the_format_has_no_word_for_is_kept(tmp_path: Path) -> None:
+    splats = replace(some_splats(), render_mode="antialiased")
+    assert read_splats(write(tmp_path / "s.glb", splats)).antialiased
+    far = some_splats().transformed(translation=(500_000.0, 5_400_000.0, 300.0))
+    assert any(far.origin)
+    assert_same(read_splats(write(tmp_path / "s.glb", far)), far)
+
+
+def test_nodes_move_what_they_hold(tmp_path: Path) -> None:
+    splats, half = some_splats(), np.sqrt(0.5)
+    document, binary = parts_of(write(tmp_path / "s.glb", splats))
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # a quarter about z
+    document["nodes"] = [
+        {"children": [1, 2], "rotation": [0, 0, half, half], "translation": [1, 2, 3]},
+        {"mesh": 0, "scale": [2, 2, 2]},
+        {"mesh": 0, "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 5, 0, 0, 1]},
+    ]
+    found = read_splats(join(tmp_path / "moved.glb", document, binary))
+    assert found.count == 2 * P
+    in_our_frame = TO_FILE @ turn @ TO_FILE
+    assert_same(found[:P], splats.transformed(scale=2.0, rotation=in_our_frame, translation=TO_FILE @ [1, 2, 3]))
+    shift = TO_FILE @ (turn @ [5, 0, 0] + [1, 2, 3])
+    assert_same(found[P:], splats.transformed(rotation=in_our_frame, translation=shift))
+
+
+def labels() -> Labels:
+    box = {"low": [-1.0, -2.0, -3.0], "high": [1.0, 2.0, 4.0]}
+    turned = {"centre": [0.1, 0.2, 0.3], "axes": [[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]], "half_sizes": [3.0, 2.0, 1.0]}
+    mug = {"instance_id": 1, "class_id": 2, "name": "mug ☕", "score": 0.25, "confidence": 0.5, "colour": [1, 2, 255]}
+    mug |= {"splats": 9, "box": box, "oriented_box": turned, "question": "a mug", "provenance": "18 views"}
+    document = {
+        "instances": [mug, mug | {"instance_id": 2, "class_id": 1, "name": "plate"}],
+        "classes": [{"class_id": 1, "name": "plate"}, {"class_id": 2, "name": "mug ☕"}],
+    }
+    columns = {"class_id": np.arange(P) % 3, "instance_id": (-np.arange(P)) % 3, "score": np.linspace(-1, 1, P)}
+    kinds = {"class_id": "i4", "instance_id": "i4", "score": "f4"}
+    return Labels({name: values.astype(kinds[name]) for name, values in columns.items()}, document)
+
+
+def test_labels_come_back_with_names_boxes_and_all_that_is_said_of_them(tmp_path: Path) -> None:
+    expected = labels()
+    write_splats(tmp_path / "s.ply", some_splats())
+    (tmp_path / "s.glb").write_bytes(b"".join(labelled(tmp_path / "s.ply", expected, ".glb")))
+    found = read_labels(tmp_path / "s.glb")
+    assert found.document == expected.document
+    for name, values in expected.columns.items():
+        np.testing.assert_array_equal(found.columns[name], values)
+    kept = np.arange(P) % 3 == 1
+    (tmp_path / "t.glb").write_bytes(b"".join(labelled(tmp_path / "s.ply", expected, ".glb", kept)))
+    one = read_labels(tmp_path / "t.glb")
+    assert [row["name"] for row in one.document["classes"]] == ["plate"] and set(one.columns["class_id"]) == {1}
+
+
+def test_feature_ids_of_others_count_from_one_with_zero_for_none(tmp_path: Path) -> None:
+    columns = {"instance_id": np.arange(P) % 4, "class_id": np.arange(P) % 2}
+    write_splats(tmp_path / "s.glb", some_splats(), columns)
+    document, binary = parts_of(tmp_path / "s.glb")
+    primitive = document["meshes"][0]["primitives"][0]
+    primitive["extensions"]["EXT_mesh_features"] = {
+        "featureIds": [{"featureCount": 3, "nullFeatureId": 3, "attribute": 0}]
+    }
+    extras = read_splats(join(tmp_path / "t.glb", document, binary)).extras
+    assert extras["instance_id"].tolist() == [1, 2, 3, 0] * 10
+    assert extras["class_id"].tolist() == [1, 2] * 20  # of an attribute alone, every id is a feature
+
+
+PRIMITIVE = "meshes.0.primitives.0"
+KIND = f"{PRIMITIVE}.extensions.KHR_gaussian_splatting"
+MANY = [{"children": list(range(1, 50_000))}, *({"mesh": 0} for _ in range(49_999))]
+WRONG: dict[str, tuple[str, Any, str]] = {  # where, what, and what is said of it; the first accessor is POSITION
+    "another file": ("buffers.0.uri", "../../etc/passwd", "buffers within the file"),
+    "an address": ("buffers.0.uri", "http://127.0.0.1/s.bin", "buffers within the file"),
+    "another kernel": (f"{KIND}.kernel", "box", "the kernel 'box'"),
+    "compressed": (f"{KIND}.extensions", {"KHR_gaussian_splatting_compression_spz_2": {}}, "compression_spz"),
+    "other extensions": ("extensionsRequired", ["EXT_meshopt_compression"], "EXT_meshopt_compression"),
+    "a count": ("accessors.0.count", 1 << 30, "as many splats"),
+    "other counts": ("accessors.4.count", P - 1, "rows of 1 plain numbers"),
+    "a bomb of nodes": ("nodes", MANY, "as many splats"),
+    "a circle of nodes": ("nodes", [{"mesh": 0, "children": [0]}], "meets a node twice"),
+    "a mesh": (f"{PRIMITIVE}.extensions", {}, "without any"),
+    "a scale for each axis": ("nodes.0.scale", [1, 2, 1], "a proper rotation"),
+    "a mirror": ("nodes.0.scale", [-1, 1, 1], "no reflection"),
+    "overlapping rows": ("bufferViews.0.byteStride", 4, "rows of 12 bytes"),
+    "beyond the file": ("bufferViews.0.byteOffset", 1 << 40, "lies in the file"),
+    "half a degree": (f"{PRIMITIVE}.attributes.KHR_gaussian_splatting:SH_DEGREE_2_COEF_1", None, "DEGREE_2_COEF_1"),
+    "no attributes": (f"{PRIMITIVE}.attributes", None, "attributes of a primitive"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_cannot_be_or_leads_elsewhere_is_refused(name: str, tmp_path: Path) -> None:
+    where, value, message = WRONG[name]
+    document, binary = parts_of(write(tmp_path / "s.glb", some_splats()))
+    place: Any = document
+    *way, last = where.split(".")
+    for step in way:
+        place = place[int(step) if step.isdecimal() else step]
+    place[last] = value
+    with pytest.raises(InvalidSplats, match=message):
+        read_splats(join(tmp_path / "t.glb", document, binary))
+
+
+def test_damaged_bytes_are_refused_or_read_and_nothing_else(tmp_path: Path) -> None:
+    write_splats(tmp_path / "s.ply", some_splats(degree=0))
+    (tmp_path / "s.glb").write_bytes(b"".join(labelled(tmp_path / "s.ply", labels(), ".glb")))
+    content, generator = (tmp_path / "s.glb").read_bytes(), np.random.default_rng(3)
+    head = struct.unpack_from("<I", content, 12)[0] + 28
+    for _ in range(300):
+        damaged = bytearray(
+            content[: int(generator.integers(20, len(content)))] if generator.random() < 0.2 else content
+        )
+        for place in generator.integers(0, min(head, len(damaged)), 3):
+            damaged[place] = generator.integers(32, 127)
+        (tmp_path / "t.glb").write_bytes(damaged)
+        try:
+            read_labels(tmp_path / "t.glb")
+        except InvalidSplats:
+            continue
