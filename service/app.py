@@ -15,8 +15,7 @@ from service import problems
 from service.auth import STRANGER, Gate
 from service.content import EventStreams
 from service.errand import revive
-from service.jobs.process import JobLimits
-from service.jobs.supervisor import Supervisor
+from service.jobs.supervisor import JobLimits, Supervisor
 from service.middleware import AnswerHead, RecordedApp, Turns
 from service.observe import Metrics, versions
 from service.queries.client import QueryClient, QueryLimits

@@ -1,30 +1,49 @@
-"""What runs in a process of its own while a request waits (`service.errand`): an upload is read before it becomes an
-asset, a pack named anew, a lift planned that nobody has ordered yet."""
+"""What runs in a process of its own. While a request waits (`service.errand`): an upload is read before it becomes an
+asset, a pack named anew, a lift planned that nobody has ordered yet. And what jobs do (`service.jobs.child`)."""
 
 from __future__ import annotations
 
+import hashlib
 import json
+import logging
 import tempfile
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from liftcore import LiftSettings, load_lift, plan_files, read_features
+from liftcore import (
+    Checkpoint,
+    Kernel,
+    LiftResult,
+    LiftSettings,
+    Plan,
+    lift_files,
+    load_lift,
+    open_engine,
+    plan_files,
+    read_features,
+)
 from liftcore.errors import InvalidFeatures, InvalidInput, InvalidLift, SplatliftError
 from liftcore.evaluate import inspect_file
 from liftcore.files import finite, identify, with_metadata, wrong_kind
 from liftcore.text.table import TableEncoder
 from service import models
-from service.child import fault_of
-from service.jobs.work import plan_document
+from service.child import fault_of, renamed
 from service.models import AssetKind, UploadKind
 from service.store.lifts import LONG, SHOWN_BYTES
 from service.uploads import INVALID, LIFT
 
+if TYPE_CHECKING:
+    from service.jobs.child import Reporter
+
 BLOCK_ROWS = 1 << 14  # of a lift, looked at together
+SHOWN_DIGITS = 12  # of the splats' digest, by which the chart of a trade-off names the scene
+
+log = logging.getLogger(__name__)
 
 
 def _described(path: Path, kind: AssetKind) -> dict[str, Any]:
@@ -198,3 +217,102 @@ def plan(file: str) -> dict[str, Any]:
         return {"event": "valid", "plan": plan_document(found, order["names"])}
     except SplatliftError as error:
         return {"event": "invalid", "fault": fault_of(error, order["names"])}
+
+
+# What jobs do: a lift, or a trade-off
+
+
+def lift_as_ordered(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
+    """Lift, and save the lift at ``output``.
+
+    Returns:
+        What the job's last message tells of it.
+
+    Raises:
+        SplatliftError: as `liftcore.lift` has it.
+    """
+
+    def planned(plan: Plan) -> None:
+        for warning in plan.warnings:  # the operator's log has them too
+            log.warning(warning)
+        report.plan(plan_document(plan, order["names"]))
+
+    settings = LiftSettings.of(**order["settings"])
+    address = order["ray_address"] if order["engine"] == "ray" else None
+    engine = open_engine(order["engine"], address, order["threads"])
+    made = lift_files(
+        Path(order["splats"]),
+        Path(order["cameras"]),
+        [Path(path) for path in order["features"]],
+        settings,
+        threads=order["threads"],
+        progress=report,
+        on_plan=planned,
+        checkpoint=Checkpoint(Path(order["work"]), order["checkpoint_seconds"]),
+        engine=engine,
+    )
+    made = _as_clients_know(made, order["file_names"])
+    output = Path(order["output"])
+    made.save(output, progress=report)
+    with output.open("rb") as handle:
+        digest = hashlib.file_digest(handle, "sha256").hexdigest()
+    return {
+        "sha256": digest,
+        "count": made.features.shape[0],
+        "channels": made.features.shape[1],
+        # Through JSON and not model_dump: what is not finite must become null before it reaches a client.
+        "metadata": json.loads(made.metadata.model_dump_json()),
+    }
+
+
+def plan_document(plan: Plan, names: Mapping[str, str]) -> dict[str, Any]:
+    """A plan as `service.models.Plan` has it, with the names that clients know in place of paths."""
+    warnings = [renamed(warning, names) for warning in (*plan.warnings, *plan.told)]
+    return finite({"summary": list(plan.summary()), "warnings": warnings, **plan.facts()})
+
+
+def _as_clients_know(made: LiftResult, names: Mapping[str, str]) -> LiftResult:
+    """The inputs by the names under which clients download them: whoever has the lift may have them beside it, and
+    paths of this machine are nobody's business.
+    """
+    metadata = made.metadata
+    resolved = {str(Path(path).resolve()): name for path, name in names.items()}  # data may lie behind a link
+    inputs = metadata.splats, metadata.cameras, *metadata.features
+    splats, cameras, *features = (
+        file.model_copy(update={"path": resolved[str(Path(file.path).resolve())]}) for file in inputs
+    )
+    update = {"splats": splats, "cameras": cameras, "features": tuple(features)}
+    return replace(made, metadata=metadata.model_copy(update=update))
+
+
+def compare_as_ordered(order: dict[str, Any], progress: Reporter) -> dict[str, Any]:
+    """Compare, and draw the chart at ``output``. Each run is a process of our group, with our environment.
+
+    Returns:
+        What the job's last message tells of it: ``document`` and ``page``.
+
+    Raises:
+        SplatliftError: as `liftcore.evaluate.compare_speeds` has it.
+    """
+    from liftcore.evaluate import SceneFiles, compare_speeds  # with matplotlib, which no lift needs
+
+    settings, parameters, labels = order["settings"], order["parameters"], order["labels"]
+    files = Path(order["splats"]), Path(order["cameras"]), tuple(Path(path) for path in order["features"])
+    scene = SceneFiles(*files)
+    if labels:
+        classes = tuple(parameters["labels"]["classes"])
+        scene = SceneFiles(*files, Path(labels["masks"]), Path(labels["table"]), classes)
+    found = compare_speeds(
+        scene,
+        budget=parameters["budget_s"],
+        settings=settings,
+        kernel=Kernel(order["kernel"]),
+        threads=order["threads"],
+        progress=progress,
+        scene=f"splats {scene.splats.stem[:SHOWN_DIGITS]}",  # a blob is named by its digest
+        command=f"POST /tradeoff {json.dumps(parameters | {'settings': settings})}",
+    )
+    with tempfile.TemporaryDirectory(prefix="splatlift-chart-") as folder:
+        chart = next(file for file in found.save(Path(folder)) if file.suffix == ".png")
+        Path(order["output"]).write_bytes(chart.read_bytes())
+    return {"document": found.document, "page": "\n".join(found.lines()) + "\n"}

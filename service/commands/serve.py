@@ -28,10 +28,9 @@ from fastapi import FastAPI
 from liftcore.cli import Parser
 from service.app import assemble
 from service.auth import is_loopback
-from service.encoders import require_encoder_files
 from service.errors import Misconfigured
 from service.observe import logging_to_stderr
-from service.settings import REMOVED_VARIABLES, ServiceSettings, read_settings, variables
+from service.settings import REMOVED_VARIABLES, ServiceSettings, read_settings, require_encoder_files, variables
 from service.state import Stopping
 from service.store.database import DATABASE, keys_were_made, require_database
 from service.store.keys import any_key

@@ -29,11 +29,10 @@ from liftcore.errors import InvalidInput, InvalidLift, Unavailable
 from liftcore.text import BUILT_IN, NO_WORDS, OWN_WORDS
 from service.app import assemble
 from service.commands.serve import bind, server_of
-from service.encoders import require_encoder_files
 from service.errors import Misconfigured
 from service.models import AssetKind
 from service.observe import logging_to_stderr
-from service.settings import ServiceSettings, read_settings
+from service.settings import ServiceSettings, read_settings, require_encoder_files
 from service.store.assets import CheckedUpload
 from service.store.lifts import FinishedLift, order_of
 from service.store.owners import SERVICE

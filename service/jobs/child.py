@@ -72,9 +72,9 @@ Work = Callable[[dict[str, Any], Reporter], dict[str, Any]]  # an order to what 
 
 def work_of(kind: JobKind) -> Work:
     """What a job of that kind does, imported beside the heartbeats."""
-    from service.jobs import work
+    from service import tasks
 
-    return work.compare_as_ordered if kind is JobKind.TRADEOFF else work.lift_as_ordered
+    return tasks.compare_as_ordered if kind is JobKind.TRADEOFF else tasks.lift_as_ordered
 
 
 def run(order: dict[str, Any], report: Reporter) -> dict[str, Any]:

@@ -43,9 +43,9 @@ from liftcore.files import cameras_of_views
 from liftcore.models import Found, OwnCamera, Seen
 from liftcore.text import OWN_WORDS
 from service.child import end_with_parent, fault_of
-from service.encoders import encoder_version
 from service.errors import NoSpace
 from service.queries.client import PIPE_BYTES, Frame, send_frame
+from service.settings import encoder_version
 
 WARM_UP_TEXT = "something"
 WORD_FILES = {"word_labels": "splat_labels", "word_map": "labels", "word_picture": "picture"}  # of `blocks_of`

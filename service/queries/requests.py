@@ -15,10 +15,10 @@ from liftcore import Query, __version__
 from liftcore.text import encoder_file
 from service import models
 from service.content import BINARY, Draft, kept, unchanged
-from service.encoders import encoder_spec, encoder_version
 from service.errors import InvalidRequest
 from service.queries import questions
 from service.queries.client import PIPE_BYTES, Frame, Waiter
+from service.settings import encoder_spec, encoder_version
 from service.state import AppState, Deps
 from service.store.assets import kernel_of
 from service.store.lifts import LiftRecord

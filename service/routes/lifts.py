@@ -13,12 +13,12 @@ from liftcore.errors import NotFound
 from liftcore.files import in_camera_orientation
 from service import models
 from service.content import FILE, TAGGED, Cursor, Limit, StoredFile, file_answer, kept, listed, unchanged
-from service.encoders import encoder_label
 from service.queries import questions
 from service.queries.requests import NO_ENCODER, Ask, made, scene_request, tagged_answer, with_encoder, with_packs
 from service.requests import JsonRoute
 from service.routes.assets import RAW_BODY, Sha256, taken
 from service.routes.queries import NPY, PLY, PNG
+from service.settings import encoder_label
 from service.state import AppState, Deps
 from service.store.lifts import LiftRecord, TradeoffRecord
 from service.uploads import LIFT, LiftIntake

@@ -9,7 +9,6 @@ from fastapi import APIRouter, Request, Response
 from fastapi import Query as Parameter
 
 from liftcore import Query
-from service.encoders import encoder_label
 from service.queries.questions import (
     AskedToRender,
     AskedToSegment,
@@ -33,6 +32,7 @@ from service.queries.requests import (
     with_encoder,
 )
 from service.requests import JsonRoute, Parameters, both
+from service.settings import encoder_label
 from service.state import AppState, Deps
 from service.store.lifts import LiftRecord
 

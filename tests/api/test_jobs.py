@@ -30,11 +30,11 @@ from service.child import fault_of
 from service.jobs import child
 from service.jobs import supervisor as pace
 from service.jobs.child import Reporter
-from service.jobs.work import plan_document
 from service.models import AssetKind
 from service.store.jobs import LINE_CHARACTERS, LOG_LINES, EventKind, log_line, note
 from service.store.owners import SERVICE
 from service.store.store import Store
+from service.tasks import plan_document
 from tests.crash.conftest import asset_of, order, until
 from tests.crash.server import standing_in
 
@@ -344,7 +344,7 @@ def test_fault_of_a_job_names_what_is_missing_and_no_folder_of_the_server(monkey
     def lift(order: dict[str, Any], progress: Progress) -> dict[str, Any]:
         raise error
 
-    monkeypatch.setattr("service.jobs.work.lift_as_ordered", lift)
+    monkeypatch.setattr("service.tasks.lift_as_ordered", lift)
     assert told({}) == fault_of(LACK)
     error = OSError(errno.ENOSPC, "No space left on device")
     assert told({})["kind"] == "no-space" and "delete" in told({})["hint"]

@@ -28,10 +28,9 @@ from liftcore.query.question import page_fields
 from liftcore.values.lift_file import save_lift
 from liftcore.values.settings import LiftSettings
 from service.commands.serve import settings_of
-from service.encoders import encoder_label, encoder_spec
 from service.errors import InvalidRequest
 from service.routes.operations import WEB
-from service.settings import ServiceSettings
+from service.settings import ServiceSettings, encoder_label, encoder_spec
 from tests.crash.conftest import until
 
 from .conftest import Uploaded

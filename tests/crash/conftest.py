@@ -17,8 +17,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from service.commands.serve import bind, server_of
-from service.jobs.process import JobLimits
-from service.jobs.supervisor import Clock, Supervisor
+from service.jobs.supervisor import Clock, JobLimits, Supervisor
 from service.models import ENDED, AssetKind
 from service.settings import ServiceSettings
 from service.store.assets import CheckedUpload

@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from service.app import create_app, job_limits
 from service.commands.serve import keep_pauses_short, server_of
-from service.jobs.process import JobProcess
-from service.jobs.supervisor import CHILD, Supervisor
+from service.jobs.supervisor import CHILD, JobProcess, Supervisor
 from service.queries.client import Frame, QueryClient
 from service.settings import ServiceSettings
 from service.store.files import DataDirectory

@@ -28,15 +28,14 @@ from liftcore.io.transforms import transforms_of
 from liftcore.values.pack import write_pack
 from service import errand, uploads
 from service.jobs.child import Reporter
-from service.jobs.process import LONGEST, JobProcess
-from service.jobs.supervisor import Lease
-from service.jobs.work import lift_as_ordered
+from service.jobs.supervisor import LONGEST, JobProcess, Lease
 from service.models import AssetKind, JobState
 from service.observe import JsonLines
 from service.store.jobs import MAX_ATTEMPTS, EventKind
 from service.store.keys import Quota
 from service.store.owners import SERVICE, Owner, Scope
 from service.store.store import Store
+from service.tasks import lift_as_ordered
 from tests.scenes import look_at, random_splats
 
 from .conftest import Supervising, alive, ended, order, state_of, supervised, until
@@ -405,7 +404,7 @@ VIEWS = 20  # three blocks
 KILLED = """if True:
     import io, json, os, signal, sys
     from service.jobs.child import Reporter
-    from service.jobs.work import lift_as_ordered
+    from service.tasks import lift_as_ordered
 
     class Deadly(Reporter):
         def __call__(self, stage, done, total, unit):

@@ -24,10 +24,9 @@ from liftcore.text import open_encoder
 from liftcore.values.lift_file import input_file
 from liftcore.values.pack import read_features
 from service import tasks
-from service.encoders import require_encoder_files
 from service.errors import Misconfigured
 from service.models import AssetKind
-from service.settings import ServiceSettings
+from service.settings import ServiceSettings, require_encoder_files
 from tests.scenes import random_splats
 
 SOG = Path(__file__).parents[2] / "data" / "splats" / "degree3.sog"
