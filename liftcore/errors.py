@@ -19,6 +19,11 @@ Every error names the argument, what was expected and what came, and says what t
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
 __all__ = [
     "InvalidCameras", "InvalidFeatures", "InvalidInput", "InvalidLift", "InvalidMasks", "InvalidPhotos",
     "InvalidQuery", "InvalidSettings", "InvalidSplats", "InvalidTable", "NotFound", "SplatliftError", "Unavailable",
@@ -33,15 +38,20 @@ class SplatliftError(Exception):
         expected: what would have been right.
         got: what came instead.
         hint: what to try next; empty when the first three say it all.
+        nearest: of a word that cannot be asked, those that can be and are near to it, the likeliest first; None of
+            any other error.
     """
 
     kind = "error"  # stable slug: the last part of the problem type in HTTP answers
 
-    def __init__(self, argument: str, *, expected: str, got: str, hint: str = "") -> None:
+    def __init__(
+        self, argument: str, *, expected: str, got: str, hint: str = "", nearest: Sequence[str] | None = None
+    ) -> None:
         self.argument = argument
         self.expected = expected
         self.got = got
         self.hint = hint
+        self.nearest = None if nearest is None else tuple(nearest)
         super().__init__(argument, expected, got, hint)
 
     def __str__(self) -> str:
@@ -52,11 +62,15 @@ class SplatliftError(Exception):
 
     def __reduce__(self) -> tuple[object, tuple[object, ...]]:
         # Errors cross process borders (jobs run in a child); keyword-only arguments need help there.
-        return _rebuild, (type(self), self.argument, self.expected, self.got, self.hint)
+        return _rebuild, (type(self), self.argument, self.expected, self.got, self.hint, self.nearest)
 
 
-def _rebuild(cls: type[SplatliftError], argument: str, expected: str, got: str, hint: str) -> SplatliftError:
-    return cls(argument, expected=expected, got=got, hint=hint)
+def _rebuild(
+    cls: type[SplatliftError], argument: str, expected: str, got: str, hint: str, nearest: Sequence[str] | None = None
+) -> SplatliftError:
+    error = cls(argument, expected=expected, got=got, hint=hint)
+    error.nearest = None if nearest is None else tuple(nearest)
+    return error
 
 
 class InvalidInput(SplatliftError):

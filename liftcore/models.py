@@ -2,6 +2,7 @@
 
 from liftcore.query.question import (
     METHODS,
+    AskableWords,
     BestWords,
     Found,
     FoundWords,
@@ -14,6 +15,6 @@ from liftcore.query.terms import NOTATIONS
 from liftcore.runtime.fields import Body, NoBoolean, takes
 
 __all__ = [
-    "METHODS", "NOTATIONS", "BestWords", "Body", "Found", "FoundWords", "ListedObjects", "NoBoolean", "Notation",
-    "OwnCamera", "Seen", "takes",
+    "METHODS", "NOTATIONS", "AskableWords", "BestWords", "Body", "Found", "FoundWords", "ListedObjects", "NoBoolean",
+    "Notation", "OwnCamera", "Seen", "takes",
 ]  # fmt: skip

@@ -120,15 +120,17 @@ def is_stopped(process: int) -> bool:
     return False
 
 
-def fault_of(error: SplatliftError, names: Mapping[str, str] | None = None) -> dict[str, str]:
-    """The error as flat JSON: kind, argument, expected, got, hint.
+def fault_of(error: SplatliftError, names: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """The error as JSON: kind, argument, expected, got, hint; of a word that cannot be asked also the nearest ones.
 
     Args:
         error: the error to send.
         names: server path -> the name that the client knows; paths of this machine are nobody's business.
     """
     fault = {name: str(getattr(error, name)) for name in FIELDS}
-    return {"kind": error.kind} | {field: renamed(text, names or {}) for field, text in fault.items()}
+    told: dict[str, Any] = {"kind": error.kind}
+    told |= {field: renamed(text, names or {}) for field, text in fault.items()}
+    return told if error.nearest is None else told | {"nearest": error.nearest}
 
 
 def renamed(text: str, names: Mapping[str, str]) -> str:
@@ -138,11 +140,13 @@ def renamed(text: str, names: Mapping[str, str]) -> str:
     return text
 
 
-def error_of(fault: Mapping[str, str]) -> SplatliftError:
+def error_of(fault: Mapping[str, Any]) -> SplatliftError:
     """The error that `fault_of` told of; an unknown kind becomes the base class."""
     kinds = {cls.kind: cls for cls in reversed(_tree(SplatliftError))}  # of two of a kind the base class counts
     cls = kinds.get(fault["kind"], SplatliftError)
-    return cls(fault["argument"], expected=fault["expected"], got=fault["got"], hint=fault["hint"])
+    error = cls(fault["argument"], expected=fault["expected"], got=fault["got"], hint=fault["hint"])
+    error.nearest = tuple(fault["nearest"]) if "nearest" in fault else None
+    return error
 
 
 def _tree(cls: type[SplatliftError]) -> list[type[SplatliftError]]:

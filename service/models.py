@@ -139,6 +139,12 @@ class Problem(BaseModel):
     expected: str | None = None
     got: str | None = None
     hint: str | None = None
+    nearest: Annotated[
+        list[str] | None,
+        Field(
+            description="of a word that cannot be asked: those that can be and are near to it, the likeliest first"
+        ),
+    ] = None
     request_id: Annotated[str | None, Field(description="as in X-Request-ID; the log has it too")] = None
 
 
@@ -168,7 +174,7 @@ class Names(BaseModel):
     next: int | None = Field(description="the cursor of the page after this one; null at the end")
 
 
-class LiftRequest(Body):
+class LiftInputs(Body):
     """What to lift. The assets must be here already."""
 
     model_config = BUILT
@@ -184,6 +190,15 @@ class LiftRequest(Body):
     )
 
 
+class LiftRequest(LiftInputs):
+    """What to lift, and the words that it is asked in. The assets must be here already."""
+
+    model_config = BUILT
+    table: AssetId | None = Field(
+        None, description="an uploaded text table whose words the lift is asked in; else those of its text space"
+    )
+
+
 class Labels(Body):
     """Masks of views, and the words that they mean: views with masks are not lifted, and say how good a lift is."""
 
@@ -194,7 +209,7 @@ class Labels(Body):
     )
 
 
-class TradeoffRequest(LiftRequest):
+class TradeoffRequest(LiftInputs):
     """What to compare: lifts of these assets, each with another preset or place of the dial."""
 
     settings: Annotated[dict[str, Scalar], Bounded, Published(LiftSettings, without=(COMPARED,))] = Field(
@@ -238,7 +253,9 @@ class Job(BaseModel):
     cameras: AssetId
     features: list[AssetId]
     settings: dict[str, Any]
-    parameters: dict[str, Any] = Field(description="of its kind: budget_s of a trade-off, and its labels")
+    parameters: dict[str, Any] = Field(
+        description="of its kind: the table of a lift's words; budget_s of a trade-off, and its labels"
+    )
     plan: Plan | None = Field(description="of a lift, from before its first view is walked; the latest attempt's")
     progress: Progress | None
     problem: Problem | None

@@ -84,13 +84,14 @@ def problem_of(error: SplatliftError) -> Problem:
         status, title = error.status, error.title
     else:
         status, title = next(TABLE[cls] for cls in type(error).__mro__ if cls in TABLE)
-    told = {name: getattr(error, name) for name in ("argument", "expected", "got")}
     return Problem(
-        type=f"/problems/{error.kind}", title=title, status=status, detail=str(error), hint=error.hint or None, **told
-    )
+        type=f"/problems/{error.kind}", title=title, status=status, detail=str(error), hint=error.hint or None,
+        argument=error.argument, expected=error.expected, got=error.got,
+        nearest=None if error.nearest is None else list(error.nearest),
+    )  # fmt: skip
 
 
-def by_status(status: int, detail: str, **told: str) -> Problem:
+def by_status(status: int, detail: str, **told: Any) -> Problem:
     """A problem that no error of ours tells of."""
     phrase = HTTPStatus(status).phrase
     slug, title = FRAMEWORK.get(status, (phrase.lower().replace(" ", "-"), phrase))

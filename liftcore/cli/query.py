@@ -153,6 +153,7 @@ def made_from(scene: Scene) -> list[Path]:
 
 def _lines(document: dict[str, Any]) -> Iterable[str]:
     asked = ", ".join(map(repr, document["query"]))
+    yield from (f"{one['text']!r} is asked as {one['word']!r}" for one in document["answer"]["wording"])
     if document["present"] is not None or document["encoder"]:
         yield document["why"]
     if document["threshold"] < math.inf:
@@ -161,6 +162,8 @@ def _lines(document: dict[str, Any]) -> Iterable[str]:
     else:
         kept = "nothing is selected; --absent keep selects what is most like it"
         yield f"{asked}: {kept if document['present'] is False else document['explanation']}"
+    if rivals := document["answer"]["rivals"]:
+        yield f"  nearer to it: {', '.join(map(repr, rivals))}"
     if "view" in document:
         view = document["view"]
         yield f"  view {view['name']}: {view['mask_share']:.2%} of the image ({view['explanation']})"

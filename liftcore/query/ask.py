@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,29 +14,34 @@ import numpy as np
 
 from liftcore.errors import InvalidQuery
 from liftcore.io.json_file import finite
-from liftcore.query.directions import directions
+from liftcore.query.directions import directions, wordings
 from liftcore.query.objects import objects
 from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.presence import (
     NOT_IN_WORDS,
     References,
+    best_splats,
     judge,
     pack_of,
+    products,
     references_beside,
     references_of,
     together,
 )
-from liftcore.query.question import Answer, Box, Objects, Point, Presence, Query, Threshold, TopSplat
+from liftcore.query.question import Answer, AskedAs, Box, Objects, Point, Presence, Query, Threshold, TopSplat
 from liftcore.query.scores import LEAST_LIKENESS, LOWEST_COSINE, combine, cosines, cosines_about
-from liftcore.query.selection import LEAST_FIRST, Rivals, contest, nearer_than_rivals, whole_things
+from liftcore.query.selection import LEAST_FIRST, SAME_WORD, Rivals, contest, nearer_than_rivals, whole_things
 from liftcore.query.terms import Vector
 from liftcore.query.threshold import find_threshold, nothing_alike
 from liftcore.text import TextEncoder, check_texts
+from liftcore.text.wording import Wording
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 
+MOST_RIVALS = 3  # words that are named as nearer than what was asked
+LEAST_RIVAL = 0.1  # of what is looked at, by evidence, to which such a word is the nearest
 _QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 
 
@@ -48,6 +53,7 @@ class Question:
     rows: np.ndarray  # [n, F] f32, the unit direction of each term
     plain: np.ndarray  # [n] bool, the terms that are compared by plain cosines: words
     references: References | str  # of the words' space, or why there are none
+    asked_as: Mapping[int, Wording]  # of the texts, by their places among the terms
     pack: np.ndarray | None = None  # [n, F] f32, unit, all words of a table that has too few to be references
 
 
@@ -136,7 +142,8 @@ def query_vectors(
 
     query = Query.of(_terms(positives), _terms(negatives), **fields)
     reader = scene.encoder(encoder) if query.texts or encoder is not None else None
-    rows = directions(scene, query, reader)
+    asked_as = wordings(scene, query, reader)
+    rows = directions(scene, query, reader, asked_as=asked_as)
     if references is not None:
         others = References.of(references, scene.channels)
     elif reader is not None:
@@ -144,7 +151,7 @@ def query_vectors(
     else:
         others = references_beside(rows, scene.metadata.text_space)
     pack = None if reader is None else pack_of(reader)
-    answer = answers(scene, [Question(query, rows, np.ones(len(rows), np.bool_), others, pack)])[0]
+    answer = answers(scene, [Question(query, rows, np.ones(len(rows), np.bool_), others, asked_as, pack)])[0]
     scores, selected = map(torch.from_numpy, (answer.scores, answer.selected))
     found = objects(scene, answer) if grouped else None
     cut, known = answer.threshold, (answer.present, answer.presence, answer.why)
@@ -173,12 +180,13 @@ def question(scene: OpenedLift, query: Query, encoder: TextEncoder | None, names
         names: what errors call each of the terms; () = what they are themselves.
     """
     words = np.array([isinstance(term, str) for term in query.terms])
-    rows = directions(scene, query, encoder, names)
+    asked_as = wordings(scene, query, encoder, names)
+    rows = directions(scene, query, encoder, names, asked_as)
     scene.counted(query.weigh)
     encoder = encoder or scene.table
     if encoder is None or not words[: len(query.positives)].any():
-        return Question(query, rows, words, "")
-    return Question(query, rows, words, references_of(encoder, scene.metadata.text_space), pack_of(encoder))
+        return Question(query, rows, words, "", asked_as)
+    return Question(query, rows, words, references_of(encoder, scene.metadata.text_space), asked_as, pack_of(encoder))
 
 
 def answers(scene: OpenedLift, questions: Sequence[Question]) -> list[Answer]:
@@ -247,10 +255,30 @@ def _answer(scene: OpenedLift, asked: Question, similarities: np.ndarray) -> Ans
     else:
         found, selected = _selected(scene, asked, kept, scores, scene.counted(query.weigh))
     clear = found.clear and presence.present is not False and bool(selected.any())
+    rivals = () if clear and presence.present is not None else _nearer_words(scene, asked, scores, selected)
+    wording = tuple(AskedAs(**word._asdict()) for word in asked.asked_as.values() if word.how)
     return Answer.of(
-        query, scores, seen, selected,
+        query, scores, seen, selected, wording=wording, rivals=rivals,
         threshold=found, clear=clear, statistics=finite(_statistics(known)), **dict(presence),
     )  # fmt: skip
+
+
+def _nearer_words(scene: OpenedLift, asked: Question, scores: np.ndarray, selected: np.ndarray) -> tuple[str, ...]:
+    """Reference words that are the nearest of all to a tenth or more of what is selected, else of the best splats."""
+    references, positives = asked.references, len(asked.query.positives)
+    own = asked.rows[:positives][asked.plain[:positives]]
+    if not isinstance(references, References) or not len(own):
+        return ()
+    rows, weights = best_splats(scene, np.where(selected, scores, np.float32(-1.0)) if selected.any() else scores)
+    if not len(rows):
+        return ()
+    same = (references.vectors @ own.T >= SAME_WORD).any(axis=1)
+    near, others = products(scene.features[rows], scene.norms[rows], own, references.vectors)
+    others[:, same] = -1.0
+    nearest = np.where(others.max(axis=1) > near.max(axis=1), others.argmax(axis=1), -1)
+    shares = np.bincount(nearest[nearest >= 0], weights[nearest >= 0], len(references.words)) / weights.sum()
+    order = np.argsort(-shares, kind="stable")[:MOST_RIVALS]
+    return tuple(references.words[row].replace("_", " ") for row in order.tolist() if shares[row] >= LEAST_RIVAL)
 
 
 def _selected(

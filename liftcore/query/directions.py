@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import groupby
@@ -14,17 +14,85 @@ import numpy as np
 from liftcore.errors import InvalidQuery, NotFound
 from liftcore.query.areas import feature_shown
 from liftcore.query.opened import OpenedLift, as_numpy
-from liftcore.query.question import Query
+from liftcore.query.presence import references_of
+from liftcore.query.question import AskableWord, AskableWords, Query
 from liftcore.query.regions import codebook_row, regions_of
 from liftcore.query.terms import Area, Example, OneSplat, Region, Term, Vector, parse_example
-from liftcore.text import TextEncoder
+from liftcore.text import RememberingEncoder, TextEncoder, check_texts
+from liftcore.text.table import TableEncoder
+from liftcore.text.wording import Wording
 
 
-def directions(scene: OpenedLift, query: Query, encoder: TextEncoder | None, names: Sequence[str] = ()) -> np.ndarray:
+def wordings(
+    scene: OpenedLift, query: Query, encoder: TextEncoder | None, names: Sequence[str] = ()
+) -> dict[int, Wording]:
+    """What each text among the terms is asked as, by its place: the word of a table, else the text itself.
+
+    Args:
+        names: what errors call each of the terms; () = what they are themselves.
+
+    Raises:
+        InvalidQuery: no word of the table stands for a text; ``nearest`` has those that could be asked.
+    """
+    encoder = encoder or scene.table
+    source = encoder.source if isinstance(encoder, RememberingEncoder) else encoder
+    texts = {place: term for place, term in enumerate(query.terms) if isinstance(term, str)}
+    if not isinstance(source, TableEncoder):
+        return {place: Wording(text, text, "") for place, text in texts.items()}
+    found: dict[int, Wording] = {}
+    for place, text in texts.items():
+        with _Names(query.terms, names)(place):
+            check_texts([text])
+            word = source.vocabulary.find(text)
+            if word is None:
+                raise source.refusal(text, named_things(scene, source.words, source.embeddings))
+        found[place] = word
+    return found
+
+
+def askable_words(scene: OpenedLift, encoder: TextEncoder, text: str, count: int) -> AskableWords:
+    """What a lift can be asked (`Scene.askable`)."""
+    source = encoder.source if isinstance(encoder, RememberingEncoder) else encoder
+    if isinstance(source, TableEncoder):
+        here = named_things(scene, source.words, source.embeddings)
+        words = tuple(AskableWord(**one._asdict()) for one in source.vocabulary.complete(text, count))
+        return AskableWords(any_text=False, words=words, here=here)
+    known = references_of(encoder, scene.metadata.text_space)
+    here = () if isinstance(known, str) else named_things(scene, known.words, known.vectors)
+    return AskableWords(any_text=True, words=(), here=here)
+
+
+def named_things(scene: OpenedLift, words: Sequence[str], vectors: np.ndarray) -> tuple[str, ...]:
+    """The words that are nearest to the lift's objects, each once, the object with the most evidence first.
+
+    An object whose word is not among the nearest hundredth also about the scene's mean is left out: the word may be
+    near to all that the scene shows.
+
+    Args:
+        words: n. vectors: [n, F] f32, unit.
+    """
+    if scene.object is None or vectors.shape[1] != scene.channels or not len(scene.thing_means):
+        return ()
+    plain = (scene.thing_means @ vectors.T).argmax(axis=1)
+    apart = (scene.thing_means - scene.rough_mean) @ vectors.T
+    ahead = (apart > np.take_along_axis(apart, plain[:, None], axis=1)).sum(axis=1)
+    sure = (ahead < max(1, len(words) // 100)) & scene.thing_means.any(axis=1)
+    rows: list[int] = np.flatnonzero(sure).tolist()
+    return tuple(dict.fromkeys(words[int(plain[row])].replace("_", " ") for row in rows))
+
+
+def directions(
+    scene: OpenedLift,
+    query: Query,
+    encoder: TextEncoder | None,
+    names: Sequence[str] = (),
+    asked_as: Mapping[int, Wording] | None = None,
+) -> np.ndarray:
     """The unit vector of every term, [n, F] f32.
 
     Args:
         names: what errors call each of the terms; () = what they are themselves.
+        asked_as: of the texts (`wordings`); None: found here.
 
     Raises:
         InvalidQuery: a text without an encoder or with one of another space, a text that it cannot read, or an
@@ -33,7 +101,7 @@ def directions(scene: OpenedLift, query: Query, encoder: TextEncoder | None, nam
         InvalidLift: the splats, the cameras or the packs that an example needs moved or changed.
     """
     named = _Names(query.terms, names)
-    rows = _encode(scene, query, encoder, named) | _regions(scene, query, named)
+    rows = _encode(scene, query, encoder, named, asked_as) | _regions(scene, query, named)
     for place, term in enumerate(query.terms):
         if not isinstance(term, str | Region):
             with named(place):
@@ -57,10 +125,17 @@ class _Names:
                 raise
             term = self.terms[place]
             got = error.got if isinstance(term, str | Vector) else f"{error.got} in {term}"
-            raise type(error)(self.names[place], expected=error.expected, got=got, hint=error.hint) from None
+            name, hint, nearest = self.names[place], error.hint, error.nearest
+            raise type(error)(name, expected=error.expected, got=got, hint=hint, nearest=nearest) from None
 
 
-def _encode(scene: OpenedLift, query: Query, encoder: TextEncoder | None, named: _Names) -> dict[int, np.ndarray]:
+def _encode(
+    scene: OpenedLift,
+    query: Query,
+    encoder: TextEncoder | None,
+    named: _Names,
+    asked_as: Mapping[int, Wording] | None,
+) -> dict[int, np.ndarray]:
     """The unit vector of each text, by its place among the terms."""
     texts = {place: term for place, term in enumerate(query.terms) if isinstance(term, str)}
     if not texts:
@@ -76,6 +151,8 @@ def _encode(scene: OpenedLift, query: Query, encoder: TextEncoder | None, named:
         expected = f"{scene.channels} channels as the lift has (its text space: {space})"
         hint = "query with the text encoder that belongs to the features' image encoder"
         raise InvalidQuery("encoder", expected=expected, got=f"{encoder.name} with {encoder.channels}", hint=hint)
+    asked_as = wordings(scene, query, encoder, named.names) if asked_as is None else asked_as
+    texts = {place: asked_as[place].word for place in texts}
     try:
         rows = encoder.encode(list(texts.values()))
     except InvalidQuery:

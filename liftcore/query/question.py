@@ -341,11 +341,44 @@ class TopSplat(Value):
     position: Point = Field(description="x y z, world frame")
 
 
+class AskedAs(Value):
+    """A text that the encoder's table lacks, and the word of it that stands for the text."""
+
+    text: str
+    word: str
+    how: Literal["spelling", "qualifier", "synonym", "number", "head"] = Field(
+        description="what makes them one: letters, a word that says which is meant, meaning, one or several, or the "
+        "head of a phrase"
+    )
+
+
+class AskableWord(Value):
+    """A word that can be asked."""
+
+    word: str
+    typed: str = Field(description="what begins as the text does: the word itself, or a synonym of it")
+
+
+class AskableWords(Value):
+    """What a lift can be asked."""
+
+    any_text: bool = Field(description="any text can be asked, not the words of a table alone")
+    words: tuple[AskableWord, ...] = Field(description="those that a text may become, the likeliest first")
+    here: tuple[str, ...] = Field(description="words for the things that the lift found by masks alone")
+
+
 class Answer(Found):
     """Where in a scene is what was asked for."""
 
     text: list[str]
     like: list[str] = Field(description="the examples, in their notation; vectors by their length")
+    wording: tuple[AskedAs, ...] = Field(
+        default=(), description="texts that were asked as another word; one that the table has is asked as it is"
+    )
+    rivals: tuple[str, ...] = Field(
+        default=(),
+        description="where it is not clear, not sure or not there: other words that are nearer, the first most",
+    )
     statistics: Mapping[str, Any] = Field(description="of the scores over the seen splats")
     top: tuple[TopSplat, ...] = ()
     box: Box | None = Field(default=None, description="around all selected splats, outliers too: see objects")

@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # these load torch
     from liftcore.io.labels import Labels
     from liftcore.query.ask import Question
     from liftcore.query.catalogue import Catalogue
-    from liftcore.query.question import Answer, BestWord, CoveringRegion, Objects, Query
+    from liftcore.query.question import Answer, AskableWords, BestWord, CoveringRegion, Objects, Query
     from liftcore.query.render import ViewMask
     from liftcore.query.segment import Segmentation
     from liftcore.query.terms import Example
@@ -234,6 +234,19 @@ class Scene(OpenedLift):
         from liftcore.query.segment import words_of
 
         return words_of(self.encoder(encoder))
+
+    def askable(
+        self, text: str = "", count: int = 8, *, encoder: TextEncoder | str | Path | None = None
+    ) -> AskableWords:
+        """What can be asked: at most so many words that a text which is being typed may become, and what is here.
+
+        Raises:
+            InvalidQuery: the lift's text space names no encoder.
+            Unavailable: the encoder's weights are not on this machine.
+        """
+        from liftcore.query.directions import askable_words
+
+        return askable_words(self, self.encoder(encoder), text, count)
 
     def regions(self, view: str, x: int, y: int) -> tuple[CoveringRegion, ...]:
         """The regions of the lift's feature packs that cover a pixel of a view's photo, the smallest first."""

@@ -2,8 +2,8 @@
 
 import json
 import re
-import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
@@ -11,30 +11,15 @@ import numpy as np
 
 from liftcore.errors import InvalidInput, InvalidQuery, InvalidTable
 from liftcore.io.safetensors_file import check_header, map_tensors
-from liftcore.runtime import nearest
 from liftcore.runtime.one_line import one_line
 from liftcore.text import check_texts
+from liftcore.text.wording import SUGGESTED, Vocabulary, plain
 
-__all__ = ["TableEncoder", "nearest_words", "plain"]
+__all__ = ["TableEncoder", "Vocabulary"]
 _HALF = re.compile("[\ud800-\udfff]")  # half a surrogate pair, which UTF-8 cannot carry
-_ARTICLES = frozenset({"a", "an", "the"})
 TABLE = "a text table: safetensors with embeddings [n, F] and metadata words, a JSON list of n strings"
+_SHOWN = 200  # characters of a word that a table lacks, in the error
 EXPECTED = "a safetensors file with embeddings and words"
-_NEAREST = 5  # words named when one is unknown
-
-
-def plain(text: str) -> str:
-    """The text as tables compare it, in Unicode's composed form.
-
-    Cases, ``_`` for a space and a leading article make no difference.
-    """
-    parts = unicodedata.normalize("NFC", text.casefold()).replace("_", " ").split()
-    return " ".join(parts[1:] if len(parts) > 1 and parts[0] in _ARTICLES else parts)
-
-
-def nearest_words(text: str, words: Iterable[str]) -> str:
-    """A hint that names the words most like the text, of the first thousands; the words are `plain`."""
-    return nearest.nearest(plain(text), words, _NEAREST)
 
 
 def check_table(path: Path) -> None:
@@ -162,9 +147,27 @@ class TableEncoder:
     def _row(self, text: str) -> int:
         row = self._rows.get(plain(text))
         if row is None:
-            expected = f"one of the {len(self.words)} words of {self.name}"
-            raise InvalidQuery("text", expected=expected, got=repr(text), hint=nearest_words(text, self._rows))
+            raise self.refusal(text)
         return row
+
+    @cached_property
+    def vocabulary(self) -> Vocabulary:
+        """The words as people may type them."""
+        return Vocabulary(self.words)
+
+    def refusal(self, text: str, here: Sequence[str] = ()) -> InvalidQuery:
+        """The error of a word that the table lacks, with words to ask for in its place.
+
+        Args:
+            here: words of what is in the scene, which come first of their kind, and alone where none is near.
+        """
+        near = self.vocabulary.nearest(text, first=here)
+        some = list(here[:SUGGESTED])
+        hint = f"nearest: {', '.join(near)}" if near else f"in this scene: {', '.join(some)}" if some else ""
+        return InvalidQuery(
+            "text", expected=f"one of the {len(self.words)} words of {self.name}", got=repr(text[:_SHOWN]), hint=hint,
+            nearest=near or some,
+        )  # fmt: skip
 
 
 def own_words(words: Sequence[str], embeddings: np.ndarray | None) -> TableEncoder | None:

@@ -81,6 +81,7 @@ class Answers:
             "views": self._views,
             "segment": self._segment,
             "what": self._what,
+            "askable": self._askable,
             "catalogue": self._catalogue,
             "regions": self._regions,
             "device": self._device,
@@ -265,6 +266,12 @@ class Answers:
         words, encoder = self._words(request)
         best = self._scene(request).what(request["example"], words, top=request["top"], encoder=encoder)
         return Frame({"words": [word.model_dump(mode="json") for word in best]})
+
+    def _askable(self, request: dict[str, Any]) -> Frame:
+        scene = self._scene(request)
+        own = scene.table if request["encoder"] == OWN_WORDS else None
+        encoder = own or self._encoder(request["encoder"], request["encoder_version"])
+        return Frame(scene.askable(request["text"], request["count"], encoder=encoder).model_dump(mode="json"))
 
     def _catalogue(self, request: dict[str, Any]) -> Frame:
         key = ("catalogue", request["lift"], request["encoder"], json.dumps(request["encoder_version"]))

@@ -10,6 +10,7 @@ from pydantic_core import PydanticCustomError
 from liftcore import Answer, CoveringRegion, Objects, Picture, Query
 from liftcore.models import (
     NOTATIONS,
+    AskableWords,
     BestWords,
     Body,
     Found,
@@ -100,6 +101,14 @@ class AskedWhat(Words):
     top: Annotated[int, Field(ge=1, le=1000), NoBoolean] = Field(5, description="how many words")
 
 
+class AskedForWords(LiftQuestion):
+    """What is being typed."""
+
+    model_config = BUILT
+    text: str = Field("", max_length=200, description="what was typed of a word; empty: what is here alone")
+    limit: int = Field(8, ge=1, le=100, description="how many words at most")
+
+
 class AskedToRender(Picture):
     """A picture of a lift's scene."""
 
@@ -124,6 +133,10 @@ class WhatAnswer(BestWords, OfLift):
     """The words that something is most like."""
 
     encoder: str
+
+
+class WordsAnswer(AskableWords, OfLift):
+    """What a lift can be asked."""
 
 
 class QueryAnswer(Answer, OfLift):

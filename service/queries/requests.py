@@ -162,21 +162,23 @@ def with_encoder(
     lift: LiftRecord,
     deps: AppState,
 ) -> dict[str, Any]:
-    """The request with the encoder of its words: an uploaded table, or one that the operator set up.
+    """The request with the encoder of its words: an uploaded table, the lift's, or one of the operator.
 
     Raises:
         InvalidRequest: there is none of the lift's space, or of two names.
         NotFound: there is no such table.
     """
-    names = dict(request["names"])
-    if asked.table is None:
+    names, chosen = dict(request["names"]), asked.table
+    if chosen is None and asked.encoder in (None, lift.metadata["text_space"]):  # the words that came with the lift
+        chosen = deps.store.jobs.get(deps.owner, lift.id).parameters.get("table")
+    if chosen is None:
         spec = encoder_spec(deps.settings, lift.metadata["text_space"], asked.encoder)
         file = encoder_file(spec)
         names |= {} if file is None else {str(file): "the encoder's file"}
-    elif asked.encoder is not None:
+    elif asked.table is not None and asked.encoder is not None:
         raise InvalidRequest("table", expected="table or encoder", got="both", hint="leave one of them out")
     else:
-        table = deps.store.assets.get(deps.owner, asked.table)
+        table = deps.store.assets.get(deps.owner, chosen)
         if table.kind is not models.AssetKind.TABLE:
             raise InvalidRequest("table", expected="an uploaded text table", got=f"{table.kind} {table.id}")
         spec = f"table:{table.path}"

@@ -14,7 +14,7 @@ from fastapi.responses import JSONResponse
 from liftcore import Kernel, LiftSettings
 from liftcore.errors import InvalidFeatures, InvalidSettings, InvalidSplats
 from liftcore.files import cameras_of_views, require_pairs, with_panoramas
-from liftcore.text.table import nearest_words, plain
+from liftcore.text.table import Vocabulary
 from service import models
 from service.child import error_of
 from service.content import Cursor, Limit, listed
@@ -91,7 +91,10 @@ async def submit_tradeoff(order: models.TradeoffRequest, deps: Deps, key: Key = 
 
 def _lift(order: models.LiftRequest, deps: AppState, key: str | None) -> Response:
     settings = LiftSettings.of_json(order.settings).model_dump(mode="json")
-    return _take(order, deps, key, sent=order.model_dump(mode="json"), settings=settings)
+    # An order without words reads as before there were any.
+    sent = order.model_dump(mode="json", exclude=None if order.table else {"table"})
+    parameters = {} if order.table is None else {"table": order.table}
+    return _take(order, deps, key, sent=sent, settings=settings, parameters=parameters)
 
 
 def _planned(order: models.LiftRequest, deps: AppState) -> models.Plan:
@@ -134,7 +137,7 @@ def _compare(order: models.TradeoffRequest, deps: AppState, key: str | None) -> 
     )
 
 
-def _take(order: models.LiftRequest, deps: AppState, key: str | None, *, sent: dict[str, Any], **of: Any) -> Response:
+def _take(order: models.LiftInputs, deps: AppState, key: str | None, *, sent: dict[str, Any], **of: Any) -> Response:
     """The answer to an order: the job that it makes, or made before. By what was ``sent`` it is known again."""
     wanted = JobOrder(
         splats=order.splats, cameras=order.cameras, features=tuple(order.features),
@@ -159,9 +162,11 @@ def _require_fit(order: JobOrder, deps: AppState) -> None:
     check_fit(cameras, packs)
     in_blocks = order.kind is models.JobKind.LIFT and deps.settings.engine is not None
     check_settings(LiftSettings.of(**order.settings), packs, in_blocks=in_blocks)
-    judges = [get(*named) for named in labels_of(order.parameters)]
-    if judges:
-        check_labels(order, cameras, packs, *judges)
+    named = [get(*asset) for asset in labels_of(order.parameters)]
+    if order.kind is models.JobKind.TRADEOFF and named:
+        check_labels(order, cameras, packs, *named)
+    elif named:
+        check_channels("table", named[0], packs)
     deps.store.files.require_room(scratch_bytes(order.kind, splats, packs))
 
 
@@ -305,23 +310,21 @@ def check_labels(
             channels, masks of no camera, or no view with features besides those with masks.
     """
     classes = order.parameters["labels"]["classes"]
-    words = dict.fromkeys(map(plain, table.counts["words"]))
+    vocabulary = Vocabulary(table.counts["words"])
     for place, word in enumerate(classes):
-        if plain(word) not in words:
+        if word not in vocabulary:
+            near = vocabulary.nearest(word)
             raise InvalidRequest(
-                f"labels.classes.{place}", expected=f"one of the {len(words)} words of {table.id}",
-                got=repr(word[:80]), hint=nearest_words(word, words),
+                f"labels.classes.{place}", expected=f"one of the {len(vocabulary.words)} words of {table.id}",
+                got=repr(word[:80]), hint=f"nearest: {', '.join(near)}" if near else "",
             )  # fmt: skip
-    if len(set(map(plain, classes))) < len(classes):
+    if len(set(map(vocabulary.word_of, classes))) < len(classes):
         got = f"{len(classes)} words, some of them the same"
         raise InvalidRequest("labels.classes", expected="each class once", got=got)
     if masks.counts["classes"] > len(classes):
         expected = f"{masks.counts['classes']} words, as the masks name classes 0..{masks.counts['classes'] - 1}"
         raise InvalidRequest("labels.classes", expected=expected, got=f"{len(classes)}")
-    channels = features[0].counts["channels"]
-    if table.counts["channels"] != channels:
-        expected, got = f"a table with {channels} channels, as the features", f"{table.counts['channels']}"
-        raise InvalidRequest("labels.table", expected=expected, got=got)
+    check_channels("labels.table", table, features)
     known = cameras.counts["names"]
     masked = set(cameras_of_views(masks.counts["names"], known).values())
     if not masked:
@@ -335,6 +338,18 @@ def check_labels(
     if masked.issuperset(views[:: LiftSettings.of(**order.settings).view_stride]):
         expected = "features of views besides those with masks, which are not lifted"
         raise InvalidRequest("labels.masks", expected=expected, got="masks of all of them")
+
+
+def check_channels(argument: str, table: AssetRecord, features: Sequence[AssetRecord]) -> None:
+    """Refuse a table of words that are no vectors of the features' space.
+
+    Raises:
+        InvalidRequest: it has other channels.
+    """
+    channels = features[0].counts["channels"]
+    if table.counts["channels"] != channels:
+        expected, got = f"a table with {channels} channels, as the features", f"{table.counts['channels']}"
+        raise InvalidRequest(argument, expected=expected, got=got)
 
 
 def scratch_bytes(kind: models.JobKind, splats: AssetRecord, features: Sequence[AssetRecord]) -> int:

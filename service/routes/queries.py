@@ -10,6 +10,7 @@ from fastapi import Query as Parameter
 
 from liftcore import Query
 from service.queries.questions import (
+    AskedForWords,
     AskedToRender,
     AskedToSegment,
     AskedWhat,
@@ -20,6 +21,7 @@ from service.queries.questions import (
     SegmentAnswer,
     WhatAnswer,
     Words,
+    WordsAnswer,
 )
 from service.queries.requests import (
     Ask,
@@ -69,6 +71,14 @@ def query(asked: Question, deps: Deps, ask: Ask) -> dict[str, Any]:
         "links": _answer_links(asked, lift, view, found=found["count"] > 0),
         **found,
     }
+
+
+@router.get("/query/words", response_model=WordsAnswer)
+def askable(asked: Annotated[AskedForWords, Parameter()], deps: Deps, ask: Ask) -> WordsAnswer:
+    """What can be asked: words that a text which is being typed may become, and words for what is here."""
+    lift = find_lift(asked.lift, deps)
+    wanted = with_encoder(scene_request("askable", lift, deps), asked, lift, deps)
+    return WordsAnswer(lift=lift.id, **ask(wanted | {"text": asked.text, "count": asked.limit}).header)
 
 
 @both(router, "/query/objects", ASKED, response_model=ObjectsAnswer)

@@ -97,9 +97,11 @@ class Event:
 
 
 def labels_of(parameters: Mapping[str, Any]) -> list[tuple[str, AssetKind]]:
-    """The assets that a job's parameters name, with their kinds: what a trade-off is judged by."""
+    """The assets that a job's parameters name, with their kinds: what a trade-off is judged by, or a lift's words."""
     named = parameters.get("labels")
-    return [] if named is None else [(named[str(kind)], kind) for kind in (AssetKind.MASKS, AssetKind.TABLE)]
+    if named is not None:
+        return [(named[str(kind)], kind) for kind in (AssetKind.MASKS, AssetKind.TABLE)]
+    return [(parameters["table"], AssetKind.TABLE)] if "table" in parameters else []
 
 
 def fingerprint(order: dict[str, Any]) -> str:

@@ -120,7 +120,11 @@ def naming(method: str, path: str, job: str, asset: str, house: Guarded) -> list
         without_view = dict.fromkeys(
             ("/query/scores", "/query/selection", "/query/splats", "/query/objects"), ("view",)
         )
-        unknown = ({"/render": ("text",)} | without_view).get(path, ()) if method == "GET" else ()
+        unknown = (
+            ({"/render": ("text",), "/query/words": ("view",)} | without_view).get(path, ())
+            if method == "GET"
+            else ()
+        )
         asked = {name: value for name, value in ASKING.items() if name not in unknown} | {"lift": job}
         return [{"json": asked | {"text": ["apple"]}} if method == "POST" else {"params": asked}]
     assert "{" in path, f"{method} {path} names nothing: is it open to all, or does it belong into NAMELESS?"

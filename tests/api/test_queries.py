@@ -413,6 +413,36 @@ def test_what_this_is_names_the_nearest_words(client: TestClient, lift: dict[str
         assert best[0]["word"] == word and best[0]["score"] > best[1]["score"]
 
 
+def test_texts_are_asked_as_words_and_others_are_refused_with_those_that_can_be(
+    client: TestClient, lift: dict[str, Any], own_table: str
+) -> None:
+    asked = {"lift": lift["id"], "table": own_table}
+    answer = client.get("/query", params=asked | {"text": "two old lights"}).json()
+    assert answer["wording"] == [{"text": "two old lights", "word": "light", "how": "head"}]
+    assert client.get("/query", params=asked | {"text": "light"}).json()["wording"] == []
+    problem = assert_problem(client.get("/query", params=asked | {"text": "boaat"}))
+    assert (problem["argument"], problem["nearest"]) == ("text.0", ["boat"])
+    words = client.get("/query/words", params=asked | {"text": "no"}).json()
+    assert (words["any_text"], words["words"]) == (False, [{"word": "novel", "typed": "novel"}])
+    assert "nearest" not in assert_problem(client.get("/query/words", params=asked | {"lift": "0" * 32}))
+
+
+def test_words_that_come_with_an_order_are_those_of_the_lift(
+    client: TestClient, uploaded: Uploaded, own_table: str
+) -> None:
+    job = ended(client, client.post("/lift", json=uploaded.order() | {"table": own_table}).headers["location"])
+    asked = {"lift": job["id"], "text": "fruit"}
+    assert client.get("/query", params=asked).json()["present"] is not False
+    assert client.get("/query/words", params=asked).json()["words"][0]["word"] == "fruit"
+    assert set(client.get("/query/words", params={"lift": job["id"]}).json()["here"]) == {"fruit", "novel", "light"}
+    assert assert_problem(client.get("/query", params=asked | {"encoder": "default"}))["nearest"]
+    assert client.delete(f"/assets/{own_table}").status_code == 409
+    narrow = client.put("/assets/table", content=text_table(CHANNELS - 1)).json()["id"]
+    wrong = client.post("/lift", json=uploaded.order() | {"table": narrow})
+    assert assert_problem(wrong)["argument"] == "table"
+    assert client.delete(f"/jobs/{job['id']}?with_lift=true").status_code == 204
+
+
 def test_an_uploaded_table_answers_questions(client: TestClient, lift: dict[str, Any], own_table: str) -> None:
     asked = {"lift": lift["id"], "text": "light", "table": own_table, "view": "middle"}
     answer = client.get("/query", params=asked).json()

@@ -1,0 +1,109 @@
+"""Words as people type them: what each is asked as, and what is said of those that nothing stands for."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from liftcore.errors import InvalidQuery
+from liftcore.query.scene import Scene
+from liftcore.text import open_encoder
+from liftcore.text.table import TableEncoder, Vocabulary
+
+OF_SCENE = ["cat", "cow", "doughnut", "boat", "airplane", "flowerpot", "fish", "hammer", "pizza", "violin", "teapot"]
+
+
+@cache
+def lvis() -> Vocabulary:
+    encoder = open_encoder("lvis")
+    assert isinstance(encoder, TableEncoder)
+    return encoder.vocabulary
+
+
+def test_every_word_of_a_table_is_asked_as_it_is() -> None:
+    assert [word for word in lvis().words if lvis().find(word) != (word, word, "")] == []
+    assert lvis().find("THE  Trash_Can") == ("THE  Trash_Can", "trash can", "")
+
+
+@pytest.mark.parametrize(
+    ("text", "word", "how"),
+    [
+        ("tea cup", "teacup", "spelling"), ("table-cloth", "tablecloth", "spelling"),
+        ("Tea-Pot?", "teapot", "spelling"), ("octopus", "octopus (animal)", "qualifier"),
+        ("crab", "crab (animal)", "qualifier"), ("donut", "doughnut", "synonym"), ("kitty", "kitten", "synonym"),
+        ("plane", "airplane", "synonym"), ("aeroplane", "airplane", "synonym"), ("bunny", "rabbit", "synonym"),
+        ("sneaker", "shoe", "synonym"), ("glasses", "spectacles", "synonym"), ("T-shirt", "jersey", "synonym"),
+        ("TV", "television set", "synonym"), ("laptop", "laptop computer", "synonym"),
+        ("fridge", "refrigerator", "synonym"), ("plant", "flowerpot", "synonym"), ("couch", "sofa", "synonym"),
+        ("people", "person", "synonym"), ("hot dog", "sausage", "synonym"), ("apples", "apple", "number"),
+        ("cows", "cow", "number"), ("knives", "knife", "number"), ("boxes", "box", "number"),
+        ("cherries", "cherry", "number"), ("trouser", "trousers", "number"), ("donuts", "doughnut", "synonym"),
+        ("the red cup", "cup", "head"), ("a small toy car", "car (automobile)", "head"),
+        ("my old sneakers", "shoe", "head"), ("a photo of two cows", "cow", "head"), ("cup of tea", "cup", "head"),
+        ("slice of pizza", "pizza", "head"), ("man with a hat", "person", "head"),
+        ("the cat on the mat", "cat", "head"), ("where is the cat?", "cat", "head"),
+        ("is there a dog here", "dog", "head"), ("the fish's tail", "fish", "head"),
+        ("wooden boat", "boat", "head"),
+    ],
+)  # fmt: skip
+def test_text_is_asked_as_the_word_that_stands_for_it(text: str, word: str, how: str) -> None:
+    assert lvis().find(text) == (text, word, how)
+
+
+@pytest.mark.parametrize(
+    ("text", "nearest"),
+    [
+        ("animal", "cat"), ("food", "pizza"), ("xylophone", "musical instrument"), ("computer", "laptop computer"),
+        ("bag", "handbag"), ("pinguin", "penguin"), ("teapott", "teapot"), ("fox", "dog"),
+        ("a furry creature", "cat"), ("utensils", "cooking utensil"),
+    ],
+)  # fmt: skip
+def test_what_nothing_stands_for_has_words_near_to_it(text: str, nearest: str) -> None:
+    assert lvis().find(text) is None
+    near = lvis().nearest(text)
+    assert 1 <= len(near) <= 5 and all(word in lvis() for word in near)
+    assert nearest in near
+
+
+@pytest.mark.parametrize("text", ["sky", "asdfgh", "Tisch", "red", "?", "the", "\u732b", "x" * 1000, "a " * 500])
+def test_what_is_like_nothing_has_no_words_near_to_it(text: str) -> None:
+    assert lvis().find(text) is None and lvis().nearest(text) == ()
+
+
+def test_words_of_a_short_table_are_found_by_meaning() -> None:
+    own = Vocabulary(OF_SCENE)
+    assert [own.find(text) for text in ("kitten", "teacup", "bull", "wolf")] == [None] * 4
+    assert own.nearest("kitten")[0] == "cat" and own.nearest("teacup")[0] == "teapot"
+    assert own.nearest("bull")[0] == "cow" and own.nearest("guitar") == ("violin",)
+    assert own.find("ship") == ("ship", "boat", "synonym") and own.find("plane") == ("plane", "airplane", "synonym")
+    assert Vocabulary(["donut", "Car_(Automobile)"]).find("doughnuts") == ("doughnuts", "donut", "synonym")
+    assert Vocabulary(["donut", "Car_(Automobile)"]).find("cars") == ("cars", "Car (Automobile)", "number")
+
+
+def test_words_of_the_scene_come_first_of_their_kind() -> None:
+    assert lvis().nearest("animals", first=["penguin", "fish"])[:2] == ("fish", "penguin")
+
+
+def test_what_is_typed_is_completed_by_words_synonyms_and_letters() -> None:
+    typed = ("dou", "don", "the tea", "pingu", "bunn", "")
+    words = {text: [one.word for one in lvis().complete(text)] for text in typed}
+    assert words["dou"][0] == "doughnut" and "doughnut" in words["don"] and "teapot" in words["the tea"]
+    assert "penguin" in words["pingu"] and "rabbit" in words["bunn"] and words[""] == []
+    assert ("doughnut", "donut") in lvis().complete("don") and len(lvis().complete("c", 5)) == 5
+
+
+def test_answer_says_what_a_text_was_asked_as(scene: Scene) -> None:
+    table = TableEncoder("words", ["apple", "book", "lamp"], np.eye(3, scene.channels, dtype=np.float32))
+    answer = scene.ask("some red apples", encoder=table, places=False)
+    (wording,) = answer.wording
+    assert (wording.text, wording.word, wording.how) == ("some red apples", "apple", "head")
+    assert (answer.scores == scene.ask("apple", encoder=table, places=False).scores).all()
+    assert scene.ask("apple", encoder=table, places=False).wording == ()
+    with pytest.raises(InvalidQuery, match="got 'boook'") as caught:
+        scene.ask("boook", encoder=table)
+    assert caught.value.nearest == ("book",)
+    with pytest.raises(InvalidQuery) as caught:
+        scene.ask("sky", encoder=table)
+    assert set(caught.value.nearest or ()) == {"apple", "book", "lamp"}  # what is in the scene
+    assert scene.askable("ap", encoder=table).words[0].word == "apple"
+    assert set(scene.askable(encoder=table).here) == {"apple", "book", "lamp"}
