@@ -23,9 +23,7 @@ WHAT = {".json": "masks", ".jsonl": "lines"}  # by the suffix; all others are sp
 def add_arguments(parser: Parser) -> None:
     """The options of the command."""
     add_lift(parser)
-    made = (
-        ".glb or .ply: splats with labels; .splat or .spz: without; .json: COCO masks in the views; .jsonl: objects"
-    )
+    made = ".glb, .ply, .spz: splats with labels; .splat: without; .json: COCO masks in the views; .jsonl: objects"
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=made)
     source = parser.add_mutually_exclusive_group()
     source.add_argument("--text", action="append", default=[], metavar="TEXT", help="label what these words find")
@@ -57,7 +55,7 @@ def run(options: argparse.Namespace) -> int:
     source = _source(options, scene)
     if isinstance(source, int) or options.only:
         what = "object"
-    elif suffix in (".splat", ".spz") or source is None:
+    elif suffix == ".splat" or source is None:
         what, source = "splats", None
     files, exports = {"output": options.output}, {"output": partial(scene.export, source=source, what=what)}
     if what == "labelled" and suffix == ".ply":
@@ -68,8 +66,10 @@ def run(options: argparse.Namespace) -> int:
     if source is not None and not isinstance(source, int) and what != "object":
         labels = scene.labels(source)
         document |= {name: len(labels.document[name]) for name in ("classes", "instances")}
-    if suffix == ".glb" and scene.splats.kernel != "3dgs":
-        document["warnings"] = [f"{scene.splats.kernel} splats are written as the nearest Gaussians, which glTF has"]
+    if suffix in (".glb", ".spz", ".splat") and scene.splats.kernel != "3dgs":
+        document["warnings"] = [
+            f"{scene.splats.kernel} splats are written as the nearest Gaussians, all that the format has"
+        ]
     reply(document, as_json=options.json)
     return 0
 

@@ -28,7 +28,7 @@ from liftcore.io.ranks import rank_files
 from liftcore.io.remote import landing, local_path
 from liftcore.io.sog import is_bundled, read_sog, sog_files
 from liftcore.io.splat import ROW, read_splat, splat_blocks
-from liftcore.io.spz import read_spz, spz_blocks
+from liftcore.io.spz import read_spz, read_spz_document, spz_blocks
 from liftcore.runtime.plugins import Plugin, find_plugin
 from liftcore.scene.harmonics import constant_terms
 from liftcore.scene.kernel import Kernel, kernel_named
@@ -56,10 +56,10 @@ Document = Mapping[str, Any]  # of `liftcore.io.labels`
 _WRITERS: dict[str, Callable[[Splats, Document | None], Iterator[bytes]]] = {
     ".ply": lambda splats, _: ply.ply_blocks(splats),
     ".splat": lambda splats, _: splat_blocks(splats),
-    ".spz": lambda splats, _: spz_blocks(splats),
+    ".spz": spz_blocks,
     ".glb": gltf_blocks,
 }
-WITH_COLUMNS = (".ply", ".glb")  # formats that hold further numbers a splat
+WITH_COLUMNS = (".ply", ".glb", ".spz")  # formats that hold further numbers a splat
 
 
 def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool = True) -> Splats:
@@ -105,7 +105,7 @@ def write_splats(path: Path | str, splats: Splats, columns: Mapping[str, Any] | 
 
     Args:
         path: a file; it may lie elsewhere (`io.remote`). A name without a suffix is a PLY.
-        columns: of a PLY or ``.glb``, further properties a splat: name -> [P] booleans or numbers of numpy or torch,
+        columns: of all but a ``.splat``, further numbers a splat: name -> [P] booleans or numbers of numpy or torch,
             such as ``{"object": result.object, "score": answer.scores}``; one that the splats have is replaced.
 
     Raises:
@@ -351,6 +351,8 @@ def _document_of(path: Path) -> dict[str, Any]:
     match format_of(path):
         case SplatFormat.GLTF:
             return read_gltf_document(path)
+        case SplatFormat.SPZ:
+            return read_spz_document(path)
         case SplatFormat.PLY:
             return read_document(path.with_name(f"{path.name}.json"))
         case _:

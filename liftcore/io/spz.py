@@ -8,16 +8,18 @@ sizes of the sections' zstd streams, then these.
 
 The frame is right, up, back (RUB) unless an extension declares another of 16. PLYs and cameras are in right, down,
 front (RDF): axes are turned, and quaternions and harmonics with them. A flag says that the splats were trained
-antialiased. The format is of nianticlabs/spz. What is written has version 3.
+antialiased. The format is of nianticlabs/spz. What is written has version 3, which every reader knows, or version 4
+where splats have labels, which are an extension (`liftcore.io.spz_labels`).
 """
 
 from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -33,7 +35,9 @@ from liftcore.io.quantised import (
     logits,
     smallest_three,
 )
+from liftcore.io.spz_labels import label_record, read_label_record, records
 from liftcore.scene.harmonics import SH_C0, band_rotation
+from liftcore.scene.kernel import NORMALS
 from liftcore.scene.render_mode import RenderMode, RenderModel
 
 if TYPE_CHECKING:
@@ -115,19 +119,37 @@ def read_spz(path: Path, *, colour: bool = True) -> Fields:
         (table,) = struct.unpack_from("<I", start, HEADER_BYTES)
         zone = content[STREAMS_HEADER_BYTES : max(table, STREAMS_HEADER_BYTES)]
         frame, sections = _declared_frame(zone, path), _streams(content, table, streams, sizes, path)
+        labels = read_label_record(zone, count) if colour and flags & HAS_EXTENSIONS else None
     else:
         body = np.frombuffer(_inflated(unpacking, unpacking.unconsumed_tail, sum(sizes), path), np.uint8)
         behind = _inflated(unpacking, unpacking.unconsumed_tail, 0, path)
         frame = _declared_frame(behind, path) if flags & HAS_EXTENSIONS else RUB
-        sections = np.split(body, np.cumsum(sizes)[:-1])
+        sections, labels = np.split(body, np.cumsum(sizes)[:-1]), None
     fields = _decoded(sections, version, degree if colour else 0, 2.0**-bits, frame, colour=colour)
-    return fields | {"render_mode": RenderMode(RenderModel.ANTIALIASED, FLAG) if flags & ANTIALIASED else None}
+    fields["render_mode"] = RenderMode(RenderModel.ANTIALIASED, FLAG) if flags & ANTIALIASED else None
+    return fields | ({"extras": labels.columns} if labels else {})
 
 
-def spz_blocks(splats: Splats) -> Iterator[bytes]:
+def read_spz_document(path: Path) -> dict[str, Any]:
+    """What the labels of a file of version 4 mean; empty where it has none."""
+    with path.open("rb") as handle:
+        start = handle.read(STREAMS_HEADER_BYTES)
+        if start[:4] != MAGIC:
+            return {}
+        _, count, *_ = _header(start, path)
+        (table,) = struct.unpack_from("<I", start, HEADER_BYTES)
+        labels = read_label_record(handle.read(max(table - STREAMS_HEADER_BYTES, 0)), count)
+    return labels.document if labels else {}
+
+
+def spz_blocks(splats: Splats, document: Mapping[str, Any] | None = None) -> Iterator[bytes]:
     """The bytes of an ``.spz`` file of any splats (`gaussian_rows`), in blocks, in the format's frame.
 
     Means have as many fractional bits as their reach leaves, 20 at most. Harmonics above degree 3 are left out.
+    Splats with extras make a file of version 4, which holds these and what they mean.
+
+    Args:
+        splats: P. document: of `liftcore.io.labels`; None: nothing is said of the extras.
 
     Raises:
         InvalidSplats: a mean lies beyond what 24 bits reach.
@@ -142,12 +164,29 @@ def spz_blocks(splats: Splats) -> Iterator[bytes]:
     for some in gaussian_rows(splats):
         for section, part in zip(sections, _encoded(some, bits, (degree + 1) ** 2 - 1), strict=True):
             section.append(part.tobytes())
-    packing = zlib.compressobj(wbits=31)
     flags = ANTIALIASED if splats.antialiased else 0
+    labelled = replace(splats, extras={name: own for name, own in splats.extras.items() if name not in NORMALS})
+    if labelled.extras:
+        head = (MAGIC, 4, splats.count, degree, bits, flags | HAS_EXTENSIONS)
+        yield from _version_4(head, label_record(labelled, document), [b"".join(section) for section in sections])
+        return
+    packing = zlib.compressobj(wbits=31)
     header = struct.pack(HEADER, MAGIC, WRITTEN_VERSION, splats.count, degree, bits, flags, 0)
     for part in (header, *(part for section in sections for part in section)):
         yield packing.compress(part)
     yield packing.flush()
+
+
+def _version_4(head: tuple[Any, ...], extensions: bytes, sections: list[bytes]) -> Iterator[bytes]:
+    import zstandard
+
+    filled = [section for section in sections if section]
+    packed = [zstandard.ZstdCompressor(level=9).compress(section) for section in filled]
+    yield struct.pack(HEADER, *head, len(packed)) + struct.pack("<I12x", STREAMS_HEADER_BYTES + len(extensions))
+    yield extensions
+    for stream, section in zip(packed, filled, strict=True):
+        yield struct.pack("<QQ", len(stream), len(section))
+    yield from packed
 
 
 def _encoded(rows: GaussianRows, bits: int, higher: int) -> tuple[np.ndarray, ...]:
@@ -244,16 +283,13 @@ def _streams(content: bytes, table: int, streams: int, sizes: list[int], path: P
 
 def _declared_frame(extensions: bytes, path: Path) -> int:
     """The frame that one of these extensions declares; RUB if none does."""
-    at = 0
-    while at + 8 <= len(extensions):
-        kind, size = struct.unpack_from("<II", extensions, at)
-        if kind == FRAME_EXTENSION and size == 4 and at + 12 <= len(extensions):
-            (frame,) = struct.unpack_from("<I", extensions, at + 8)
+    for kind, payload in records(extensions):
+        if kind == FRAME_EXTENSION and len(payload) == 4:
+            (frame,) = struct.unpack("<I", payload)
             if frame > len(FRAMES):
                 expected = f"one of the {len(FRAMES)} frames of the format"
                 raise InvalidSplats(str(path), expected=expected, got=f"frame {frame}", hint=HINT)
             return frame or RUB
-        at += 8 + size
     return RUB
 
 

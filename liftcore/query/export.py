@@ -145,7 +145,7 @@ def object_splats(scene: OpenedLift, answer: Answer, suffix: str = ".ply") -> It
     """The splats of an answer's objects, as a file in blocks: a PLY with every property to the byte, or another.
 
     They are those that `objects` and masks show, without strays; of more than are grouped, all that were selected.
-    A ``.glb`` has their labels, too.
+    A ``.glb`` and an ``.spz`` have their labels, too.
 
     Raises:
         InvalidQuery: none was selected, or nothing asked for is there: most viewers open no file without splats; or
@@ -167,7 +167,7 @@ def object_splats(scene: OpenedLift, answer: Answer, suffix: str = ".ply") -> It
         )
     whole = answer.count > MOST_SPLATS and not answer.query.keeps_some
     kept = answer.selected if whole else objects(scene, answer).numbers >= 0
-    if suffix == ".glb" and not whole:
+    if suffix in (".glb", ".spz") and not whole:
         return labelled(scene.splat_file, labels(scene, answer), suffix, kept)
     return some_rows(scene.splat_file, kept, suffix)
 

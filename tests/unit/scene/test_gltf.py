@@ -135,17 +135,18 @@ def labels() -> Labels:
     return Labels({name: values.astype(kinds[name]) for name, values in columns.items()}, document)
 
 
-def test_labels_come_back_with_names_boxes_and_all_that_is_said_of_them(tmp_path: Path) -> None:
+@pytest.mark.parametrize("suffix", [".glb", ".spz"])
+def test_labels_come_back_with_names_boxes_and_all_that_is_said_of_them(suffix: str, tmp_path: Path) -> None:
     expected = labels()
     write_splats(tmp_path / "s.ply", some_splats())
-    (tmp_path / "s.glb").write_bytes(b"".join(labelled(tmp_path / "s.ply", expected, ".glb")))
-    found = read_labels(tmp_path / "s.glb")
-    assert found.document == expected.document
+    (tmp_path / f"s{suffix}").write_bytes(b"".join(labelled(tmp_path / "s.ply", expected, suffix)))
+    found = read_labels(tmp_path / f"s{suffix}")
+    assert {kind: found.document[kind] for kind in ("instances", "classes")} == expected.document
     for name, values in expected.columns.items():
         np.testing.assert_array_equal(found.columns[name], values)
     kept = np.arange(P) % 3 == 1
-    (tmp_path / "t.glb").write_bytes(b"".join(labelled(tmp_path / "s.ply", expected, ".glb", kept)))
-    one = read_labels(tmp_path / "t.glb")
+    (tmp_path / "t").write_bytes(b"".join(labelled(tmp_path / "s.ply", expected, suffix, kept)))
+    one = read_labels(tmp_path / "t")
     assert [row["name"] for row in one.document["classes"]] == ["plate"] and set(one.columns["class_id"]) == {1}
 
 
@@ -198,19 +199,31 @@ def test_what_cannot_be_or_leads_elsewhere_is_refused(name: str, tmp_path: Path)
         read_splats(join(tmp_path / "t.glb", document, binary))
 
 
-def test_damaged_bytes_are_refused_or_read_and_nothing_else(tmp_path: Path) -> None:
+@pytest.mark.parametrize("suffix", [".glb", ".spz"])
+def test_damaged_bytes_are_refused_or_read_and_nothing_else(suffix: str, tmp_path: Path) -> None:
     write_splats(tmp_path / "s.ply", some_splats(degree=0))
-    (tmp_path / "s.glb").write_bytes(b"".join(labelled(tmp_path / "s.ply", labels(), ".glb")))
-    content, generator = (tmp_path / "s.glb").read_bytes(), np.random.default_rng(3)
-    head = struct.unpack_from("<I", content, 12)[0] + 28
-    for _ in range(300):
-        damaged = bytearray(
-            content[: int(generator.integers(20, len(content)))] if generator.random() < 0.2 else content
-        )
-        for place in generator.integers(0, min(head, len(damaged)), 3):
+    content = b"".join(labelled(tmp_path / "s.ply", labels(), suffix))
+    generator, told = np.random.default_rng(3), len(content) if suffix == ".spz" else parts_begin(content)
+    for _ in range(200):
+        whole = generator.random() < 0.8
+        damaged = bytearray(content if whole else content[: int(generator.integers(20, len(content)))])
+        for place in generator.integers(4, min(told, len(damaged)), 3):
             damaged[place] = generator.integers(32, 127)
-        (tmp_path / "t.glb").write_bytes(damaged)
+        (tmp_path / "t").write_bytes(damaged)
         try:
-            read_labels(tmp_path / "t.glb")
+            read_labels(tmp_path / "t")
         except InvalidSplats:
             continue
+
+
+def parts_begin(content: bytes) -> int:
+    return int(struct.unpack_from("<I", content, 12)[0]) + 28
+
+
+def test_labels_change_nothing_else_of_an_spz(tmp_path: Path) -> None:
+    write_splats(tmp_path / "s.ply", some_splats())
+    write_splats(tmp_path / "plain.spz", some_splats())
+    (tmp_path / "labelled.spz").write_bytes(b"".join(labelled(tmp_path / "s.ply", labels(), ".spz")))
+    plain, with_labels = read_splats(tmp_path / "plain.spz"), read_splats(tmp_path / "labelled.spz")
+    for name in ("means", "quats", "log_scales", "opacity_logits", "sh"):
+        assert torch.equal(getattr(plain, name), getattr(with_labels, name)), name

@@ -43,12 +43,19 @@ def test_columns_of_a_file_that_was_read_stay_and_one_of_the_same_name_is_replac
     assert found["mask"].tolist() == found["score"].tolist() == list(range(0, P, 2))
 
 
-@pytest.mark.parametrize("suffix", [".splat", ".spz"])
+@pytest.mark.parametrize("suffix", [".splat", ".spz", ".glb"])
 def test_the_suffix_names_the_format(suffix: str, tmp_path: Path) -> None:
-    lc.write_splats(tmp_path / f"s{suffix}", random_splats(3))
-    assert lc.read_splats(tmp_path / f"s{suffix}").count == P
-    with pytest.raises(lc.InvalidSplats, match=r"columns: expected a path that ends in \.ply or \.glb"):
-        lc.write_splats(tmp_path / f"s{suffix}", random_splats(3), COLUMNS)
+    path = tmp_path / f"s{suffix}"
+    lc.write_splats(path, random_splats(3))
+    assert lc.read_splats(path).count == P and not lc.read_splats(path).extras
+    if suffix == ".splat":
+        with pytest.raises(lc.InvalidSplats, match=r"columns: expected a path that ends in \.ply or \.glb or \.spz"):
+            lc.write_splats(path, random_splats(3), COLUMNS)
+        return
+    lc.write_splats(path, random_splats(3), COLUMNS)
+    found = lc.read_splats(path).extras
+    for name, values in COLUMNS.items():
+        np.testing.assert_allclose(found[name], np.asarray(values).reshape(P), rtol=1e-6)
 
 
 @pytest.mark.parametrize(

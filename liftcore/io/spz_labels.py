@@ -1,0 +1,87 @@
+"""Labels in an ``.spz`` of version 4, as an extension that other readers skip (docs/formats.md specifies it).
+
+The payload is the length of a JSON text (u32), that text, and a zstd stream a column. The text has ``columns``, each
+with its ``name``, ``type`` (i4 or f4) and the ``bytes`` of its stream, in their order, and all of the document.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from liftcore.io.labels import COLUMN, FORMAT, IDS, Labels
+from liftcore.io.ply import MODEL
+
+if TYPE_CHECKING:
+    from liftcore.scene.splats import Splats
+
+EXTENSION = 0x51F70001  # vendor 0x51F7, its first
+MAX_COLUMNS = 16
+TYPES = ("i4", "f4")
+
+
+def label_record(splats: Splats, document: Mapping[str, Any] | None) -> bytes:
+    """The extension's record for the extras of splats, and what these mean."""
+    import zstandard
+
+    columns, streams = [], []
+    for name, column in splats.extras.items():
+        code = "f4" if column.is_floating_point() else "i4"
+        streams.append(zstandard.ZstdCompressor().compress(column.cpu().numpy().astype(f"<{code}").tobytes()))
+        columns.append({"name": name, "type": code, "bytes": len(streams[-1])})
+    text = json.dumps({"format": FORMAT, **(document or {}), "columns": columns}, ensure_ascii=False).encode()
+    payload = struct.pack("<I", len(text)) + text + b"".join(streams)
+    return struct.pack("<II", EXTENSION, len(payload)) + payload
+
+
+def read_label_record(extensions: bytes, count: int) -> Labels | None:
+    """The labels of P splats among the records of a file; None where there are none that can be read."""
+    for kind, payload in records(extensions):
+        if kind == EXTENSION:
+            try:
+                return _read(payload, count)
+            except (ValueError, RecursionError, struct.error):
+                return None
+    return None
+
+
+def records(extensions: bytes) -> Iterator[tuple[int, bytes]]:
+    """Number and payload of each extension; of one that is cut short what is left."""
+    at = 0
+    while at + 8 <= len(extensions):
+        kind, size = struct.unpack_from("<II", extensions, at)
+        yield kind, extensions[at + 8 : at + 8 + size]
+        at += 8 + size
+
+
+def _read(payload: bytes, count: int) -> Labels:
+    """Raises ValueError where the payload is none of the format."""
+    import zstandard
+
+    (length,) = struct.unpack_from("<I", payload)
+    document = json.loads(payload[4 : 4 + length])
+    at, columns = 4 + length, {}
+    told = document.get("columns") if isinstance(document, dict) else None
+    if not isinstance(told, list) or len(told) > MAX_COLUMNS or document.get("format") != FORMAT:
+        raise ValueError("no document of labels")
+    for one in told:
+        own = one if isinstance(one, dict) else {}
+        name, code, size = (own.get(key) for key in ("name", "type", "bytes"))
+        if not isinstance(name, str) or code not in TYPES or type(size) is not int or size < 0:
+            raise ValueError("no column")
+        stream, at = payload[at : at + size], at + size
+        try:
+            if zstandard.frame_content_size(stream) not in (-1, 4 * count):
+                raise ValueError("a column of another size")
+            values = zstandard.ZstdDecompressor().decompress(stream, max_output_size=4 * count)
+        except zstandard.ZstdError as error:
+            raise ValueError(str(error)) from None
+        if len(values) != 4 * count:
+            raise ValueError("a column of another size")
+        if COLUMN.fullmatch(name) and not MODEL.fullmatch(name):
+            columns[name] = np.frombuffer(values, f"<{code}").astype(np.int32 if name in IDS else f"<{code}")
+    return Labels(columns, document | {"columns": list(columns)})
