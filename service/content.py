@@ -8,7 +8,6 @@ import re
 import time
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO
 
@@ -68,36 +67,29 @@ def kept(etag: str) -> dict[str, str]:
     return {"ETag": etag, "Cache-Control": "private, no-cache"}
 
 
-@dataclass(frozen=True)
-class StoredFile:
-    """A file whose bytes never change."""
+def file_answer(request: Request, path: Path, size: int, sha256: str, name: str) -> Response:
+    """A stored file, whose bytes never change: 200, 206 for one range, 304 when the client has it.
 
-    path: Path
-    bytes: int  # when it was stored
-    sha256: str
-    name: str  # for who saves it
-
-
-def file_answer(request: Request, file: StoredFile) -> Response:
-    """The file: 200, 206 for one range, 304 when the client has it.
+    Args:
+        path: of the file. size: in bytes, when it was stored. sha256: of the bytes. name: for who saves it.
 
     Raises:
         RangeNotSatisfiable: the range begins beyond the end.
         NotFound: the file is not there, or no longer what was stored.
     """
-    etag = f'"{file.sha256}"'
-    status = whole_status(file.path, file.bytes)
+    etag = f'"{sha256}"'
+    status = whole_status(path, size)
     if status is None:
-        there = "one of another size" if file.path.exists() else "none"
+        there = "one of another size" if path.exists() else "none"
         raise NotFound(
-            "content", expected=f"a file of {file.bytes} bytes in the data directory", got=there,
+            "content", expected=f"a file of {size} bytes in the data directory", got=there,
             hint="it was deleted a moment ago, or something else wrote there: upload it again, or lift again",
         )  # fmt: skip
     if (same := unchanged(request, etag)) is not None:
         return same
     asked, condition = request.headers.get("range"), request.headers.get("if-range", etag)
-    part = _range_of(asked, file.bytes) if asked is not None and condition == etag else None
-    return _FileAnswer(part, file.path, headers=kept(etag), filename=file.name, stat_result=status)
+    part = _range_of(asked, size) if asked is not None and condition == etag else None
+    return _FileAnswer(part, path, headers=kept(etag), filename=name, stat_result=status)
 
 
 def _range_of(header: str, size: int) -> tuple[int, int] | None:

@@ -3,7 +3,6 @@ asset, a pack named anew, a lift planned that nobody has ordered yet. And what j
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 import tempfile
@@ -34,6 +33,7 @@ from liftcore.text.table import TableEncoder
 from service import models
 from service.child import fault_of, renamed
 from service.models import AssetKind, UploadKind
+from service.store.files import sha256_of
 from service.store.lifts import LONG, SHOWN_BYTES
 from service.uploads import INVALID, LIFT
 
@@ -254,10 +254,8 @@ def lift_as_ordered(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
     made = _as_clients_know(made, order["file_names"])
     output = Path(order["output"])
     made.save(output, progress=report)
-    with output.open("rb") as handle:
-        digest = hashlib.file_digest(handle, "sha256").hexdigest()
     return {
-        "sha256": digest,
+        "sha256": sha256_of(output),
         "count": made.features.shape[0],
         "channels": made.features.shape[1],
         # Through JSON and not model_dump: what is not finite must become null before it reaches a client.

@@ -7,7 +7,6 @@ is deleted on the page is a link. What a lift of Python has in memory alone is w
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import os
 import secrets
@@ -34,6 +33,7 @@ from service.models import AssetKind
 from service.observe import logging_to_stderr
 from service.settings import ServiceSettings, read_settings, require_encoder_files
 from service.store.assets import CheckedUpload
+from service.store.files import sha256_of
 from service.store.lifts import FinishedLift, order_of
 from service.store.owners import SERVICE
 from service.store.recovery import checked, header_of
@@ -128,9 +128,7 @@ def adopt(store: Store, settings: ServiceSettings, path: Path) -> str:
         _link(store, settings, AssetKind.FEATURES, pack, path)
     lift = secrets.token_hex(16)
     store.files.lift(lift).symlink_to(path.resolve())
-    with path.open("rb") as handle:
-        digest = hashlib.file_digest(handle, "sha256").hexdigest()
-    made = FinishedLift(store.files.lift(lift), digest, shape[0], shape[1], told)
+    made = FinishedLift(store.files.lift(lift), sha256_of(path), shape[0], shape[1], told)
     store.lifts.adopt(SERVICE, lift, replace(order, features=tuple(asset for _, asset in kept)), made)
     return lift
 

@@ -11,7 +11,7 @@ import anyio
 from fastapi import APIRouter, Path, Query, Request, Response
 
 from service import models
-from service.content import FILE, Cursor, Limit, StoredFile, file_answer, listed
+from service.content import FILE, Cursor, Limit, file_answer, listed
 from service.errand import run_errand
 from service.errors import Crashed
 from service.requests import JsonRoute, require_plain
@@ -123,7 +123,7 @@ def get_content(asset: AssetId, request: Request, deps: Deps) -> Response:
     """The bytes of an asset, or a range of them."""
     found = deps.store.assets.get(deps.owner, asset)
     digest = found.id.removeprefix("sha256:")
-    return file_answer(request, StoredFile(found.path, found.bytes, digest, found.file_name))
+    return file_answer(request, found.path, found.bytes, digest, found.file_name)
 
 
 @router.patch(

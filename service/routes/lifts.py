@@ -12,7 +12,7 @@ from fastapi.responses import JSONResponse, StreamingResponse
 from liftcore.errors import NotFound
 from liftcore.files import in_camera_orientation
 from service import models
-from service.content import FILE, TAGGED, Cursor, Limit, StoredFile, file_answer, kept, listed, unchanged
+from service.content import FILE, TAGGED, Cursor, Limit, file_answer, kept, listed, unchanged
 from service.queries import questions
 from service.queries.requests import NO_ENCODER, Ask, made, scene_request, tagged_answer, with_encoder, with_packs
 from service.requests import JsonRoute
@@ -95,7 +95,7 @@ def get_lift(lift: str, deps: Deps) -> models.LiftResult:
 def get_features(lift: str, request: Request, deps: Deps) -> Response:
     """The lift file (safetensors), or a range of it."""
     found = deps.store.lifts.get(deps.owner, lift)
-    return file_answer(request, StoredFile(found.path, found.bytes, found.sha256, f"lift-{found.id}.safetensors"))
+    return file_answer(request, found.path, found.bytes, found.sha256, f"lift-{found.id}.safetensors")
 
 
 @router.get("/tradeoffs/{tradeoff}", response_model=models.Tradeoff, tags=["trade-offs"])

@@ -12,7 +12,6 @@ import json
 import os
 import re
 import shutil
-import sqlite3
 import threading
 from collections import Counter
 from collections.abc import Iterator
@@ -31,7 +30,7 @@ from service.models import JOB_ID, AssetKind, UploadKind
 from service.settings import ServiceSettings
 from service.store.assets import CheckedUpload
 from service.store.database import DATABASE, KEYS_REQUIRED, copy_database, open_to_read, remember_generation
-from service.store.files import keep_private, sync_directory
+from service.store.files import keep_private, sha256_of, sync_directory
 from service.store.lifts import FinishedLift, order_of
 from service.store.owners import SERVICE
 from service.store.store import Store
@@ -93,12 +92,13 @@ def verify(data: Path) -> list[str]:
         NotFound: there is no database.
     """
     _require_database(data)
-    with closing(_opened(data)) as connection:
+    with closing(open_to_read(data / DATABASE)) as connection:
         damage = [
             f"{DATABASE}: {row[0]}" for row in connection.execute("PRAGMA integrity_check(10)") if row[0] != "ok"
         ]
-        charts = connection.execute("SELECT id, chart, sha256 FROM tradeoffs")
-        damage += [f"trade-off {job}: another chart" for job, *found in charts if _digest_of(found[0]) != found[1]]
+        charts = connection.execute("SELECT id, sha256, chart FROM tradeoffs")
+        changed = [job for job, digest, chart in charts if hashlib.sha256(chart).hexdigest() != digest]
+    damage += [f"trade-off {job}: another chart" for job in changed]
     for file, size, digest in _files(data):
         why = _damage_of(data / file, size, digest)
         if why is not None and (file, size, digest) in _files(data):  # else it was deleted while we looked
@@ -122,23 +122,15 @@ def _damage_of(path: Path, size: int, digest: str) -> str | None:
 
 def _files(data: Path) -> list[tuple[str, int, str]]:
     """Path below the directory, bytes and sha256 of every file that the database knows."""
-    with closing(_opened(data)) as connection:
+    with closing(open_to_read(data / DATABASE)) as connection:
         return connection.execute(
             "SELECT file, bytes, substr(id, 8) FROM assets UNION SELECT file, bytes, sha256 FROM lifts"
         ).fetchall()
 
 
 def _generation(data: Path) -> int:
-    with closing(_opened(data)) as connection:
+    with closing(open_to_read(data / DATABASE)) as connection:
         return connection.execute("SELECT number FROM generation").fetchone()[0]
-
-
-def _opened(data: Path) -> sqlite3.Connection:
-    return open_to_read(data / DATABASE)
-
-
-def _digest_of(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
 
 
 def _linked(source: Path, target: Path) -> bool:
@@ -198,34 +190,24 @@ def rebuild(store: Store, settings: ServiceSettings) -> dict[str, Any]:
     Returns:
         ``assets`` by kind and ``lifts``: how many were added; ``left``: files that could not be, and why.
     """
-    left: list[dict[str, str]] = []
-    assets: Counter[str] = Counter()
-    known = {asset.path for asset in store.assets.all(SERVICE)}
-    for path in sorted(store.files.root.glob("blobs/*/*")):
-        if path not in known:
+    root, left, added = store.files.root, list[dict[str, str]](), Counter[UploadKind]()
+    known = {record.path for record in (*store.assets.all(SERVICE), *store.lifts.all(SERVICE))}
+    for add, pattern in ((_add_asset, "blobs/*/*"), (_add_lift, "lifts/*")):  # lifts are of assets
+        for path in sorted(set(root.glob(pattern)) - known):
             try:
-                assets[_add_asset(store, settings, path)] += 1
-            except SplatliftError as error:
-                left.append({"file": store.files.relative(path), "why": str(error)})
-    lifts = 0
-    known = {lift.path for lift in store.lifts.all(SERVICE)}
-    for path in sorted(store.files.root.glob("lifts/*")):
-        if path not in known:
-            try:
-                _add_lift(store, settings, path)
-                lifts += 1
+                added[add(store, settings, path)] += 1
             except SplatliftError as error:
                 left.append({"file": store.files.relative(path), "why": str(error)})
     store.database.catch_up()
-    return {"assets": dict(assets), "lifts": lifts, "left": left}
+    lifts = added.pop(LIFT, 0)
+    return {"assets": dict(added), "lifts": lifts, "left": left}
 
 
 def _add_asset(store: Store, settings: ServiceSettings, path: Path) -> AssetKind:
     """A blob is whole when its name is its digest; what it holds is read by the check of uploads."""
     if not path.is_file():
         raise NotFound("asset", expected="a regular file", got="something else")
-    with path.open("rb") as handle:
-        digest = hashlib.file_digest(handle, "sha256").hexdigest()
+    digest = sha256_of(path)
     if path != store.files.blob(digest, path.suffix):
         raise NotFound("asset", expected="a file named after its sha256", got=f"one whose sha256 is {digest}")
     kind = _kind_of(path)
@@ -249,7 +231,7 @@ def _kind_of(path: Path) -> AssetKind:
     return AssetKind(found.kind)
 
 
-def _add_lift(store: Store, settings: ServiceSettings, path: Path) -> None:
+def _add_lift(store: Store, settings: ServiceSettings, path: Path) -> UploadKind:
     """A lift remembers the settings and the digests of what it was made of: that is its job's order.
 
     One that was brought may have been made with a folder of cameras: then those of its poses are looked for.
@@ -269,9 +251,8 @@ def _add_lift(store: Store, settings: ServiceSettings, path: Path) -> None:
     order = replace(order, features=here)  # lifts may be brought without their packs
     for asset, kind in order.assets():
         store.assets.get(SERVICE, asset, kind)  # a lift without what it was made of can be shown to nobody
-    with path.open("rb") as handle:
-        digest = hashlib.file_digest(handle, "sha256").hexdigest()
-    store.lifts.adopt(SERVICE, path.stem, order, FinishedLift(path, digest, count, channels, told))
+    store.lifts.adopt(SERVICE, path.stem, order, FinishedLift(path, sha256_of(path), count, channels, told))
+    return LIFT
 
 
 def _cameras_of(store: Store, settings: ServiceSettings, lift: Path) -> str | None:
