@@ -1,9 +1,11 @@
 """Public: what questions and bodies of requests are made of, for programs that serve them. Loads no torch."""
 
+from liftcore.query.edits import Edit
 from liftcore.query.question import (
     METHODS,
     AskableWords,
     BestWords,
+    Box,
     Found,
     FoundWords,
     ListedObjects,
@@ -15,6 +17,6 @@ from liftcore.query.terms import NOTATIONS
 from liftcore.runtime.fields import Body, NoBoolean, takes
 
 __all__ = [
-    "METHODS", "NOTATIONS", "AskableWords", "BestWords", "Body", "Found", "FoundWords", "ListedObjects", "NoBoolean",
-    "Notation", "OwnCamera", "Seen", "takes",
+    "METHODS", "NOTATIONS", "AskableWords", "BestWords", "Body", "Box", "Edit", "Found", "FoundWords",
+    "ListedObjects", "NoBoolean", "Notation", "OwnCamera", "Seen", "takes",
 ]  # fmt: skip

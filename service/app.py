@@ -20,7 +20,7 @@ from service.middleware import AnswerHead, RecordedApp, Turns
 from service.observe import Metrics, versions
 from service.queries.client import QueryClient, QueryLimits
 from service.requests import KnownParameters
-from service.routes import assets, jobs, lifts, operations, queries
+from service.routes import assets, jobs, lifts, operations, queries, selections
 from service.settings import ServiceSettings
 from service.state import AppState, Readiness, Stopping
 from service.store.store import Collector, Store
@@ -78,7 +78,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
     app.add_middleware(Turns)
     problems.install(app)
     app.include_router(operations.router)  # probes and links to the page may carry what they like
-    for module in (assets, jobs, lifts, queries):
+    for module in (assets, jobs, lifts, queries, selections):
         app.include_router(module.router, dependencies=[KnownParameters])
     return app
 

@@ -5,7 +5,7 @@ SplatliftError
     ├── Unauthorized, MissingScope, ForeignOrigin, Misdirected      who may ask
     ├── InvalidRequest, UnreadableBody, DigestMismatch, UnsupportedEncoding, TooLarge,
     │   RangeNotSatisfiable, KeyReused
-    ├── InUse, Conflict                                             what the state of things does not allow
+    ├── InUse, Conflict, Changed                                             what the state of things does not allow
     ├── OverQuota, OverLimit, NoSpace                               what there is no room for
     ├── RetryLater: TooMany, Busy (NotReady)                        what may go well in a while
     ├── TimedOut, ClientLeft, Crashed                               what ended without an answer
@@ -109,6 +109,12 @@ class Conflict(ServiceError):
     """A job whose state does not allow what was asked."""
 
     kind, status, title = "conflict", 409, "The job's state does not allow that"
+
+
+class Changed(ServiceError):
+    """What is to be changed has another version than its ETag was of."""
+
+    kind, status, title = "changed", 412, "It was changed meanwhile"
 
 
 class KeyReused(ServiceError):

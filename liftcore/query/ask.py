@@ -31,6 +31,7 @@ from liftcore.query.presence import (
 from liftcore.query.question import Answer, AskedAs, Box, Objects, Point, Presence, Query, Threshold, TopSplat
 from liftcore.query.scores import LEAST_LIKENESS, LOWEST_COSINE, combine, cosines, cosines_about
 from liftcore.query.selection import LEAST_FIRST, SAME_WORD, Rivals, contest, nearer_than_rivals, whole_things
+from liftcore.query.selections import set_members
 from liftcore.query.terms import Vector
 from liftcore.query.threshold import find_threshold, nothing_alike
 from liftcore.text import TextEncoder, check_texts
@@ -179,7 +180,7 @@ def question(scene: OpenedLift, query: Query, encoder: TextEncoder | None, names
     Args:
         names: what errors call each of the terms; () = what they are themselves.
     """
-    words = np.array([isinstance(term, str) for term in query.terms])
+    words = np.array([isinstance(term, str) for term in query.terms], np.bool_)
     asked_as = wordings(scene, query, encoder, names)
     rows = directions(scene, query, encoder, names, asked_as)
     scene.counted(query.weigh)
@@ -243,6 +244,8 @@ def _similarities(scene: OpenedLift, questions: Sequence[Question]) -> list[np.n
 
 def _answer(scene: OpenedLift, asked: Question, similarities: np.ndarray) -> Answer:
     query, seen = asked.query, scene.seen
+    if query.sets:
+        return _set_answer(scene, query)
     presence, kept = _presence(scene, asked, similarities)
     scores = combine(similarities if kept.all() else similarities[:, kept], int(kept[: len(query.positives)].sum()))
     if not scene.all_seen:
@@ -279,6 +282,20 @@ def _nearer_words(scene: OpenedLift, asked: Question, scores: np.ndarray, select
     shares = np.bincount(nearest[nearest >= 0], weights[nearest >= 0], len(references.words)) / weights.sum()
     order = np.argsort(-shares, kind="stable")[:MOST_RIVALS]
     return tuple(references.words[row].replace("_", " ") for row in order.tolist() if shares[row] >= LEAST_RIVAL)
+
+
+def _set_answer(scene: OpenedLift, query: Query) -> Answer:
+    """Sets as they are: a score of one for their splats and zero for the others, whether seen or not."""
+    members = np.zeros(len(scene.features), np.bool_)
+    for one in query.splat_sets:
+        members |= set_members(scene, one)
+    named, count, scores = ", ".join(query.sets), int(members.sum()), members.astype(np.float32)
+    found = Threshold(value=0.5, method="set", explanation=f"the splats of {named}, as they are", clear=count > 0)
+    here = Presence(present=count > 0, presence=float(count > 0), why=f"{named} has {count} splats.")
+    return Answer.of(
+        query, scores, np.ones_like(members), members,
+        threshold=found, clear=count > 0, statistics=finite(_statistics(scores)), **dict(here),
+    )  # fmt: skip
 
 
 def _selected(

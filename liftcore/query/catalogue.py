@@ -166,8 +166,13 @@ def one_object_splats(scene: OpenedLift, number: int, suffix: str = ".ply") -> I
     """
     from liftcore.io.splats import some_rows
 
+    return some_rows(scene.splat_file, object_members(scene, number), suffix)
+
+
+def object_members(scene: OpenedLift, number: int) -> np.ndarray:
+    """[P] bool, the splats of an object; NotFound where the lift has none of that number."""
     count = 0 if scene.object_views is None else len(scene.object_views)
     if scene.object is None or not 0 <= number < count:
         expected = f"a number from 0 to {count - 1}" if count else "a lift with objects"
         raise NotFound("object", expected=expected, got=str(number), hint="the list of the lift's objects has them")
-    return some_rows(scene.splat_file, scene.object == number, suffix)
+    return scene.object == number

@@ -17,7 +17,8 @@ from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.presence import references_of
 from liftcore.query.question import AskableWord, AskableWords, Query
 from liftcore.query.regions import codebook_row, regions_of
-from liftcore.query.terms import Area, Example, OneSplat, Region, Term, Vector, parse_example
+from liftcore.query.selections import set_members
+from liftcore.query.terms import Area, Example, OneSplat, Region, SplatSet, Term, Vector, parse_example
 from liftcore.text import RememberingEncoder, TextEncoder, check_texts
 from liftcore.text.table import TableEncoder
 from liftcore.text.wording import Wording
@@ -106,7 +107,8 @@ def directions(
         if not isinstance(term, str | Region):
             with named(place):
                 rows[place] = _unit(_feature(scene, term), "vector" if isinstance(term, Vector) else str(term))
-    return np.stack([rows[place] for place in range(len(query.terms))])
+    empty = np.zeros((0, scene.channels), np.float32)  # of a query of sets
+    return np.stack([rows[place] for place in range(len(query.terms))]) if rows else empty
 
 
 @dataclass(frozen=True)
@@ -176,13 +178,18 @@ def _regions(scene: OpenedLift, query: Query, named: _Names) -> dict[int, np.nda
     return rows
 
 
-def _feature(scene: OpenedLift, example: Area | OneSplat | Vector) -> np.ndarray:
+def _feature(scene: OpenedLift, example: Area | OneSplat | SplatSet | Vector) -> np.ndarray:
     if isinstance(example, Area):
         return feature_shown(scene, example)
     if isinstance(example, Vector):
         if len(example.values) != scene.channels:
             raise InvalidQuery("vector", expected=f"{scene.channels} channels, as the lift has", got=str(example))
         return np.array(example.values)
+    if isinstance(example, SplatSet):
+        rows = np.flatnonzero(set_members(scene, example) & scene.seen)
+        if not rows.size:
+            raise InvalidQuery(str(example), expected="a set with splats that have a feature", got="none of them")
+        return scene.mean_of(rows)
     count = len(scene.features)
     if example.splat >= count:
         raise InvalidQuery(str(example), expected=f"a splat in 0..{count - 1}", got=str(example.splat))

@@ -1,5 +1,6 @@
 """How many things an answer found, and where each lies: components of the graph in which splats touch."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 from liftcore.errors import InvalidQuery
 from liftcore.query.opened import OpenedLift
 from liftcore.query.question import Answer, Box, FoundObject, Objects, Point
+from liftcore.query.terms import SplatSet
 from liftcore.scene.touching import touching
 
 if TYPE_CHECKING:
@@ -25,12 +27,15 @@ def objects(scene: OpenedLift, answer: Answer) -> Objects:
     are groups of fewer splats than the query's ``min_size``. A query that knows how many instances there are has so
     many objects at most, those of the highest scores, and one that keeps the largest has one; all else are strays.
 
+    Of a query of sets each set is a thing, and none of its splats is a stray; one of several sets is of the first.
+
     Raises:
         InvalidQuery: more splats were selected than are grouped.
         InvalidLift: the splats moved or changed since the lift.
     """
     rows = np.flatnonzero(answer.selected)
-    if len(rows) > MOST_SPLATS:
+    sets = answer.query.splat_sets
+    if len(rows) > MOST_SPLATS and not sets:
         expected = f"at most {MOST_SPLATS:,} splats at or above it, to make objects of them"
         raise InvalidQuery("threshold", expected=expected, got=f"{len(rows):,}", hint="name a higher threshold")
     numbers = np.full(len(answer.scores), -1, np.int32)
@@ -38,11 +43,11 @@ def objects(scene: OpenedLift, answer: Answer) -> Objects:
         return Objects.of((), numbers, 0)
     weights = scene.counted(answer.query.weigh)[rows].astype(np.float64)
     weights = weights if weights.any() else np.ones(len(rows))
-    groups = touching(scene.splats, rows)
+    groups = _set_numbers(scene, sets)[rows] if sets else touching(scene.splats, rows)
     sums = np.bincount(groups, weights)
     order = np.argsort(-sums, kind="stable")
     order = order[np.bincount(groups)[order] >= answer.query.min_size]
-    large = int((sums[order] >= LEAST_EVIDENCE * sums.max()).sum())
+    large = len(order) if sets else int((sums[order] >= LEAST_EVIDENCE * sums.max()).sum())
     kept = order[: min(1, large) if answer.query.keep == "largest" else large]
     if answer.query.instances is not None and len(kept) > answer.query.instances:
         scores = np.bincount(groups, weights * answer.scores[rows])[kept] / sums[kept]
@@ -53,17 +58,29 @@ def objects(scene: OpenedLift, answer: Answer) -> Objects:
     found = []
     for number in range(len(kept)):
         inside = numbers[rows] == number
-        box = trimmed_box(scene.splats.positions(rows[inside]), weights[inside])
+        own, mine = rows[inside], weights[inside]
+        mine = mine if mine.any() else np.ones(len(own))
+        box = largest_box(scene.splats, own, mine) if sets else trimmed_box(scene.splats.positions(own), mine)
         found.append(
             FoundObject(
                 splats=int(inside.sum()),
                 share=float(weights[inside].sum() / weights.sum()),
-                score=float(np.average(answer.scores[rows[inside]], weights=weights[inside])),
+                score=float(np.average(answer.scores[own], weights=mine)),
                 centre=_point(np.mean(box, axis=0)),
                 box=box,
             )
         )
     return Objects.of(found, numbers, int((numbers[rows] < 0).sum()))
+
+
+def _set_numbers(scene: OpenedLift, sets: Sequence[SplatSet]) -> np.ndarray:
+    """[P] i32, the place of the first set that holds a splat; -1 of none."""
+    from liftcore.query.selections import set_members
+
+    numbers = np.full(len(scene.features), -1, np.int32)
+    for place, one in reversed(list(enumerate(sets))):
+        numbers[set_members(scene, one)] = place
+    return numbers
 
 
 def largest_box(splats: "Splats", rows: np.ndarray, weights: np.ndarray) -> Box:

@@ -20,6 +20,7 @@ from liftcore.values.lift_file import read_lift
 if TYPE_CHECKING:  # these load torch
     from torch import Tensor
 
+    from liftcore.query.selections import Selection
     from liftcore.raster.base import Raster
     from liftcore.scene.cameras import Camera, Cameras
     from liftcore.scene.compositing import CompositingParams
@@ -69,6 +70,7 @@ class OpenedLift:
     ) -> None:
         self.device = device
         self.labelled: tuple[Any, Any] | None = None  # what was last exported, and its `Labels`, for two files of it
+        self.selections: dict[str, Selection] = {}  # by their names; `Scene.select` makes them
         self._encoders: dict[str | None, TextEncoder] = {}
         places = {"splats": splats, "cameras": cameras}
         self._moved = {role: Path(at) if isinstance(at, str | Path) else None for role, at in places.items()}

@@ -26,7 +26,7 @@ from pydantic import (
 from pydantic_core import CoreSchema, core_schema
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.terms import NOTATIONS, Example, Term, Vector, parse_example
+from liftcore.query.terms import NOTATIONS, SETS, Example, SplatSet, Term, Vector, parse_example, parse_set
 from liftcore.runtime.fields import Body, NoBoolean, Shown, takes
 from liftcore.scene.compositing import MAX_SIDE
 
@@ -60,7 +60,7 @@ def _plain(example: Any) -> Any:
     return str(example) if isinstance(example, Example) else example
 
 
-def _camera(given: Any) -> Any:
+def as_own_camera(given: Any) -> Any:
     return OwnCamera.of(given) if hasattr(given, "K") else given
 
 
@@ -72,6 +72,10 @@ Texts = Annotated[list[str], BeforeValidator(_several)]
 Examples = Annotated[
     list[Annotated[Notation | Numbers, takes(EXAMPLES)]],
     BeforeValidator(_examples),
+]
+Sets = Annotated[
+    list[Annotated[str, Field(min_length=1, max_length=120, description=SETS)]],
+    BeforeValidator(_several),
 ]
 Method = Literal["auto", "valley", "paper", "otsu", "stability"]
 METHODS: tuple[str, ...] = get_args(Method)
@@ -127,7 +131,7 @@ class Seen(Body):
     view: ViewName | None = Field(
         default=None, description="the name of a camera, for pictures and for links to them"
     )
-    camera: Annotated[OwnCamera | None, BeforeValidator(_camera)] = Field(
+    camera: Annotated[OwnCamera | None, BeforeValidator(as_own_camera)] = Field(
         default=None, description="for pictures, in place of a view"
     )
 
@@ -173,6 +177,11 @@ class Query(Seen):
     )
     negatives: Texts = Field(default=[], description="what it is not; may be given several times")
     unlike: Examples = Field(default=[], description="an example of what it is not, likewise")
+    sets: Sets = Field(
+        default=[],
+        description=f"{SETS}: splats that belong together, taken as they are, without texts and examples; "
+        "may be given several times",
+    )
     threshold: Cut = Field(
         default="auto",
         description=f"{', '.join(METHODS)} or a number from -1 to 1: how to find it, or the score from which a splat "
@@ -211,15 +220,18 @@ class Query(Seen):
     @model_validator(mode="after")
     def _asks(self) -> Self:
         against = bool(self.negatives or self.unlike)
-        if not (self.text or self.like):
+        if self.sets and (self.text or self.like or against):
+            hint = "ask for like=object:N to find what is like one"
+            raise InvalidQuery("sets", expected="sets without texts and examples", got="both", hint=hint)
+        if not self.sets and not (self.text or self.like):
             raise InvalidQuery(
                 "query", expected="a text or an example of what to look for",
                 got="only what it is not" if against else "neither",
                 hint="say what to look for, too" if against else "",
             )  # fmt: skip
-        count = sum(map(len, (self.text, self.like, self.negatives, self.unlike)))
+        count = sum(map(len, (self.text, self.like, self.negatives, self.unlike, self.sets)))
         if count > MOST_TERMS:
-            raise InvalidQuery("query", expected=f"at most {MOST_TERMS} texts and examples", got=str(count))
+            raise InvalidQuery("query", expected=f"at most {MOST_TERMS} texts, examples and sets", got=str(count))
         return self
 
     @classmethod
@@ -236,6 +248,11 @@ class Query(Seen):
     def terms(self) -> tuple[Term, ...]:
         """Positives, then negatives."""
         return (*self.positives, *self.negatives, *_parsed(self.unlike, "unlike"))
+
+    @cached_property
+    def splat_sets(self) -> tuple[SplatSet, ...]:
+        """The sets that are taken as they are."""
+        return tuple(parse_set(one, f"sets.{place}") for place, one in enumerate(self.sets))
 
     @property
     def places(self) -> list[str]:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:  # these load torch
     from liftcore.query.question import Answer, AskableWords, BestWord, CoveringRegion, Objects, Query
     from liftcore.query.render import ViewMask
     from liftcore.query.segment import Segmentation
+    from liftcore.query.selections import Selection
     from liftcore.query.terms import Example
     from liftcore.scene.cameras import Camera
     from liftcore.scene.kernel import Kernel
@@ -145,6 +146,25 @@ class Scene(OpenedLift):
     ) -> np.ndarray:
         """[H, W] f32, the scores as a view shows them; arguments as in `look`."""
         return self.look(query, view, encoder=encoder).attention
+
+    def select(self, name: str, source: Answer | Query | str | np.ndarray | int | None = None) -> Selection:
+        """A selection by its name, made where there is none: splats that `Selection.edit` corrects.
+
+        It is asked for as ``Query(sets=["selection:NAME"])``, and an example of what is like it as
+        ``like="selection:NAME"``.
+
+        Args:
+            source: what it becomes, as in `Selection.edit`; None: it stays as it is.
+
+        Raises:
+            InvalidQuery: a name that questions cannot take; or as `Selection.edit`, like NotFound and InvalidLift.
+        """
+        from liftcore.query.selections import Selection
+        from liftcore.query.terms import parse_set
+
+        parse_set(f"selection:{name}", "name")
+        found = self.selections.setdefault(name, Selection(self, name))
+        return found if source is None else found.edit("set", source)
 
     def render(self, view: str | Camera, what: str = "rgb") -> np.ndarray:
         """A view: [H, W, 3] u8 sRGB of ``rgb``, ``pca``, ``cluster`` or ``confidence``; [H, W] f32 of ``depth``.

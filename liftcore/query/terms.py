@@ -9,6 +9,8 @@ Examples stand in place of words, "more of this":
 | `VIEW:stroke:x0,y0,x1,y1,...` | what most pixels show on the line through these, two or more |
 | `region:VIEW:LEVEL:ID` | the codebook row of a region, as the lift's feature packs hold it |
 | `splat:J` | the feature of a splat, by its row in the splat file |
+| `object:N` | the mean of an object's features, by its number in the lift (`liftcore.query.catalogue`) |
+| `selection:NAME` | the mean of the features of a selection (`liftcore.query.selections`) |
 
 How boxes and strokes are read: `liftcore.query.areas`. A vector has no notation. Names of views may hold colons and
 commas: the notation is read from its end.
@@ -19,12 +21,14 @@ from dataclasses import dataclass
 
 from liftcore.errors import InvalidQuery
 
-NOTATIONS = "VIEW:x,y, VIEW:box:x0,y0,x1,y1, VIEW:stroke:x0,y0,x1,y1,..., region:VIEW:LEVEL:ID or splat:J"
+SETS = "object:N or selection:NAME"
+NOTATIONS = f"VIEW:x,y, VIEW:box:x0,y0,x1,y1, VIEW:stroke:x0,y0,x1,y1,..., region:VIEW:LEVEL:ID, splat:J, {SETS}"
 _PIXEL = re.compile(r"(.+):\s*(-?\d{1,9})\s*,\s*(-?\d{1,9})\s*", re.ASCII | re.DOTALL)
 _AREA = re.compile(r"(.+):(box|stroke):([^:]*)", re.ASCII | re.DOTALL)
 _WHOLE = re.compile(r"\s*-?\d{1,9}\s*", re.ASCII)
 _REGION = re.compile(r"region:(.+):(\d{1,9}):(\d{1,9})", re.ASCII | re.DOTALL)
 _SPLAT = re.compile(r"splat:(\d{1,18})", re.ASCII)
+_SET = re.compile(r"object:(?P<object>\d{1,9})|selection:(?P<selection>[^:,]{1,100})", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -87,6 +91,17 @@ class OneSplat:
 
 
 @dataclass(frozen=True)
+class SplatSet:
+    """Splats that belong together: an object of the lift, or a selection of the scene."""
+
+    kind: str  # object or selection
+    name: str  # the object's number, or the selection's name
+
+    def __str__(self) -> str:
+        return f"{self.kind}:{self.name}"
+
+
+@dataclass(frozen=True)
 class Vector:
     """A feature from elsewhere, of the encoder that made the lift's."""
 
@@ -97,7 +112,7 @@ class Vector:
 
 
 Area = Pixel | PixelBox | Stroke  # of a camera's image
-Example = Area | Region | OneSplat | Vector
+Example = Area | Region | OneSplat | SplatSet | Vector
 Term = str | Example  # a text, or an example
 
 
@@ -119,9 +134,23 @@ def parse_example(notation: str, argument: str = "like") -> Example:
         return Region(region[1], int(region[2]), int(region[3]))
     if splat := _SPLAT.fullmatch(notation):
         return OneSplat(int(splat[1]))
+    if members := _SET.fullmatch(notation):
+        return _splat_set(members)
     if area := _AREA.fullmatch(notation):
         return _area(notation, area, argument)
     raise InvalidQuery(argument, expected=NOTATIONS, got=repr(notation[:120]))
+
+
+def parse_set(notation: str, argument: str = "sets") -> SplatSet:
+    """Read the notation of a set of splats; InvalidQuery where it is none."""
+    if members := _SET.fullmatch(notation):
+        return _splat_set(members)
+    raise InvalidQuery(argument, expected=SETS, got=repr(notation[:120]))
+
+
+def _splat_set(parts: re.Match[str]) -> SplatSet:
+    kind, name = next((kind, name) for kind, name in parts.groupdict().items() if name is not None)
+    return SplatSet(kind, str(int(name)) if kind == "object" else name)
 
 
 def _area(notation: str, parts: re.Match[str], argument: str) -> PixelBox | Stroke:

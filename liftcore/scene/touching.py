@@ -33,9 +33,15 @@ def touching(splats: Splats, rows: np.ndarray, threads: int | None = None) -> np
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
-    count = len(rows)
-    if count < 2:
-        return np.zeros(count, np.int32)
+    count, pairs = len(rows), touching_pairs(splats, rows, threads)
+    graph = csr_array((np.ones(len(pairs[0]), np.int8), pairs), shape=(count, count))
+    return connected_components(graph, directed=True, connection="weak")[1]
+
+
+def touching_pairs(splats: Splats, rows: np.ndarray, threads: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """[m] and [m] i32, places among the rows [n] of pairs that touch, each once or twice; arguments of `touching`."""
+    if len(rows) < 2:
+        return np.zeros(0, np.int32), np.zeros(0, np.int32)
     means = splats.means.cpu().numpy()[rows].astype(np.float64)
     shapes = np.concatenate([means, _covariances(splats, rows)], axis=1)
 
@@ -43,10 +49,8 @@ def touching(splats: Splats, rows: np.ndarray, threads: int | None = None) -> np
         touch = _touch(shapes[own], shapes[near])
         return np.repeat(own, touch.sum(axis=1)), near[touch]
 
-    looks = map_nearest(means, look, threads)
-    pairs = tuple(np.concatenate(parts) for parts in zip(*looks, strict=True))
-    graph = csr_array((np.ones(len(pairs[0]), np.int8), pairs), shape=(count, count))
-    return connected_components(graph, directed=True, connection="weak")[1]
+    own, near = zip(*map_nearest(means, look, threads), strict=True)
+    return np.concatenate(own), np.concatenate(near)
 
 
 def _touch(own: np.ndarray, near: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ import json
 import sys
 import threading
 import traceback
+import zlib
 from collections.abc import Callable, Iterable, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -40,7 +41,7 @@ from liftcore import (
     open_encoder,
 )
 from liftcore.files import cameras_of_views
-from liftcore.models import Found, OwnCamera, Seen
+from liftcore.models import Edit, Found, OwnCamera, Seen
 from liftcore.text import OWN_WORDS
 from service.child import end_with_parent, fault_of
 from service.errors import NoSpace
@@ -48,6 +49,7 @@ from service.queries.client import PIPE_BYTES, Frame, send_frame
 from service.settings import encoder_version
 
 WARM_UP_TEXT = "something"
+EDITED = "edited"  # the name of a selection while it is edited; those of questions are hexadecimal
 WORD_FILES = {"word_labels": "splat_labels", "word_map": "labels", "word_picture": "picture"}  # of `blocks_of`
 SPLATS_FILES = {"object": "object", "scores": "coloured"}
 PRODUCT_BYTES = 128 << 20  # of the cosines that one pass over a lift's features may give
@@ -85,6 +87,8 @@ class Answers:
             "catalogue": self._catalogue,
             "regions": self._regions,
             "device": self._device,
+            "edit": self._edit,
+            "count_objects": self._count_objects,
         }
 
     @property
@@ -149,6 +153,8 @@ class Answers:
                 self._scenes.popitem()
             self._scenes[request["lift"]] = self._open(request)
         scene = self._scenes[request["lift"]]
+        for name, bits in request.get("selections", {}).items():
+            _selected(scene, name, bits)
         if "features" in request:
             scene.find_packs([Path(path) for path in request["features"]])
         return scene
@@ -278,10 +284,23 @@ class Answers:
         found = self._kept(key, lambda: self._named_objects(request))
         assert isinstance(found, Catalogue)
         first, last = request["first"], request["first"] + request["count"]
-        things = (one.model_dump(mode="json") for one in found.listed(first, last, features=request["means"]))
+        if request["splat"] is not None:
+            first, last = self._object_of(request)
+        given = {thing: {"name": name, "hidden": hidden} for thing, (name, hidden) in request["things"]}
+        things = (
+            one.model_dump(mode="json") | {"hidden": False} | _given(given.get(one.id))
+            for one in found.listed(first, last, features=request["means"])
+        )
         after = last if last < len(found.objects) else None
         told = {"explanation": found.explanation, "count": len(found.objects), "next": after}
         return _json(request, told, "objects", things)
+
+    def _object_of(self, request: dict[str, Any]) -> tuple[int, int]:
+        """The place of a splat's object among all, and the one after it; nothing where it has none."""
+        numbers, splat = self._scene(request).object, request["splat"]
+        if numbers is None or splat >= len(numbers) or numbers[splat] < 0:
+            return 0, 0
+        return int(numbers[splat]), int(numbers[splat]) + 1
 
     def _regions(self, request: dict[str, Any]) -> Frame:
         found = self._scene(request).regions(request["view"], request["x"], request["y"])
@@ -294,10 +313,37 @@ class Answers:
             return Frame({"lack": fault_of(error)})
         return Frame({"lack": None})
 
+    def _edit(self, request: dict[str, Any]) -> Frame:
+        """A selection after an edit: what it holds, and zlib of its bits."""
+        scene = self._scene(request)
+        answer = self._answer(request) if "query" in request else None
+        edit = Edit.model_validate(request["edit"])
+        selection = _selected(scene, EDITED, request["before"]).edit(edit, answer)
+        count, box = int(selection.splats.sum()), selection.box
+        told = None if box is None else {"low": box.low, "high": box.high}
+        return Frame({"edit": edit.described(), "count": count, "box": told}, zlib.compress(selection.bits))
+
+    def _count_objects(self, request: dict[str, Any]) -> Frame:
+        views = self._scene(request).object_views
+        return Frame({"count": 0 if views is None else len(views)})
+
     def _named_objects(self, request: dict[str, Any]) -> Catalogue:
         """The objects of a lift; all words of the table that the request names, if it does, name them."""
         words, encoder = ([], None) if request["encoder"] is None else self._words(request)
         return self._scene(request).catalogue(words, encoder=encoder)
+
+
+def _selected(scene: Scene, name: str, bits: str) -> Any:
+    """A selection of these splats, without the history of one of the same name."""
+    scene.selections.pop(name, None)
+    return scene.select(name).edit(Edit(how="set", bits=bits))
+
+
+def _given(thing: dict[str, Any] | None) -> dict[str, Any]:
+    """What somebody gave an object: whether it is hidden, and a name, which no score belongs to."""
+    if thing is None or thing["name"] is None:
+        return {} if thing is None else {"hidden": thing["hidden"]}
+    return thing | {"score": None}
 
 
 def _small_file(content: bytes, request: dict[str, Any]) -> Frame:
@@ -343,7 +389,8 @@ def use_one_library_thread() -> None:
 def _key(request: dict[str, Any]) -> str:
     """What an answer is kept by: a digest, as a question may be as long as a body."""
     names = ("lift", "encoder", "encoder_version", "query" if "query" in request else "words")
-    return hashlib.sha256(json.dumps([request[name] for name in names]).encode()).hexdigest()
+    told = [*(request[name] for name in names), request.get("selections")]
+    return hashlib.sha256(json.dumps(told).encode()).hexdigest()
 
 
 def bytes_of(made: Answer | Objects | ViewMask | Segmentation | Catalogue) -> int:

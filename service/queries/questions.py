@@ -7,12 +7,14 @@ from typing import Annotated, Any, ClassVar
 from pydantic import AfterValidator, BaseModel, Field
 from pydantic_core import PydanticCustomError
 
-from liftcore import Answer, CoveringRegion, Objects, Picture, Query
+from liftcore import Answer, CoveringRegion, Objects, Picture, Query, SceneObject
 from liftcore.models import (
     NOTATIONS,
     AskableWords,
     BestWords,
     Body,
+    Box,
+    Edit,
     Found,
     FoundWords,
     ListedObjects,
@@ -159,6 +161,87 @@ class CoveringRegions(OfLift):
     regions: list[CoveringRegion] = Field(description="one a level at most, the smallest first")
 
 
+SelectionName = Annotated[str, Field(min_length=1, max_length=models.LIFT_NAME_CHARACTERS, pattern=models.PRINTABLE)]
+
+
+class AskedEdit(Edit):
+    """One change of a selection."""
+
+    model_config = BUILT
+    query: Question | None = Field(None, description="a question: the splats that answer it")  # pyright: ignore[reportIncompatibleVariableOverride]
+
+
+class NewSelection(Body):
+    """A selection to begin."""
+
+    model_config = BUILT
+    name: SelectionName = Field(description="for people")
+    edit: AskedEdit | None = Field(None, description="how, of no splats, it begins; left out, it has none")
+
+
+class SelectionChange(Body):
+    """What to change of a selection; what is left out stays."""
+
+    model_config = BUILT
+    name: SelectionName | None = Field(None, description="for people")
+    step: Annotated[int, Field(ge=0, le=10**9), NoBoolean] | None = Field(
+        None, description="the number of a step of its history: undo and redo"
+    )
+
+
+class ThingChange(Body):
+    """What to change of a thing; what is left out stays."""
+
+    model_config = BUILT
+    name: SelectionName | None = Field(None, description="of your own; null for the nearest word again")
+    hidden: bool = Field(False, description="whether lists leave it out")
+
+
+class Thing(BaseModel):
+    """What somebody calls a thing of a lift."""
+
+    id: int
+    name: str | None = Field(description="null where it has none of its own")
+    hidden: bool
+
+
+class ListedSelection(OfLift):
+    """A set of splats that is corrected by hand."""
+
+    id: str
+    name: str
+    count: int = Field(description="splats")
+    box: Box | None = Field(description="of its largest group of splats that touch; null of none")
+    step: int = Field(description="where in its history it is")
+    first: int = Field(description="the steps that it can go to, by PATCH")
+    last: int
+    version: int = Field(description="its ETag, for If-Match")
+    created: float = Field(description="seconds since 1970")
+    changed: float
+    links: dict[str, str]
+
+
+class SelectionStep(BaseModel):
+    """A step of a selection's history."""
+
+    number: int
+    edit: dict[str, Any] = Field(description="what made it of the step before, without bits")
+    count: int = Field(description="splats after it")
+
+
+class Selection(ListedSelection):
+    """A selection with its history."""
+
+    history: list[SelectionStep] = Field(description="also the steps that were undone")
+    bits: str | None = Field(description="base64 of a bit a splat, the first the lowest of its byte, if asked for")
+
+
+class Selections(BaseModel):
+    """The selections of a lift, newest first."""
+
+    selections: list[ListedSelection]
+
+
 class AskedForSceneObjects(BaseModel):
     """Which objects to list, and what names them."""
 
@@ -169,12 +252,21 @@ class AskedForSceneObjects(BaseModel):
         description="a text space that the operator set up as a table, the lift's own, or default: likewise",
     )
     features: Annotated[bool, Field(description="with the mean feature of each")] = False
+    splat: int | None = Field(None, ge=0, le=10**9, description="the one of this splat alone, by its row")
     limit: int = Field(100, ge=1, le=1000, description="how many to list")
     cursor: int = Field(0, ge=0, le=10**9, description="the `next` of the page before")
 
 
+class NamedObject(SceneObject):
+    """A thing of a lift, perhaps with a name that somebody gave it."""
+
+    hidden: bool = Field(description="whether somebody hid it")
+
+
 class SceneObjects(ListedObjects, OfLift):
     """Some of the objects of a lift, those with the most evidence first."""
+
+    objects: tuple[NamedObject, ...]  # pyright: ignore[reportIncompatibleVariableOverride]
 
     encoder: str | None = Field(description="what named them, without its file; null for nothing")
     next: int | None = Field(description="the cursor of the page after this one; null at the end")

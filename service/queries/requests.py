@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import hashlib
 import json
 from collections.abc import AsyncIterator, Callable
@@ -26,7 +27,7 @@ from service.store.lifts import LiftRecord
 ROW_BYTES, SCORE_BYTES = 32, 4  # of a splat in the .splat format, and in an array
 NUMBER_BYTES = 24  # of a number in JSON, at most
 NO_ENCODER: dict[str, Any] = {"encoder": None, "encoder_version": None}  # of a question without words
-REGION = "region:"  # what needs the lift's feature packs begins with it
+REGION, SELECTION = "region:", "selection:"  # what needs the lift's packs, or a selection of it, begins so
 NPY, PNG, JSON = "application/x-npy", "image/png", "application/json"
 MEDIA_TYPES = {
     **dict.fromkeys(("scores", "selection", "layer", "word_labels"), NPY),
@@ -123,10 +124,23 @@ def scene_request(operation: str, lift: LiftRecord, deps: AppState) -> dict[str,
 def query_request(operation: str, asked: questions.Question, lift: LiftRecord, deps: AppState) -> dict[str, Any]:
     """The same with a query; texts bring their encoder, and examples of regions the lift's feature packs."""
     request: dict[str, Any] = scene_request(operation, lift, deps)
+    named = [str(one).removeprefix(SELECTION) for one in (*asked.sets, *asked.like, *asked.unlike) if _selects(one)]
+    if named:
+        found = {name: deps.store.selections.get(deps.owner, lift.id, name) for name in dict.fromkeys(named)}
+        request["selections"] = {name: bits_of(deps.store.selections.bits(one)) for name, one in found.items()}
     request = with_encoder(request, asked, lift, deps) if asked.texts else {**request, **NO_ENCODER}
     if any(isinstance(example, str) and example.startswith(REGION) for example in (*asked.like, *asked.unlike)):
         request = with_packs(request, lift, deps, "like")
     return request | {"query": asked.model_dump(mode="json", include=set(Query.deciding()))}
+
+
+def _selects(example: object) -> bool:
+    return isinstance(example, str) and example.startswith(SELECTION)
+
+
+def bits_of(bits: bytes) -> str:
+    """The splats of a selection, as the query process takes them."""
+    return base64.b64encode(bits).decode()
 
 
 def seen_from(asked: questions.Seen) -> dict[str, Any]:

@@ -210,7 +210,9 @@ def scene_objects(
     if asked.table is not None or asked.encoder is not None:
         wanted = with_encoder(wanted, asked, found, deps)
     named = None if wanted["encoder"] is None else encoder_label(wanted["encoder"])
-    wanted |= {"first": asked.cursor, "count": asked.limit, "means": asked.features}
+    things = deps.store.selections.things(deps.owner, found.id)
+    wanted |= {"first": asked.cursor, "count": asked.limit, "means": asked.features, "things": list(things.items())}
+    wanted |= {"splat": asked.splat}
     return made(deps, wanted | {"head": {"lift": found.id, "encoder": named}}, found, ask, {})
 
 

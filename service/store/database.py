@@ -19,7 +19,7 @@ from typing import Any, Generic, TypeVar, cast
 from liftcore.files import whole_file
 from service.errors import InvalidRequest, Misconfigured, StaleDatabase
 from service.store.files import remove, sync_directory
-from service.store.schema import MIGRATING_RELEASE, SCHEMA, VERSION
+from service.store.schema import MIGRATING_RELEASE, OF_0_4, SCHEMA, SELECTIONS, VERSION
 
 DATABASE = "service.sqlite"  # in the data directory, beside two files that know an empty or older one from it:
 GENERATION = "generation"  # the number that the newest counted transaction had
@@ -85,14 +85,15 @@ class Database:
             version = connection.execute("PRAGMA user_version").fetchone()[0]
             if version == 0 and least is not None:
                 raise StaleDatabase(self._path.parent, "an empty one")
-            if version not in (0, VERSION):
+            if version not in (0, OF_0_4, VERSION):
                 hint = "use the release that wrote it, or another data directory"
                 if version < VERSION:
                     hint = f"start a service of release {MIGRATING_RELEASE} over it once, which migrates it"
                 expected = f"a database of schema version {VERSION}"
                 raise Misconfigured("data", expected=expected, got=f"{version}", hint=hint)
-            if version == 0:
-                for statement in SCHEMA.split(";\n"):  # `executescript` would commit before it begins
+            if version != VERSION:
+                statements = SCHEMA if version == 0 else SELECTIONS
+                for statement in statements.split(";\n"):  # `executescript` would commit before it begins
                     connection.execute(statement)
                 connection.execute(f"PRAGMA user_version = {VERSION}")
             self._require_generation(least)

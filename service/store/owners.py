@@ -59,11 +59,15 @@ NOBODY = Owner("-", sees_all=False)  # the id of no key, so nothing is theirs
 
 
 def stored_bytes(connection: sqlite3.Connection, owner: Owner) -> int:
-    """What an owner's assets, lifts and trade-offs take; bytes that several have count for each of them."""
+    """What an owner's assets and results, selections too, take; bytes that several have count for each of them."""
     assets = "SELECT total(bytes) FROM assets JOIN asset_owners ON asset = id WHERE owner = :owner"
     lifts = "SELECT total(lifts.bytes) FROM lifts JOIN jobs USING (id) WHERE owner = :owner"
     tradeoffs = "SELECT total(tradeoffs.bytes) FROM tradeoffs JOIN jobs USING (id) WHERE owner = :owner"
-    total = f"SELECT ({assets}) + ({lifts}) + ({tradeoffs})"
+    selections = (
+        "SELECT total(length(splats)) FROM selection_steps JOIN selections ON selections.id = selection"
+        " JOIN (SELECT id AS job, owner FROM jobs) ON job = lift WHERE owner = :owner"
+    )
+    total = f"SELECT ({assets}) + ({lifts}) + ({tradeoffs}) + ({selections})"
     return int(connection.execute(total, {"owner": owner.key}).fetchone()[0])
 
 

@@ -33,6 +33,7 @@ from service.store.jobs import JobStore
 from service.store.keys import KeyStore, any_key
 from service.store.lifts import LiftStore, TradeoffStore
 from service.store.owners import SERVICE
+from service.store.selections import SelectionStore
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,7 @@ class Store:
     jobs: JobStore
     lifts: LiftStore
     tradeoffs: TradeoffStore
+    selections: SelectionStore
 
     @classmethod
     def open(cls, root: Path, *, floor_bytes: int = 0, new: bool = False, rebuilding: bool = False) -> Self:
@@ -80,6 +82,7 @@ class Store:
             jobs=JobStore(database, files),
             lifts=LiftStore(database, files),
             tradeoffs=TradeoffStore(database),
+            selections=SelectionStore(database, files),
         )
 
     def close(self) -> None:

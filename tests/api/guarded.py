@@ -134,5 +134,6 @@ def every_route(app: FastAPI) -> list[tuple[str, str]]:
 
 def address(path: str, job: str, asset: str) -> str:
     """A route's path with the ids in their places."""
-    path = path.replace("{kind}", "cameras").replace("{asset}", asset).replace("{thing}", "0")
+    for name, value in {"kind": "cameras", "asset": asset, "thing": "0", "selection": "0" * 16}.items():
+        path = path.replace(f"{{{name}}}", value)
     return re.sub(r"\{(job|lift|tradeoff)\}", job, path)

@@ -101,8 +101,9 @@ def test_scopes_are_as_documented() -> None:
 
 def naming(method: str, path: str, job: str, asset: str, house: Guarded) -> list[dict[str, Any]]:
     """Requests to a route that name a job, a lift or an asset, once for each place that takes a name."""
-    if method == "PATCH":
-        return [{"json": {"encoder" if path.startswith("/assets") else "name": "a name"}}]
+    if method == "PATCH" or "/selections" in path:
+        name = {"encoder" if path.startswith("/assets") else "name": "a name"}
+        return [{"json": {"how": "grow"} if path.endswith("/edits") else name}]
     of_views = {"/photo": {}, "/regions": {"x": 1, "y": 1}, "/regions/mask": {"level": 0, "region": 0}}
     place = next((more for end, more in of_views.items() if path.endswith(end)), None)
     if place is not None:

@@ -1,0 +1,205 @@
+"""Selections over HTTP: begun, corrected, gone back in, asked like any question; whose they are, and how many."""
+
+from __future__ import annotations
+
+import base64
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+
+from service.store import selections as module
+from service.store.database import DATABASE
+from service.store.schema import OF_0_4, TABLES_OF_0_4
+from service.store.store import Store
+
+from .conftest import parts_of
+from .guarded import Guarded, guarded
+from .test_queries import array
+from .tiny_scene import SPLATS_A_CLUSTER, WORDS
+
+LAMP = {"query": {"text": [WORDS[2]], "threshold": 0.5}}
+ALL = 3 * SPLATS_A_CLUSTER
+
+
+@pytest.fixture
+def route(client: TestClient, lift: dict[str, Any]) -> Iterator[str]:
+    yield f"/lifts/{lift['id']}/selections"
+    for one in client.get(f"/lifts/{lift['id']}/selections").json()["selections"]:
+        client.delete(one["links"]["self"])
+
+
+def begun(client: TestClient, route: str, **edit: Any) -> dict[str, Any]:
+    asked = {"name": "mine"} | ({"edit": {"how": "set", **edit}} if edit else {})
+    reply = client.post(route, json=asked)
+    assert reply.status_code == 201, reply.text
+    assert reply.headers["location"] == reply.json()["links"]["self"]
+    return reply.json()
+
+
+def splats_of(client: TestClient, selection: dict[str, Any]) -> list[int]:
+    """Its rows, by the question and by its bits."""
+    asked = array(client.get(selection["links"]["selection"]).content)
+    bits = client.get(selection["links"]["self"], params={"bits": True}).json()["bits"]
+    told = np.unpackbits(np.frombuffer(base64.b64decode(bits), np.uint8), count=ALL, bitorder="little")
+    assert (asked == told).all()
+    return np.flatnonzero(asked).tolist()
+
+
+def test_selection_is_begun_edited_and_gone_back_in(client: TestClient, route: str) -> None:
+    selection = begun(client, route, **LAMP)
+    lamp = splats_of(client, selection)
+    assert 0 < selection["count"] == len(lamp) < ALL
+    assert (selection["step"], selection["first"], selection["last"]) == (0, 0, 0)
+    edits = selection["links"]["edits"]
+    with_apple = client.post(edits, json={"how": "add", "area": "middle:box:0,0,10,24", "through": True}).json()
+    assert with_apple["count"] == len(lamp) + SPLATS_A_CLUSTER and with_apple["box"] is not None
+    assert [step["count"] for step in with_apple["history"]] == [len(lamp), with_apple["count"]]
+    assert with_apple["history"][1]["edit"]["area"] == "middle:box:0,0,10,24"
+    back = client.patch(selection["links"]["self"], json={"step": 0}).json()
+    assert (back["step"], back["last"], splats_of(client, back)) == (0, 1, lamp)
+    grown = client.post(edits, json={"how": "grow", "steps": 9}).json()  # what was undone is forgotten
+    assert (grown["step"], grown["last"]) == (1, 1)
+    assert splats_of(client, grown) == list(range(2 * SPLATS_A_CLUSTER, ALL))
+    renamed = client.patch(selection["links"]["self"], json={"name": "the lamp"}).json()
+    assert client.get(route).json()["selections"][0]["name"] == renamed["name"] == "the lamp"
+    assert client.delete(selection["links"]["self"]).status_code == 204
+    assert client.get(selection["links"]["self"]).status_code == 404
+
+
+def test_selection_is_asked_exported_and_an_example(client: TestClient, lift: dict[str, Any], route: str) -> None:
+    bits = np.packbits(np.arange(ALL) >= ALL - 3, bitorder="little")
+    selection = begun(client, route, bits=base64.b64encode(bits.tobytes()).decode())
+    assert splats_of(client, selection) == [ALL - 3, ALL - 2, ALL - 1]
+    answer = client.get(selection["links"]["query"]).json()
+    assert (answer["count"], answer["present"]) == (3, True)
+    for name, link in answer["links"].items():
+        assert client.get(link).status_code == 200, name
+    assert b"element vertex 3\n" in client.get(selection["links"]["splats"]).content[:200]
+    like = {"lift": lift["id"], "like": f"selection:{selection['id']}"}
+    assert client.get("/query", params=like).json()["count"] > 10
+    tag = client.get(selection["links"]["selection"]).headers["etag"]
+    client.post(selection["links"]["edits"], json={"how": "set", "query": {"sets": ["object:0"]}})
+    changed = client.get(selection["links"]["selection"], headers={"If-None-Match": tag})
+    assert changed.status_code == 200 and array(changed.content).sum() > 3
+
+
+def test_edit_of_an_older_version_is_refused(client: TestClient, route: str) -> None:
+    selection = begun(client, route, **LAMP)
+    edits, own = selection["links"]["edits"], selection["links"]["self"]
+    tag = client.get(own).headers["etag"]
+    first = client.post(edits, json={"how": "grow"}, headers={"If-Match": tag})
+    assert first.status_code == 200 and first.headers["etag"] != tag
+    for method, path, body in (("POST", edits, {"how": "grow"}), ("PATCH", own, {"step": 0}), ("DELETE", own, None)):
+        late = client.request(method, path, json=body, headers={"If-Match": tag})
+        assert (late.status_code, late.json()["type"]) == (412, "/problems/changed")
+    assert client.patch(own, json={"step": 0}, headers={"If-Match": f"W/{first.headers['etag']}"}).status_code == 200
+    assert client.delete(own, headers={"If-Match": "*"}).status_code == 204
+
+
+@pytest.mark.parametrize(
+    ("body", "argument"),
+    [
+        ({"how": "add"}, "how"),
+        ({"how": "grow", "bits": "AA=="}, "how"),
+        ({"how": "add", "bits": "AA=="}, "bits"),
+        ({"how": "add", "bits": "!"}, "bits"),
+        ({"how": "add", "area": "middle:3,3"}, "area"),
+        ({"how": "add", "area": "nowhere:box:0,0,3,3"}, "view"),
+        ({"how": "add", "query": {"sets": ["selection:0123456789abcdef"]}}, "selection"),
+        ({"how": "add", "query": {"sets": ["object:77"]}}, "object"),
+        ({"how": "add", "query": {"text": ["lamp"], "sets": ["object:0"]}}, "sets"),
+        ({"how": "add", "query": {"text": ["lamp"], "lift": "0" * 32}}, "edit.query.lift"),
+        ({"how": "shrink", "steps": 0}, "steps"),
+    ],
+)
+def test_wrong_edits_are_problems_and_change_nothing(
+    client: TestClient, route: str, body: dict[str, Any], argument: str
+) -> None:
+    selection = begun(client, route)
+    reply = client.post(selection["links"]["edits"], json=body)
+    assert reply.status_code in (404, 422) and argument in reply.json()["argument"], reply.text
+    assert client.get(selection["links"]["self"]).json()["version"] == 1
+
+
+def test_selections_and_their_history_are_bounded(
+    client: TestClient, route: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "HISTORY", 2)
+    selection = begun(client, route)
+    last = selection
+    for _ in range(4):
+        last = client.post(selection["links"]["edits"], json={"how": "set", "query": {"sets": ["object:0"]}}).json()
+    assert (last["step"], last["first"], last["last"]) == (4, 2, 4)
+    assert client.patch(selection["links"]["self"], json={"step": 1}).status_code == 422
+    monkeypatch.setattr(module, "MOST", 1)
+    refused = client.post(route, json={"name": "more"})
+    assert (refused.status_code, refused.json()["type"]) == (422, "/problems/over-limit")
+
+
+def test_things_take_names_and_are_hidden(client: TestClient, lift: dict[str, Any], route: str) -> None:
+    objects = f"/lifts/{lift['id']}/objects"
+    listed = client.get(objects).json()["objects"]
+    assert listed and not any(one["hidden"] for one in listed)
+    assert client.patch(f"{objects}/0", json={"name": "the mug"}).json() == {
+        "id": 0, "name": "the mug", "hidden": False
+    }  # fmt: skip
+    assert client.patch(f"{objects}/0", json={"hidden": True}).json()["name"] == "the mug"
+    first = client.get(objects).json()["objects"][0]
+    assert (first["name"], first["score"], first["hidden"]) == ("the mug", None, True)
+    assert client.patch(f"{objects}/0", json={"name": None, "hidden": False}).status_code == 200
+    assert client.get(objects).json()["objects"] == listed
+    assert client.patch(f"{objects}/99", json={"hidden": True}).status_code == 404
+
+
+def test_splat_tells_its_thing(client: TestClient, lift: dict[str, Any]) -> None:
+    objects = f"/lifts/{lift['id']}/objects"
+    for row in (0, ALL - 1):
+        (thing,) = client.get(objects, params={"splat": row}).json()["objects"]
+        members = array(client.get("/query/selection", params={"sets": f"object:{thing['id']}"}).content)
+        assert members[row] and members.sum() == thing["splats"]
+    assert client.get(objects, params={"splat": ALL}).json()["objects"] == []
+
+
+@pytest.fixture
+def hers(tmp_path: Path) -> Iterator[Guarded]:
+    with guarded(tmp_path / "data") as made:
+        yield made
+
+
+def test_selection_belongs_to_whom_its_lift_does_and_goes_with_it(hers: Guarded) -> None:
+    route = f"/lifts/{hers.done}/selections"
+    own = hers.ask("alice", "POST", route, json={"name": "hers"}).json()["links"]["self"]
+    assert hers.ask("boss", "GET", own).status_code == 200
+    for method, path in (("GET", route), ("GET", own), ("DELETE", own), ("PATCH", own), ("POST", f"{own}/edits")):
+        body = {"how": "grow"} if method == "POST" else {} if method == "PATCH" else None
+        assert hers.ask("bob", method, path, json=body).status_code == 404
+    assert hers.ask("alice", "DELETE", f"/jobs/{hers.done}?with_lift=true").status_code == 204
+    with hers.store.database.read() as connection:
+        assert connection.execute("SELECT count(*) FROM selection_steps").fetchone()[0] == 0
+
+
+def test_selections_count_for_the_quota(client: TestClient, lift: dict[str, Any], route: str) -> None:
+    from service.store.owners import SERVICE, stored_bytes
+
+    with parts_of(client).store.database.read() as connection:
+        before = stored_bytes(connection, SERVICE)
+        begun(client, route, **LAMP)
+        assert stored_bytes(connection, SERVICE) > before
+
+
+def test_database_of_release_0_4_gets_the_tables_of_selections(tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir()
+    old = sqlite3.connect(tmp_path / "data" / DATABASE)
+    old.executescript(TABLES_OF_0_4)
+    old.execute(f"PRAGMA user_version = {OF_0_4}")
+    old.close()
+    for _ in range(2):
+        store = Store.open(tmp_path / "data")
+        with store.database.read() as connection:
+            assert connection.execute("SELECT count(*) FROM selections").fetchone()[0] == 0
+        store.close()

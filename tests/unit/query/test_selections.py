@@ -1,0 +1,135 @@
+"""Selections: what each edit takes, against slow definitions; the way back; and what is asked of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from liftcore.errors import InvalidQuery, NotFound
+from liftcore.query.question import Query
+from liftcore.query.scene import Scene
+from liftcore.raster.reference import ReferenceRaster
+from liftcore.scene.touching import touching_pairs
+from tests.api.tiny_scene import SPLATS_A_CLUSTER as OF_A_CLUSTER
+
+ALL = np.arange(3 * OF_A_CLUSTER)
+
+
+def rows_of(splats: np.ndarray) -> list[int]:
+    return np.flatnonzero(splats).tolist()
+
+
+def cluster(number: int) -> np.ndarray:
+    return np.repeat(np.arange(3) == number, OF_A_CLUSTER)
+
+
+def test_edits_take_splats_by_box_area_question_and_booleans(scene: Scene) -> None:
+    selection = scene.select("mine")
+    assert not selection.splats.any() and selection.box is None
+    low, high = scene.axes[:, cluster(0)].min(axis=1), scene.axes[:, cluster(0)].max(axis=1)
+    selection.edit("set", box=(tuple(low.tolist()), tuple(high.tolist())))
+    assert rows_of(selection.splats) == rows_of(cluster(0))
+    selection.edit("add", cluster(2))
+    assert rows_of(selection.splats) == rows_of(cluster(0) | cluster(2))
+    selection.edit("remove", Query(like=["region:left:0:2"], threshold=0.5))
+    assert rows_of(selection.splats) == rows_of(cluster(0))
+    selection.edit("set", area="middle:box:20,0,32,24", through=True)
+    assert rows_of(selection.splats) == rows_of(cluster(2))
+    assert [edit["how"] for edit in selection.history] == ["set", "add", "remove", "set"]
+
+
+def test_edits_are_undone_and_redone_one_by_one(scene: Scene) -> None:
+    selection = scene.select("mine", cluster(0)).edit("add", cluster(1)).undo()
+    assert rows_of(selection.splats) == rows_of(cluster(0))
+    assert rows_of(selection.redo().redo().splats) == rows_of(cluster(0) | cluster(1))
+    selection.undo().edit("add", cluster(2)).redo()  # what was undone is forgotten
+    assert rows_of(selection.splats) == rows_of(cluster(0) | cluster(2))
+    assert not selection.undo().undo().undo().splats.any() and selection.history == ()
+
+
+@pytest.mark.parametrize("area", ["middle:box:4,2,15,20", "middle:stroke:4,4,28,20"])
+def test_area_takes_the_splats_whose_centres_are_seen_there(area: str, scene: Scene) -> None:
+    # By the definition in float64: light is lost by all that a dense A has on the ray before the splat.
+    camera = scene.cameras["middle"]
+    numbers = [int(one) for one in area.split(":")[2].split(",")]
+    x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    if "box" in area:
+        mask = (x >= numbers[0]) & (x < numbers[2]) & (y >= numbers[1]) & (y < numbers[3])
+    else:
+        ends = np.array(numbers, np.float64).reshape(2, 2)
+        way = ends[1] - ends[0]
+        share = np.clip(((x - ends[0, 0]) * way[0] + (y - ends[0, 1]) * way[1]) / (way @ way), 0, 1)
+        mask = np.hypot(x - ends[0, 0] - share * way[0], y - ends[0, 1] - share * way[1]) <= 4
+    places = scene.splats.means.numpy().astype(np.float64) @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    columns = np.floor(places[:, 0] / places[:, 2] * camera.fx + camera.cx).astype(int)
+    lines = np.floor(places[:, 1] / places[:, 2] * camera.fy + camera.cy).astype(int)
+    pixels = torch.tensor(np.stack([columns, lines], axis=1), dtype=torch.int32)
+    rays = ReferenceRaster(scene.splats).ray_rows(camera, pixels, scene.compositing)
+    expected, through = list[int](), list[int]()
+    for splat in ALL:
+        if not mask[lines[splat], columns[splat]]:
+            continue
+        through.append(int(splat))
+        ray = slice(int(rays.indptr[splat]), int(rays.indptr[splat + 1]))
+        on_ray = rays.splats[ray].numpy()
+        before = float(rays.weights[ray].double().numpy()[places[on_ray, 2] < places[splat, 2]].sum())
+        expected += [int(splat)] if before < 0.75 else []
+    selection = scene.select("mine").edit("set", area=area, radius=4)
+    assert rows_of(selection.splats) == expected and 0 < len(expected) < len(through) < len(ALL)
+    assert rows_of(selection.edit("set", area=area, radius=4, through=True).splats) == through
+
+
+def test_selection_grows_and_shrinks_by_splats_that_touch(scene: Scene) -> None:
+    own, near = touching_pairs(scene.splats, ALL)
+    pairs = {(int(a), int(b)) for one, other in zip(own, near, strict=True) for a, b in ((one, other), (other, one))}
+    seed = ALL == 30
+    selection = scene.select("mine", seed).edit("grow", steps=2)
+    grown = {30}
+    for _ in range(2):
+        grown |= {b for a, b in pairs if a in grown}
+    assert set(rows_of(selection.splats)) == grown and 1 < len(grown) < len(ALL)
+    selection.edit("shrink")
+    assert set(rows_of(selection.splats)) == {a for a in grown if all(b in grown for x, b in pairs if x == a)}
+    whole = scene.select("mine", cluster(1)).edit("grow", steps=100)
+    assert rows_of(whole.splats) == rows_of(cluster(1))  # the clusters lie apart
+
+
+def test_selection_is_asked_and_exported_as_it_is(scene: Scene, tmp_path: Path) -> None:
+    strange = cluster(0) | (ALL == 59)  # a splat far away is no stray of a selection
+    scene.select("mine", strange)
+    answer = scene.ask(Query(sets=["selection:mine"]))
+    assert rows_of(answer.selected) == rows_of(strange) and answer.present and answer.count == 21
+    found = scene.objects(answer)
+    assert [one.splats for one in found.objects] == [21] and found.strays == 0
+    assert found.objects[0].box == scene.select("mine").box
+    scene.export(tmp_path / "object.ply", answer, "object")
+    assert Scene(scene.lift).splats.count == 60
+    assert b"element vertex 21\n" in (tmp_path / "object.ply").read_bytes()[:200]
+    like = scene.ask(Query(like=["selection:mine"]))
+    assert rows_of(like.selected) == rows_of(cluster(0))
+    both = scene.select("other", cluster(2)) and scene.objects(Query(sets=["selection:other", "selection:mine"]))
+    assert sorted(one.splats for one in both.objects) == [20, 20]  # a splat of two sets is of the first
+
+
+def test_edits_without_a_source_or_with_two_are_refused(scene: Scene) -> None:
+    selection = scene.select("mine", cluster(0))
+    with pytest.raises(InvalidQuery, match="one of query, area, box, bits"):
+        selection.edit("add")
+    with pytest.raises(InvalidQuery, match="no source"):
+        selection.edit("grow", cluster(0))
+    with pytest.raises(InvalidQuery, match="a boolean for each of 60"):
+        selection.edit("add", np.zeros(3, np.bool_))
+    with pytest.raises(InvalidQuery, match="8 bytes for 60"):
+        selection.edit("add", bits="AAAA")
+    with pytest.raises(InvalidQuery, match="VIEW:box"):
+        selection.edit("add", area="middle:3,4")
+    with pytest.raises(NotFound, match="a selection of the scene: mine"):
+        scene.ask(Query(sets=["selection:yours"]))
+    with pytest.raises(InvalidQuery, match="object:N or selection:NAME"):
+        scene.select("a:b")
+    with pytest.raises(InvalidQuery, match="without texts and examples"):
+        Query(text=["apple"], sets=["object:1"])
+    assert rows_of(selection.splats) == rows_of(cluster(0)) and len(selection.history) == 1
