@@ -11,6 +11,7 @@ from liftcore.query.question import (
     ListedObjects,
     Notation,
     OwnCamera,
+    SceneTree,
     Seen,
 )
 from liftcore.query.terms import NOTATIONS
@@ -18,5 +19,5 @@ from liftcore.runtime.fields import Body, NoBoolean, takes
 
 __all__ = [
     "METHODS", "NOTATIONS", "AskableWords", "BestWords", "Body", "Box", "Edit", "Found", "FoundWords",
-    "ListedObjects", "NoBoolean", "Notation", "OwnCamera", "Seen", "takes",
+    "ListedObjects", "NoBoolean", "Notation", "OwnCamera", "SceneTree", "Seen", "takes",
 ]  # fmt: skip

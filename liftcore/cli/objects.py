@@ -11,6 +11,8 @@ from liftcore.cli.options import Parser, add_encoder, place, text_encoder
 from liftcore.cli.query import made_from
 from liftcore.cli.reply import free_outputs, place_of, reply, write_files
 from liftcore.cli.segment import read_words
+from liftcore.errors import InvalidQuery
+from liftcore.files import check_output
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -24,6 +26,7 @@ def add_arguments(parser: Parser) -> None:
     named = "name each by the nearest of these words: a file of one a line, or a text table (.safetensors)"
     parser.add_argument("--vocabulary", type=Path, metavar="FILE", help=named)
     add_encoder(parser)
+    parser.add_argument("--tree", action="store_true", help="their parts and groups of them, too")
     parser.add_argument("--features", action="store_true", help="with --json: each one's mean feature, too")
     parser.add_argument("--csv", type=Path, metavar="CSV", help="write the list as a table")
     parser.add_argument("--splats", type=Path, metavar="FOLDER", help="write one PLY an object, object-ID.ply")
@@ -39,6 +42,8 @@ def run(options: argparse.Namespace) -> int:
     scene = Scene(options.lift)
     if files or options.splats:
         free_outputs(files, made_from(scene))
+    if options.tree:
+        return _tree(options, scene)
     encoder, found = named_catalogue(options, scene)
     answer = found.summary(features=options.features)
     document: dict[str, Any] = {"encoder": None if encoder is None else encoder.name}
@@ -51,8 +56,6 @@ def run(options: argparse.Namespace) -> int:
     document |= {"explanation": found.explanation, "objects": objects}
     exports: dict[str, Any] = {"csv": partial(scene.export, source=found)}
     if options.splats:
-        from liftcore.files import check_output
-
         for one in found.objects:
             name = f"object-{one.id}"
             files[name] = check_output(options.splats / f"{name}.ply", [*given, *made_from(scene)], "ply")
@@ -66,6 +69,40 @@ def named_catalogue(options: argparse.Namespace, scene: Scene) -> tuple[TextEnco
     """The objects of a lift, named by ``--vocabulary`` or the words of the encoder, and that encoder."""
     encoder, words = _vocabulary(options, scene)
     return encoder, scene.catalogue(words, encoder=encoder)
+
+
+def _tree(options: argparse.Namespace, scene: Scene) -> int:
+    """List the nodes of the tree, and write what was asked for."""
+    encoder, words = _vocabulary(options, scene)
+    if options.csv or options.features:
+        named = "--csv" if options.csv else "--features"
+        raise InvalidQuery(named, expected="the list of objects", got="--tree", hint="--json has the tree")
+    answer = scene.tree(words, encoder=encoder)
+    files, exports = dict[str, Any](), dict[str, Any]()
+    for one in answer.nodes if options.splats else ():
+        name = "-".join(["object", *map(str, one.path)])
+        given = [path for path in (options.lift, options.table, options.vocabulary) if path]
+        files[name] = check_output(options.splats / f"{name}.ply", [*given, *made_from(scene)], "ply")
+        exports[name] = partial(scene.export, source=one.id)
+    document: dict[str, Any] = {"encoder": None if encoder is None else encoder.name}
+    document |= {"answer": answer.model_dump(mode="json"), "files": write_files(files, exports)}
+    reply(document, as_json=options.json, lines=_tree_lines(document["answer"], document["files"]))
+    return 0
+
+
+def _tree_lines(answer: dict[str, Any], files: dict[str, str]) -> Iterable[str]:
+    yield answer["explanation"]
+    nodes = {one["id"]: one for one in answer["nodes"]}
+    waiting = [one["id"] for one in answer["nodes"] if one["parent"] is None][::-1]
+    while waiting:
+        one = nodes[waiting.pop()]
+        name = "" if one["name"] is None else f" {one['name']} ({one['score']:.3f})"
+        yield (
+            f"{'  ' * len(one['path'])}{one['id']}{name}, {one['kind']}: {one['splats']} splats, {one['share']:.1%} "
+            f"of the evidence, a mask of it in {one['confidence']:.0%} of the views that see it"
+        )
+        waiting += one["parts"][::-1]
+    yield from (f"  {kind}: {path}" for kind, path in files.items())
 
 
 def _vocabulary(options: argparse.Namespace, scene: Scene) -> tuple[TextEncoder | None, list[str]]:

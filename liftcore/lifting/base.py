@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from liftcore.runtime.device import Device
     from liftcore.solve.aggregate import Aggregation
     from liftcore.solve.diagnostics import ViewMeasures
-    from liftcore.solve.objects import RegionObjects
+    from liftcore.solve.objects import NodeVectors, RegionObjects
     from liftcore.values.lift_views import LiftViews
 
 Weights = TypeVar("Weights")  # W of all views, wherever it lies; a value that no step changes
@@ -62,7 +62,11 @@ class Steps(Protocol[Weights]):
         ...
 
     def find_objects(self, W: Weights) -> RegionObjects:
-        """Find what masks of many views keep together."""
+        """Find what masks of many views keep together, and the parts of it."""
+        ...
+
+    def node_vectors(self, W: Weights, objects: RegionObjects) -> NodeVectors:
+        """What the masks of each node say, before W is reweighted."""
         ...
 
     def compare_masks(self, W: Weights) -> Weights:

@@ -27,12 +27,14 @@ from liftcore.solve.aggregate import Aggregation, aggregate, solve_from_kept_reg
 from liftcore.solve.closed_form import solve
 from liftcore.solve.consensus import mask_consensus
 from liftcore.solve.diagnostics import ViewMeasures, measure_samples
+from liftcore.solve.directions import region_totals
 from liftcore.solve.least_squares import AllRays, reference, refine
 from liftcore.solve.loss import huber_factors
-from liftcore.solve.objects import RegionObjects, region_objects
+from liftcore.solve.objects import NodeVectors, RegionObjects, region_objects
 from liftcore.solve.reweight import Agreement, agreement_factors, reweighted, whole_regions
 from liftcore.solve.smooth import smooth
 from liftcore.solve.smooth_by_halves import choose_smoothness
+from liftcore.solve.sums import added
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import LiftSettings
@@ -112,6 +114,11 @@ class InMemory(Steps[SceneWeights]):
 
     def find_objects(self, W: SceneWeights) -> RegionObjects:
         return region_objects(W.weights.cpu(), W.geometry.levels, W.geometry.evidence().numpy(), self.threads)
+
+    def node_vectors(self, W: SceneWeights, objects: RegionObjects) -> NodeVectors:
+        codebook = W.geometry.codebook
+        totals = added(region_totals(W.weights.cpu(), self.threads), (1, codebook.regions))[0]
+        return NodeVectors.of(codebook, totals, objects)
 
     def compare_masks(self, W: SceneWeights) -> SceneWeights:
         weights = W.weights.cpu()

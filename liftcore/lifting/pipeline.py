@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Unpack
 
+import numpy as np
 import torch
 
 from liftcore.errors import InvalidSettings
@@ -26,7 +27,7 @@ from liftcore.runtime.torch_modes import usual_modes
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
 from liftcore.solve.diagnostics import ViewMeasures, certify, lift_warnings
-from liftcore.solve.objects import object_facts
+from liftcore.solve.objects import NodeVectors, RegionObjects, object_facts
 from liftcore.solve.reweight import agreement_facts
 from liftcore.values.lift_options import LiftOptions
 from liftcore.values.lift_views import Given
@@ -122,10 +123,11 @@ def _run(
     settings, views = inputs.settings, inputs.views
     with timings.stage("geometry"):
         W, weighed = steps.weigh(views, plan, on_plan)
-    objects = aggregation = None
+    objects = said = aggregation = None
     if settings.finds_objects(weighed.masks):
         with timings.stage("objects"):
             objects = steps.find_objects(W)
+            said = steps.node_vectors(W, objects) if settings.objects else None
     W, reliability = reweigh(steps, W, weighed.masks, settings, timings)
     clusters = objects if settings.clusters_by_masks else None
     with timings.stage("solve"):
@@ -144,9 +146,8 @@ def _run(
         facts["aggregation"] = aggregation.facts
     if settings.robust_steps:
         facts["reweighting"] = agreement_facts(weighed.levels, reliability, support.confidence)
-    objects = objects if settings.objects else None
-    if objects:
-        facts["objects"] = object_facts(objects)
+    if objects and said:
+        facts["objects"] = object_facts(objects, said)
     with timings.step("certify"):
         measures = steps.measure(W, X)
         diagnostics = diagnose(inputs, weighed, X.dtype, support, measures, facts)
@@ -161,10 +162,17 @@ def _run(
         cluster=aggregation.clusters if aggregation else None,
         cluster_features=aggregation.cluster_features if aggregation else None,
         embeddings=torch.from_numpy(table.embeddings) if table else None,
-        object=torch.from_numpy(objects.labels) if objects else None,
-        object_views=torch.from_numpy(objects.views) if objects else None,
+        **(object_tensors(objects, said) if objects and said else {}),
     )
     return steps.deliver(W, lift)
+
+
+def object_tensors(objects: RegionObjects, said: NodeVectors) -> dict[str, torch.Tensor]:
+    """What a lift holds of objects and their parts."""
+    columns = {"object": objects.labels, "object_views": objects.views, "node": objects.node}
+    columns |= {"node_parents": objects.tree.parents, "node_views": objects.node_views}
+    columns |= {"node_confidence": objects.tree.confidence, "node_features": said.vectors.astype(np.float16)}
+    return {name: torch.from_numpy(column) for name, column in columns.items()}
 
 
 def reweigh(

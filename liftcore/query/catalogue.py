@@ -1,8 +1,11 @@
-"""The objects of a lift, one by one: where each lies, how large it is, what shows it best, and its name.
+"""The objects of a lift and their parts, one by one: where each lies, how large it is, what shows it, and its name.
 
 Objects are found at lift time by masks alone (`liftcore.solve.objects`); the lift keeps one number a splat. They are
 numbered from 0, the one with the most evidence first, the same for the same lift. An object's feature is the mean of
 its splats' unit features by evidence. Its name is the nearest word, however far that is; the cosine says how far.
+
+Parts and groups are numbered after the objects. Their features are what their own masks say, without those of their
+parts (`liftcore.solve.objects.NodeVectors`): a splat's feature is the sum of what all levels say.
 """
 
 from __future__ import annotations
@@ -11,14 +14,15 @@ import csv
 import io
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from liftcore.errors import InvalidQuery, NotFound
+from liftcore.errors import InvalidQuery
 from liftcore.query.objects import largest_box
 from liftcore.query.opened import OpenedLift, as_numpy
-from liftcore.query.question import ListedObjects, SceneObject
+from liftcore.query.question import ListedObjects, SceneNode, SceneObject, SceneTree
 from liftcore.query.scores import cosines, norms_of
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.origin import MAP_REACH
@@ -29,6 +33,7 @@ NOT_LOOKED_FOR = (
     "this lift holds no objects: they are found by lifts of masks, by the preset default or the setting objects; "
     "grids have no masks"
 )
+NO_TREE = "this lift holds no tree: it was made before lifts had one; lift again"
 NONE_FOUND = "no object: masks of three views never keep the same splats together"
 _BLOCK = 1 << 14  # rows of features widened at once
 
@@ -70,33 +75,79 @@ def catalogue(scene: OpenedLift, words: Sequence[str] = (), vectors: Any = None)
     """
     if scene.object is None or scene.object_views is None:
         return Catalogue((), NOT_LOOKED_FOR, np.zeros((0, scene.channels), np.float32))
-    labels, number = scene.object, len(scene.object_views)
+    number = len(scene.object_views)
     features = object_features(scene)
-    names, scores = _named(features, words, vectors)
+    facts = _described(scene, scene.object, np.arange(number), scene.object_views, _named(features, words, vectors))
+    told = f"{number} objects, which masks of three or more views keep together" if number else NONE_FOUND
+    return Catalogue(tuple(SceneObject(**one) for one in facts), told, features)
+
+
+def tree(scene: OpenedLift, words: Sequence[str] = (), vectors: Any = None) -> SceneTree:
+    """The objects of a lift with their parts and groups, named by the nearest of some words; arguments as above.
+
+    Raises:
+        InvalidQuery, InvalidLift: as `catalogue`.
+    """
+    if scene.object is None or scene.object_views is None:
+        return SceneTree(explanation=NOT_LOOKED_FOR, count=0, nodes=())
+    if scene.node is None or scene.node_parents is None or scene.node_views is None:
+        return SceneTree(explanation=NO_TREE, count=0, nodes=())
+    assert scene.node_confidence is not None and scene.node_features is not None
+    objects, parents = len(scene.object_views), scene.node_parents
+    features = np.concatenate([object_features(scene), scene.node_features[objects:].astype(np.float32)])
+    order = np.array(sorted(range(len(parents)), key=lambda node: (len(scene.node_path(node)), node)), np.int64)
+    place = np.empty(len(parents) + 1, np.int64)
+    place[order], place[-1] = np.arange(len(parents)), -1
+    splats, above = place[scene.node], place[parents[order]]
+    facts = _described(scene, splats, above, scene.node_views[order], _named(features[order], words, vectors))
+    nodes = []
+    for one, node in sorted(zip(facts, order.tolist(), strict=True), key=lambda pair: pair[1]):
+        path = scene.node_path(node)
+        under = np.flatnonzero(parents == node).tolist()
+        kind = "object" if node < objects else "part" if min(path) < objects else "group"
+        more = {"id": node, "kind": kind, "path": path, "parts": tuple(under)}
+        parent = int(parents[node]) if parents[node] >= 0 else None
+        confidence = float(scene.node_confidence[node])
+        nodes.append(SceneNode(**one | more, parent=parent, confidence=confidence))
+    counts = {kind: sum(one.kind == kind for one in nodes) for kind in ("object", "part", "group")}
+    told = f"{counts['object']} objects with {counts['part']} parts, in {counts['group']} groups"
+    return SceneTree(explanation=told if nodes else NONE_FOUND, count=len(nodes), nodes=tuple(nodes))
+
+
+def _described(
+    scene: OpenedLift,
+    labels: np.ndarray,
+    above: np.ndarray,
+    views: np.ndarray,
+    named: tuple[list[str | None], list[float | None]],
+) -> list[dict[str, Any]]:
+    """The fields of a `SceneObject` of each of some nodes, whose splats are also those of the nodes above them.
+
+    Args:
+        labels: [P] i32, the smallest node of each splat, -1 for none. above: [N], the node above each, which comes
+            before it; -1 or itself: none. views: [N, V] i32. named: name and score of each.
+    """
     order = np.argsort(labels, kind="stable")
-    ends = np.searchsorted(labels[order], np.arange(number + 1))
+    ends = np.searchsorted(labels[order], np.arange(len(views) + 1))
+    rows_of = [order[first:last] for first, last in pairwise(ends.tolist())]
+    for node in range(len(views) - 1, -1, -1):
+        if 0 <= above[node] < node:
+            rows_of[above[node]] = np.concatenate([rows_of[above[node]], rows_of[node]])
     evidence = scene.evidence.astype(np.float64)
     whole, known = evidence.sum() or 1.0, scene.metadata.views
     found = []
-    for one in range(number):
-        rows = order[ends[one] : ends[one + 1]]
+    for one, (name, score, mixed) in enumerate(zip(*named, rows_of, strict=True)):
+        rows = np.sort(mixed)
         weights = evidence[rows] if evidence[rows].any() else np.ones(rows.size)
         box = largest_box(scene.splats, rows, weights)
         x, y, z = np.mean(box, axis=0).tolist()
+        shown = tuple(known[view] for view in views[one] if 0 <= view < len(known))
+        share = float(evidence[rows].sum() / whole)
         found.append(
-            SceneObject(
-                id=one,
-                name=names[one],
-                score=scores[one],
-                splats=int(rows.size),
-                share=float(evidence[rows].sum() / whole),
-                centre=(x, y, z),
-                box=box,
-                views=tuple(known[view] for view in scene.object_views[one] if 0 <= view < len(known)),
-            )
+            {"id": one, "name": name, "score": score, "splats": int(rows.size), "share": share, "centre": (x, y, z)}
+            | {"box": box, "views": shown}
         )
-    told = f"{number} objects, which masks of three or more views keep together" if number else NONE_FOUND
-    return Catalogue(tuple(found), told, features)
+    return found
 
 
 def object_features(scene: OpenedLift) -> np.ndarray:
@@ -158,21 +209,12 @@ def table_csv(found: Catalogue) -> bytes:
 
 
 def one_object_splats(scene: OpenedLift, number: int, suffix: str = ".ply") -> Iterable[bytes]:
-    """The splats of one object, as a file in blocks; of a PLY every property of theirs to the byte.
+    """The splats of one object, or another node, as a file in blocks; of a PLY every property of theirs to the byte.
 
     Raises:
-        NotFound: the lift has no object of that number.
+        NotFound: the lift has no such object.
         InvalidLift: the splats moved or changed since the lift.
     """
     from liftcore.io.splats import some_rows
 
-    return some_rows(scene.splat_file, object_members(scene, number), suffix)
-
-
-def object_members(scene: OpenedLift, number: int) -> np.ndarray:
-    """[P] bool, the splats of an object; NotFound where the lift has none of that number."""
-    count = 0 if scene.object_views is None else len(scene.object_views)
-    if scene.object is None or not 0 <= number < count:
-        expected = f"a number from 0 to {count - 1}" if count else "a lift with objects"
-        raise NotFound("object", expected=expected, got=str(number), hint="the list of the lift's objects has them")
-    return scene.object == number
+    return some_rows(scene.splat_file, scene.members(number), suffix)

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from liftcore.errors import InvalidLift, InvalidQuery
+from liftcore.errors import InvalidLift, InvalidQuery, NotFound
 from liftcore.io.splats import quick_count
 from liftcore.query.scores import mean_direction, norms_of
 from liftcore.scene.kernel import Kernel
 from liftcore.text.table import TableEncoder, own_words
-from liftcore.values.lift_file import read_lift
+from liftcore.values.lift_file import NODE_TENSORS, OBJECT_TENSORS, read_lift
 
 if TYPE_CHECKING:  # these load torch
     from torch import Tensor
@@ -54,6 +54,16 @@ class OpenedLift:
     """[P] i32, -1 = of no object; None: objects were not looked for"""
     object_views: np.ndarray | None
     """[N, V] i32, of `Lift`"""
+    node: np.ndarray | None
+    """[P] i32, the smallest node of each splat (`Lift`); None in lifts without a tree"""
+    node_parents: np.ndarray | None
+    """[T] i32, -1 for none"""
+    node_views: np.ndarray | None
+    """[T, V] i32"""
+    node_confidence: np.ndarray | None
+    """[T] f32 in 0..1"""
+    node_features: np.ndarray | None
+    """[T, F] f16, unit; zero for none"""
     _told: str
     """the metadata of a lift file, as JSON"""
     _moved: dict[str, Path | None]
@@ -81,7 +91,7 @@ class OpenedLift:
             given: dict[str, Any] = {}
         else:
             names = ("features", "evidence", "seen", "cluster", "cluster_features", "confidence", "embeddings")
-            arrays = {name: as_numpy(getattr(source, name)) for name in (*names, "object", "object_views")}
+            arrays = {name: as_numpy(getattr(source, name)) for name in (*names, *OBJECT_TENSORS, *NODE_TENSORS)}
             self.path, moved = Path("lift"), None
             given = {"lift": source, "metadata": self._with_places(source.metadata)}
         self._hold(arrays)
@@ -100,6 +110,9 @@ class OpenedLift:
         self.confidence = arrays.get("confidence")
         self._embeddings = arrays.get("embeddings")
         self.object, self.object_views = arrays.get("object"), arrays.get("object_views")
+        self.node, self.node_parents = arrays.get("node"), arrays.get("node_parents")
+        self.node_views, self.node_confidence = arrays.get("node_views"), arrays.get("node_confidence")
+        self.node_features = arrays.get("node_features")
 
     def encoder(
         self,
@@ -243,6 +256,34 @@ class OpenedLift:
         ends = np.searchsorted(own[order], np.arange(len(self.object_views) + 1))
         means = [self.mean_of(order[first:last]) for first, last in pairwise(ends.tolist())]
         return np.stack(means) if means else np.zeros((0, self.channels), np.float32)
+
+    def node_path(self, node: int) -> tuple[int, ...]:
+        """The nodes of the tree that hold a node, the largest first, and itself."""
+        assert self.node_parents is not None
+        found = [node]
+        while (above := int(self.node_parents[found[-1]])) >= 0:
+            found.append(above)
+        return tuple(reversed(found))
+
+    def members(self, number: int) -> np.ndarray:
+        """[P] bool, the splats of an object, or of another node of the tree with its parts.
+
+        Raises:
+            NotFound: the lift has no such object.
+        """
+        count = 0 if self.object_views is None else len(self.object_views)
+        nodes = count if self.node_parents is None else len(self.node_parents)
+        if self.object is None or not 0 <= number < nodes:
+            expected = f"a number from 0 to {nodes - 1}" if nodes else "a lift with objects"
+            hint = "the list of the lift's objects has them"
+            raise NotFound("object", expected=expected, got=str(number), hint=hint)
+        if self.node is None or self.node_parents is None:
+            return self.object == number
+        below, above = np.zeros(nodes + 1, np.bool_), np.arange(nodes)
+        while (above >= 0).any():
+            below[:-1] |= above == number
+            above = np.where(above >= 0, self.node_parents[above], -1)
+        return below[self.node]  # the last place is of no node
 
     def mean_of(self, rows: np.ndarray) -> np.ndarray:
         """[F] f32, the unit mean of the unit features of splats [n] by evidence; of many, of evenly chosen ones."""

@@ -537,6 +537,24 @@ class ListedObjects(Value):
     objects: tuple[SceneObject, ...]
 
 
+class SceneNode(SceneObject):
+    """An object, a part of one, or a group of objects; what is said of objects holds for it."""
+
+    kind: Literal["object", "part", "group"]
+    parent: int | None = Field(description="the node that it is a part of; null where it is of none")
+    path: tuple[int, ...] = Field(description="the nodes that hold it, the largest first, and itself")
+    parts: tuple[int, ...] = Field(description="the nodes that are its parts, those with the most evidence first")
+    confidence: float = Field(description="of the views that see it, the share that has a mask of the whole")
+
+
+class SceneTree(Value):
+    """Objects, their parts and groups of them, or some of these; the first are the objects."""
+
+    explanation: str = Field(description="why there are so many; or why there are none")
+    count: int = Field(description="of all pages")
+    nodes: tuple[SceneNode, ...]
+
+
 class CoveringRegion(Value):
     """A region that covers a pixel."""
 

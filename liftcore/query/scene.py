@@ -18,7 +18,15 @@ if TYPE_CHECKING:  # these load torch
     from liftcore.io.labels import Labels
     from liftcore.query.ask import Question
     from liftcore.query.catalogue import Catalogue
-    from liftcore.query.question import Answer, AskableWords, BestWord, CoveringRegion, Objects, Query
+    from liftcore.query.question import (
+        Answer,
+        AskableWords,
+        BestWord,
+        CoveringRegion,
+        Objects,
+        Query,
+        SceneTree,
+    )
     from liftcore.query.render import ViewMask
     from liftcore.query.segment import Segmentation
     from liftcore.query.selections import Selection
@@ -198,6 +206,20 @@ class Scene(OpenedLift):
         if words and vectors is None:
             vectors = self.encoder(encoder).encode(words)
         return catalogue(self, words, vectors)
+
+    def tree(
+        self, words: Sequence[str] = (), vectors: Any = None, *, encoder: TextEncoder | str | Path | None = None
+    ) -> SceneTree:
+        """The objects of `catalogue` with their parts and groups of them: a node's parts are nodes, too.
+
+        Args:
+            words, vectors, encoder: as in `catalogue`.
+        """
+        from liftcore.query.catalogue import tree
+
+        if words and vectors is None:
+            vectors = self.encoder(encoder).encode(words)
+        return tree(self, words, vectors)
 
     def segment(
         self,

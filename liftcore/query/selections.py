@@ -157,9 +157,7 @@ def set_members(scene: OpenedLift, members: SplatSet) -> np.ndarray:
             known = ", ".join(list(scene.selections)[:20]) or "none yet"
             raise NotFound("selection", expected=f"a selection of the scene: {known}", got=repr(members.name))
         return found.splats
-    from liftcore.query.catalogue import object_members
-
-    return object_members(scene, int(members.name))
+    return scene.members(int(members.name))
 
 
 def _source(scene: OpenedLift, edit: Edit, answer: Answer | None) -> np.ndarray:

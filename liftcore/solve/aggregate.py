@@ -113,7 +113,7 @@ def aggregate(
     names = views.names
     progress("aggregate", 0, len(names), "views")
     if things is not None:
-        clustering = Clustering(torch.from_numpy(things.labels), len(things.views), {"clustered_by": "graph"})
+        clustering = Clustering(torch.from_numpy(things.labels), things.count, {"clustered_by": "graph"})
     else:
         clustering = cluster_splats(features, evidence, settings, threads)
         if settings.aggregation_clusters != "hdbscan":

@@ -1,52 +1,53 @@
 """Objects without words: regions that other views keep together are one thing. No feature is read.
 
-Regions are nodes. With R as mask consensus has it (`liftcore.solve.consensus`), splats counting by ``sqrt(t_j)``, a
-level of view v **sees** region m where it holds at least OBSERVES of it, and its region n **contains** m where n has
-CONTAINS of what the level holds. View v observes a pair where it sees both, and supports it where a region of any of
-its levels contains both, so that masks of a whole thing hold its parts together. Then::
+Regions are nodes of a graph; `liftcore.solve.region_tree` says which of them are one thing, and which its parts. Here
+it gets what it reads, the containers of each node: with R as mask consensus has it (`liftcore.solve.consensus`),
+splats counting by ``sqrt(t_j)``, a level of a view **sees** region m where it holds at least OBSERVES of it, and its
+region n **contains** m where n has CONTAINS of what the level holds.
 
-    rate(A, B) = (sum of supporting views) / (sum of observing views)      over pairs of a region of A with one of B
-
-and the two clusters of the highest rate become one, down to a rate of TOGETHER. That is average linkage in which a
-pair counts as often as it was observed: opposite sides of a wall, which no view sees together, neither join nor part.
-A rate of two clusters with a third lies between their own, so that neighbour chains find the same tree as a search
-among all pairs does (Murtagh 1983). Compare MaskClustering (Yan et al., CVPR 2024), whose consensus rate this is.
-
-A cluster with regions of LEAST_VIEWS views is an **object**. A splat belongs to the object whose regions weigh most
-at it, if these have half of all objects' weight there. Objects are numbered by evidence, the largest first.
+A splat belongs to a **path** of nodes: to the root whose regions, with those of its parts, weigh most at it, if these
+have half of all roots' weight there; then to the part of it that weighs most, if this has half of all parts' weight
+and of what the levels that show the part have there; and so on. A part that has SAME_SPLATS of its whole's splats is
+that whole, seen twice. **Objects** are the roots, numbered by evidence, the largest first; of a root that holds
+MOST_OF_SCENE of the splats, its parts are. Other nodes are numbered after them.
 
 Memory and time are bounded: nodes are the regions of evenly chosen views, MOST_REGIONS at most, with two tables of
-that square (134 MB); regions of other views then join the object that has most of them. Counts are whole numbers and
-sums have the order of splats, so that the number of threads changes no bit.
+that square (134 MB); regions of other views then join the smallest node that has most of them. Counts are whole
+numbers and sums have the order of splats, so that the number of threads changes no bit.
 
 **How it splits.** What contains a node is a function of MOST_SPLATS of its splats and of the nodes that these belong
-to, so blocks of views find it for their own nodes (`node_views`). The graph is the driver's. The object of a splat is
-a function of its row of W (`object_labels`); the objects of the other regions and the best views are sums over
-splats, taken by pieces (`object_shares`, `view_shares`).
+to, so blocks of views find it for their own nodes (`node_containers`). The tree is the driver's. The path of a splat
+is a function of its row of W (`node_labels`); the nodes of the other regions and the best views are sums over splats,
+taken by pieces (`node_shares`, `view_shares`).
 """
 
+import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import torch
 from scipy.sparse import csr_array
 
 from liftcore.runtime.jit import kernel
+from liftcore.solve.codebook import Codebook
 from liftcore.solve.consensus import SplatTuples
 from liftcore.solve.membership import Memberships, RegionGroups, memberships
+from liftcore.solve.region_tree import NO_NODE, SPLIT, UNSEEN, RegionTree, node_groups, region_tree
 from liftcore.solve.sums import PieceSums, added, in_order, piece_sums, pieces
 from liftcore.values.region_weights import RegionWeights, row_blocks, run_each
 
-NO_OBJECT = -1
+CPU = torch.device("cpu")
 OBSERVES = 0.3  # of a region, that a level must see to say anything of it, as for mask consensus
 CONTAINS = 0.7  # of what a level sees of a region: less, and the region lies across two others
-TOGETHER = 0.5  # of the views that see two regions: most of them
-LEAST_VIEWS = 3  # with a region of a thing: two may make the same mistake
+SAME_SPLATS = 0.9  # of a whole, from which a part is that whole
+MOST_OF_SCENE = 0.8  # of its splats: what holds more sets nothing apart
+SAY_THE_SAME = 0.8  # cosine of parts and wholes: of masks that are named alike it is .95 and more
 MOST_REGIONS = 1 << 12
 FEWEST_VIEWS = 16  # that give nodes, where there are so many, however many regions they have
 MOST_SPLATS = 1 << 11  # of a region, evenly chosen: a share needs no more
-BEST_VIEWS = 5  # that are kept of each object
+BEST_VIEWS = 5  # that are kept of each node
 BLOCK_ENTRIES = 1 << 18
 
 
@@ -62,20 +63,28 @@ class NodeSplats:
 
 
 @dataclass(frozen=True)
-class NodeViews:
-    """What levels and views say of some nodes."""
+class RegionObjects:
+    """What the graph of regions holds together: N nodes, of which the first K are objects."""
 
-    container: np.ndarray  # [n, views * levels] i32, the node of each level that contains it; -1: none
-    sees: np.ndarray  # [n, views] f32, one where the view sees it
+    labels: np.ndarray  # [P] i32, the object of each splat; -1 for none
+    node: np.ndarray  # [P] i32, the smallest node of each splat; -1 for none
+    tree: RegionTree  # of all views; its nodes in no order but that the first are objects
+    node_views: np.ndarray  # [N, BEST_VIEWS] i32, that show most of each, best first; -1 after the last
+    count: int  # K
+
+    @property
+    def views(self) -> np.ndarray:
+        """[K, BEST_VIEWS] i32, those of objects."""
+        return self.node_views[: self.count]
 
 
 @dataclass(frozen=True)
-class RegionObjects:
-    """What the graph of regions holds together."""
+class NodeNumbers:
+    """What the nodes of a tree are, once it is known which splats they hold: [N + 1] i32 each, the last -1."""
 
-    labels: np.ndarray  # [P] i32, the object of each splat; -1 for none
-    views: np.ndarray  # [K, BEST_VIEWS] i32, the views that show most of each, best first; -1 after the last
-    regions: np.ndarray  # [M] i32, the object of each region; -1 for none
+    node: np.ndarray  # its number, that of its whole where it is the same thing; -1: no splat is of it
+    object: np.ndarray  # the object that it is or is of; -1 for none
+    count: int  # objects
 
 
 def region_objects(
@@ -86,7 +95,7 @@ def region_objects(
     *,
     members: Memberships | None = None,
 ) -> RegionObjects:
-    """The objects of a scene whose W lies in one place.
+    """The objects of a scene whose W lies in one place, with their parts.
 
     Args:
         W: of all views, by rows of codebooks, on the CPU.
@@ -100,15 +109,14 @@ def region_objects(
     sizes = np.bincount(W.region.numpy()[members.own], minlength=levels.size)
     nodes, others = choose_nodes(groups, sizes)
     table = node_splats(W, members, nodes, threads)
-    clusters = node_clusters(nodes, groups, node_views(table, nodes, groups, threads), threads)
-    number = int(clusters.max(initial=-1)) + 1
-    labels = object_labels(W, clusters, number, threads)
+    tree = region_tree(nodes, groups, node_containers(table, nodes, groups, threads), threads)
+    number = tree.parents.size
+    labels = node_labels(W, groups, tree, threads)
     if number and others.size:
-        join(clusters, others, object_shares(W, labels, number, others, threads), number)
-        labels = object_labels(W, clusters, number, threads)
+        tree = with_others(tree, others, node_shares(W, labels, number, others, threads))
+        labels = node_labels(W, groups, tree, threads)
     shown = added(view_shares(W, groups, labels, number, threads), (1, number * groups.views))
-    place = object_numbers(labels, evidence, number)
-    return numbered(labels, clusters, place, shown.reshape(number, groups.views))
+    return numbered(labels, tree, node_numbering(labels, evidence, tree), shown.reshape(number, groups.views))
 
 
 def choose_nodes(groups: RegionGroups, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -198,104 +206,52 @@ def by_node(starts: np.ndarray, members: np.ndarray, nodes: int) -> tuple[np.nda
     return table.indptr, table.indices
 
 
-def node_views(table: NodeSplats, nodes: np.ndarray, groups: RegionGroups, threads: int | None = None) -> NodeViews:
-    """What the levels and views of all nodes say of those of a table.
+def node_containers(
+    table: NodeSplats, nodes: np.ndarray, groups: RegionGroups, threads: int | None = None
+) -> np.ndarray:
+    """[n, views * levels] i32: of the nodes of a table, the node of each level that contains it, SPLIT or UNSEEN.
 
     Args:
         nodes: [N] i64, all of them, as the table's members number them.
     """
-    number, group, views = _node_groups(nodes, groups)
+    _, group, views = node_groups(nodes, groups)
     size = table.begins.size - 1
-    found = NodeViews(np.full((size, groups.levels * views), -1, np.int32), np.zeros((size, views), np.float32))
+    found = np.full((size, groups.levels * views), UNSEEN, np.int32)
     arrays = table.begins, table.splats, table.starts, table.members, table.counts
     run_each(
-        lambda a, b: contain(a, b, *arrays, group, groups.levels, found.container, found.sees),
-        row_blocks(np.diff(table.begins), max(size, 1), BLOCK_ENTRIES >> 3) if number.size else [],
+        lambda a, b: contain(a, b, *arrays, group, found),
+        row_blocks(np.diff(table.begins), max(size, 1), BLOCK_ENTRIES >> 3) if nodes.size else [],
         threads,
     )
     return found
 
 
-def _node_groups(nodes: np.ndarray, groups: RegionGroups) -> tuple[np.ndarray, np.ndarray, int]:
-    """The view of each node among those of nodes, [N] i64, its group among theirs [N] i32, and how many views."""
-    view = groups.view[nodes]
-    number = np.unique(view, return_inverse=True)[1]
-    level = groups.group[nodes] - view * groups.levels
-    return number, (number * groups.levels + level).astype(np.int32), int(number.max(initial=-1)) + 1
-
-
-def node_clusters(
-    nodes: np.ndarray, groups: RegionGroups, found: NodeViews, threads: int | None = None
-) -> np.ndarray:
-    """[M] i32: the cluster of each region, numbered from 0; -1 for regions of none.
+def node_labels(W: RegionWeights, groups: RegionGroups, tree: RegionTree, threads: int | None = None) -> np.ndarray:
+    """[n] i32: the smallest node of each splat of a block, -1 for none.
 
     Args:
-        found: of all nodes, in their order.
+        W: of all views, a row for each splat of the block.
     """
-    clusters = np.full(groups.view.size, NO_OBJECT, np.int32)
-    if nodes.size:
-        parts = clustered(*_graph(found, groups.levels, threads))
-        clusters[nodes] = _of_enough_views(parts, groups.view[nodes])
-    return clusters
-
-
-def _graph(found: NodeViews, levels: int, threads: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """How many views support each pair of nodes, and how many observe it: [N, N] f32 each."""
-    container, size = found.container, len(found.container)
-    node, at = np.nonzero(container >= 0)
-    held = csr_array((np.ones(node.size, np.int8), (node, container[node, at])), shape=(size, size)).tocsc()
-    held.sort_indices()
-    supporting = np.zeros((size, size), np.float32)
-    blocks = [(first, min(first + 64, size)) for first in range(0, size, 64)]
-    run_each(lambda a, b: support(a, b, container, levels, held.indptr, held.indices, supporting), blocks, threads)
-    return supporting, found.sees @ found.sees.T
-
-
-def clustered(supporting: np.ndarray, observing: np.ndarray) -> np.ndarray:
-    """[N] i64, the cluster of each node, from 0 in the order of their first nodes.
-
-    Args:
-        supporting, observing: [N, N] f32, symmetric; both are overwritten.
-    """
-    from scipy.sparse.csgraph import connected_components
-
-    size = supporting.shape[0]
-    pairs, rates = np.zeros((max(size - 1, 0), 2), np.int64), np.zeros(max(size - 1, 0))
-    neighbour_chain(supporting, observing, pairs, rates)
-    # Of nodes that stand for clusters: those of a merge that counts were merged at higher rates before.
-    one, other = pairs[rates >= TOGETHER].T
-    merged = csr_array((np.ones(one.size, np.int8), (one, other)), shape=(size, size))
-    return connected_components(merged, directed=False)[1]
-
-
-def _of_enough_views(clusters: np.ndarray, view: np.ndarray) -> np.ndarray:
-    """[N] i32: clusters numbered anew, -1 for those with regions of fewer than LEAST_VIEWS views."""
-    pairs = np.unique(np.stack([clusters, view]), axis=1)
-    views = np.bincount(pairs[0])
-    enough = views >= min(LEAST_VIEWS, np.unique(view).size)
-    return np.where(enough, np.cumsum(enough) - 1, NO_OBJECT)[clusters].astype(np.int32)
-
-
-def object_labels(W: RegionWeights, clusters: np.ndarray, number: int, threads: int | None = None) -> np.ndarray:
-    """[n] i32: the cluster of each splat of a block, -1 for none.
-
-    Args:
-        W: of all views, a row for each splat of the block. clusters: [M] i32 below the number, -1 for none.
-    """
-    labels = np.full(W.indptr.shape[0] - 1, NO_OBJECT, np.int32)
+    labels = np.full(W.indptr.shape[0] - 1, NO_NODE, np.int32)
     indptr, region, weight = (part.numpy() for part in (W.indptr, W.region, W.weight))
+    shows = np.zeros((tree.parents.size, groups.views * groups.levels), np.bool_)
+    place, node = groups.group[tree.region >= 0], tree.region[tree.region >= 0]
+    while node.size:
+        shows[node, place] = True
+        node = tree.parents[node]
+        place, node = place[node >= 0], node[node >= 0]
     run_each(
-        lambda a, b: elect(a, b, indptr, region, weight, clusters, number, labels),
+        lambda a, b: elect(a, b, indptr, region, weight, groups.group, tree.region, tree.parents, shows, labels),
         W.blocks(1 << 16, 1 << 20),
         threads,
     )
     return labels
 
 
-def object_shares(
+def node_shares(
     W: RegionWeights, labels: np.ndarray, number: int, others: np.ndarray, threads: int | None = None
 ) -> Iterator[PieceSums]:
-    """The weight of some regions [n] i64 in each object at every piece of a block: [1, (number + 1) n], -1 first."""
+    """The weight of some regions [n] i64 in each label at every piece of a block: [1, (number + 1) n], -1 first."""
     place, shape = node_numbers(others, int(W.offsets[-1])), (number + 1, others.size)
 
     def summed(first: int, last: int) -> PieceSums:
@@ -314,26 +270,28 @@ def object_shares(
     return in_order(summed, pieces(W.indptr.shape[0] - 1), threads)
 
 
-def join(clusters: np.ndarray, others: np.ndarray, shares: Iterable[PieceSums], number: int) -> None:
-    """Regions of views without nodes take the cluster that has over half of their weight, in place.
+def with_others(tree: RegionTree, others: np.ndarray, shares: Iterable[PieceSums]) -> RegionTree:
+    """The tree with regions of views without nodes, each of the smallest node that has over half of its weight.
 
     Args:
-        clusters: [M] i32. others: [n] i64, these regions. shares: theirs (`object_shares`), of all splats.
+        others: [n] i64, these regions. shares: theirs (`node_shares`), of all splats.
     """
-    shape = number + 1, others.size
+    shape = tree.parents.size + 1, others.size
     table = csr_array(shape, dtype=np.float64)
     for part in shares:
         table = table + csr_array((part.values[0], np.divmod(part.places, others.size)), shape=shape)
-    found = table.tocoo()
-    totals = np.bincount(found.col, found.data, others.size)
-    most = (found.row > 0) & (found.data > totals[found.col] / 2)  # one of a region at most
-    clusters[others[found.col[most]]] = found.row[most] - 1
+    totals = np.asarray(table.sum(axis=0)).ravel()
+    found = csr_array(tree.lineage().T.astype(np.float64) @ csr_array(table)[1:]).tocoo()
+    most = found.data > totals[found.col] / 2  # nodes of one path
+    region = tree.region.copy()
+    np.maximum.at(region, others[found.col[most]], found.row[most])  # parts come after their wholes
+    return replace(tree, region=region)
 
 
 def view_shares(
     W: RegionWeights, groups: RegionGroups, labels: np.ndarray, number: int, threads: int | None = None
 ) -> Iterator[PieceSums]:
-    """The weight of each object in each view at every piece of a block: [1, number views]."""
+    """The weight of each label in each view at every piece of a block: [1, number views]."""
     arrays = labels, W.indptr.numpy(), W.region.numpy(), W.weight.numpy(), groups.view, groups.views
 
     def add(first: int, last: int, table: np.ndarray) -> None:
@@ -342,39 +300,132 @@ def view_shares(
     return piece_sums(add, labels.size, (1, number * groups.views), threads)
 
 
-def object_numbers(labels: np.ndarray, evidence: np.ndarray, number: int) -> np.ndarray:
-    """[K + 1] i32: the number of each cluster as an object, the most evidence first; -1 without a splat, and last.
+def node_numbering(labels: np.ndarray, evidence: np.ndarray, tree: RegionTree) -> NodeNumbers:
+    """Which nodes are objects, and the numbers of all.
 
     Args:
-        labels: [P] i32, the cluster of each splat. evidence: [P]. number: K.
+        labels: [P] i32, the smallest node of each splat. evidence: [P].
     """
-    own = labels >= 0
-    order = np.argsort(-np.bincount(labels[own], evidence[own], number), kind="stable")
-    order = order[np.bincount(labels[own], minlength=number)[order] > 0]
-    place = np.full(number + 1, NO_OBJECT, np.int32)
+    number, own = tree.parents.size, labels >= 0
+    above = tree.lineage().T.astype(np.float64)
+    splats = above @ np.bincount(labels[own], minlength=number)
+    same, parents = np.arange(number), tree.parents.copy()
+    for node in range(number):
+        whole = tree.parents[node]
+        if whole >= 0:
+            parents[node] = same[whole]
+            if splats[node] >= SAME_SPLATS * splats[whole]:
+                same[node] = same[whole]
+    kept = (same == np.arange(number)) & (splats > 0)
+    root, parts = np.full(number, NO_NODE), np.bincount(parents[kept & (parents >= 0)], minlength=number)
+    for node in np.flatnonzero(kept):
+        whole = parents[node]
+        apart = whole < 0 or (root[whole] == NO_NODE)
+        most = apart and splats[node] >= MOST_OF_SCENE * (evidence > 0).sum() and parts[node] > 1
+        root[node] = NO_NODE if most else node if apart else root[whole]
+    objects = np.where(kept, root, NO_NODE)
+    of_object = np.append(objects[same], NO_NODE)[labels]  # -1 is the place after the last node
+    sums = np.bincount(of_object[of_object >= 0], evidence[of_object >= 0], number)
+    first = np.argsort(-sums, kind="stable")
+    first = first[(objects == np.arange(number))[first]]
+    whole = above @ np.bincount(labels[own], evidence[own], number)
+    later = np.argsort(-whole, kind="stable")
+    order = np.concatenate([first, later[(kept & (objects != np.arange(number)))[later]]])
+    place = np.full(number + 1, NO_NODE, np.int32)
     place[order] = np.arange(order.size)
-    return place
+    return NodeNumbers(place[np.append(same, NO_NODE)], place[np.append(objects[same], NO_NODE)], first.size)
 
 
-def numbered(labels: np.ndarray, clusters: np.ndarray, place: np.ndarray, shown: np.ndarray) -> RegionObjects:
+def numbered(labels: np.ndarray, tree: RegionTree, numbers: NodeNumbers, shown: np.ndarray) -> RegionObjects:
     """The objects of a scene.
 
     Args:
-        labels: [P] i32, the cluster of each splat. clusters: [M] i32, of each region. place: of `object_numbers`.
-        shown: [K, V] f64, the weight of each cluster in each view.
+        labels: [P] i32, the smallest node of each splat. numbers: of the tree's nodes (`node_numbering`).
+        shown: [N, V] f64, the weight of each label in each view.
     """
-    order = np.argsort(place[:-1], kind="stable")[int((place[:-1] < 0).sum()) :]
-    return RegionObjects(place[labels], _best_views(shown[order]), place[clusters])
+    new = numbers.node[:-1]
+    first = np.unique(new, return_index=True)[1]  # a whole comes before parts that are the same thing
+    order = first[int((new < 0).any()) :]
+    above = tree.parents[order]
+    made = RegionTree(
+        numbers.node[tree.region], np.where(above >= 0, new[above], NO_NODE).astype(np.int32), tree.confidence[order]
+    )
+    whole = np.asarray(tree.lineage().T.astype(np.float64) @ shown)[order]
+    return RegionObjects(numbers.object[labels], numbers.node[labels], made, _best_views(whole), numbers.count)
 
 
-def object_facts(found: RegionObjects) -> dict[str, Any]:
+@dataclass(frozen=True)
+class NodeVectors:
+    """What the masks of nodes say."""
+
+    vectors: np.ndarray  # [N, F] f32, the unit mean of the unit vectors of a node's own regions; zeros for none
+    level_agreement: float | None  # cosine of parts and their wholes, about the scene's mean; None without parts
+
+    @classmethod
+    def of(cls, codebook: Codebook, totals: np.ndarray, found: RegionObjects) -> "NodeVectors":
+        """Means by the weights of regions; those of a node's parts are not its own, so levels stay apart.
+
+        The agreement is free of noise: masks of a part and of its whole are others, so the mean product of their
+        vectors is that of what they mean, and of the squared length of a mean of noisy ones their own squares are
+        taken away. Parts count by their splats.
+
+        Args:
+            totals: [M] f64, the weight of each region.
+        """
+        tree, number = found.tree, found.tree.parents.size
+        own = np.flatnonzero(tree.region >= 0)
+        places = tree.region[own], own
+        shares, squares = (csr_array((totals[own] ** k, places), shape=(number, totals.size)) for k in (1, 2))
+        parts = np.flatnonzero(tree.parents >= 0)
+        wholes = tree.parents[parts]
+        splats = tree.lineage().T.astype(np.float64) @ np.bincount(found.node[found.node >= 0], minlength=number)
+        whole, sums = totals.sum() or 1.0, np.zeros((number, codebook.channels))
+        products, power = np.zeros(parts.size), np.zeros(number)
+        weights = np.maximum(shares.sum(axis=1), 1e-30)
+        for channels in codebook.slices():
+            unit = codebook.unit_values(channels, CPU).numpy()
+            sums[:, channels] = shares @ unit
+            unit = unit - (totals @ unit / whole).astype(np.float32)
+            centred = shares @ unit
+            products += (centred[parts] * centred[wholes]).sum(axis=1)
+            power += (centred**2).sum(axis=1) - squares @ (unit**2).sum(axis=1)
+        power /= np.maximum(weights**2 - squares.sum(axis=1), 1e-30)
+        lengths = np.linalg.norm(sums, axis=1, keepdims=True)
+        vectors = np.divide(sums, lengths, out=np.zeros_like(sums), where=lengths > 0).astype(np.float32)
+        scale = float(splats[parts] @ power[parts]) * float(splats[parts] @ power[wholes])
+        told = float(splats[parts] @ (products / (weights[parts] * weights[wholes])))
+        known = scale > 0 and min(splats[parts] @ power[parts], splats[parts] @ power[wholes]) > 0
+        return cls(vectors, float(np.clip(told / math.sqrt(scale), -1, 1)) if known else None)
+
+
+def object_facts(found: RegionObjects, said: NodeVectors) -> dict[str, Any]:
     """What the graph of regions held together, for the diagnostics."""
-    share = float((found.labels >= 0).mean())
-    return {"found": len(found.views), "splats_share": share, "regions": int((found.regions >= 0).sum())}
+    own = np.bincount(found.node[found.node >= 0], minlength=len(found.node_views))
+    held = (found.tree.lineage().T.astype(np.float64) @ own) / max(found.node.size, 1)
+    facts: dict[str, Any] = {
+        "found": found.count,
+        "splats_share": float((found.labels >= 0).mean()),
+        "regions": int((found.tree.region >= 0).sum()),
+        "nodes": len(found.node_views),
+        "largest_share": float(held.max(initial=0.0)),
+        "level_agreement": said.level_agreement,
+    }
+    told = []
+    if facts["largest_share"] >= MOST_OF_SCENE:
+        largest = int(held.argmax())
+        rest = "objects are its parts" if largest >= found.count else "no part of it was found: take finer masks"
+        told.append(f"masks hold {facts['largest_share']:.0%} of the splats together as one thing; {rest}")
+    if said.level_agreement is not None and said.level_agreement < SAY_THE_SAME:
+        told.append(
+            f"masks of things and of their parts say different things (their vectors' cosine is "
+            f"{said.level_agreement:.2f}), and a splat's feature is the sum of both: ask nodes of the tree, or lift "
+            "one level alone (levels=0, 1, ...)"
+        )
+    return facts | ({"warning": "; ".join(told)} if told else {})
 
 
 def _best_views(shown: np.ndarray) -> np.ndarray:
-    """[K, BEST_VIEWS] i32: the views in which each object weighs most."""
+    """[K, BEST_VIEWS] i32: the views in which each node weighs most."""
     best = np.full((len(shown), BEST_VIEWS), -1, np.int32)
     order = np.argsort(-shown, axis=1, kind="stable")[:, :BEST_VIEWS]
     best[:, : order.shape[1]] = np.where(np.take_along_axis(shown, order, axis=1) > 0, order, -1)
@@ -427,8 +478,8 @@ def list_tuple_nodes(begins, tuples, parents, members, number, starts, found):
 
 
 @kernel
-def contain(first, last, begins, splats, starts, members, counts, group, several, container, sees):
-    """For nodes ``first..last``: the node of each group that contains it, and which views see it."""
+def contain(first, last, begins, splats, starts, members, counts, group, container):
+    """For nodes ``first..last``: the node of each group that contains it, or that it is split there, or unseen."""
     R, seen = np.zeros(group.size), np.zeros(container.shape[1])
     most, largest = np.zeros(container.shape[1]), np.zeros(container.shape[1], np.int32)
     met = np.empty(group.size, np.int32)
@@ -453,90 +504,67 @@ def contain(first, last, begins, splats, starts, members, counts, group, several
         for i in range(found):
             g = group[met[i]]
             if seen[g] >= OBSERVES * size:
-                sees[m, g // several] = 1.0
-                if most[g] >= CONTAINS * seen[g]:
-                    container[m, g] = largest[g]
+                container[m, g] = largest[g] if most[g] >= CONTAINS * seen[g] else SPLIT
         for i in range(found):
             n = met[i]
             R[n], seen[group[n]], most[group[n]] = 0.0, 0.0, 0.0
 
 
 @kernel
-def support(first, last, container, several, begins, held, supporting):
-    """For nodes ``first..last``: in how many views a region contains it and each other node, whatever the level."""
-    told = np.full(container.shape[0], -1, np.int32)
-    for m in range(first, last):
-        told[:] = -1
-        for g in range(container.shape[1]):
-            c = container[m, g]
-            if c >= 0:
-                v = g // several
-                for k in range(begins[c], begins[c + 1]):
-                    n = held[k]
-                    if told[n] != v:
-                        told[n] = v
-                        supporting[m, n] += 1.0
-
-
-@kernel
-def neighbour_chain(supporting, observing, pairs, rates):
-    """Merge all nodes, each time two that are nearest to each other; a cluster keeps the row of its first node."""
-    size, start, length = supporting.shape[0], 0, 0
-    alive, chain = np.ones(size, np.bool_), np.empty(size + 1, np.int64)
-    for merge in range(size - 1):
-        if length == 0:
-            while not alive[start]:
-                start += 1
-            chain[0], length = start, 1
-        while True:
-            a, best, rate = chain[length - 1], -1, -1.0
-            if length > 1:
-                best = chain[length - 2]
-                rate = supporting[a, best] / observing[a, best] if observing[a, best] > 0 else 0.0
-            for n in range(size):
-                if alive[n] and n != a:
-                    own = supporting[a, n] / observing[a, n] if observing[a, n] > 0 else 0.0
-                    if own > rate:
-                        best, rate = n, own
-            if length > 1 and best == chain[length - 2]:
-                break
-            chain[length] = best
-            length += 1
-        length -= 2
-        a, b = min(a, best), max(a, best)
-        pairs[merge, 0], pairs[merge, 1], rates[merge] = a, b, rate
-        alive[b] = False
-        for n in range(size):
-            if alive[n] and n != a:
-                supporting[a, n] += supporting[b, n]
-                observing[a, n] += observing[b, n]
-                supporting[n, a], observing[n, a] = supporting[a, n], observing[a, n]
-
-
-@kernel
-def elect(first, last, indptr, region, weight, clusters, number, labels):
-    """For splats ``first..last``: the object whose regions weigh most, if these are half of all objects' weight."""
-    sums = np.zeros(number)
+def elect(first, last, indptr, region, weight, group, node, parents, shows, labels):
+    """For splats ``first..last``: the smallest node of their path; ``shows`` [N, groups] says what levels show."""
+    sums, totals = np.zeros(parents.size), np.zeros(shows.shape[1])
+    met, groups = np.empty(parents.size, np.int32), np.empty(shows.shape[1], np.int32)
     for j in range(first, last):
-        whole, best = 0.0, -1
+        found, levels = 0, 0
         for k in range(indptr[j], indptr[j + 1]):
-            c = clusters[region[k]]
-            if c >= 0:
-                sums[c] += weight[k]
-                whole += weight[k]
-                if best < 0 or sums[c] > sums[best]:
-                    best = c
-        if best >= 0 and 2.0 * sums[best] >= whole:
+            g, n = group[region[k]], node[region[k]]
+            if g >= 0:
+                if totals[g] == 0.0:
+                    groups[levels] = g
+                    levels += 1
+                totals[g] += weight[k]
+            while n >= 0:
+                if sums[n] == 0.0:
+                    met[found] = n
+                    found += 1
+                sums[n] += weight[k]
+                n = parents[n]
+        best = heaviest_part(-1, met[:found], sums, parents)
+        while best >= 0:
             labels[j] = best
-        for k in range(indptr[j], indptr[j + 1]):
-            c = clusters[region[k]]
-            if c >= 0:
-                sums[c] = 0.0
+            best = heaviest_part(best, met[:found], sums, parents)
+            if best >= 0 and 2.0 * sums[best] < shown_weight(best, groups[:levels], totals, shows):
+                best = -1
+        sums[met[:found]] = 0.0
+        totals[groups[:levels]] = 0.0
+
+
+@kernel
+def heaviest_part(whole, met, sums, parents):
+    """The part of a node that weighs most, where it has half of what all parts weigh; -1 for none."""
+    best, every = -1, 0.0
+    for n in met:
+        if parents[n] == whole:
+            every += sums[n]
+            if best < 0 or sums[n] > sums[best]:
+                best = n
+    return best if best >= 0 and 2.0 * sums[best] >= every else -1
+
+
+@kernel
+def shown_weight(node, groups, totals, shows):
+    """What the levels that show a node weigh at a splat."""
+    seen = 0.0
+    for g in groups:
+        if shows[node, g]:
+            seen += totals[g]
+    return seen
 
 
 @kernel
 def show(first, last, labels, indptr, region, weight, view, views, shown):
-    """Add the weight [K V] that each object has in each view, of splats ``first..last``."""
+    """Add the weight [N V] that each label has in each view, of splats ``first..last``."""
     for j in range(first, last):
         if labels[j] >= 0:
             for k in range(indptr[j], indptr[j + 1]):

@@ -15,6 +15,7 @@ from liftcore.runtime.one_line import one_line
 from liftcore.scene.origin import FILE_ORIGIN, Origin
 from liftcore.scene.views import composed
 from liftcore.text.table import TableEncoder, own_words
+from liftcore.values.lift_file import NODE_TENSORS
 from liftcore.values.settings import LiftSettings
 
 if TYPE_CHECKING:
@@ -98,6 +99,16 @@ class Lift:
     """[P] i32, -1 = of no object; None: objects were not looked for"""
     object_views: Tensor | None = None
     """[N, 5] i32, places in ``views`` that show most of each, -1 after the last"""
+    node: Tensor | None = None
+    """[P] i32, the smallest of objects, parts and groups that a splat is of; -1: of none; None: no tree was made"""
+    node_parents: Tensor | None = None
+    """[T] i32, the node that each node is a part of, -1 for none; the first N nodes are the objects"""
+    node_views: Tensor | None = None
+    """[T, 5] i32, as ``object_views``"""
+    node_confidence: Tensor | None = None
+    """[T] f32 in 0..1, of the views that see a node those that have a mask of the whole"""
+    node_features: Tensor | None = None
+    """[T, F] f16, the unit mean of its own masks' unit vectors, without those of its parts; zero where they cancel"""
 
     def __repr__(self) -> str:
         splats, channels = self.features.shape
@@ -146,6 +157,8 @@ class Lift:
         for labels, table in (("cluster", "cluster_features"), ("object", "object_views")):
             if labels in columns and (values := getattr(self, table)) is not None:
                 columns[labels], columns[table] = _renumbered(columns[labels], values)
+        if self.node is not None:
+            columns |= _cropped_tree({name: getattr(self, name) for name in NODE_TENSORS}, rows)
         places = {row: place for row, *place in self.metadata.landmarks}
         numbered = enumerate(rows.tolist())
         landmarks = tuple((new, *places[old]) for new, old in numbered if old in places)
@@ -246,6 +259,21 @@ def _renumbered(labels: Tensor, table: Tensor) -> tuple[Tensor, Tensor]:
     used, numbers = torch.unique(labels, return_inverse=True)
     none = int((used < 0).sum())
     return (numbers - none).clamp_min(-1).to(labels.dtype), table[used[none:].long()]
+
+
+def _cropped_tree(tree: dict[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
+    """The tree of some rows [n], without nodes of which no splat is left."""
+    import torch
+
+    node, parents = tree["node"][rows], tree["node_parents"].long()
+    used = torch.zeros(len(parents) + 1, dtype=torch.bool, device=node.device)  # the last is of -1
+    above = torch.unique(node).long()
+    while len(above := above[above >= 0]):
+        used[above] = True
+        above = parents[above]
+    numbers = torch.where(used, used.cumsum(0) - 1, -1).to(node.dtype)
+    kept = {name: part[used[:-1]] for name, part in tree.items() if name != "node"}
+    return kept | {"node": numbers[node.long()], "node_parents": numbers[parents[used[:-1]]]}
 
 
 def _off_landmarks(landmarks: tuple[Landmark, ...], splats: Splats) -> int:

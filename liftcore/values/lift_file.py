@@ -3,10 +3,11 @@
 A ``.safetensors`` file holds ``features`` [P, F], ``evidence`` [P], ``agreement`` [P] and ``seen`` [P]. After
 reweighting it has ``confidence`` [P] f32, which tells right splats from wrong ones, as agreement does not; after
 Post-Lifting Aggregation ``cluster`` [P] i32, -1 for splats in none, and ``cluster_features`` [K, F]; where objects
-were looked for ``object`` [P] i32, -1 for none, and ``object_views`` [N, 5] i32 (`Lift`); of packs with words
-their vectors, ``embeddings`` [n, F] f32. Its metadata hold settings, inputs with digests, the encoder, words, the
-certificate, timings and the version, as JSON. A lift too large for one file is a folder of shards with the same
-tensors (`liftcore.io.shards`).
+were looked for ``object`` [P] i32, -1 for none, and ``object_views`` [N, 5] i32, and of the tree of objects, parts
+and groups ``node`` [P] i32, ``node_parents`` [T] i32, ``node_views`` [T, 5] i32, ``node_confidence`` [T] f32 and
+``node_features`` [T, F] f16 (`Lift`); of packs with words their vectors, ``embeddings`` [n, F] f32. Its metadata
+hold settings, inputs with digests, the encoder, words, the certificate, timings and the version, as JSON. A lift too
+large for one file is a folder of shards with the same tensors (`liftcore.io.shards`).
 """
 
 from __future__ import annotations
@@ -41,8 +42,10 @@ NEAR = 3  # folders of an input's path, and above a lift, among which it is look
 MOST_BESIDE = 16  # files of one kind beside a lift, that are read to know one of them
 CLUSTER_TENSORS = ("cluster", "cluster_features")  # in lifts with aggregation only
 OBJECT_TENSORS = ("object", "object_views")  # in lifts that looked for objects
+NODE_TENSORS = ("node", "node_parents", "node_views", "node_confidence", "node_features")  # beside objects
+MOST_DEPTH = 63  # of a tree of nodes
 EMBEDDINGS = "embeddings"  # in lifts of packs with words
-ALL = (*TENSORS, CONFIDENCE, *CLUSTER_TENSORS, *OBJECT_TENSORS, EMBEDDINGS)
+ALL = (*TENSORS, CONFIDENCE, *CLUSTER_TENSORS, *OBJECT_TENSORS, *NODE_TENSORS, EMBEDDINGS)
 
 
 def save_lift(lift: Lift, path: Path | str) -> None:
@@ -165,6 +168,35 @@ def _check_shapes(arrays: dict[str, np.ndarray], path: Path | str) -> None:
         if not fits or int(one.min()) < -1 or int(one.max()) >= len(table):
             got = f"{list(one.shape)} {one.dtype} and {list(table.shape)} {table.dtype}"
             raise InvalidLift(str(path), expected=f"a {pair[0]} of -1 or a row of {pair[1]} for each splat", got=got)
+    _check_tree(arrays, path)
+
+
+def _check_tree(arrays: dict[str, np.ndarray], path: Path | str) -> None:
+    """Refuse a tree whose tensors do not fit together, or that is none."""
+    parts = {name: arrays[name] for name in NODE_TENSORS if name in arrays}
+    if not parts:
+        return
+    rows, channels = arrays["features"].shape
+    shapes = {name: f"{list(part.shape)} {part.dtype}" for name, part in parts.items()}
+    count = len(parts["node_views"]) if parts.get("node_views") is not None and parts["node_views"].ndim else -1
+    wide = parts["node_views"].shape[-1] if count >= 0 else 0
+    expected = {
+        "node": f"[{rows}] int32",
+        "node_parents": f"[{count}] int32",
+        "node_views": f"[{count}, {wide}] int32",
+        "node_confidence": f"[{count}] float32",
+        "node_features": f"[{count}, {channels}] float16",
+    }
+    if shapes != expected or len(arrays.get(OBJECT_TENSORS[1], ())) > count:
+        raise InvalidLift(str(path), expected=f"of a tree {expected}", got=str(shapes))
+    node, parents = parts["node"], parts["node_parents"]
+    inside = all(int(part.min(initial=-1)) >= -1 and int(part.max(initial=-1)) < count for part in (node, parents))
+    above = np.append(parents, np.int32(-1)) if inside else parents
+    for _ in range(MOST_DEPTH.bit_length() if inside else 0):  # each step leads twice as far up
+        above = above[above]
+    if not inside or (above >= 0).any():
+        expected = f"nodes of a tree, each -1 or a part of another, at most {MOST_DEPTH} deep"
+        raise InvalidLift(str(path), expected=expected, got="others")
 
 
 def input_files(

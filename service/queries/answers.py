@@ -41,7 +41,7 @@ from liftcore import (
     open_encoder,
 )
 from liftcore.files import cameras_of_views
-from liftcore.models import Edit, Found, OwnCamera, Seen
+from liftcore.models import Edit, Found, OwnCamera, SceneTree, Seen
 from liftcore.text import OWN_WORDS
 from service.child import end_with_parent, fault_of
 from service.errors import NoSpace
@@ -59,7 +59,7 @@ ENTRY_BYTES = 2 << 10  # of what is kept, beside its tensors and its question
 NUMBER_BYTES = 32  # of a number of a question: a Python float and the place in its tuple
 
 
-Kept = Answer | Objects | ViewMask | Segmentation | Catalogue
+Kept = Answer | Objects | ViewMask | Segmentation | Catalogue | SceneTree
 
 
 class Answers:
@@ -85,6 +85,7 @@ class Answers:
             "what": self._what,
             "askable": self._askable,
             "catalogue": self._catalogue,
+            "tree": self._tree,
             "regions": self._regions,
             "device": self._device,
             "edit": self._edit,
@@ -302,6 +303,19 @@ class Answers:
             return 0, 0
         return int(numbers[splat]), int(numbers[splat]) + 1
 
+    def _tree(self, request: dict[str, Any]) -> Frame:
+        def make() -> SceneTree:
+            words, encoder = ([], None) if request["encoder"] is None else self._words(request)
+            return self._scene(request).tree(words, encoder=encoder)
+
+        key = ("tree", request["lift"], request["encoder"], json.dumps(request["encoder_version"]))
+        found = self._kept(key, make)
+        assert isinstance(found, SceneTree)
+        first, last = request["first"], request["first"] + request["count"]
+        after = last if last < found.count else None
+        told = {"explanation": found.explanation, "count": found.count, "next": after}
+        return _json(request, told, "nodes", (one.model_dump(mode="json") for one in found.nodes[first:last]))
+
     def _regions(self, request: dict[str, Any]) -> Frame:
         found = self._scene(request).regions(request["view"], request["x"], request["y"])
         return Frame({"regions": [one.model_dump(mode="json") for one in found]})
@@ -393,7 +407,7 @@ def _key(request: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(told).encode()).hexdigest()
 
 
-def bytes_of(made: Answer | Objects | ViewMask | Segmentation | Catalogue) -> int:
+def bytes_of(made: Kept) -> int:
     """The memory that an answer, with its question, the objects of one, a view of one or named splats take."""
     if isinstance(made, Answer):
         tensors = made.scores.nbytes + made.seen.nbytes + made.selected.nbytes
@@ -404,6 +418,8 @@ def bytes_of(made: Answer | Objects | ViewMask | Segmentation | Catalogue) -> in
         return ENTRY_BYTES + made.labels.nbytes + made.margin.nbytes + sum(len(word.encode()) for word in made.words)
     if isinstance(made, Catalogue):
         return ENTRY_BYTES * (1 + len(made.objects)) + made.features.nbytes
+    if isinstance(made, SceneTree):
+        return ENTRY_BYTES * (1 + len(made.nodes))
     return ENTRY_BYTES + made.attention.nbytes + made.row_sums.nbytes + made.mask.nbytes
 
 

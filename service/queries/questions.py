@@ -20,6 +20,7 @@ from liftcore.models import (
     ListedObjects,
     NoBoolean,
     Notation,
+    SceneTree,
     Seen,
     takes,
 )
@@ -242,19 +243,31 @@ class Selections(BaseModel):
     selections: list[ListedSelection]
 
 
-class AskedForSceneObjects(BaseModel):
-    """Which objects to list, and what names them."""
+class AskedForNodes(BaseModel):
+    """Which nodes of a lift's tree to list, and what names them."""
 
-    table: AssetId | None = Field(None, description="an uploaded text table: objects are named by its words")
+    table: AssetId | None = Field(None, description="an uploaded text table: they are named by its words")
     encoder: str | None = Field(
         None,
         max_length=200,
         description="a text space that the operator set up as a table, the lift's own, or default: likewise",
     )
-    features: Annotated[bool, Field(description="with the mean feature of each")] = False
-    splat: int | None = Field(None, ge=0, le=10**9, description="the one of this splat alone, by its row")
     limit: int = Field(100, ge=1, le=1000, description="how many to list")
     cursor: int = Field(0, ge=0, le=10**9, description="the `next` of the page before")
+
+
+class AskedForSceneObjects(AskedForNodes):
+    """Which objects to list, and what names them."""
+
+    features: Annotated[bool, Field(description="with the mean feature of each")] = False
+    splat: int | None = Field(None, ge=0, le=10**9, description="the one of this splat alone, by its row")
+
+
+class LiftTree(SceneTree, OfLift):
+    """Some of the nodes of a lift's tree: objects first, those with the most evidence first."""
+
+    encoder: str | None = Field(description="what named them, without its file; null for nothing")
+    next: int | None = Field(description="the cursor of the page after this one; null at the end")
 
 
 class NamedObject(SceneObject):

@@ -32,7 +32,7 @@ NPY, PNG, JSON = "application/x-npy", "image/png", "application/json"
 MEDIA_TYPES = {
     **dict.fromkeys(("scores", "selection", "layer", "word_labels"), NPY),
     **dict.fromkeys(("mask", "attention", "render", "word_map", "word_picture", "region_mask"), PNG),
-    **dict.fromkeys(("catalogue", "segment"), JSON),
+    **dict.fromkeys(("catalogue", "segment", "tree"), JSON),
     **dict.fromkeys(("splats", "scene"), BINARY),
 }
 
@@ -172,7 +172,7 @@ def with_packs(request: dict[str, Any], lift: LiftRecord, deps: AppState, argume
 
 def with_encoder(
     request: dict[str, Any],
-    asked: questions.LiftQuestion | questions.AskedForSceneObjects,
+    asked: questions.LiftQuestion | questions.AskedForNodes,
     lift: LiftRecord,
     deps: AppState,
 ) -> dict[str, Any]:

@@ -205,14 +205,24 @@ def scene_objects(
     lift: str, deps: Deps, ask: Ask, asked: Annotated[questions.AskedForSceneObjects, Query()]
 ) -> Response:
     """The things in the scene, found by masks alone when it was lifted; a vocabulary names them."""
+    things = list(deps.store.selections.things(deps.owner, deps.store.lifts.get(deps.owner, lift).id).items())
+    more = {"means": asked.features, "things": things, "splat": asked.splat}
+    return _nodes("catalogue", lift, deps, ask, asked, **more)
+
+
+@router.get("/lifts/{lift}/tree", response_model=questions.LiftTree, tags=["lifts"])
+def scene_tree(lift: str, deps: Deps, ask: Ask, asked: Annotated[questions.AskedForNodes, Query()]) -> Response:
+    """The same things with their parts and groups of them, objects first; a node's splats are an object's."""
+    return _nodes("tree", lift, deps, ask, asked)
+
+
+def _nodes(operation: str, lift: str, deps: Deps, ask: Ask, asked: questions.AskedForNodes, **more: Any) -> Response:
     found = deps.store.lifts.get(deps.owner, lift)
-    wanted: dict[str, Any] = scene_request("catalogue", found, deps) | NO_ENCODER | {"words": None}
+    wanted: dict[str, Any] = scene_request(operation, found, deps) | NO_ENCODER | {"words": None}
     if asked.table is not None or asked.encoder is not None:
         wanted = with_encoder(wanted, asked, found, deps)
     named = None if wanted["encoder"] is None else encoder_label(wanted["encoder"])
-    things = deps.store.selections.things(deps.owner, found.id)
-    wanted |= {"first": asked.cursor, "count": asked.limit, "means": asked.features, "things": list(things.items())}
-    wanted |= {"splat": asked.splat}
+    wanted |= {"first": asked.cursor, "count": asked.limit, **more}
     return made(deps, wanted | {"head": {"lift": found.id, "encoder": named}}, found, ask, {})
 
 
@@ -228,7 +238,8 @@ def shape_lift(lift: LiftRecord) -> models.LiftResult:
     """A lift as clients get it; paths of this machine stay here."""
     own = f"/lifts/{lift.id}"
     links = {"self": own, "job": f"/jobs/{lift.id}", "features": f"{own}/features"}
-    links |= {"views": f"{own}/views", "objects": f"{own}/objects", "query": f"/query?lift={lift.id}&text="}
+    links |= {"views": f"{own}/views", "objects": f"{own}/objects", "tree": f"{own}/tree"}
+    links |= {"query": f"/query?lift={lift.id}&text="}
     told = {"views": [], "words": [], "origin": (0.0, 0.0, 0.0), **lift.metadata, **vars(lift), "links": links}
     return models.LiftResult(**{name: told[name] for name in models.LiftResult.model_fields})
 

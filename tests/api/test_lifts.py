@@ -272,6 +272,10 @@ def test_objects_are_there_without_words_and_a_table_names_them(
     pages = [client.get(route, params={"limit": 2, "cursor": first}).json() for first in (0, 2)]
     assert pages[0]["objects"] + pages[1]["objects"] == whole["objects"]
     assert (pages[0]["next"], pages[1]["next"]) == (2, None)
+    tree = client.get(lift["links"]["tree"], params={"limit": 2}).json()
+    assert (tree["count"], tree["next"], tree["lift"]) == (3, 2, lift["id"])
+    for node, thing in zip(tree["nodes"], whole["objects"], strict=False):
+        assert node.items() >= thing.items() and (node["kind"], node["path"]) == ("object", [node["id"]])
     table = client.put("/assets/table", content=scene.table).json()["id"]
     for how in ({"table": table}, {"encoder": "default"}, {"encoder": lift["text_space"]}):
         named = client.get(route, params={**how, "features": True}).json()["objects"]

@@ -221,7 +221,7 @@ def test_questions_of_the_guide_are_answered(scene_folder: Path, capsys: pytest.
     commands = commands_between(GUIDE, "## Asking", "### Text encoders", scene_folder)
     shutil.copy("kept", "features.safetensors")
     capsys.readouterr()
-    assert [command[0] for command in commands] == ["query"] * 4 + ["segment"] * 2 + ["objects", "export"]
+    assert [command[0] for command in commands] == ["query"] * 4 + ["segment"] * 2 + ["objects", "export", "objects"]
     assert [main(command) for command in commands] == [0] * len(commands)
     told = capsys.readouterr().out
     assert "3 of 3 words are there" in told and "middle:6,12: apple " in told

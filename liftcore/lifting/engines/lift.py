@@ -46,14 +46,14 @@ from liftcore.solve.diagnostics import ViewMeasures, joined, measure_view
 from liftcore.solve.directions import RegionDirections
 from liftcore.solve.loss import mean_distance
 from liftcore.solve.objects import (
-    NodeViews,
+    NodeVectors,
     RegionObjects,
     choose_nodes,
-    join,
-    node_clusters,
+    node_numbering,
     numbered,
-    object_numbers,
+    with_others,
 )
+from liftcore.solve.region_tree import RegionTree, region_tree
 from liftcore.solve.reweight import SceneAgreement, whole_regions
 from liftcore.solve.sums import added, unpacked
 from liftcore.values.lift_views import LiftViews
@@ -270,22 +270,26 @@ class InBlocks(Steps[Job]):
         nodes, others = (map_tensors(W.folder / steps.NODES)[0][name] for name in ("nodes", "others"))
         self.run("objects", steps.contain, W, W.weighings)
         parts = [map_tensors(W.piece_file("contain", number))[0] for number in range(W.weighings)]
-        together = NodeViews(*(np.concatenate([part[name] for part in parts]) for name in ("container", "sees")))
-        clusters = node_clusters(nodes, groups, together, self.threads)
-        number = int(clusters.max(initial=-1)) + 1
+        containers = np.concatenate([part["container"] for part in parts])
+        tree = region_tree(nodes, groups, containers, self.threads)
+        number = tree.parents.size
         if number and others.size:
-            self._label(W, 0, clusters)
-            join(clusters, others, (part for file in _pieces(W, "labels-0") for part in unpacked(file)), number)
-        self._label(W, 1, clusters)
+            self._label(W, 0, tree)
+            tree = with_others(tree, others, (part for file in _pieces(W, "labels-0") for part in unpacked(file)))
+        self._label(W, 1, tree)
         labels, evidence = _column(W, "labels-1", "labels"), _column(W, "rows", "evidence")
         shown = _sums(W, "labels-1", (1, number * groups.views))
-        place = object_numbers(labels, evidence, number)
-        steps.write_piece(W.folder / steps.OBJECTS, {"place": place})
-        return numbered(labels, clusters, place, shown.reshape(number, groups.views))
+        numbers = node_numbering(labels, evidence, tree)
+        steps.write_piece(W.folder / steps.OBJECTS, {"object": numbers.object})
+        return numbered(labels, tree, numbers, shown.reshape(number, groups.views))
 
-    def _label(self, job: Job, step: int, clusters: np.ndarray) -> None:
-        steps.write_piece(job.folder / steps.CLUSTERS.format(step), {"clusters": clusters})
+    def _label(self, job: Job, step: int, tree: RegionTree) -> None:
+        steps.write_piece(job.folder / steps.TREE.format(step), vars(tree))
         self.run("objects", steps.label, replace(job, step=step), job.solutions)
+
+    def node_vectors(self, W: Job, objects: RegionObjects) -> NodeVectors:
+        codebook = steps.codebook_of(W)
+        return NodeVectors.of(codebook, _sums(W, "rows", (1, codebook.regions))[0], objects)
 
     def compare_masks(self, W: Job) -> Job:
         self.run("consensus", steps.share, W, W.weighings)
@@ -365,7 +369,7 @@ def _with_clusters(job: Job, clusters: RegionObjects | None) -> Job:
     if clusters is None:
         return job
     guarded = bool(job.settings.aggregation_guard and job.settings.robust_steps)
-    return replace(job, clusters=len(clusters.views), guarded=guarded)
+    return replace(job, clusters=clusters.count, guarded=guarded)
 
 
 def _pieces(job: Job, step: str) -> Iterator[dict[str, np.ndarray]]:

@@ -47,13 +47,14 @@ from liftcore.solve.directions import StoredDirections, region_totals
 from liftcore.solve.loss import RegionDistances, huber_factors
 from liftcore.solve.membership import RegionGroups, memberships
 from liftcore.solve.objects import (
-    node_views,
-    object_labels,
-    object_shares,
+    node_containers,
+    node_labels,
+    node_shares,
     sampled_nodes,
     sampled_splats,
     view_shares,
 )
+from liftcore.solve.region_tree import RegionTree
 from liftcore.solve.reweight import SceneAgreement, ViewConsistency, reweighted
 from liftcore.solve.rows import SomeRows, fill_rows, gather_rows, take_rows, values_of
 from liftcore.solve.sums import PieceSums, packed
@@ -68,8 +69,8 @@ CODEBOOK = "codebook.safetensors"  # rows/v [M_v, F] and, where regions are tupl
 TUPLES = "tuples.safetensors"  # bases [pieces] i64, parents and members [T] i32
 CURVE = "curve.safetensors"  # bounds [2, 3] f64 of the splats with weight
 NODES = "nodes.safetensors"  # nodes and others, i64
-CLUSTERS = "clusters-{}.safetensors"  # clusters [M] i32, by the step of `label`
-OBJECTS = "objects.safetensors"  # place [K + 1] i32, the number of each cluster as an object
+TREE = "tree-{}.safetensors"  # of regions (`RegionTree`), by the step of `label`
+OBJECTS = "objects.safetensors"  # object [N + 1] i32, the object that each node of the tree is of
 MERGED = "merged.safetensors"  # merged [K, F], the features of the aggregation
 AGREEMENT = "agreement-{}.safetensors"  # regions [M] f32, numbers [3] f64
 
@@ -202,7 +203,7 @@ def _taken(tuples: SplatTuples, rows: np.ndarray) -> SplatTuples:
 
 @piece_of("contain")
 def contain(job: Job, piece: int, threads: int | None) -> Piece:
-    """Write what the levels and views of all nodes say of those of some views."""
+    """Write which nodes contain those of some views."""
     block, groups, nodes = _view_block(job, piece), groups_of(job), mapped(job.folder / NODES)["nodes"]
     own = memberships(block.W, groups, threads).own
     begins, rows = sampled_splats(block.W, own, nodes, block.base)
@@ -210,10 +211,8 @@ def contain(job: Job, piece: int, threads: int | None) -> Piece:
     chosen[rows] = True
     local, numbers = np.flatnonzero(chosen), (np.cumsum(chosen) - 1)[rows]
     tuples, totals = _tuples_of(job, block.splats[local])
-    found = node_views(
-        sampled_nodes(begins, numbers, tuples, totals, nodes, groups.view.size), nodes, groups, threads
-    )
-    return {"container": found.container, "sees": found.sees}, ()
+    table = sampled_nodes(begins, numbers, tuples, totals, nodes, groups.view.size)
+    return {"container": node_containers(table, nodes, groups, threads)}, ()
 
 
 @piece_of("share")
@@ -316,22 +315,22 @@ def _splat_block(job: Job, piece: int) -> SplatBlock:
 
 @piece_of("labels-{step}")
 def label(job: Job, piece: int, threads: int | None) -> Piece:
-    """Write the object of each splat, and what objects weigh: in step 0 in other regions, then in views."""
-    block, clusters = _splat_block(job, piece), mapped(job.folder / CLUSTERS.format(job.step))["clusters"]
-    number = int(clusters.max(initial=-1)) + 1
-    labels = object_labels(block.W, clusters, number, threads)
+    """Write the smallest node of each splat, and what nodes weigh: in step 0 in other regions, then in views."""
+    block, tree = _splat_block(job, piece), RegionTree(**mapped(job.folder / TREE.format(job.step)))
+    groups, number = groups_of(job), tree.parents.size
+    labels = node_labels(block.W, groups, tree, threads)
     if job.step == 0:
         others = mapped(job.folder / NODES)["others"]
-        sums = object_shares(block.W, labels, number, others, threads)
+        sums = node_shares(block.W, labels, number, others, threads)
     else:
-        sums = view_shares(block.W, groups_of(job), labels, number, threads)
+        sums = view_shares(block.W, groups, labels, number, threads)
     return {"labels": labels}, list(sums)
 
 
 def labels_of(job: Job, piece: int) -> np.ndarray:
     """[n] i32: the object of each splat of a block, as the driver numbers them; -1 for none."""
     labels = map_tensors(job.piece_file("labels-1", piece))[0]["labels"]
-    return mapped(job.folder / OBJECTS)["place"][labels]
+    return mapped(job.folder / OBJECTS)["object"][labels]
 
 
 def _consensus(job: Job, block: SplatBlock, threads: int | None) -> Tensor | None:

@@ -10,11 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from liftcore.cli import main
-from liftcore.errors import InvalidLift, InvalidQuery
+from liftcore.errors import InvalidLift, InvalidQuery, NotFound
 from liftcore.query.catalogue import NOT_LOOKED_FOR, catalogue, table_csv
-from liftcore.query.result import load_lift
+from liftcore.query.result import LiftResult, load_lift
 from liftcore.query.scene import Scene
 from liftcore.values.lift_file import save_lift
 from tests.api.tiny_scene import CHANNELS, SPLATS_A_CLUSTER, VIEWS, WORDS, text_table
@@ -44,6 +45,64 @@ def test_a_lift_from_before_opens_and_says_that_it_holds_none(scene: Scene, tmp_
     save_lift(replace(scene.lift, object_views=None), tmp_path / "half.lift")
     with pytest.raises(InvalidLift, match="object and object_views, or neither"):
         load_lift(tmp_path / "half.lift")
+
+
+def with_parts(scene: Scene) -> LiftResult:
+    """The lift with its first object in halves, which say something else than it does."""
+    lift = LiftResult.of(scene.lift.cpu())
+    assert lift.object is not None and lift.object_views is not None and lift.node_features is not None
+    node, first = lift.object.clone(), torch.nonzero(lift.object == 0)[:, 0]
+    node[first[::2]], node[first[1::2]] = 3, 4
+    vectors = torch.from_numpy(np.concatenate([EYE, 3 * EYE[[1, 2]]])).half()
+    return replace(
+        lift, node=node, node_parents=torch.tensor([-1, -1, -1, 0, 0]).int(), node_features=vectors,
+        node_views=torch.cat([lift.object_views, lift.object_views[[0, 0]]]), node_confidence=torch.ones(5) / 2,
+    )  # fmt: skip
+
+
+def test_parts_have_paths_places_and_names_of_what_their_own_masks_say(scene: Scene, tmp_path: Path) -> None:
+    with_parts(scene).save(tmp_path / "parts.lift")
+    opened = Scene(tmp_path / "parts.lift", scene.splats, scene.cameras)
+    found, objects = opened.tree(WORDS, EYE), opened.catalogue(WORDS, EYE).objects
+    assert [(one.id, one.kind, one.parent) for one in found.nodes[:3]] == [(n, "object", None) for n in range(3)]
+    for one, thing in zip(found.nodes, objects, strict=False):
+        assert {name: getattr(one, name) for name in vars(thing)} == vars(thing)
+    assert [(one.kind, one.path, one.name) for one in found.nodes[3:]] == [
+        ("part", (0, 3), WORDS[1]), ("part", (0, 4), WORDS[2])
+    ]  # fmt: skip
+    assert found.nodes[0].parts == (3, 4) and found.nodes[0].splats == sum(one.splats for one in found.nodes[3:])
+    for one in found.nodes:
+        inside = opened.members(one.id)
+        assert inside.sum() == one.splats and set(np.flatnonzero(inside)) <= set(
+            np.flatnonzero(opened.members(one.path[0]))
+        )
+    with pytest.raises(NotFound, match="from 0 to 4"):
+        opened.members(5)
+
+
+def test_rows_of_a_lift_keep_their_part_of_the_tree(scene: Scene) -> None:
+    lift = with_parts(scene)
+    assert lift.node is not None
+    cropped = lift[(lift.node != 1) & (lift.node != 3)]
+    assert cropped.node is not None and cropped.node_parents is not None and cropped.object_views is not None
+    assert cropped.node_parents.tolist() == [-1, -1, 0] and len(cropped.object_views) == 2
+    assert torch.equal((cropped.node == 2), lift.node[(lift.node != 1) & (lift.node != 3)] == 4)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"node_parents": torch.tensor([-1, -1, -1, 4, 3]).int()},
+        {"node_parents": torch.tensor([-1, -1, -1, 0, 9]).int()},
+        {"node_confidence": torch.ones(4)},
+        {"node_views": None},
+    ],
+    ids=["a circle", "no such node", "too few", "one of them"],
+)
+def test_a_tree_that_is_none_is_refused(scene: Scene, tmp_path: Path, change: dict[str, torch.Tensor]) -> None:
+    save_lift(replace(with_parts(scene), **change), tmp_path / "wrong.lift")
+    with pytest.raises(InvalidLift, match="tree"):
+        load_lift(tmp_path / "wrong.lift")
 
 
 @pytest.mark.parametrize("vectors", [None, EYE[:2], np.zeros((3, CHANNELS)), np.ones((3, CHANNELS + 1))])

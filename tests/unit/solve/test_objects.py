@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from liftcore.solve import objects
-from liftcore.solve.objects import CONTAINS, LEAST_VIEWS, OBSERVES, TOGETHER, region_objects
+from liftcore.solve.objects import CONTAINS, OBSERVES, region_objects
+from liftcore.solve.region_tree import LEAST_VIEWS, TOGETHER
 from liftcore.values.region_weights import RegionWeights, stacked
 from tests.unit.solve.sparse_views import dense, of_dense
 from tests.unit.solve.test_consensus import SPLATS, belonging, of_things, random_scene
@@ -109,8 +110,9 @@ def test_views_beyond_the_bound_join_what_the_others_found(monkeypatch: pytest.M
     monkeypatch.setattr(objects, "FEWEST_VIEWS", 5)
     W, levels = of_things([[0, 1, 2, 3]] * 12)
     found = region_objects(W, levels, np.ones(SPLATS))
-    assert len(found.views) == 4 and (found.regions >= 0).all()
-    np.testing.assert_array_equal(found.regions.reshape(12, 4), found.regions[:4][None].repeat(12, axis=0))
+    regions = found.tree.region
+    assert len(found.views) == 4 and (regions >= 0).all()
+    np.testing.assert_array_equal(regions.reshape(12, 4), regions[:4][None].repeat(12, axis=0))
 
 
 def test_the_number_of_threads_changes_no_label() -> None:

@@ -24,6 +24,7 @@ from liftcore.solve.consensus import (
 from liftcore.solve.directions import RegionDirections, region_totals
 from liftcore.solve.loss import RegionDistances, huber_factors, mean_distance
 from liftcore.solve.membership import RegionGroups, memberships
+from liftcore.solve.region_tree import region_tree
 from liftcore.solve.reweight import SceneAgreement, ViewConsistency, agreement_factors
 from liftcore.solve.rows import SomeRows, gather_rows, take_rows
 from liftcore.solve.sums import PIECE, PieceSums, added, packed, unpacked
@@ -205,19 +206,18 @@ def test_objects_by_blocks_are_those_of_the_whole_scene(
         splats = part.splats[local]
         own = SplatTuples(*take_rows(tuples.starts, splats, tuples.tuples), tuples.parents, tuples.members)
         table = objects.sampled_nodes(begins, numbers, own, totals[splats], nodes, LEVELS.size)
-        found.append(objects.node_views(table, nodes, groups, 1))
-    together = [np.concatenate([getattr(part, name) for part in found]) for name in ("container", "sees")]
-    clusters = objects.node_clusters(nodes, groups, objects.NodeViews(*together), 1)
-    number = int(clusters.max()) + 1
+        found.append(objects.node_containers(table, nodes, groups, 1))
+    tree = region_tree(nodes, groups, np.concatenate(found), 1)
+    number = tree.parents.size
     cut = [W.of_splats(*ends) for ends in blocks]
-    labels = [objects.object_labels(part, clusters, number, 1) for part in cut]
+    labels = [objects.node_labels(part, groups, tree, 1) for part in cut]
     shares = [
         sums
         for part, own in zip(cut, labels, strict=True)
-        for sums in objects.object_shares(part, own, number, others, 1)
+        for sums in objects.node_shares(part, own, number, others, 1)
     ]
-    objects.join(clusters, others, over_files(shares), number)
-    labels = [objects.object_labels(part, clusters, number, 1) for part in cut]
+    tree = objects.with_others(tree, others, over_files(shares))
+    labels = [objects.node_labels(part, groups, tree, 1) for part in cut]
     sums = [
         sums
         for part, own in zip(cut, labels, strict=True)
@@ -225,10 +225,12 @@ def test_objects_by_blocks_are_those_of_the_whole_scene(
     ]
     shown = added(over_files(sums), (1, number * VIEWS)).reshape(number, VIEWS)
     every = np.concatenate(labels)
-    got = objects.numbered(every, clusters, objects.object_numbers(every, evidence, number), shown)
+    got = objects.numbered(every, tree, objects.node_numbering(every, evidence, tree), shown)
     assert (got.labels >= 0).any() and len(got.views) > 1
-    for name in ("labels", "views", "regions"):
+    for name in ("labels", "node", "node_views"):
         np.testing.assert_array_equal(getattr(got, name), getattr(whole, name))
+    for name, part in vars(whole.tree).items():
+        np.testing.assert_array_equal(getattr(got.tree, name), part)
 
 
 def test_hubers_loss_in_blocks_is_that_of_the_whole_scene(

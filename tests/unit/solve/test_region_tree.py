@@ -1,0 +1,132 @@
+"""The tree of regions on a scene of rooms, things and parts, whose masks have the mistakes that segmenters make."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from liftcore.solve.codebook import Codebook, ViewCodebook
+from liftcore.solve.objects import NodeVectors, RegionObjects, object_facts, region_objects
+from liftcore.values.region_weights import RegionWeights, stacked
+from tests.unit.solve.sparse_views import of_dense
+
+SPLATS, VIEWS = 240, 12
+PART = np.arange(SPLATS) // 20  # twelve parts of twenty splats
+THING = PART // 3  # four things of three parts
+ROOM = np.zeros(SPLATS, int)
+
+
+def three_levels(
+    seed: int, *, wrong: float = 0.3, rooms: bool = False, parts_in: float = 1.0
+) -> tuple[RegionWeights, np.ndarray, Codebook]:
+    """Masks of parts and things, and of the whole where asked for, each with its own vector and a little noise.
+
+    Args:
+        wrong: share of the masks that are merged with a neighbour, or cut anywhere. parts_in: of views with parts.
+    """
+    rng = np.random.default_rng(seed)
+    vectors = np.random.default_rng(99).normal(size=(17, 32))
+    parts, levels, books = [], [], []
+    for _ in range(VIEWS):
+        columns, rows = [], []
+        shown: list[np.ndarray] = [ROOM] if rooms else []
+        shown += [THING, PART] if rng.random() < parts_in else [THING]
+        for level, right in enumerate(shown):
+            labels, base = right.copy(), {0: 16, 3: 12, 11: 0}[int(right.max())]
+            for one in np.unique(right):
+                if rng.random() < wrong / 2 and one:
+                    labels[labels == one] = one - 1
+                elif rng.random() < wrong / 2:
+                    cut = (labels == one) & (np.arange(SPLATS) > rng.choice(np.flatnonzero(right == one)))
+                    labels[cut] = labels.max() + 1
+            for one in range(labels.max() + 1):
+                inside = labels == one
+                columns.append(inside * rng.uniform(0.5, 1.5, SPLATS))
+                meant = base + (np.bincount(right[inside]).argmax() if inside.any() else 0)
+                rows.append(vectors[meant] + 0.3 * rng.normal(size=32))
+                levels.append(level)
+        parts.append(of_dense(np.stack(columns, axis=1) * (rng.random(SPLATS) < 0.9)[:, None]))
+        books.append(ViewCodebook(torch.tensor(np.array(rows), dtype=torch.float32)))
+    return stacked(parts, SPLATS), np.array(levels, np.int8), Codebook(books)
+
+
+def members(found: RegionObjects) -> list[np.ndarray]:
+    """[P] bool of each node."""
+    above = found.tree.lineage().toarray().astype(bool)
+    return [np.append(above[:, node], False)[found.node] for node in range(len(above))]
+
+
+def mean_iou(nodes: list[np.ndarray], owners: np.ndarray) -> float:
+    """Of the best node of each owner."""
+    table = np.stack(nodes)
+    ious = []
+    for owner in range(int(owners.max()) + 1):
+        truth = owners == owner
+        ious.append(float(((table & truth).sum(axis=1) / (table | truth).sum(axis=1)).max()))
+    return float(np.mean(ious))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_things_and_their_parts_are_nodes_though_a_third_of_the_masks_is_wrong(seed: int) -> None:
+    W, levels, _ = three_levels(seed)
+    found = region_objects(W, levels, np.ones(SPLATS))
+    nodes, parents = members(found), found.tree.parents
+    assert found.count == 4 and (parents[:4] < 0).all()
+    assert mean_iou(nodes, THING) > 0.95
+    assert mean_iou(nodes, PART) > 0.85
+    assert len(nodes) < 2 * 16  # of some seventy wrong masks hardly any is repeated by a quarter of the views
+    for node in np.flatnonzero(parents >= 0):
+        assert nodes[node].sum() and not (nodes[node] & ~nodes[parents[node]]).any()
+
+
+def test_parts_that_half_of_the_views_show_are_found() -> None:
+    W, levels, _ = three_levels(0, wrong=0.1, parts_in=0.5)
+    found = region_objects(W, levels, np.ones(SPLATS))
+    assert mean_iou(members(found), PART) > 0.8
+
+
+def test_what_holds_the_whole_scene_is_a_group_and_its_parts_are_the_objects() -> None:
+    W, levels, codebook = three_levels(1, wrong=0.0, rooms=True)
+    found = region_objects(W, levels, np.arange(SPLATS) + 1.0)
+    assert found.count == 4 and set(found.tree.parents[:4]) == {4} and found.tree.parents[4] < 0
+    np.testing.assert_array_equal(found.labels, 3 - THING)  # the most evidence first
+    totals = np.bincount(W.region.numpy(), W.weight.numpy(), levels.size)
+    facts = object_facts(found, NodeVectors.of(codebook, totals, found))
+    assert (
+        facts["largest_share"] == 1.0 and "100%" in facts["warning"] and "objects are its parts" in facts["warning"]
+    )
+
+
+def test_levels_that_say_different_things_are_told_and_kept_apart() -> None:
+    W, levels, codebook = three_levels(2, wrong=0.0)
+    totals = np.bincount(W.region.numpy(), W.weight.numpy(), levels.size)
+    found = region_objects(W, levels, np.ones(SPLATS))
+    other = NodeVectors.of(codebook, totals, found)
+    assert other.level_agreement is not None and abs(other.level_agreement) < 0.5
+    assert "different things" in object_facts(found, other)["warning"]
+    truth = np.random.default_rng(99).normal(size=(17, 32))
+    truth /= np.linalg.norm(truth, axis=1, keepdims=True)
+    for node, inside in enumerate(members(found)):
+        meant = 12 + THING[inside][0] if found.tree.parents[node] < 0 else PART[inside][0]
+        assert int((truth @ other.vectors[node]).argmax()) == meant
+    alike = [view.rows.clone() for view in codebook.views]
+    start = 0
+    for rows in alike:  # parts that are named as their things are
+        for row in range(len(rows)):
+            node = found.tree.region[start + row]
+            thing = node if found.tree.parents[node] < 0 else found.tree.parents[node]
+            noise = np.random.default_rng(start + row).normal(size=32)
+            rows[row] = torch.tensor(truth[int(thing)] + 0.2 * noise)
+        start += len(rows)
+    same = NodeVectors.of(Codebook([ViewCodebook(rows) for rows in alike]), totals, found)
+    assert same.level_agreement is not None and same.level_agreement > 0.9
+    assert "warning" not in object_facts(found, same)
+
+
+def test_the_number_of_threads_changes_no_node() -> None:
+    W, levels, _ = three_levels(3)
+    one, many = (region_objects(W, levels, np.ones(SPLATS), threads) for threads in (1, 5))
+    np.testing.assert_array_equal(one.node, many.node)
+    for name, part in vars(one.tree).items():
+        np.testing.assert_array_equal(getattr(many.tree, name), part)
