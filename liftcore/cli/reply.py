@@ -96,6 +96,8 @@ def smoothing_line(facts: Mapping[str, Any]) -> str:
         return f"smoothness 0{reason}"
     moved = "not at all" if facts["moved"] is None else f"by {facts['moved']:.1%} of their length"
     by = "place and colour" if facts["colours"] else "place alone, as the splats have no colours"
+    parted = facts.get("parted", 0.0)
+    by += f", but where masks part them ({parted:.1%} of affinity)" if parted else ""
     return (
         f"smoothness {facts['smoothness']:g}{reason}: features moved {moved} towards their neighbours' in {by}; "
         f"{facts['filled']} splats without evidence took their neighbours' "

@@ -30,6 +30,7 @@ from liftcore.solve.diagnostics import ViewMeasures, measure_samples
 from liftcore.solve.directions import region_totals
 from liftcore.solve.least_squares import AllRays, reference, refine
 from liftcore.solve.loss import huber_factors
+from liftcore.solve.mask_edges import weaken_edges
 from liftcore.solve.objects import NodeVectors, RegionObjects, region_objects
 from liftcore.solve.reweight import Agreement, agreement_factors, reweighted, whole_regions
 from liftcore.solve.smooth import smooth
@@ -165,19 +166,22 @@ class InMemory(Steps[SceneWeights]):
         return X, facts
 
     def smooth(self, W: SceneWeights, X: Tensor, support: Support) -> tuple[Tensor, dict[str, Any]]:
-        graph, strength, choice = SplatGraph.of(self.splats, self.threads), self.settings.smoothness, dict[str, Any]()
+        weights, strength, choice = W.weights.cpu(), self.settings.smoothness, dict[str, Any]()
+        graph, parted = weaken_edges(
+            SplatGraph.of(self.splats, self.threads), weights, W.geometry.levels, self.threads
+        )  # fmt: skip
         if strength == "auto":
             with self.timings.stage("halves"):
                 chosen = choose_smoothness(
-                    W.weights.cpu(), W.geometry.codebook, graph, support.confidence, means=self.splats.means,
-                    seed=self.settings.seed, progress=self.timings.progress, threads=self.threads,
+                    weights, W.geometry.codebook, graph, support.confidence, seed=self.settings.seed,
+                    progress=self.timings.progress, threads=self.threads,
                 )  # fmt: skip
             strength, choice = chosen.smoothness, {"candidates": chosen.facts()}
         seen = torch.from_numpy(support.sums > 0)
         X, facts = smooth(
             X, graph, support.evidence, support.confidence, seen, strength, self.timings.progress, self.threads
         )
-        return X, facts | choice
+        return X, facts | {"parted": parted} | choice
 
     def aggregate(self, W: SceneWeights, X: Tensor, clusters: RegionObjects | None) -> tuple[Tensor, Aggregation]:
         settings, agreement, judged = self.settings, W.agreement, None

@@ -28,7 +28,9 @@ ROOM = 0.5  # of the free memory, that features may take before they lie in a ma
 def refine(
     lift: AnyLift, splats: Splats, smoothness: float, progress: Progress = silent, threads: int | None = None
 ) -> AnyLift:
-    """Smooth the features of a lift, as `LiftSettings.smoothness` does it in a lift: the same bits.
+    """Smooth the features of a lift, as `LiftSettings.smoothness` does it in a lift.
+
+    Of grids the bits are the same. Masks weaken edges of the graph in a lift alone: it keeps no weights of its views.
 
     Args:
         lift: of any engine; it stays as it is. splats: that were lifted. smoothness: lambda, above zero.

@@ -5,10 +5,15 @@ After the closed form, X0, with evidence D, confidence c and affinities a_jk (`l
     min over X of  sum_j w_j |x_j - x0_j|^2  +  lambda sum_jk a_jk sqrt(w_j w_k) |x_j - x_k|^2,   each pair once
     w_j = D_j max(c_j, 0.02)
 
-Conjugate gradients from X0 on, with the diagonal as preconditioner, in blocks of channels: float32 with sums in
-float64. A channel stops by itself, and every sum has a fixed order, so that neither the number of threads nor the
-size of a block changes a bit. The solution is a mean of X0's rows, so no channel of it leaves the range of X0's; nor
-does what is delivered.
+Conjugate gradients from X0 on, with the diagonal as preconditioner: float32 with sums in float64. All channels share
+a matrix, so they share the steps, too: those that are best for PROBES random sums of channels, which know every
+channel by its energy. In the form of Stiefel (1958) a step needs the last two iterates alone,
+
+    x <- x + alpha M^-1 (b - K x) + beta (x - x_before),
+
+and with alpha and beta known it is one pass over the graph, by blocks of channels, without any sum over the scene.
+Every sum has a fixed order, so that the number of threads changes no bit. The solution
+is a mean of X0's rows, so no channel of it leaves the range of X0's; nor does what is delivered.
 
 A splat without evidence has no term of its own. It takes the limit of the solution for w_j towards zero, the mean of
 its neighbours by ``a_jk sqrt(w_k)``, and those behind it the mean of these, ring by ring.
@@ -17,15 +22,17 @@ its neighbours by ``a_jk sqrt(w_k)``, and those behind it the mean of these, rin
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from liftcore.raster.cpu.simd import LANES, in_all_lanes, keep_lanes, lanes_at, plus, plus_product, times
 from liftcore.runtime.jit import kernel
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, silent
@@ -34,12 +41,15 @@ from liftcore.scene.splats import Splats
 
 LEAST_CONFIDENCE = 0.02  # that a splat counts by: one view alone says something, too
 LEAST_WEIGHT = 1e-30  # of the largest; a splat below it has no evidence
-BLOCK = 32  # channels solved at a time: four [P, 32] f32
+BLOCK = 4 * LANES  # channels solved at a time: three [P, 32] f32
 ROWS = 1 << 13  # splats of one piece of work
-TOLERANCE = 1e-3  # of each channel's gradient, relative to that at X0, over sqrt(1 + lambda): what varies slowly
-# over the scene has little of the gradient, the less the larger lambda
+PROBES = LANES  # random sums of all channels, by which steps are found
+TOLERANCE = 1e-3  # of the gradient, relative to that at X0, over sqrt(1 + lambda): what varies slowly over the scene
+# has little of the gradient, the less the larger lambda
 ROUGHLY = 2e-2  # a tolerance by which features are compared, not delivered
 STEPS = 200  # of conjugate gradients at most; with lambda 4 about 20 are enough
+
+Step = tuple[np.float32, np.float32]  # alpha and beta
 
 
 @dataclass(frozen=True)
@@ -76,8 +86,6 @@ def smooth(
     smoothness: float,
     progress: Progress = silent,
     threads: int | None = None,
-    *,
-    block: int = BLOCK,
 ) -> tuple[Tensor, dict[str, Any]]:
     """Draw the features of splats that are near in place and colour together.
 
@@ -88,11 +96,10 @@ def smooth(
         seen: [P] bool, the splats whose row of X was solved for; the others take their neighbours' features.
         smoothness: lambda; zero leaves X as it is.
         threads: None takes the cores that this process may use. The number changes no bit.
-        block: channels solved at a time; the number changes no bit.
 
     Returns:
-        X, and its facts for the diagnostics: ``smoothness``, the ``steps`` of the slowest channel, its ``residual``
-        (the preconditioned gradient's length over that at X0), ``moved`` (the root of
+        X, and its facts for the diagnostics: ``smoothness``, the ``steps``, the ``residual`` (the preconditioned
+        gradient's length over that at X0, of the probes), ``moved`` (the root of
         ``sum_j w_j |x_j - x0_j|^2 / sum_j w_j |x0_j|^2``), ``filled``, the splats without evidence that took a
         feature, and whether ``colours`` counted.
     """
@@ -103,15 +110,17 @@ def smooth(
     for rows, _ in rings:
         has_feature[rows] = True
     order, (count, channels) = torch.from_numpy(graph.order).long(), X.shape
-    squares, steps, residual = np.zeros((2, channels)), 0, 0.0
+    squares, steps, residual = np.zeros((2, channels)), list[Step](), 0.0
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
-        for begin in range(0, channels if smoothness and has_evidence.any() else 0, block):
-            columns = X[:, begin : begin + block]
-            values = np.empty(columns.shape, np.float32)
+        if smoothness and has_evidence.any():
+            _, steps, residual = _conjugate_gradients(system, _probe(X, order, has_evidence, pool), pool)
+        for begin in range(0, channels if smoothness and has_evidence.any() else 0, BLOCK):
+            columns = X[:, begin : begin + BLOCK]
+            width, values = columns.shape[1], np.zeros((count, BLOCK), np.float32)
 
             def read(rows: slice, columns: Tensor = columns, values: np.ndarray = values) -> tuple[Any, Any]:
                 """Take rows of X in the graph's order; their least and greatest value in each channel."""
-                own, part = has_evidence[rows], values[rows]
+                own, part = has_evidence[rows], values[rows, : columns.shape[1]]
                 part[:] = columns.index_select(0, order[rows]).float().numpy()
                 part[~own] = 0.0
                 supported = part[own]
@@ -119,32 +128,31 @@ def smooth(
 
             lows, highs = zip(*_map_rows(read, count, pool), strict=True)
             low, high = np.min(lows, axis=0), np.max(highs, axis=0)
-            solution, taken, gradient = _solve(system, values, pool)
-            steps, residual = max(steps, taken), max(residual, gradient)
+            solution = _descend(system, values, steps, pool)
 
             def clip(
                 rows: slice, low: np.ndarray = low, high: np.ndarray = high, values: np.ndarray = solution
             ) -> None:
-                np.clip(values[rows], low, high, out=values[rows])
+                part = values[rows, : low.size]
+                np.clip(part, low, high, out=part)
 
             _map_rows(clip, count, pool)
-            squares[:, begin : begin + block] = _movement(system.weights, values, solution, pool)
+            squares[:, begin : begin + BLOCK] = _movement(system.weights, values, solution, pool)[:, :width]
             for rows, shares in rings:
                 solution[rows] = shares @ solution
 
             def write(rows: slice, columns: Tensor = columns, values: np.ndarray = solution) -> None:
                 """Put rows into their places in X."""
                 own = has_feature[rows]
-                columns.index_copy_(
-                    0, order[rows][torch.from_numpy(own)], torch.from_numpy(values[rows][own]).to(X.dtype)
-                )
+                part = torch.from_numpy(values[rows][own, : columns.shape[1]]).to(X.dtype)
+                columns.index_copy_(0, order[rows][torch.from_numpy(own)], part)
 
             _map_rows(write, count, pool)
-            progress("smooth", min(begin + block, channels), channels, "channels")
+            progress("smooth", min(begin + BLOCK, channels), channels, "channels")
     moved, whole = squares.sum(axis=1).tolist()
     facts: dict[str, Any] = {
         "smoothness": smoothness,
-        "steps": steps,
+        "steps": len(steps),
         "residual": residual,
         "moved": float(np.sqrt(moved / whole)) if whole > 0 and np.isfinite(whole) else None,
         "filled": sum(len(rows) for rows, _ in rings),
@@ -152,8 +160,8 @@ def smooth(
     }
     if residual > system.tolerance:
         facts["warning"] = (
-            f"smoothness={smoothness:g} ended after {steps} steps with {residual:.1g} of the gradient left: features "
-            "are less smooth than asked for"
+            f"smoothness={smoothness:g} ended after {len(steps)} steps with {residual:.1g} of the gradient left: "
+            "features are less smooth than asked for"
         )
     return X, facts
 
@@ -165,8 +173,10 @@ def smooth_channels(
 
     Splats without evidence come back as zeros.
     """
-    known = np.where(weights[:, None] > 0, values, np.float32(0.0))
-    return _solve(_System.of(graph, weights, smoothness, ROUGHLY), known, pool)[0]
+    known = np.zeros((len(values), -(-values.shape[1] // LANES) * LANES), np.float32)
+    np.copyto(known[:, : values.shape[1]], values, where=weights[:, None] > 0)
+    system = _System.of(graph, weights, smoothness, ROUGHLY)
+    return _conjugate_gradients(system, known, pool)[0][:, : values.shape[1]]
 
 
 def warm_up_smoothing() -> None:
@@ -219,60 +229,114 @@ def _rings(graph: SplatGraph, weights: np.ndarray) -> list[tuple[np.ndarray, Any
     return rings
 
 
-def _solve(system: _System, start: np.ndarray, pool: Executor) -> tuple[np.ndarray, int, float]:
-    """The minimum [P, C] f32 from X0 [P, C] f32 on, the steps taken, and the largest relative gradient left."""
-    graph, (count, channels) = system.graph, start.shape
+def _probe(X: Tensor, order: Tensor, known: np.ndarray, pool: Executor) -> np.ndarray:
+    """[P, PROBES] f32, in the graph's order: sums of X's channels with random signs, zero where not known [P]."""
+    signs = torch.from_numpy(np.random.default_rng(0).choice(np.array([-1.0, 1.0], np.float32), (X.shape[1], PROBES)))
+
+    def add(rows: slice) -> np.ndarray:
+        return (X.index_select(0, order[rows]).float() @ signs).numpy()
+
+    sums = np.concatenate(_map_rows(add, len(X), pool))
+    return np.where(known[:, None] & np.isfinite(sums), sums, np.float32(0.0))
+
+
+def _conjugate_gradients(system: _System, start: np.ndarray, pool: Executor) -> tuple[np.ndarray, list[Step], float]:
+    """Minimise from X0 [P, C] f32 on, all channels as one vector: X, its steps, and the relative gradient left.
+
+    C is a multiple of LANES.
+    """
+    graph, count = system.graph, len(start)
     X, rest, direction = start.copy(), np.zeros_like(start), start.copy()
-    image = np.empty_like(start)
+    image, steps = np.empty_like(start), list[Step]()
 
-    def run(work: Callable[..., Any], *arguments: Any) -> np.ndarray:
-        return _row_sums(work, arguments, (channels,), count, pool)
+    def run(work: Callable[..., Any], *arguments: Any) -> float:
+        return float(_row_sums(work, arguments, (1,), count, pool)[0])
 
-    def multiply(weights: np.ndarray) -> np.ndarray:
-        return run(multiply_rows, graph.starts, graph.neighbours, system.couplings, weights, direction, image)
+    def multiply(weights: np.ndarray) -> float:
+        flat = direction.reshape(-1), image.reshape(-1)
+        return run(multiply_rows, graph.starts, graph.neighbours, system.couplings, weights, *flat)
 
     multiply(np.zeros_like(system.weights))  # lambda L X0, the gradient at X0
-    ones, zeros = np.ones(channels, np.float32), np.zeros(channels, np.float32)
-    slope = run(advance_rows, system.inverse, ones, direction, image, zeros, X, rest)
-    first, active, steps = slope.copy(), np.isfinite(slope) & (slope > 0), 0
-    run(turn_rows, system.inverse, zeros, rest, direction)
-    while active.any() and steps < STEPS:
+    one, zero = np.float32(1.0), np.float32(0.0)
+    first = slope = run(advance_rows, system.inverse, one, direction, image, zero, X, rest)
+    run(turn_rows, system.inverse, zero, rest, direction)
+    turn = length = zero
+    while 0 < slope < np.inf and slope > system.tolerance**2 * first and len(steps) < STEPS:
         curvature = multiply(system.weights)
-        active &= np.isfinite(curvature) & (curvature > 0)
-        length = np.divide(slope, curvature, out=np.zeros(channels), where=active).astype(np.float32)
+        if not 0 < curvature < np.inf:
+            break
+        before, length = length, np.float32(slope / curvature)
+        steps.append((length, length * turn / before if steps else zero))
         new = run(advance_rows, system.inverse, length, direction, image, length, X, rest)
-        turn = np.divide(new, slope, out=np.zeros(channels), where=active).astype(np.float32)
-        slope, steps = new, steps + 1
-        active &= slope > system.tolerance**2 * first
+        slope, turn = new, np.float32(new / slope)
         run(turn_rows, system.inverse, turn, rest, direction)
-    left = np.divide(slope, first, out=np.zeros(channels), where=np.isfinite(first) & (first > 0))
-    return X, steps, float(np.sqrt(left.max(initial=0.0)))
+    return X, steps, float(np.sqrt(slope / first)) if first > 0 else 0.0
+
+
+def _descend(system: _System, start: np.ndarray, steps: Sequence[Step], pool: Executor) -> np.ndarray:
+    """Take steps that are known from X0 [P, BLOCK] f32 on; [P, BLOCK] f32."""
+    graph, X, before = system.graph, start.copy(), start.copy()
+    arrays = graph.starts, graph.neighbours, system.couplings, system.weights, system.inverse, start.reshape(-1)
+
+    def take(step: Step, X: np.ndarray, before: np.ndarray, rows: slice) -> None:
+        step_rows(rows.start, rows.stop, *arrays, X.reshape(-1), before.reshape(-1), *step)
+
+    for step in steps:
+        _map_rows(partial(take, step, X, before), len(start), pool)
+        X, before = before, X
+    return X
+
+
+@kernel
+def step_rows(
+    first, last, starts, neighbours, couplings, weights, inverse, start, X, before, length, turn
+):  # fmt: skip
+    """Write the iterate after X over that before it, in rows first..last of flat [P, 32] arrays."""
+    less, turned = in_all_lanes(np.float32(-1.0)), in_all_lanes(turn)
+    for j in range(first, last):
+        at, own, far = BLOCK * j, in_all_lanes(weights[j]), in_all_lanes(np.float32(length * inverse[j]))
+        x0, x1 = times(less, lanes_at(X, at)), times(less, lanes_at(X, at + 8))
+        x2, x3 = times(less, lanes_at(X, at + 16)), times(less, lanes_at(X, at + 24))
+        r0, r1 = times(own, plus(lanes_at(start, at), x0)), times(own, plus(lanes_at(start, at + 8), x1))
+        r2, r3 = times(own, plus(lanes_at(start, at + 16), x2)), times(own, plus(lanes_at(start, at + 24), x3))
+        for n in range(starts[j], starts[j + 1]):
+            k, coupling = BLOCK * np.int64(neighbours[n]), in_all_lanes(couplings[n])
+            r0 = plus_product(r0, coupling, plus(lanes_at(X, k), x0))
+            r1 = plus_product(r1, coupling, plus(lanes_at(X, k + 8), x1))
+            r2 = plus_product(r2, coupling, plus(lanes_at(X, k + 16), x2))
+            r3 = plus_product(r3, coupling, plus(lanes_at(X, k + 24), x3))
+        for part, (x, rest) in enumerate(((x0, r0), (x1, r1), (x2, r2), (x3, r3))):
+            place = at + 8 * part
+            moved = times(less, plus(x, lanes_at(before, place)))
+            keep_lanes(before, place, plus_product(plus_product(times(less, x), far, rest), turned, moved))
 
 
 @kernel
 def multiply_rows(first, last, starts, neighbours, couplings, weights, direction, image, dots):
-    """Write ``(diag(w) + lambda L) P`` of rows first..last; add the columns' ``p^T K p`` to dots [C] f64."""
-    channels = direction.shape[1]
+    """Write ``(diag(w) + lambda L) P`` of rows first..last of flat [P, C] arrays; add ``p^T K p`` to dots [1] f64."""
+    less, channels = in_all_lanes(np.float32(-1.0)), direction.size // weights.size
     for j in range(first, last):
-        for c in range(channels):
-            image[j, c] = weights[j] * direction[j, c]
-        for n in range(starts[j], starts[j + 1]):
-            coupling, k = couplings[n], neighbours[n]
-            for c in range(channels):
-                image[j, c] += coupling * (direction[j, c] - direction[k, c])
-        for c in range(channels):
-            dots[c] += np.float64(direction[j, c]) * image[j, c]
+        for c in range(0, channels, LANES):
+            at, own = channels * j + c, in_all_lanes(weights[j])
+            values = lanes_at(direction, at)
+            product = times(own, values)
+            for n in range(starts[j], starts[j + 1]):
+                near = lanes_at(direction, channels * np.int64(neighbours[n]) + c)
+                product = plus_product(product, in_all_lanes(couplings[n]), plus(values, times(less, near)))
+            keep_lanes(image, at, product)
+            for lane in range(at, at + LANES):
+                dots[0] += np.float64(direction[lane]) * image[lane]
 
 
 @kernel
 def advance_rows(first, last, inverse, fall, direction, image, length, X, rest, dots):
-    """Take a step of rows first..last, ``X += length P``, ``R -= fall K P``; add ``r^T M^-1 r`` to dots [C] f64."""
+    """Take a step of rows first..last, ``X += length P``, ``R -= fall K P``; add ``r^T M^-1 r`` to dots [1] f64."""
     for j in range(first, last):
         for c in range(X.shape[1]):
-            X[j, c] += length[c] * direction[j, c]
-            left = rest[j, c] - fall[c] * image[j, c]
+            X[j, c] += length * direction[j, c]
+            left = rest[j, c] - fall * image[j, c]
             rest[j, c] = left
-            dots[c] += np.float64(left) * left * inverse[j]
+            dots[0] += np.float64(left) * left * inverse[j]
 
 
 @kernel
@@ -280,7 +344,7 @@ def turn_rows(first, last, inverse, turn, rest, direction, dots):
     """Write the next direction of rows first..last, ``P = M^-1 R + turn P``."""
     for j in range(first, last):
         for c in range(direction.shape[1]):
-            direction[j, c] = inverse[j] * rest[j, c] + turn[c] * direction[j, c]
+            direction[j, c] = inverse[j] * rest[j, c] + turn * direction[j, c]
 
 
 def _movement(weights: np.ndarray, before: np.ndarray, after: np.ndarray, pool: Executor) -> np.ndarray:

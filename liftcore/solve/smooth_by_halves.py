@@ -9,7 +9,8 @@ in bits a splat, where each splat counts once, by how clearly b names it::
     m_j = (d'_j - d_j) / d'_j,   the distances of x^b_j from its nearest and its second prototype
 
 and the mean of both directions. From zero on, lambda grows as long as the information does; of these lambdas the
-least is taken whose information is within a standard error of the most. The reasons:
+least is taken whose information is less than the most by no more than a standard error of their difference. Both are
+of the same splats, so it is the difference splat by splat that says how sure it is. The reasons:
 
 - **Names, not distances.** Most splats lie inside things, where a mean over neighbours only takes noise away. That
   moves them nearer to the other half while the few at edges go over to another thing, and a mean of distances does
@@ -21,7 +22,8 @@ least is taken whose information is within a standard error of the most. The rea
   count against it.
 - **Each splat once.** By evidence, large things in front would decide for small ones.
 
-Lambda grows by steps of about 3, between which figures change little.
+Lambda grows by steps of about 3, between which figures change little. Patches of the scene, SPLATS in all, stand for
+it: what a lambda does to a splat, its neighbourhood decides.
 """
 
 from __future__ import annotations
@@ -37,7 +39,6 @@ import torch
 from torch import Tensor
 
 from liftcore.runtime.device import CPU
-from liftcore.runtime.memory import zeros
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, silent
 from liftcore.solve.closed_form import solve
@@ -46,7 +47,7 @@ from liftcore.solve.directions import region_totals
 from liftcore.solve.reweight import reweighted
 from liftcore.solve.smooth import smooth_channels, smoothing_weights
 from liftcore.solve.sums import added
-from liftcore.values.region_weights import MEMORY_LIMIT, RegionWeights
+from liftcore.values.region_weights import RegionWeights
 
 if TYPE_CHECKING:
     from liftcore.scene.neighbours import SplatGraph
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
 STRENGTHS = (0.1, 0.3, 1.0, 4.0)  # lambdas that are tried, ascending
 CHANNELS = 16  # principal ones, in which halves are compared
 PROTOTYPES = 32
+SPLATS = 1 << 16  # that are compared
 SAMPLE = 1 << 14  # splats that make prototypes, and regions that say which channels are principal
 ROUNDS = 10  # of Lloyd's algorithm
 ROWS = 1 << 14  # of a table at a time
@@ -78,7 +80,6 @@ def choose_smoothness(
     graph: SplatGraph,
     confidence: Tensor | None,
     *,
-    means: Tensor | None = None,
     seed: int = 0,
     progress: Progress = silent,
     threads: int | None = None,
@@ -88,12 +89,15 @@ def choose_smoothness(
     Args:
         W: of all views as it is solved, a row for each of the P splats, on the CPU. codebook: E, of its regions.
         graph: of the P splats. confidence: [P] f32, as `liftcore.solve.smooth.smooth` has it.
-        means: [P, 3] of the splats: neighbours are solved together. seed: of samples.
+        seed: of samples.
         threads: None takes the cores that this process may use. The number changes no bit.
     """
+    graph = graph.patches(SPLATS)
+    W = _rows_of(W, torch.from_numpy(graph.order).long())
+    confidence = None if confidence is None else confidence[torch.from_numpy(graph.order).long()]
     rows = principal_channels(codebook, added(region_totals(W, threads), (1, codebook.regions))[0])
     view = torch.repeat_interleave(W.offsets.diff())
-    halves = [_Half.of(W, rows, view % 2 == half, means, threads) for half in (0, 1)]
+    halves = [_Half.of(W, rows, view % 2 == half, threads) for half in (0, 1)]
     judged = (halves[0].sums > 0) & (halves[1].sums > 0)
     if rows.shape[1] == 0 or not judged.any():
         return SmoothnessChoice(0.0, {})
@@ -108,26 +112,45 @@ def choose_smoothness(
     if not all(squares.any() for _, squares in names):  # of one prototype alone, too
         return SmoothnessChoice(0.0, {})
 
-    def mean_information(features: Sequence[np.ndarray]) -> np.ndarray:
+    def compare(features: Sequence[np.ndarray]) -> tuple[float, list[np.ndarray]]:
         others = zip(features, reversed(names), strict=True)
         both = [information(nearest_prototypes(own, centres)[0], *other) for own, other in others]
-        return np.mean(both, axis=0)
+        return float(np.mean([bits for bits, _ in both])), [splats for _, splats in both]
 
-    best, error = mean_information([half.features for half in halves]).tolist()
-    bits, order = {0.0: best}, graph.order
-    supports = [smoothing_weights(torch.from_numpy(half.sums), confidence)[order] for half in halves]
+    smoothed = [half.features for half in halves]
+    tries = {0.0: compare(smoothed)}
+    supports = [smoothing_weights(torch.from_numpy(half.sums), confidence) for half in halves]
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         for number, strength in enumerate(STRENGTHS):
-            smoothed = [np.empty_like(half.features) for half in halves]
-            for half, support, features in zip(halves, supports, smoothed, strict=True):
-                features[order] = smooth_channels(graph, half.features[order], support, strength, pool)
+            best = max(bits for bits, _ in tries.values())
+            smoothed = [
+                smooth_channels(graph, half.features, support, strength, pool)
+                for half, support in zip(halves, supports, strict=True)
+            ]
             progress("halves", number + 1, len(STRENGTHS), "lambdas")
-            bits[strength], next_error = mean_information(smoothed).tolist()
-            if bits[strength] <= best:
+            tries[strength] = compare(smoothed)
+            if tries[strength][0] <= best:
                 break
-            best, error = bits[strength], next_error
     progress("halves", len(STRENGTHS), len(STRENGTHS), "lambdas")
-    return SmoothnessChoice(min(one for one, value in bits.items() if value >= best - error), bits)
+    most, splats = max(tries.values(), key=lambda one: one[0])
+
+    def is_as_good(bits: float, own: list[np.ndarray]) -> bool:
+        others = zip(splats, own, reversed(names), strict=True)
+        errors = [standard_error(one - other, squares) for one, other, (_, squares) in others]
+        return most - bits <= sum(errors) / len(errors)
+
+    return SmoothnessChoice(
+        min(strength for strength, one in tries.items() if is_as_good(*one)),
+        {strength: bits for strength, (bits, _) in tries.items()},
+    )
+
+
+def _rows_of(W: RegionWeights, rows: Tensor) -> RegionWeights:
+    """W of some splats [n] i64, a row each in their order; without evidence."""
+    starts, entries = W.take(rows)
+    none = W.evidence_splats[:0], W.evidence[:0]
+    every = torch.arange(len(rows), dtype=torch.int32)
+    return RegionWeights(every, starts, W.region[entries], W.weight[entries], *none, W.offsets)
 
 
 @dataclass(frozen=True)
@@ -138,14 +161,10 @@ class _Half:
     sums: np.ndarray  # [P] f64, of the rows of its W
 
     @classmethod
-    def of(cls, W: RegionWeights, rows: Tensor, own: Tensor, means: Tensor | None, threads: int | None) -> _Half:
+    def of(cls, W: RegionWeights, rows: Tensor, own: Tensor, threads: int | None) -> _Half:
         """Of W's regions that are its own [M] bool, which read rows [M, C] f32."""
-        size = W.weight.nbytes
-        factors = zeros(tuple(W.weight.shape), torch.float32, name="weights", in_file=2 * size > MEMORY_LIMIT)
-        torch.index_select(own.float(), 0, W.region, out=factors)
-        half = reweighted(W, factors)
-        book = Codebook((ViewCodebook(rows),))
-        features = solve(half, book, torch.float32, means=means, threads=threads).features
+        half = reweighted(W, own.float()[W.region.long()])
+        features = solve(half, Codebook((ViewCodebook(rows),)), torch.float32, threads=threads).features
         return cls(features.numpy(), half.row_sums().numpy())
 
 
@@ -213,20 +232,24 @@ def nearest_prototypes(features: np.ndarray, centres: np.ndarray) -> tuple[np.nd
     return names, margins
 
 
-def information(names: np.ndarray, others: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def information(names: np.ndarray, others: np.ndarray, weights: np.ndarray) -> tuple[float, np.ndarray]:
     """The mutual information of two names of each splat [P] i64, by weights [P] f64 with a positive sum.
 
     Few splats in many pairs of names seem to tell more than they do: that is corrected for (Miller and Madow, 1955).
 
     Returns:
-        [2] f64: bits a splat, and their standard error.
+        Bits a splat, and those of each splat [P] f64, whose mean they are before the correction.
     """
     pairs = names * PROTOTYPES + others
     joint = np.bincount(pairs, weights, minlength=PROTOTYPES**2).reshape(PROTOTYPES, -1) / weights.sum()
     splats = weights.sum() ** 2 / np.square(weights).sum()
     rows, columns, both = joint.sum(axis=1), joint.sum(axis=0), joint > 0
-    nats = np.log(np.divide(joint, np.outer(rows, columns), out=np.ones_like(joint), where=both))
-    mean = (joint * nats).sum()
-    error = np.sqrt((joint * (nats - mean) ** 2).sum() / splats)
+    bits = np.log2(np.divide(joint, np.outer(rows, columns), out=np.ones_like(joint), where=both))
     spare = np.count_nonzero(rows) + np.count_nonzero(columns) - np.count_nonzero(both) - 1
-    return np.array([mean + spare / (2 * splats), error]) / np.log(2)
+    return float((joint * bits).sum() + spare / (2 * splats * np.log(2))), bits.ravel()[pairs]
+
+
+def standard_error(values: np.ndarray, weights: np.ndarray) -> float:
+    """Of the mean of values [P] by weights [P], which are no counts."""
+    shares = weights / weights.sum()
+    return float(np.sqrt(np.square(shares * (values - shares @ values)).sum()))

@@ -263,9 +263,9 @@ class LiftSettings(Shown):
         0.0,
         description="lambda of the term that draws the features of splats near in place and colour together: 0 is "
         "off; `auto` takes the strength that halves of the views ask for, off among them. A strength "
-        "of your own loses on maps that vary within things. `splatlift refine` does it to a lift that "
-        "is there, with a number. On a card it runs on the processor. Refused with an `engine`, and "
-        "with `aggregation_resolve`",
+        "of your own loses on maps that vary within things. Masks weaken edges that they know. "
+        "`splatlift refine` does it to a lift that is there, with a number and without its masks. On a card it "
+        "runs on the processor. Refused with an `engine`, and with `aggregation_resolve`",
     )
     cg_steps: int = Field(
         0,

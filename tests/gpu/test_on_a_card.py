@@ -18,9 +18,9 @@ from tests.backends import needs_triton
 
 pytestmark = needs_triton
 FEW: dict[str, Any] = {"certificate_rays": 6}  # as the interpreter traces one in a thirtieth of a second
-GRIDS: list[dict[str, Any]] = [{}, {"preset": "top-k"}, {"cg_steps": 1}, {"aggregation": True}]
+GRIDS: list[dict[str, Any]] = [{}, {"preset": "top-k"}, {"cg_steps": 1}, {"aggregation": True}, {"smoothness": 1}]
 MAPS: list[dict[str, Any]] = [{"preset": preset.value} for preset in Preset]
-MAPS += [{"loss": "huber"}, {"robust_steps": 2}, {"cg_steps": 1}, {"dtype": "float32"}]
+MAPS += [{"loss": "huber"}, {"robust_steps": 2}, {"cg_steps": 1}, {"dtype": "float32"}, {"smoothness": 1}]
 MAPS += [{"aggregation": True}, {"aggregation": True, "aggregation_resolve": True}, {"objects": True}]
 MAPS += [{"aggregation": True, "aggregation_clusters": "graph"}, {"engine": lc.LocalEngine(1)}]
 CASES = [*((False, how) for how in MAPS), *((True, how) for how in GRIDS)]

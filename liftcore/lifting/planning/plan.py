@@ -38,7 +38,6 @@ from liftcore.scene.splats import Splats
 from liftcore.solve.codebook import TABLE_BYTES
 from liftcore.solve.consensus import BLOCK_ENTRIES
 from liftcore.solve.diagnostics import shape_warnings
-from liftcore.solve.smooth_by_halves import CHANNELS
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.pack import Views
 from liftcore.values.region_weights import MEMORY_LIMIT
@@ -59,6 +58,7 @@ BLOCK_BYTES = 9  # of an entry that lies by region
 CG_VECTORS, CG_CHANNELS = 14, 32  # [P, 32] f32 of conjugate gradients, with the images of a view
 CLUSTERING = 80_000_000  # of hdbscan and what it stands on
 TOUCHING_BYTES = 1_000  # of a splat, where those that touch are told
+MEMBER_BYTES = 5  # of an entry: whether its splat belongs to its region, and to which
 SMOOTHING_BYTES = 1_000  # of a splat: the graph as it is made, or with a block of channels
 SPARE = 0.9  # of the free memory: 10 % are left to other processes
 CARD_SPARE = 0.8  # of a card's free memory: what is freed does not lie in one piece
@@ -350,10 +350,8 @@ def memory_parts(
     if settings.cg_steps or settings.reference_channels:
         parts["refinement"] = 4 * (splats.count * (CG_VECTORS * CG_CHANNELS) + 3 * largest * CG_CHANNELS)
     if settings.smoothness:
-        parts["smoothing"] = SMOOTHING_BYTES * splats.count
-        if settings.smoothness == "auto":  # a factor an entry of W, and two lifts in few channels before and after
-            entries = min(_entries(seen, features, names, settings), MEMORY_LIMIT / ENTRY_BYTES)
-            parts["smoothing"] += int(4 * entries) + 4 * 4 * CHANNELS * splats.count
+        entries = _entries(seen, features, names, settings)
+        parts["smoothing"] = SMOOTHING_BYTES * splats.count + int(MEMBER_BYTES * entries)
     if settings.aggregation:
         parts["aggregation"] = CLUSTERING + 24 * channels * min(splats.count, settings.aggregation_sample)
         if settings.aggregation_clusters in ("auto", "touching"):  # afterwards, and of one cluster at a time

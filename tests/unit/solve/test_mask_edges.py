@@ -1,0 +1,81 @@
+"""Edges that masks know: counts of views, what they say, and things that colours cannot tell apart."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from liftcore.scene.neighbours import SplatGraph
+from liftcore.solve.mask_edges import MOST, one_thing, weaken_edges
+from liftcore.solve.smooth import smooth
+from liftcore.values.region_weights import stacked
+from tests.scenes import random_splats
+from tests.unit.scene.test_neighbours import dense
+from tests.unit.solve.sparse_views import of_dense
+from tests.unit.solve.test_consensus import SPLATS, belonging, random_scene
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("seed", range(3))
+def test_edges_weaken_as_often_as_views_part_them(seed: int, threads: int) -> None:
+    W, levels = random_scene(seed)
+    graph = SplatGraph.of(random_splats(seed, SPLATS))
+    _, _, groups, B = belonging(W, levels)
+    joined, parted = np.zeros((2, SPLATS, SPLATS), int)
+    for group in groups:
+        own = B[:, group].astype(int)
+        together, seen = own @ own.T, own.sum(axis=1)
+        joined += together
+        parted += np.outer(seen, seen) - together
+    edges, before = np.zeros((MOST + 1, MOST + 1)), dense(graph)
+    np.add.at(edges, (joined[before > 0], parted[before > 0]), 1)
+    weakened, share = weaken_edges(graph, W, levels, threads)
+    np.testing.assert_allclose(dense(weakened), before * one_thing(edges)[joined, parted], rtol=1e-5)
+    assert 0 < share < 1
+
+
+def test_masks_that_are_often_wrong_say_less() -> None:
+    def said(split: float, merged: float) -> np.ndarray:
+        rng, edges = np.random.default_rng(0), np.zeros((MOST + 1, MOST + 1))
+        for count, rate in ((95_000, split), (5_000, 1 - merged)):
+            parted = rng.binomial(5, rate, count)
+            np.add.at(edges, (5 - parted, parted), 1)
+        return one_thing(edges)
+
+    right, wrong = said(0.01, 0.05), said(0.2, 0.3)
+    assert right[0, 0] == wrong[0, 0] == 1
+    assert right[0, 5] < 1e-3 < wrong[0, 5]
+    assert right[2, 3] < 0.5 < wrong[3, 2]
+    assert right[4, 1] > 0.95
+
+
+SIDE = 30  # splats of a square cloth
+PLACES = np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE)), axis=-1).reshape(-1, 2)
+THINGS = {
+    "thin": PLACES[:, 0] == 15,
+    "small": (np.abs(PLACES - 15) <= 1).all(axis=1),
+    "large": (np.abs(PLACES - 15) <= 7).all(axis=1),
+}
+
+
+@pytest.mark.parametrize("kind", THINGS)
+def test_thing_of_the_colour_of_its_cloth_stays_apart_from_it(kind: str) -> None:
+    thing, rng, count, views = THINGS[kind].astype(int), np.random.default_rng(1), SIDE**2, 6
+    means = torch.from_numpy(np.column_stack([PLACES, np.zeros(count)])).float()
+    splats = replace(random_splats(1, count), means=means, sh=torch.zeros(count, 1, 3))
+    merged = rng.permutation(views) < 2  # views whose mask of the cloth has the thing, too
+    W = stacked([of_dense(np.eye(2)[0 * thing if whole else thing]) for whole in merged], count)
+    graph = SplatGraph.of(splats)
+    weakened, _ = weaken_edges(graph, W, np.zeros(2 * views, np.int8))
+    truth, ones = torch.from_numpy(np.eye(2)[thing]).float(), torch.ones(count)
+    noisy = truth + 0.5 * torch.from_numpy(rng.normal(size=(count, 2))).float()
+
+    def wrong(X: torch.Tensor) -> int:
+        return int((X.argmax(dim=1).numpy() != thing)[THINGS[kind]].sum())
+
+    apart, together = (smooth(noisy.clone(), one, ones, None, ones > 0, 4.0)[0] for one in (weakened, graph))
+    assert wrong(apart) == 0
+    assert wrong(together) > 0
