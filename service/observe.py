@@ -36,7 +36,7 @@ from liftcore import __version__
 from service import models
 from service.models import JobState
 from service.queries.client import QueryClient
-from service.store.schema import VERSION
+from service.store.database import VERSION
 from service.store.store import Store
 
 if TYPE_CHECKING:

@@ -21,13 +21,13 @@ from service.auth import CALLER, Caller
 from service.content import EventStreams
 from service.errand import ErrandLimits
 from service.errors import NotReady
-from service.jobs.supervisor import Supervisor
 from service.models import Version
 from service.observe import Metrics
 from service.queries.client import QueryClient
 from service.settings import ServiceSettings
 from service.store.owners import Owner
 from service.store.store import Store
+from service.supervisor import Supervisor
 
 PATIENCE_SECONDS = 2.0  # for all checks of readiness; a disk that takes longer is no disk to work with
 FRESH_SECONDS = 1.0  # a look counts for so long: however many ask, the disk is written once a second

@@ -1,5 +1,5 @@
 """What runs in a process of its own. While a request waits (`service.errand`): an upload is read before it becomes an
-asset, a pack named anew, a lift planned that nobody has ordered yet. And what jobs do (`service.jobs.child`)."""
+asset, a pack named anew, a lift planned that nobody has ordered yet. And what jobs do (`service.job_child`)."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from service.store.lifts import LONG, SHOWN_BYTES
 from service.uploads import INVALID, LIFT
 
 if TYPE_CHECKING:
-    from service.jobs.child import Reporter
+    from service.job_child import Reporter
 
 BLOCK_ROWS = 1 << 14  # of a lift, looked at together
 SHOWN_DIGITS = 12  # of the splats' digest, by which the chart of a trade-off names the scene

@@ -19,8 +19,14 @@ from typing import Any, Generic, TypeVar, cast
 from liftcore.files import whole_file
 from service.errors import InvalidRequest, Misconfigured, StaleDatabase
 from service.store.files import remove, sync_directory
-from service.store.schema import MIGRATING_RELEASE, OF_0_4, SCHEMA, SELECTIONS, VERSION
 
+VERSION = 14  # SQLite's user_version
+OF_0_4 = 13  # that of release 0.4, which takes databases of any version before to it, and lacks SELECTIONS
+MIGRATING_RELEASE = "0.4.0"
+TABLES_OF_0_4, SELECTIONS = (
+    Path(__file__).with_name(f"{name}.sql").read_text(encoding="utf-8") for name in ("schema_of_0_4", "selections")
+)
+SCHEMA = TABLES_OF_0_4 + SELECTIONS
 DATABASE = "service.sqlite"  # in the data directory, beside two files that know an empty or older one from it:
 GENERATION = "generation"  # the number that the newest counted transaction had
 KEYS_REQUIRED = "keys.required"  # there when a key was ever made

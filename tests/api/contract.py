@@ -24,12 +24,12 @@ import httpx
 
 from service.app import create_app, job_limits, query_limits
 from service.errand import TaskResult
-from service.jobs.supervisor import Supervisor
 from service.queries.client import QueryClient
 from service.settings import ServiceSettings
 from service.store.keys import Quota
 from service.store.owners import Scope
 from service.store.store import Store
+from service.supervisor import Supervisor
 from service.uploads import Report
 from tests.crash.conftest import address_of, listening, stand_in, until
 

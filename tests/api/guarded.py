@@ -14,7 +14,6 @@ from fastapi.testclient import TestClient
 from starlette.routing import Route
 
 from service.app import create_app
-from service.jobs.supervisor import Supervisor
 from service.models import JobKind
 from service.queries.client import QueryClient
 from service.settings import ServiceSettings
@@ -23,6 +22,7 @@ from service.store.keys import Quota
 from service.store.lifts import FinishedLift, FinishedTradeoff
 from service.store.owners import Owner, Scope
 from service.store.store import Store
+from service.supervisor import Supervisor
 from tests.crash.conftest import order
 from tests.crash.server import NoQueries
 

@@ -26,10 +26,10 @@ from liftcore.query.scene import Scene
 from liftcore.runtime.device import choose_device
 from liftcore.runtime.progress import Progress
 from liftcore.values.settings import LiftSettings
+from service import job_child as child
+from service import supervisor as pace
 from service.child import fault_of
-from service.jobs import child
-from service.jobs import supervisor as pace
-from service.jobs.child import Reporter
+from service.job_child import Reporter
 from service.models import AssetKind
 from service.store.jobs import LINE_CHARACTERS, LOG_LINES, EventKind, log_line, note
 from service.store.owners import SERVICE

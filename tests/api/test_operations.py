@@ -25,12 +25,11 @@ from prometheus_client import REGISTRY
 from prometheus_client.parser import text_string_to_metric_families
 from pydantic import ValidationError
 
-from service import middleware
+from service import app as layers
 from service.commands.serve import AnnouncingServer
 from service.content import EventStreams
 from service.errand import ErrandLimits
 from service.errors import Busy, NoSpace
-from service.jobs.supervisor import Supervisor
 from service.models import BODY_BRACKETS, BODY_COMMAS, PACKS, SETTINGS, AssetKind
 from service.observe import SAME_A_MINUTE, JsonLines, Sparing, TextLines, working_for
 from service.queries.client import Frame
@@ -41,6 +40,7 @@ from service.store.database import Database
 from service.store.files import DataDirectory
 from service.store.owners import SERVICE
 from service.store.store import Store
+from service.supervisor import Supervisor
 from service.uploads import check
 from tests.crash.conftest import order, until
 from tests.crash.server import NoQueries
@@ -409,11 +409,11 @@ def test_upload_to_a_stalled_disk_keeps_nobody_else_waiting(
                 upload.join()
 
 
-@pytest.mark.parametrize(("seconds", "at_once"), [(1000.0, middleware.PLACES), (0.001, 2 * middleware.PLACES)])
+@pytest.mark.parametrize(("seconds", "at_once"), [(1000.0, layers.PLACES), (0.001, 2 * layers.PLACES)])
 def test_few_requests_begin_at_a_time_and_none_waits_for_slow_ones(
     monkeypatch: pytest.MonkeyPatch, seconds: float, at_once: int
 ) -> None:
-    monkeypatch.setattr(middleware, "TURN_SECONDS", seconds)
+    monkeypatch.setattr(layers, "TURN_SECONDS", seconds)
     begun: list[str] = []
 
     async def ask_all() -> None:
@@ -424,15 +424,15 @@ def test_few_requests_begin_at_a_time_and_none_waits_for_slow_ones(
             if scope["path"] == "/slow":
                 await go_on.wait()
 
-        turns: Any = middleware.Turns(app)
+        turns: Any = layers.Turns(app)
         async with anyio.create_task_group() as asked:
-            for path in ["/slow"] * 2 * middleware.PLACES + ["/healthz"]:
+            for path in ["/slow"] * 2 * layers.PLACES + ["/healthz"]:
                 asked.start_soon(turns, {"type": "http", "path": path}, None, None)
             while "/healthz" not in begun or begun.count("/slow") < at_once:
                 await anyio.sleep(0.001)
             assert begun.count("/slow") == at_once
             go_on.set()
-        assert begun.count("/slow") == 2 * middleware.PLACES
+        assert begun.count("/slow") == 2 * layers.PLACES
 
     anyio.run(ask_all)
 

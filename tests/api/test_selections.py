@@ -13,8 +13,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.store import selections as module
-from service.store.database import DATABASE
-from service.store.schema import OF_0_4, TABLES_OF_0_4
+from service.store.database import DATABASE, OF_0_4, TABLES_OF_0_4
 from service.store.store import Store
 
 from .conftest import parts_of

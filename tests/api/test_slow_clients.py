@@ -16,11 +16,11 @@ import pytest
 import uvicorn
 
 from service.app import create_app, job_limits
-from service.jobs.supervisor import Supervisor
 from service.models import AssetKind
 from service.queries.client import QueryClient
 from service.settings import ServiceSettings
 from service.store.store import Store
+from service.supervisor import Supervisor
 from tests.crash.conftest import address_of, listening, until
 from tests.crash.server import NoQueries
 

@@ -17,13 +17,13 @@ import uvicorn
 from fastapi import FastAPI
 
 from service.commands.serve import bind, server_of
-from service.jobs.supervisor import Clock, JobLimits, Supervisor
 from service.models import ENDED, AssetKind
 from service.settings import ServiceSettings
 from service.store.assets import CheckedUpload
 from service.store.jobs import JobOrder, JobRecord
 from service.store.owners import SERVICE, Owner
 from service.store.store import Store
+from service.supervisor import Clock, JobLimits, Supervisor
 
 METADATA = {"views": [], "certificate": {}}  # all that the store asks of a lift's
 Supervising = Callable[..., AbstractContextManager[Supervisor]]

@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING, Any, cast
 
 from service.app import create_app, job_limits
 from service.commands.serve import keep_pauses_short, server_of
-from service.jobs.supervisor import CHILD, JobProcess, Supervisor
 from service.queries.client import Frame, QueryClient
 from service.settings import ServiceSettings
 from service.store.files import DataDirectory
 from service.store.jobs import JobStore
 from service.store.lifts import LiftStore, TradeoffStore
 from service.store.store import Store
+from service.supervisor import CHILD, JobProcess, Supervisor
 
 from .conftest import order, stand_in
 

@@ -17,7 +17,7 @@ import httpx
 from safetensors.numpy import load
 
 from service.child import children_of
-from service.jobs.supervisor import MARK
+from service.supervisor import MARK
 
 ROOT = Path(__file__).parents[2]
 PATIENCE_SECONDS = 1800.0  # of a machine that has other things to do: no promise is about time here

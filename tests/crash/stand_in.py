@@ -2,7 +2,7 @@
 
     python stand_in.py BEHAVIOUR ORDER
 
-It talks as ``service.jobs.child`` does. A lift of it is its job's inputs, digested; what it needs to know of earlier
+It talks as ``service.job_child`` does. A lift of it is its job's inputs, digested; what it needs to know of earlier
 attempts lies in its work folder.
 """
 

@@ -27,14 +27,14 @@ from liftcore.io.splats import write_splats
 from liftcore.io.transforms import transforms_of
 from liftcore.values.pack import write_pack
 from service import errand, uploads
-from service.jobs.child import Reporter
-from service.jobs.supervisor import LONGEST, JobProcess, Lease
+from service.job_child import Reporter
 from service.models import AssetKind, JobState
 from service.observe import JsonLines
 from service.store.jobs import MAX_ATTEMPTS, EventKind
 from service.store.keys import Quota
 from service.store.owners import SERVICE, Owner, Scope
 from service.store.store import Store
+from service.supervisor import LONGEST, JobProcess, Lease
 from service.tasks import lift_as_ordered
 from tests.scenes import look_at, random_splats
 
@@ -403,7 +403,7 @@ ROOT = Path(__file__).parents[2]
 VIEWS = 20  # three blocks
 KILLED = """if True:
     import io, json, os, signal, sys
-    from service.jobs.child import Reporter
+    from service.job_child import Reporter
     from service.tasks import lift_as_ordered
 
     class Deadly(Reporter):

@@ -18,11 +18,10 @@ from service.errors import Misconfigured, StaleDatabase
 from service.models import AssetKind, JobKind, JobState
 from service.store import database as markers
 from service.store.assets import ALL
-from service.store.database import DATABASE
+from service.store.database import DATABASE, SCHEMA
 from service.store.files import DataDirectory
 from service.store.keys import Quota
 from service.store.owners import SERVICE, Owner, Scope
-from service.store.schema import SCHEMA
 from service.store.store import Collector, Store, collect, empty_quarantine
 
 from .conftest import Supervising, asset_of, ended, often, order, until

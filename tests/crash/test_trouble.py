@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from service.jobs import supervisor as supervisors
+from service import supervisor as supervisors
 from service.models import JobState
 from service.store import database
 from service.store.database import DATABASE

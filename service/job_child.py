@@ -1,6 +1,6 @@
 """The process of one job: reads its order, does it, and says how it goes in JSON lines on stdout.
 
-Run as ``python -m service.jobs.child ORDER``, with a JSON file. Messages are ``{"event": "progress", ...}``,
+Run as ``python -m service.job_child ORDER``, with a JSON file. Messages are ``{"event": "progress", ...}``,
 ``{"event": "plan", ...}`` and ``{"event": "beat"}``, any number of times, then one ``{"event": "done", ...}`` or
 ``{"event": "fault", ...}``. It writes nothing but its draft and its checkpoint, so whatever ends it leaves no half a
 result behind. When its stdin closes it ends by itself, with all that it started.
