@@ -179,8 +179,9 @@ class InMemory(Steps[SceneWeights]):
             strength, choice = chosen.smoothness, {"candidates": chosen.facts()}
         seen = torch.from_numpy(support.sums > 0)
         X, facts = smooth(
-            X, graph, support.evidence, support.confidence, seen, strength, self.timings.progress, self.threads
-        )
+            X, graph, support.evidence, support.confidence, seen, strength, self.timings.progress, self.threads,
+            device=W.device,
+        )  # fmt: skip
         return X, facts | {"parted": parted} | choice
 
     def aggregate(self, W: SceneWeights, X: Tensor, clusters: RegionObjects | None) -> tuple[Tensor, Aggregation]:

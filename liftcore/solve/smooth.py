@@ -33,11 +33,13 @@ import torch
 from torch import Tensor
 
 from liftcore.raster.cpu.simd import LANES, in_all_lanes, keep_lanes, lanes_at, plus, plus_product, times
+from liftcore.runtime.device import CPU, Device
 from liftcore.runtime.jit import kernel
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, silent
 from liftcore.scene.neighbours import SplatGraph
 from liftcore.scene.splats import Splats
+from liftcore.solve.smooth_on_card import SmoothingSystem
 
 LEAST_CONFIDENCE = 0.02  # that a splat counts by: one view alone says something, too
 LEAST_WEIGHT = 1e-30  # of the largest; a splat below it has no evidence
@@ -75,6 +77,14 @@ class _System:
         relative = tolerance / (1.0 + smoothness) ** 0.5
         return cls(graph, weights.astype(np.float32), couplings, inverse.astype(np.float32), relative)
 
+    def on_card(self, place: torch.device) -> SmoothingSystem:
+        """The same on a device."""
+        indices = (
+            torch.from_numpy(part).to(place, torch.int64) for part in (self.graph.starts, self.graph.neighbours)
+        )
+        values = (torch.from_numpy(part).to(place).double() for part in (self.couplings, self.weights, self.inverse))
+        return SmoothingSystem(*indices, *values)
+
 
 @one_thread()
 def smooth(
@@ -86,6 +96,8 @@ def smooth(
     smoothness: float,
     progress: Progress = silent,
     threads: int | None = None,
+    *,
+    device: Device = CPU,
 ) -> tuple[Tensor, dict[str, Any]]:
     """Draw the features of splats that are near in place and colour together.
 
@@ -96,6 +108,7 @@ def smooth(
         seen: [P] bool, the splats whose row of X was solved for; the others take their neighbours' features.
         smoothness: lambda; zero leaves X as it is.
         threads: None takes the cores that this process may use. The number changes no bit.
+        device: that takes the steps.
 
     Returns:
         X, and its facts for the diagnostics: ``smoothness``, the ``steps``, the ``residual`` (the preconditioned
@@ -111,12 +124,15 @@ def smooth(
         has_feature[rows] = True
     order, (count, channels) = torch.from_numpy(graph.order).long(), X.shape
     squares, steps, residual = np.zeros((2, channels)), list[Step](), 0.0
+    card = None if device.kind == "cpu" else system.on_card(device.place)
+    block = BLOCK if card is None else card.channels
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         if smoothness and has_evidence.any():
             _, steps, residual = _conjugate_gradients(system, _probe(X, order, has_evidence, pool), pool)
-        for begin in range(0, channels if smoothness and has_evidence.any() else 0, BLOCK):
-            columns = X[:, begin : begin + BLOCK]
-            width, values = columns.shape[1], np.zeros((count, BLOCK), np.float32)
+        for begin in range(0, channels if smoothness and has_evidence.any() else 0, block):
+            columns = X[:, begin : begin + block]
+            width = columns.shape[1]
+            values = np.zeros((count, BLOCK if card is None else width), np.float32)
 
             def read(rows: slice, columns: Tensor = columns, values: np.ndarray = values) -> tuple[Any, Any]:
                 """Take rows of X in the graph's order; their least and greatest value in each channel."""
@@ -128,7 +144,12 @@ def smooth(
 
             lows, highs = zip(*_map_rows(read, count, pool), strict=True)
             low, high = np.min(lows, axis=0), np.max(highs, axis=0)
-            solution = _descend(system, values, steps, pool)
+            if card is None:
+                solution = _descend(system, values, steps, pool)
+            else:
+                start = torch.from_numpy(values).to(device.place).double()
+                solution = card.descend(start, [(float(length), float(turn)) for length, turn in steps])
+                solution = solution.float().cpu().numpy()
 
             def clip(
                 rows: slice, low: np.ndarray = low, high: np.ndarray = high, values: np.ndarray = solution
@@ -137,7 +158,7 @@ def smooth(
                 np.clip(part, low, high, out=part)
 
             _map_rows(clip, count, pool)
-            squares[:, begin : begin + BLOCK] = _movement(system.weights, values, solution, pool)[:, :width]
+            squares[:, begin : begin + block] = _movement(system.weights, values, solution, pool)[:, :width]
             for rows, shares in rings:
                 solution[rows] = shares @ solution
 
@@ -148,7 +169,7 @@ def smooth(
                 columns.index_copy_(0, order[rows][torch.from_numpy(own)], part)
 
             _map_rows(write, count, pool)
-            progress("smooth", min(begin + BLOCK, channels), channels, "channels")
+            progress("smooth", min(begin + block, channels), channels, "channels")
     moved, whole = squares.sum(axis=1).tolist()
     facts: dict[str, Any] = {
         "smoothness": smoothness,

@@ -22,6 +22,7 @@ GRIDS: list[dict[str, Any]] = [{}, {"preset": "top-k"}, {"cg_steps": 1}, {"aggre
 MAPS: list[dict[str, Any]] = [{"preset": preset.value} for preset in Preset]
 MAPS += [{"loss": "huber"}, {"robust_steps": 2}, {"cg_steps": 1}, {"dtype": "float32"}, {"smoothness": 1}]
 MAPS += [{"aggregation": True}, {"aggregation": True, "aggregation_resolve": True}, {"objects": True}]
+MAPS += [{"smoothness": 1.0}, {"smoothness": "auto"}]
 MAPS += [{"aggregation": True, "aggregation_clusters": "graph"}, {"engine": lc.LocalEngine(1)}]
 CASES = [*((False, how) for how in MAPS), *((True, how) for how in GRIDS)]
 

@@ -1,0 +1,48 @@
+"""The steps of `liftcore.solve.smooth` by a card, in float64.
+
+``embedding_bag`` takes the sums of rows, each in a fixed order: the same lift has the same bits on one card.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import embedding_bag
+
+TABLE_BYTES = 1 << 29  # of each of the five tables [P, C] f64 that a block of channels takes
+
+
+@dataclass(frozen=True)
+class SmoothingSystem:
+    """The matrix ``diag(w) + lambda L`` on a device, with rows in the graph's order."""
+
+    starts: Tensor  # [P + 1] i64, of the rows' entries
+    neighbours: Tensor  # [E] i64, rows
+    couplings: Tensor  # [E] f64, lambda a_jk sqrt(w_j w_k)
+    weights: Tensor  # [P] f64, w
+    inverse: Tensor  # [P] f64, of the diagonal; zero without evidence
+
+    @property
+    def channels(self) -> int:
+        """How many are solved at a time."""
+        return max(TABLE_BYTES // (8 * max(len(self.weights), 1)), 1)
+
+    def descend(self, start: Tensor, steps: Sequence[tuple[float, float]]) -> Tensor:
+        """Take steps that are known from X0 [P, C] f64 on; [P, C] f64."""
+        diagonal = (self.weights[:, None] + self._bags(torch.ones_like(start[:, :1]))).contiguous()
+        pull, inverse = self.weights[:, None] * start, self.inverse[:, None]
+        X = before = start
+        for length, turn in steps:
+            rest = pull - diagonal * X + self._bags(X)
+            X, before = X + (length * inverse) * rest + turn * (X - before), X
+        return X
+
+    def _bags(self, values: Tensor) -> Tensor:
+        """``sum_k lambda a_jk sqrt(w_j w_k) x_k`` of each row, [P, C]."""
+        return embedding_bag(
+            self.neighbours, values, self.starts, mode="sum", per_sample_weights=self.couplings,
+            include_last_offset=True,
+        )  # fmt: skip
