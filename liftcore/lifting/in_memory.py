@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from liftcore.lifting.planning.plan import TIMED_VIEWS, Plan, plan_lift
 from liftcore.query.result import LiftResult
 from liftcore.raster import open_raster
 from liftcore.raster.base import Raster
-from liftcore.runtime.device import Device
+from liftcore.runtime.device import Device, give_back_memory, out_of_memory
 from liftcore.runtime.progress import Timings
 from liftcore.scene.neighbours import SplatGraph
 from liftcore.scene.splats import Splats
@@ -59,6 +60,11 @@ class SceneWeights:
     def weights(self) -> RegionWeights:
         """W, a row for every splat."""
         return self.geometry.weights
+
+    @cached_property
+    def on_processor(self) -> RegionWeights:
+        """W on the CPU, copied once."""
+        return self.weights.cpu()
 
     def row_sums(self) -> np.ndarray:
         """[P] f64, of W as it was weighed."""
@@ -114,7 +120,7 @@ class InMemory(Steps[SceneWeights]):
         return W, WeighedViews(plans[-1], geometry.levels, W.weights.region.shape[0], geometry.blind)
 
     def find_objects(self, W: SceneWeights) -> RegionObjects:
-        return region_objects(W.weights.cpu(), W.geometry.levels, W.geometry.evidence().numpy(), self.threads)
+        return region_objects(W.on_processor, W.geometry.levels, W.geometry.evidence().numpy(), self.threads)
 
     def node_vectors(self, W: SceneWeights, objects: RegionObjects) -> NodeVectors:
         codebook = W.geometry.codebook
@@ -122,22 +128,31 @@ class InMemory(Steps[SceneWeights]):
         return NodeVectors.of(codebook, totals, objects)
 
     def compare_masks(self, W: SceneWeights) -> SceneWeights:
-        weights = W.weights.cpu()
-        shares = mask_consensus(weights, W.geometry.levels, self.threads, means=self.splats.means)
-        return replace(W, geometry=replace(W.geometry, weights=weights), consensus=torch.from_numpy(shares))
+        shares = mask_consensus(W.on_processor, W.geometry.levels, self.threads, means=self.splats.means)
+        return replace(W, consensus=torch.from_numpy(shares))
 
     def reweight(self, W: SceneWeights) -> tuple[SceneWeights, float | None]:
-        weights = W.weights.cpu()
-        agreement = agreement_factors(
-            weights, W.geometry.codebook, self.settings.robust_steps, self.timings.progress,
-            means=self.splats.means, threads=self.threads,
-            reliability=whole_regions(self.settings.reliability, W.geometry.levels), consensus=W.consensus,
-        )  # fmt: skip
-        W = replace(W.with_factors(weights, agreement.factors), consensus=None, agreement=agreement)
-        return W, agreement.reliability
+        def agreed(weights: RegionWeights, on_card: bool) -> tuple[SceneWeights, float | None]:
+            agreement = agreement_factors(
+                weights, W.geometry.codebook, self.settings.robust_steps, self.timings.progress,
+                means=self.splats.means, threads=self.threads, on_card=on_card,
+                reliability=whole_regions(self.settings.reliability, W.geometry.levels), consensus=W.consensus,
+            )  # fmt: skip
+            result = replace(W.with_factors(weights, agreement.factors), consensus=None, agreement=agreement)
+            return result, agreement.reliability
+
+        if W.device.kind == "cpu" or W.weights.device != W.device.place:
+            return agreed(W.on_processor, False)
+        try:
+            return agreed(W.weights, True)
+        except RuntimeError as error:
+            if not out_of_memory(error):
+                raise
+        give_back_memory()  # out here the error holds nothing any more
+        return agreed(W.on_processor, False)
 
     def discount_distance(self, W: SceneWeights) -> SceneWeights:
-        weights, how = W.weights.cpu(), {"means": self.splats.means, "threads": self.threads}
+        weights, how = W.on_processor, {"means": self.splats.means, "threads": self.threads}
         return W.with_factors(weights, huber_factors(weights, W.geometry.codebook, self.timings.progress, **how))
 
     def solve(self, W: SceneWeights, clusters: RegionObjects | None) -> tuple[Tensor, Support]:
@@ -166,7 +181,7 @@ class InMemory(Steps[SceneWeights]):
         return X, facts
 
     def smooth(self, W: SceneWeights, X: Tensor, support: Support) -> tuple[Tensor, dict[str, Any]]:
-        weights, strength, choice = W.weights.cpu(), self.settings.smoothness, dict[str, Any]()
+        weights, strength, choice = W.on_processor, self.settings.smoothness, dict[str, Any]()
         graph, parted = weaken_edges(
             SplatGraph.of(self.splats, self.threads), weights, W.geometry.levels, self.threads
         )  # fmt: skip
@@ -187,7 +202,7 @@ class InMemory(Steps[SceneWeights]):
     def aggregate(self, W: SceneWeights, X: Tensor, clusters: RegionObjects | None) -> tuple[Tensor, Aggregation]:
         settings, agreement, judged = self.settings, W.agreement, None
         if settings.aggregation_guard and agreement and agreement.explained is not None:
-            judged = W.weights.cpu(), agreement.directions, agreement.explained
+            judged = W.on_processor, agreement.directions, agreement.explained
         X, found = aggregate(
             X, W.geometry.evidence().numpy(), self.splats, W.raster, W.views, settings, self.timings.progress,
             self.threads, things=clusters, judged=judged,
@@ -196,7 +211,7 @@ class InMemory(Steps[SceneWeights]):
             return X, found
         with self.timings.stage("resolve"):
             X, facts = solve_from_kept_regions(
-                X, found, W.weights.cpu(), W.geometry.codebook, W.row_sums(), self.timings.progress,
+                X, found, W.on_processor, W.geometry.codebook, W.row_sums(), self.timings.progress,
                 means=self.splats.means, threads=self.threads,
             )  # fmt: skip
         return X, replace(found, facts=found.facts | facts)

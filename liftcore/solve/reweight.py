@@ -118,17 +118,25 @@ def agreement_factors(
     threads: int | None = None,
     reliability: Tensor | None = None,
     consensus: Tensor | None = None,
+    on_card: bool = False,
 ) -> Agreement:
     """What each entry of W is multiplied with after so many steps, for a scene whose W lies in one place.
 
     Args:
-        W: of all views by rows of codebooks, on the CPU. means: [P, 3] of the splats; neighbours are judged together.
+        W: of all views by rows of codebooks, on the CPU or on the device that works. means: [P, 3] of the splats;
+            neighbours are judged together.
         threads: None takes the cores that this process may use. The number changes no bit.
         reliability: [M] bool, the regions that have factors as a whole; None: none has.
         consensus: [nnz] f32 of each entry (`mask_consensus`).
+        on_card: work where W lies, by `liftcore.solve.reweight_on_card`.
     """
-    directions = RegionDirections.of_weights(W, codebook, threads)
-    block = ViewConsistency(W, means, threads)
+    if on_card:
+        from liftcore.solve.reweight_on_card import ViewConsistencyOnCard
+
+        block: ViewConsistency | ViewConsistencyOnCard = ViewConsistencyOnCard(W)
+        directions = RegionDirections(codebook, block.totals(), W.region.shape[0])
+    else:
+        block, directions = ViewConsistency(W, means, threads), RegionDirections.of_weights(W, codebook, threads)
     factors, scores, scene = None, torch.zeros(2, 0, dtype=torch.float32), None
     for step in range(steps):
         table = np.zeros((2, codebook.regions + 1))

@@ -198,13 +198,15 @@ def step_of(
     return after, told / sums[:, 0], median
 
 
+@pytest.mark.parametrize("on_card", [False, True], ids=["processor", "card"])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_reliability_and_confidence_equal_their_definition(seed: int) -> None:
+def test_reliability_and_confidence_equal_their_definition(seed: int, on_card: bool) -> None:
     W, levels = random_scene(seed, views=5)
     masks = every(W)
     masks[: int(W.offsets[seed % 3])] = False  # of some views, as those of grids
     books, q = books_of(W, seed), mask_consensus(W, levels)
-    got = agreement_factors(W, codebook_of(books), 1, reliability=masks, consensus=torch.from_numpy(q))
+    consensus = torch.from_numpy(q)
+    got = agreement_factors(W, codebook_of(books), 1, reliability=masks, consensus=consensus, on_card=on_card)
     after, (confidence, explained), median = step_of(W, books, entries(W, q), masks.numpy())
     assert got.reliability == pytest.approx(median, rel=1e-4)
     np.testing.assert_allclose(entries(W, (W.weight * got.factors).numpy()), after, rtol=2e-3, atol=1e-5)

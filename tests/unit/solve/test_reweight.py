@@ -20,6 +20,8 @@ from liftcore.values.settings import LiftSettings
 from tests.scenes import write_scene
 from tests.unit.solve.sparse_views import codebook_of, dense, of_dense
 
+on_both = pytest.mark.parametrize("on_card", [False, True], ids=["processor", "card"])
+
 
 @dataclass
 class Scene:
@@ -99,10 +101,11 @@ def scenes(draw: st.DrawFn) -> Scene:
     return scene
 
 
+@on_both
 @settings(max_examples=30, deadline=None)
-@given(scenes(), st.integers(0, 3))
-def test_the_steps_equal_their_definition_and_keep_every_splats_sum(scene, steps):
-    got, expected, D = scene.after(steps), defined(scene, steps), scene.denominators
+@given(scene=scenes(), steps=st.integers(0, 3))
+def test_the_steps_equal_their_definition_and_keep_every_splats_sum(scene, steps, on_card):
+    got, expected, D = scene.after(steps, on_card=on_card), defined(scene, steps), scene.denominators
     for mine, real in zip(got, expected, strict=True):
         assert np.abs(over(mine - real, D[:, None])).max() < 2e-3
     sums = np.sum([view.sum(axis=1, dtype=np.float64) for view in got], axis=0)
@@ -160,29 +163,34 @@ def test_what_a_cluster_explains_is_its_mean_cosine_in_float64(monkeypatch, tabl
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-6)
 
 
+@on_both
 @pytest.mark.parametrize(("views", "steps"), [(2, 1), (4, 2), (7, 3)])
-def test_steps_that_change_much_equal_their_definition_to_the_last_digits(views, steps):
+def test_steps_that_change_much_equal_their_definition_to_the_last_digits(views, steps, on_card):
     scene = random_scene(views, count=20, views=views, channels=33)
     scene.books[0][0] = 0
     scene.books[1] = scene.books[1].half()
     scene.weights[1][3] = 0
     D, moved = scene.denominators[:, None], 0.0
-    for mine, real, first in zip(scene.after(steps), defined(scene, steps), scene.weights, strict=True):
+    for mine, real, first in zip(
+        scene.after(steps, on_card=on_card), defined(scene, steps), scene.weights, strict=True
+    ):
         np.testing.assert_allclose(over(mine, D), over(real, D), atol=1e-5)
         moved = max(moved, np.abs(over(real - first, D)).max())
     assert moved > 0.05
 
 
-def test_slices_of_channels_are_judged_together(monkeypatch):
+@on_both
+def test_slices_of_channels_are_judged_together(monkeypatch, on_card):
     scene = random_scene(3, count=500)
-    whole = scene.after(2)
+    whole = scene.after(2, on_card=on_card)
     for module in ("codebook", "directions"):
         monkeypatch.setattr(f"liftcore.solve.{module}.TABLE_BYTES", 1)
-    for sliced, expected in zip(scene.after(2), whole, strict=True):
+    for sliced, expected in zip(scene.after(2, on_card=on_card), whole, strict=True):
         np.testing.assert_allclose(sliced, expected, rtol=1e-4, atol=1e-5)
 
 
-def test_splats_of_many_views_and_of_many_regions_equal_the_definition():
+@on_both
+def test_splats_of_many_views_and_of_many_regions_equal_the_definition(on_card):
     scene = random_scene(4, count=3, views=2 * LONG, rows=3)
     seen = np.sum([view.any(axis=1) for view in scene.weights], axis=0)
     assert (seen > LONG).all()
@@ -190,18 +198,19 @@ def test_splats_of_many_views_and_of_many_regions_equal_the_definition():
     scene.weights.append(rng.random((3, 2 * LONG + 30)).astype(np.float32))
     scene.books.append(torch.tensor(rng.normal(0, 1, (2 * LONG + 30, 150)), dtype=torch.float32))
     D = scene.denominators[:, None]
-    for mine, real in zip(scene.after(1), defined(scene, 1), strict=True):
+    for mine, real in zip(scene.after(1, on_card=on_card), defined(scene, 1), strict=True):
         np.testing.assert_allclose(mine / D, real / D, atol=1e-6)
 
 
+@on_both
 @pytest.mark.parametrize(("rows", "channels"), [(20_000, 8), (8, 10_000)])
-def test_a_step_over_very_many_terms_keeps_its_digits(rows, channels):
+def test_a_step_over_very_many_terms_keeps_its_digits(rows, channels, on_card):
     rng = np.random.default_rng(2)
     direction = rng.normal(0, 1, channels)
     books = rng.uniform(-1, 2, (2, rows, 1)) * direction + rng.normal(0, 1, (2, rows, channels))
     weights = rng.uniform(0.001, 1, (2, 1, rows)).astype(np.float32)
     scene = Scene([*weights], [torch.tensor(book, dtype=torch.float32) for book in books])
-    got, exact = np.concatenate(scene.after(1)), np.concatenate(defined(scene, 1))
+    got, exact = np.concatenate(scene.after(1, on_card=on_card)), np.concatenate(defined(scene, 1))
     assert np.abs(got - exact).max() < 1e-6 * exact.max()
 
 
