@@ -124,7 +124,7 @@ class InMemory(Steps[SceneWeights]):
 
     def node_vectors(self, W: SceneWeights, objects: RegionObjects) -> NodeVectors:
         codebook = W.geometry.codebook
-        totals = added(region_totals(W.weights.cpu(), self.threads), (1, codebook.regions))[0]
+        totals = added(region_totals(W.on_processor, self.threads), (1, codebook.regions))[0]
         return NodeVectors.of(codebook, totals, objects)
 
     def compare_masks(self, W: SceneWeights) -> SceneWeights:
