@@ -46,7 +46,7 @@ LEAST_WEIGHT = 1e-30  # of the largest; a splat below it has no evidence
 BLOCK = 4 * LANES  # channels solved at a time: three [P, 32] f32
 ROWS = 1 << 13  # splats of one piece of work
 PROBES = LANES  # random sums of all channels, by which steps are found
-TOLERANCE = 1e-3  # of the gradient, relative to that at X0, over sqrt(1 + lambda): what varies slowly over the scene
+TOLERANCE = 2e-3  # of the gradient, relative to that at X0, over sqrt(1 + lambda): what varies slowly over the scene
 # has little of the gradient, the less the larger lambda
 ROUGHLY = 2e-2  # a tolerance by which features are compared, not delivered
 STEPS = 200  # of conjugate gradients at most; with lambda 4 about 20 are enough

@@ -1,9 +1,9 @@
-"""What the smoothness of features gains and costs: one lift of each pack, refined by several lambdas.
+"""What the smoothness of features gains and costs: lifts of each pack with several lambdas.
 
     python -m tests.benchmarks.smoothness SCENE [--every N] [--packs NAME ...] [--lambdas L ...]
         [--colours KIND] [--json]
 
-``auto`` among the lambdas is a lift of its own; ``chosen`` is its lambda. One colour, or a random one a splat, says
+``chosen`` is the lambda that ``auto`` took. One colour, or a random one a splat, says
 nothing of the scene.
 
 With truth in the layout of ``tabletop``: splat accuracy, argmax mIoU and the worst class of each pack
@@ -36,20 +36,17 @@ Judge = Callable[[lc.LiftResult], dict[str, float]]
 
 
 def rows(folder: Path, pack: str, every: int, lambdas: list[str], colours: str) -> Iterator[dict[str, Any]]:
-    """One lift of the preset ``default``, and what it becomes by each lambda; seconds are those of the step."""
+    """A lift of the preset ``default`` with each lambda; seconds are those of the step and of all other steps."""
     splats, cameras = read_scene(folder)
     splats, views = coloured(splats, colours), read_pack(folder, pack, every)
-    lifted = lc.lift(splats, cameras, views, certificate_rays=0).cpu()
     judge = truth_judge(folder) if (folder / "truth.json").is_file() else fidelity_judge(folder, splats, cameras)
     for smoothness in lambdas:
-        if smoothness == "auto":
-            result = lc.lift(splats, cameras, views, certificate_rays=0, smoothness="auto").cpu()
-        else:
-            result = lifted.refined(splats, smoothness=float(smoothness)) if float(smoothness) else lifted
+        strength = smoothness if smoothness == "auto" else float(smoothness)
+        result = lc.lift(splats, cameras, views, certificate_rays=0, smoothness=strength, progress=False).cpu()
         timings = result.metadata.timings
         step = timings.get("smooth", 0.0) + timings.get("halves", 0.0)
         facts = result.diagnostics.get("smoothing", {"smoothness": 0.0})
-        head = {"pack": pack, "views": len(lifted.views), "smoothness": smoothness, "chosen": facts["smoothness"]}
+        head = {"pack": pack, "views": len(views), "smoothness": smoothness, "chosen": facts["smoothness"]}
         yield head | judge(result) | {"step s": step, "lift s": sum(timings.values()) - step}
 
 
