@@ -24,7 +24,7 @@ from service.errors import Busy, RangeNotSatisfiable, require_share
 from service.models import ENDED
 from service.problems import PROBLEM
 from service.store.database import CURSOR, Page
-from service.store.files import whole_status
+from service.store.files import require_whole
 from service.store.jobs import Event, EventKind
 
 BLOCK_BYTES = 256 << 10  # of a draft that is read and sent at a time
@@ -78,13 +78,7 @@ def file_answer(request: Request, path: Path, size: int, sha256: str, name: str)
         NotFound: the file is not there, or no longer what was stored.
     """
     etag = f'"{sha256}"'
-    status = whole_status(path, size)
-    if status is None:
-        there = "one of another size" if path.exists() else "none"
-        raise NotFound(
-            "content", expected=f"a file of {size} bytes in the data directory", got=there,
-            hint="it was deleted a moment ago, or something else wrote there: upload it again, or lift again",
-        )  # fmt: skip
+    status = require_whole(path, size)
     if (same := unchanged(request, etag)) is not None:
         return same
     asked, condition = request.headers.get("range"), request.headers.get("if-range", etag)

@@ -198,12 +198,18 @@ def _out_of_memory(kind: UploadKind) -> InvalidInput:
 
 
 def rename(pack: str, changes: str, header: str) -> dict[str, Any]:
-    """Write what a checked pack begins with, its length and its header, under other names.
+    """Write what a checked pack begins with, its length and its header, under other names: ``valid``, or ``invalid``
+    with the error.
 
     Args:
         changes: the names, a JSON object. header: the file to write.
     """
-    Path(header).write_bytes(next(with_metadata(Path(pack), json.loads(changes))))
+    path = Path(pack)
+    try:
+        read_features(path)  # somebody may have been at it since it was stored
+    except SplatliftError as error:
+        return _invalid(error, AssetKind.FEATURES, path)
+    Path(header).write_bytes(next(with_metadata(path, json.loads(changes))))
     return {"event": "valid"}
 
 

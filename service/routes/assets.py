@@ -11,12 +11,14 @@ import anyio
 from fastapi import APIRouter, Path, Query, Request, Response
 
 from service import models
+from service.child import error_of
 from service.content import FILE, Cursor, Limit, file_answer, listed
 from service.errand import run_errand
 from service.errors import Crashed
 from service.requests import JsonRoute, require_plain
 from service.state import AppState, Deps
 from service.store.assets import SHOWN_CHARACTERS, AssetRecord
+from service.store.files import require_whole
 from service.uploads import AssetIntake, Intake, Taken, require_size, too_slow
 
 T = TypeVar("T")
@@ -140,6 +142,7 @@ async def change_pack(asset: AssetId, change: models.PackChange, deps: Deps) -> 
 
 def _retagged(asset: str, change: models.PackChange, deps: AppState) -> tuple[AssetRecord, bool]:
     found = deps.store.assets.get(deps.owner, asset, models.AssetKind.FEATURES)
+    require_whole(found.path, found.bytes)
     limit = deps.settings.max_upload_bytes(models.AssetKind.FEATURES)
     intake = AssetIntake(deps.store, deps.owner, models.AssetKind.FEATURES, limit)
     try:
@@ -150,6 +153,8 @@ def _retagged(asset: str, change: models.PackChange, deps: AppState) -> tuple[As
             heard = run_errand("service.tasks.rename", given, scratch, deps.check_limits)
             if heard is None:
                 raise too_slow(models.AssetKind.FEATURES, deps.check_limits)
+            if heard.last["event"] == "invalid":
+                raise error_of(heard.last["fault"])
             if heard.last["event"] != "valid":
                 raise Crashed(
                     "asset", expected="a pack whose header is read", got="one that is not", hint="try again"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import hashlib
 import os
@@ -16,6 +17,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TextIO
 
+from liftcore.errors import NotFound
 from service.errors import Misconfigured, NoSpace
 
 LOCK_SECONDS = 0.5  # for another process to let go of the directory
@@ -217,16 +219,28 @@ def sha256_of(path: Path) -> str:
 
 def is_whole(path: Path, size: int) -> bool:
     """Whether a regular file still has the bytes that it was stored with; a pipe in its place would be waited for."""
-    return whole_status(path, size) is not None
-
-
-def whole_status(path: Path, size: int) -> os.stat_result | None:
-    """What the system says of such a file, or None."""
     try:
+        require_whole(path, size)
+    except NotFound:
+        return False
+    return True
+
+
+def require_whole(path: Path, size: int) -> os.stat_result:
+    """What the system says of such a file.
+
+    Raises:
+        NotFound: it is not there, or no longer what was stored.
+    """
+    with contextlib.suppress(OSError):
         status = path.stat()
-    except OSError:
-        return None
-    return status if stat.S_ISREG(status.st_mode) and status.st_size == size else None
+        if stat.S_ISREG(status.st_mode) and status.st_size == size:
+            return status
+    raise NotFound(
+        "content", expected=f"a file of {size} bytes in the data directory",
+        got="one of another size" if path.exists() else "none",
+        hint="it was deleted a moment ago, or something else wrote there: upload it again, or lift again",
+    )  # fmt: skip
 
 
 def _locked(lock: TextIO) -> bool:

@@ -22,7 +22,7 @@ from service.store.store import Store
 from service.uploads import STEP, AssetIntake, Intake
 from tests.crash.server import standing_in
 
-from .conftest import Uploaded
+from .conftest import Uploaded, parts_of
 from .test_problems import assert_problem
 from .tiny_scene import (
     TinyScene,
@@ -54,6 +54,18 @@ def test_packs_are_named_anew_as_assets_of_their_own(client: TestClient, uploade
     assert_problem(client.patch(f"/assets/{uploaded.splats}", json={"encoder": "x"}))
     for wrong in ({"encoder": ""}, {"text_space": "a\nb"}, {"words": "x"}):
         assert assert_problem(client.patch(at, json=wrong))["status"] == 422
+
+
+def test_pack_that_was_damaged_or_lost_on_the_disk_is_not_named_anew(client: TestClient, scene: TinyScene) -> None:
+    pack = scene.features.replace(b"by hand", b"by foot")
+    asset = client.put("/assets/features", content=pack).json()["id"]
+    (path,) = (parts_of(client).store.files.root / "blobs").glob(f"*/{asset.removeprefix('sha256:')}*")
+    path.write_bytes(bytes(len(pack)))
+    told = assert_problem(client.patch(f"/assets/{asset}", json={"encoder": "x"}))
+    assert (told["status"], told["type"]) == (422, "/problems/invalid-features") and str(path) not in str(told)
+    path.unlink()
+    assert assert_problem(client.patch(f"/assets/{asset}", json={"encoder": "x"}))["status"] == 404
+    assert client.delete(f"/assets/{asset}").status_code == 204
 
 
 def test_pack_that_takes_too_long_to_name_anew_is_told_as_a_slow_upload_is(
