@@ -167,6 +167,9 @@ def _lines(document: dict[str, Any]) -> Iterable[str]:
     if "view" in document:
         view = document["view"]
         yield f"  view {view['name']}: {view['mask_share']:.2%} of the image ({view['explanation']})"
+    for one in document["answer"]["candidates"]:
+        shown = f"{one['splats']} splats, {one['share']:.0%} of what is shown there"
+        yield f"  may be {one['set']}, {one['kind']}: {shown}"
     for best in document.get("top", []):
         yield f"  splat {best['splat']}: score {best['score']:.4g} at {place_of(best['position'])}"
     for number, thing in enumerate(document.get("objects", []), 1):

@@ -91,6 +91,27 @@ def _rendered(scene: OpenedLift, camera: Camera, area: Area | None, pixels: np.n
     Args:
         area: whose pixels these are; where none of them meets the scene it is to blame. None: there may be none.
     """
+    rays = _rays(scene, camera, area, pixels)
+    features = [weights.astype(np.float64) @ scene.features[splats].astype(np.float64) for splats, weights in rays]
+    return np.stack(features) if features else np.zeros((0, scene.channels))
+
+
+def splats_shown(scene: OpenedLift, area: Area) -> tuple[np.ndarray, np.ndarray]:
+    """The splats on the rays of an area's pixels, [n] i32, and their weights there, [n] f32; some several times.
+
+    Raises:
+        NotFound, InvalidQuery, InvalidLift: as `feature_shown`.
+    """
+    camera = scene.cameras[area.view]
+    rays = _rays(scene, camera, area, _pixels(area, *camera.photo_size)[0])
+    splats, weights = zip(*rays, strict=True)
+    return np.concatenate(splats), np.concatenate(weights)
+
+
+def _rays(
+    scene: OpenedLift, camera: Camera, area: Area | None, pixels: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The splats and their weights on each of the rays of `_rendered`, whose arguments these are."""
     import torch
 
     from liftcore.scene.cameras import drawn_by, pixel_of
@@ -99,7 +120,7 @@ def _rendered(scene: OpenedLift, camera: Camera, area: Area | None, pixels: np.n
     drawn = [place for x, y in pixels.tolist() if (place := pixel_of(camera, x, y)) is not None]
     if not drawn:
         if area is None:
-            return np.zeros((0, scene.channels))
+            return []
         hint, got = "pick one nearer to the middle", "one at the rim of a wide lens"
         raise InvalidQuery(str(area), expected=f"{what} that a pinhole sees", got=got, hint=hint)
     found = scene.raster.ray_rows(drawn_by(camera), torch.tensor(drawn, dtype=torch.int32), scene.compositing)
@@ -109,12 +130,7 @@ def _rendered(scene: OpenedLift, camera: Camera, area: Area | None, pixels: np.n
     if area is not None and max(met) < MINIMUM_ROW_SUM:
         got = f"{'a ray' if len(rays) == 1 else 'rays'} that splats fill by {max(met):.1%}"
         raise InvalidQuery(str(area), expected=f"{what} that shows the scene", got=got, hint="pick one on a surface")
-    features = [
-        weights[ray].astype(np.float64) @ scene.features[splats[ray]].astype(np.float64)
-        for ray, share in zip(rays, met, strict=True)
-        if share >= MINIMUM_ROW_SUM
-    ]
-    return np.stack(features) if features else np.zeros((0, scene.channels))
+    return [(splats[ray], weights[ray]) for ray, share in zip(rays, met, strict=True) if share >= MINIMUM_ROW_SUM]
 
 
 def _common(scene: OpenedLift, rows: np.ndarray, around: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ import numpy as np
 
 from liftcore.errors import InvalidQuery
 from liftcore.io.json_file import finite
+from liftcore.query.candidates import candidates
 from liftcore.query.directions import directions, wordings
 from liftcore.query.objects import objects
 from liftcore.query.opened import OpenedLift, as_numpy
@@ -28,7 +29,18 @@ from liftcore.query.presence import (
     references_of,
     together,
 )
-from liftcore.query.question import Answer, AskedAs, Box, Objects, Point, Presence, Query, Threshold, TopSplat
+from liftcore.query.question import (
+    Answer,
+    AskedAs,
+    Box,
+    Candidate,
+    Objects,
+    Point,
+    Presence,
+    Query,
+    Threshold,
+    TopSplat,
+)
 from liftcore.query.scores import LEAST_LIKENESS, LOWEST_COSINE, combine, cosines, cosines_about
 from liftcore.query.selection import LEAST_FIRST, SAME_WORD, Rivals, contest, nearer_than_rivals, whole_things
 from liftcore.query.selections import set_members
@@ -56,6 +68,7 @@ class Question:
     references: References | str  # of the words' space, or why there are none
     asked_as: Mapping[int, Wording]  # of the texts, by their places among the terms
     pack: np.ndarray | None = None  # [n, F] f32, unit, all words of a table that has too few to be references
+    candidates: tuple[Candidate, ...] = ()  # what clicks among them may mean
 
 
 @dataclass(frozen=True)
@@ -186,7 +199,7 @@ def question(scene: OpenedLift, query: Query, encoder: TextEncoder | None, names
     scene.counted(query.weigh)
     encoder = encoder or scene.table
     if encoder is None or not words[: len(query.positives)].any():
-        return Question(query, rows, words, "", asked_as)
+        return Question(query, rows, words, "", asked_as, candidates=candidates(scene, query))
     return Question(query, rows, words, references_of(encoder, scene.metadata.text_space), asked_as, pack_of(encoder))
 
 
@@ -262,7 +275,8 @@ def _answer(scene: OpenedLift, asked: Question, similarities: np.ndarray) -> Ans
     wording = tuple(AskedAs(**word._asdict()) for word in asked.asked_as.values() if word.how)
     return Answer.of(
         query, scores, seen, selected, wording=wording, rivals=rivals,
-        threshold=found, clear=clear, statistics=finite(_statistics(known)), **dict(presence),
+        candidates=asked.candidates, threshold=found, clear=clear, statistics=finite(_statistics(known)),
+        **dict(presence),
     )  # fmt: skip
 
 

@@ -104,8 +104,7 @@ def tree(scene: OpenedLift, words: Sequence[str] = (), vectors: Any = None) -> S
     for one, node in sorted(zip(facts, order.tolist(), strict=True), key=lambda pair: pair[1]):
         path = scene.node_path(node)
         under = np.flatnonzero(parents == node).tolist()
-        kind = "object" if node < objects else "part" if min(path) < objects else "group"
-        more = {"id": node, "kind": kind, "path": path, "parts": tuple(under)}
+        more = {"id": node, "kind": scene.node_kind(node), "path": path, "parts": tuple(under)}
         parent = int(parents[node]) if parents[node] >= 0 else None
         confidence = float(scene.node_confidence[node])
         nodes.append(SceneNode(**one | more, parent=parent, confidence=confidence))

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -264,6 +264,13 @@ class OpenedLift:
         while (above := int(self.node_parents[found[-1]])) >= 0:
             found.append(above)
         return tuple(reversed(found))
+
+    def node_kind(self, node: int) -> Literal["object", "part", "group"]:
+        """What a node of the tree is: the first are the objects."""
+        objects = 0 if self.object_views is None else len(self.object_views)
+        if node < objects:
+            return "object"
+        return "part" if min(self.node_path(node)) < objects else "group"
 
     def members(self, number: int) -> np.ndarray:
         """[P] bool, the splats of an object, or of another node of the tree with its parts.

@@ -350,6 +350,20 @@ class Found(Presence):
     clear: bool = Field(description="whether what was found stands apart")
 
 
+NodeKind = Literal["object", "part", "group"]
+
+
+class Candidate(Value):
+    """A node of the lift's tree that a click may mean."""
+
+    id: int
+    set: str = Field(description="its notation, for sets")
+    kind: NodeKind
+    splats: int = Field(description="how many")
+    share: float = Field(description="of what is shown there, by weight")
+    confidence: float | None = Field(description="of the views that see it, the share that has a mask of the whole")
+
+
 class TopSplat(Value):
     """One of the best splats."""
 
@@ -398,6 +412,9 @@ class Answer(Found):
     )
     statistics: Mapping[str, Any] = Field(description="of the scores over the seen splats")
     top: tuple[TopSplat, ...] = ()
+    candidates: tuple[Candidate, ...] = Field(
+        default=(), description="of clicks: the nested things that they may mean, the smallest first"
+    )
     box: Box | None = Field(default=None, description="around all selected splats, outliers too: see objects")
     _query: Query = PrivateAttr()
     _arrays: tuple[np.ndarray, np.ndarray, np.ndarray] = PrivateAttr()
@@ -540,7 +557,7 @@ class ListedObjects(Value):
 class SceneNode(SceneObject):
     """An object, a part of one, or a group of objects; what is said of objects holds for it."""
 
-    kind: Literal["object", "part", "group"]
+    kind: NodeKind
     parent: int | None = Field(description="the node that it is a part of; null where it is of none")
     path: tuple[int, ...] = Field(description="the nodes that hold it, the largest first, and itself")
     parts: tuple[int, ...] = Field(description="the nodes that are its parts, those with the most evidence first")

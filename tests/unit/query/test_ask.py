@@ -355,7 +355,7 @@ def test_a_lift_with_other_rows_than_its_splats_answers_nothing(
 ) -> None:
     path = lift_tiny(tmp_path)
     lift, splats = load_lift(path), tmp_path / f"other{suffix}"
-    rows = ("features", "evidence", "agreement", "seen", "confidence", "cluster", "object")
+    rows = ("features", "evidence", "agreement", "seen", "confidence", "cluster", "object", "node")
     cropped = {name: getattr(lift, name)[:-1] for name in rows if getattr(lift, name) is not None}
     save_lift(replace(lift, **cropped), tmp_path / "cropped.lift")
     ask(Scene(path), Query.of((OneSplat(0),)))

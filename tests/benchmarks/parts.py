@@ -1,0 +1,149 @@
+"""Parts and wholes on the tabletop scene: the tree of a lift, and what clicks and words find of it.
+
+    python -m tests.benchmarks.parts DIR [--every N ...] [--json]
+    python -m tests.benchmarks.parts --look DIR VIEW X,Y OUT.png ...
+
+``nodes`` and ``largest`` are of the tree; ``thing`` and ``part`` the mean IoU, over splats with evidence over 0.5, of
+the best node of each true thing and part (table and curtain, which hold the things, left out), ``worst part`` the
+least. ``clicks`` are one a true part and held-out view that shows 100 pixels of it, at its innermost pixel:
+``best`` is the mean mask IoU of the best candidate with the part, ``best thing`` with the thing, ``alone`` that of
+the plain answer of the same click with the part. ``agreement`` is that of levels, ``seconds`` the objects stage of
+the lift's ``of``.
+
+``--look`` draws a view of a scene with the candidates of a click side by side, for eyes.
+"""
+
+import argparse
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from safetensors.torch import load_file
+from scipy.ndimage import distance_transform_edt
+
+import liftcore as lc
+from liftcore.query.areas import MINIMUM_ROW_SUM
+from liftcore.query.ask import ask
+from liftcore.query.candidates import candidates
+from liftcore.query.question import Query
+from liftcore.query.scene import Scene
+from tests.benchmarks.base import command_line, mask_iou, read_pack, read_scene, tell
+from tests.benchmarks.tabletop import Truth, tabletop
+
+PARTS = 4  # of a thing at most, as truth numbers them
+LEAST_PIXELS = 100  # of a part in a view, to be clicked
+CLOTHS = ("tablecloth", "curtain")
+
+
+def masks(scene: Scene, members: np.ndarray, view: str) -> np.ndarray:
+    """[H, W, n] bool: the pixels that are mostly of each of some sets of splats [P, n] bool."""
+    values = torch.from_numpy(np.concatenate([members, np.ones((len(members), 1))], axis=1).astype(np.float32))
+    image = scene.image(view, lambda camera: scene.raster.render(camera, values, scene.compositing)).numpy()
+    sums = image[..., -1:]
+    return (sums >= MINIMUM_ROW_SUM) & (image[..., :-1] >= 0.5 * sums)
+
+
+def innermost(mask: np.ndarray) -> tuple[int, int]:
+    """x and y of the pixel that lies deepest in a mask."""
+    y, x = np.unravel_index(distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1].argmax(), mask.shape)
+    return int(x), int(y)
+
+
+def best_nodes(scene: Scene, truth: Truth, owners: np.ndarray) -> np.ndarray:
+    """The IoU of the best node of each owner, over the splats that count."""
+    counted, own = truth.counted.numpy(), owners[truth.counted.numpy()]
+    assert scene.node_parents is not None
+    nodes = np.stack([scene.members(node)[counted] for node in range(len(scene.node_parents))])
+    things = [row for row, word in enumerate(truth.words) if word not in CLOTHS]
+    wanted = [one for one in np.unique(own) if (one // PARTS if owners.max() >= len(truth.words) else one) in things]
+    tables = [(nodes & (own == one)).sum(axis=1) / (nodes | (own == one)).sum(axis=1) for one in wanted]
+    return np.array([table.max() for table in tables])
+
+
+def click_ious(scene: Scene, truth: Truth, owners: np.ndarray) -> dict[str, list[float]]:
+    """What one click a part and held-out view finds."""
+    found: dict[str, list[float]] = {"best": [], "best thing": [], "alone": []}
+    of_parts = np.stack([owners == one for one in range(int(owners.max()) + 1)], axis=1)
+    for view, classes in truth.held_out.items():
+        true, shown = masks(scene, of_parts, view), classes.numpy()
+        for one in range(of_parts.shape[1]):
+            if truth.words[one // PARTS] in CLOTHS or true[..., one].sum() < LEAST_PIXELS:
+                continue
+            x, y = innermost(true[..., one])
+            query = Query(like=[f"{view}:{x},{y}"], top=0)
+            sets = [scene.members(node.id) for node in candidates(scene, query)]
+            sets.append(ask(scene, query).selected)
+            seen = masks(scene, np.stack(sets, axis=1), view)
+            ious = [mask_iou(seen[..., k], true[..., one]) for k in range(len(sets))]
+            things = [mask_iou(seen[..., k], shown == one // PARTS) for k in range(len(sets) - 1)]
+            found["best"].append(max(ious[:-1], default=0.0))
+            found["best thing"].append(max(things, default=0.0))
+            found["alone"].append(ious[-1])
+    return found
+
+
+def rows_of(folder: Path, packs: list[str], every: list[int]) -> Iterator[dict[str, Any]]:
+    """One row a lift of the tabletop scene by `default`."""
+    truth, known = tabletop(folder), load_file(folder / "truth.safetensors")
+    owners = (PARTS * known["splat_object"].long() + known["splat_part"].long()).numpy()
+    for pack in packs:
+        for step in every:
+            lifted = truth.lift(read_pack(folder, pack), preset="default", view_stride=step)
+            yield {"features": f"{pack}, {len(lifted.views)} views"} | measured(truth.opened(lifted), truth, owners)
+
+
+def measured(scene: Scene, truth: Truth, owners: np.ndarray) -> dict[str, Any]:
+    """The figures of one lift; owners [P] int, the part of each splat."""
+    facts, spent = scene.metadata.certificate["objects"], scene.metadata.timings
+    parts, clicks = best_nodes(scene, truth, owners), click_ious(scene, truth, owners)
+    return {
+        "nodes": facts["nodes"], "largest": facts["largest_share"], "agreement": facts["level_agreement"],
+        "thing": float(best_nodes(scene, truth, truth.objects.numpy()).mean()),
+        "part": float(parts.mean()), "worst part": float(parts.min()), "clicks": len(clicks["best"]),
+        **{name: float(np.mean(values)) for name, values in clicks.items()},
+        "seconds": spent["objects"], "of": sum(spent.values()),
+    }  # fmt: skip
+
+
+def look(folder: Path, clicks: list[str]) -> None:
+    """Draw the candidates of clicks: VIEW X,Y OUT.png each, on a lift of the folder's regions by `default`."""
+    splats, cameras = read_scene(folder)
+    lifted = lc.lift(splats, cameras, read_pack(folder, "regions"), preset="default").cpu()
+    scene = Scene(lifted, splats, cameras)
+    for view, place, out in zip(clicks[::3], clicks[1::3], clicks[2::3], strict=True):
+        drawn = scene.render(view)
+        meant = candidates(scene, Query(like=[f"{view}:{place}"]))
+        print(view, place, [(one.set, one.kind, one.splats) for one in meant])
+        tiles = [drawn]
+        for one in meant:
+            (mask,) = np.moveaxis(masks(scene, scene.members(one.id)[:, None], view), 2, 0)
+            tiles.append(np.where(mask[..., None], drawn, drawn // 4))
+        Image.fromarray(np.concatenate(tiles, axis=1)).save(out)
+
+
+def main() -> None:
+    """Print the table, or one JSON object; or draw pictures."""
+    if sys.argv[1:2] == ["--look"]:
+        parser = argparse.ArgumentParser()
+        parser.add_argument("--look", type=Path)
+        parser.add_argument("clicks", nargs="+")
+        options = parser.parse_args()
+        look(options.look, options.clicks)
+        return
+    parser = command_line(
+        "tests.benchmarks.parts",
+        __doc__,
+        ("folder", {"type": Path}),
+        ("--features", {"nargs": "+", "default": ["features_hard"]}),
+        ("--every", {"nargs": "+", "type": int, "default": [1, 4], "metavar": "N", "help": "every N-th view alone"}),
+    )
+    options = parser.parse_args()
+    tell(rows_of(options.folder, options.features, options.every), as_json=options.json)
+
+
+if __name__ == "__main__":
+    main()

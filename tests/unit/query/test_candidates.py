@@ -1,0 +1,56 @@
+"""What a click may mean: the nested things that lie there, the smallest first."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from liftcore.cli import main
+from liftcore.query.question import Query
+from liftcore.query.scene import Scene
+from tests.unit.query.test_catalogue import with_parts
+
+
+@pytest.fixture
+def nested(scene: Scene, tmp_path: Path) -> Scene:
+    """The scene with its first object in two parts, 3 and 4."""
+    with_parts(scene).save(tmp_path / "parts.lift.safetensors")
+    return Scene(tmp_path / "parts.lift.safetensors", scene.splats, scene.cameras)
+
+
+def meant(scene: Scene, *like: str, unlike: tuple[str, ...] = ()) -> list[tuple[int, str]]:
+    query = Query(like=list(like), unlike=list(unlike))
+    return [(one.id, one.kind) for one in scene.ask(query).candidates]
+
+
+def test_a_splat_means_its_part_and_then_the_whole(nested: Scene) -> None:
+    first, second, other = (f"splat:{np.flatnonzero(nested.members(node))[0]}" for node in (3, 4, 1))
+    assert meant(nested, first) == [(3, "part"), (0, "object")]
+    assert meant(nested, other) == [(1, "object")]
+    assert meant(nested, first, second) == [(0, "object")]
+    assert meant(nested, first, other) == []
+    assert meant(nested, first, unlike=(second,)) == [(3, "part")]
+
+
+def test_a_pixel_means_what_weighs_most_on_its_ray_and_its_set_is_asked_alone(nested: Scene) -> None:
+    view = nested.metadata.views[0]
+    camera = nested.cameras[view]
+    place = nested.splats.means.numpy()[nested.members(1)].mean(axis=0)
+    x, y, z = camera.K @ (camera.viewmat[:3, :3] @ place + camera.viewmat[:3, 3])
+    answer = nested.ask(Query(like=[f"{view}:{int(x / z)},{int(y / z)}"]))
+    (one,) = answer.candidates
+    assert (one.id, one.set) == (1, "object:1") and one.share > 0.5 and one.splats == int(nested.members(1).sum())
+    alone = nested.ask(Query(sets=[one.set]))
+    np.testing.assert_array_equal(alone.selected, nested.members(1))
+
+
+def test_the_command_names_them(nested: Scene, capsys: pytest.CaptureFixture[str]) -> None:
+    row = np.flatnonzero(nested.members(4))[0]
+    assert main(["query", str(nested.path), "--like", f"splat:{row}", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)["answer"]["candidates"]
+    assert [(one["id"], one["kind"], one["share"]) for one in told] == [(4, "part", 1.0), (0, "object", 1.0)]
+    assert main(["query", str(nested.path), "--like", f"splat:{row}"]) == 0
+    assert "may be object:4, part" in capsys.readouterr().out
