@@ -49,7 +49,8 @@ def masks(scene: Scene, members: np.ndarray, view: str) -> np.ndarray:
 
 def innermost(mask: np.ndarray) -> tuple[int, int]:
     """x and y of the pixel that lies deepest in a mask."""
-    y, x = np.unravel_index(distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1].argmax(), mask.shape)
+    depth = np.asarray(distance_transform_edt(np.pad(mask, 1)))[1:-1, 1:-1]
+    y, x = np.unravel_index(depth.argmax(), mask.shape)
     return int(x), int(y)
 
 
