@@ -45,6 +45,7 @@ CHECKED = re.compile("PUT /assets/.*|POST /lifts|PATCH /assets/.*|POST (/lift/pl
 OPEN = frozenset(
     {
         "/", "/web/page.js", "/web/page.css", "/web/LICENSES.txt", "/healthz", "/readyz", "/version",
+        "/web/example/point_cloud.spz", "/web/example/cameras.json", "/web/example/features.safetensors",
         "/openapi.json", "/docs", "/docs/swagger-ui-bundle.js", "/docs/swagger-ui.css",
     }
 )  # fmt: skip

@@ -47,13 +47,14 @@ from liftcore.query.selections import set_members
 from liftcore.query.terms import Vector
 from liftcore.query.threshold import find_threshold, nothing_alike
 from liftcore.text import TextEncoder, check_texts
-from liftcore.text.wording import Wording
+from liftcore.text.wording import Wording, base_of, plain
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 
 MOST_RIVALS = 3  # words that are named as nearer than what was asked
+MOST_OF_IT = 0.5  # the same where an answer is clear
 LEAST_RIVAL = 0.1  # of what is looked at, by evidence, to which such a word is the nearest
 _QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 
@@ -271,7 +272,8 @@ def _answer(scene: OpenedLift, asked: Question, similarities: np.ndarray) -> Ans
     else:
         found, selected = _selected(scene, asked, kept, scores, scene.counted(query.weigh))
     clear = found.clear and presence.present is not False and bool(selected.any())
-    rivals = () if clear and presence.present is not None else _nearer_words(scene, asked, scores, selected)
+    least = MOST_OF_IT if clear and presence.present is not None else LEAST_RIVAL
+    rivals = _nearer_words(scene, asked, scores, selected, least)
     wording = tuple(AskedAs(**word._asdict()) for word in asked.asked_as.values() if word.how)
     return Answer.of(
         query, scores, seen, selected, wording=wording, rivals=rivals,
@@ -280,8 +282,10 @@ def _answer(scene: OpenedLift, asked: Question, similarities: np.ndarray) -> Ans
     )  # fmt: skip
 
 
-def _nearer_words(scene: OpenedLift, asked: Question, scores: np.ndarray, selected: np.ndarray) -> tuple[str, ...]:
-    """Reference words that are the nearest of all to a tenth or more of what is selected, else of the best splats."""
+def _nearer_words(
+    scene: OpenedLift, asked: Question, scores: np.ndarray, selected: np.ndarray, least: float
+) -> tuple[str, ...]:
+    """Reference words that are the nearest of all to a share of what is selected, or of the best splats else."""
     references, positives = asked.references, len(asked.query.positives)
     own = asked.rows[:positives][asked.plain[:positives]]
     if not isinstance(references, References) or not len(own):
@@ -289,13 +293,15 @@ def _nearer_words(scene: OpenedLift, asked: Question, scores: np.ndarray, select
     rows, weights = best_splats(scene, np.where(selected, scores, np.float32(-1.0)) if selected.any() else scores)
     if not len(rows):
         return ()
+    names = {plain(base_of(word.word)) for word in asked.asked_as.values()}  # "fish" and "fish (food)" are one
     same = (references.vectors @ own.T >= SAME_WORD).any(axis=1)
+    same |= np.array([plain(base_of(word)) in names for word in references.words])
     near, others = products(scene.features[rows], scene.norms[rows], own, references.vectors)
     others[:, same] = -1.0
     nearest = np.where(others.max(axis=1) > near.max(axis=1), others.argmax(axis=1), -1)
     shares = np.bincount(nearest[nearest >= 0], weights[nearest >= 0], len(references.words)) / weights.sum()
     order = np.argsort(-shares, kind="stable")[:MOST_RIVALS]
-    return tuple(references.words[row].replace("_", " ") for row in order.tolist() if shares[row] >= LEAST_RIVAL)
+    return tuple(references.words[row].replace("_", " ") for row in order.tolist() if shares[row] >= least)
 
 
 def _set_answer(scene: OpenedLift, query: Query) -> Answer:

@@ -408,7 +408,7 @@ class Answer(Found):
     )
     rivals: tuple[str, ...] = Field(
         default=(),
-        description="where it is not clear, not sure or not there: other words that are nearer, the first most",
+        description="other words that are nearer to what was found, or most like it; of a clear answer to most of it",
     )
     statistics: Mapping[str, Any] = Field(description="of the scores over the seen splats")
     top: tuple[TopSplat, ...] = ()

@@ -87,7 +87,7 @@ def _key(text: str) -> str:
     return _BETWEEN.sub("", plain(text).strip(_AROUND)) or plain(text)
 
 
-def _base(word: str) -> str:
+def base_of(word: str) -> str:
     """The word without its qualifier."""
     return _QUALIFIER.sub("", word) or word
 
@@ -111,7 +111,7 @@ class Vocabulary:
     def _bases(self) -> dict[str, str]:
         # Of several meanings an animal comes before the others, and food after them.
         order = sorted(self.words, key=lambda word: ("(food)" in word) - ("(animal)" in word))
-        return {_key(_base(word)): word for word in reversed(order)}
+        return {_key(base_of(word)): word for word in reversed(order)}
 
     def __contains__(self, text: str) -> bool:
         """Whether a text is one of the words itself."""
@@ -147,7 +147,7 @@ class Vocabulary:
             if key in self._bases:
                 return self._bases[key], "qualifier" if same else "number"
             for other in _synonyms().get(key, ()):
-                word = self._keys.get(_key(other)) or self._bases.get(_key(_base(other)))
+                word = self._keys.get(_key(other)) or self._bases.get(_key(base_of(other)))
                 if word is not None:
                     return word, "synonym"
         return None
@@ -189,7 +189,7 @@ class Vocabulary:
         for typed, others in _typed_synonyms().items():
             if typed.startswith(start):
                 for other in others:
-                    word = self._keys.get(_key(other)) or self._bases.get(_key(_base(other)))
+                    word = self._keys.get(_key(other)) or self._bases.get(_key(base_of(other)))
                     take([(word, typed)] if word else [])
         found = self.find(text)
         take([(found.word, found.word)] if found else [])
@@ -204,7 +204,7 @@ class Vocabulary:
         typed = plain(text).strip(_AROUND)[:_TYPED]
         if len(typed) < _TYPED_LEAST:
             return []
-        known = {plain(_base(word))[:_TYPED]: word for word in reversed(self.words[:_COMPARED])}
+        known = {plain(base_of(word))[:_TYPED]: word for word in reversed(self.words[:_COMPARED])}
         known = {name: word for name, word in known.items() if name.startswith(typed[0])}
         alike = get_close_matches(typed, known, n=3, cutoff=_TYPO)
         if not alike:
@@ -222,7 +222,7 @@ class Vocabulary:
         for group, members in _table()["groups"].items():
             if _key(group) in forms or any(_key(member) in forms for member in members):
                 for member in (group, *members):
-                    found = self._keys.get(_key(member)) or self._bases.get(_key(_base(member)))
+                    found = self._keys.get(_key(member)) or self._bases.get(_key(base_of(member)))
                     if found is not None and _key(found) not in forms:
                         yield found
 
@@ -245,7 +245,7 @@ class Vocabulary:
     def _with_token(self, text: str) -> list[str]:
         """Words of several parts, one of which is the text; those that end with it come first."""
         forms = {form for form in _forms(text) if form}
-        parted = [(word, plain(_base(word)).split()) for word in self.words]
+        parted = [(word, plain(base_of(word)).split()) for word in self.words]
         ends = [word for word, parts in parted if len(parts) > 1 and parts[-1] in forms]
         return ends + [word for word, parts in parted if len(parts) > 1 and forms & set(parts[:-1])]
 
@@ -306,7 +306,7 @@ def _typed_synonyms() -> dict[str, list[str]]:
     for name in ("lvis", "everyday"):
         for word, synonyms in _table()[name].items():
             for synonym in synonyms:
-                for form in {plain(synonym), plain(_base(synonym))}:
+                for form in {plain(synonym), plain(base_of(synonym))}:
                     found.setdefault(form, []).append(word)
     return found
 
@@ -319,7 +319,7 @@ def _synonyms() -> dict[str, list[str]]:
         found.setdefault(_key(typed), []).extend(words)
     for name in ("lvis", "everyday"):
         for word, synonyms in _table()[name].items():
-            for form in {_key(word), _key(_base(word))}:
+            for form in {_key(word), _key(base_of(word))}:
                 found.setdefault(form, []).extend(synonyms)
     return found
 

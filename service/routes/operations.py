@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import anyio
+import zstandard
 from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.openapi.docs import get_swagger_ui_html
 from fastapi.responses import HTMLResponse, JSONResponse
@@ -48,7 +49,8 @@ def _policy(scripts: str, styles: str, **more: str) -> dict[str, str]:
 
 
 # The page asks this service, and sorts and unpacks splats, which is done by WebAssembly in workers.
-PAGE_HEADERS = _policy("'self' 'wasm-unsafe-eval'", "'self'", worker_src="blob:") | {"Cache-Control": "no-cache"}
+PAGE_HEADERS = _policy("'self' 'wasm-unsafe-eval'", "'self'", worker_src="blob:", font_src="data:")
+PAGE_HEADERS |= {"Cache-Control": "no-cache"}
 KEPT = {"Cache-Control": "public, max-age=31536000, immutable"}  # the page asks for them by their digest
 
 router = APIRouter(tags=["operations"])
@@ -138,6 +140,23 @@ def _serve(path: str, file: Path, media_type: str, headers: dict[str, str] | Non
         return Response(file.read_bytes(), media_type=media_type, headers=headers)
 
 
+EXAMPLE = Path(__file__).parents[1] / "commands" / "tabletop"
+
+
+def _serve_example(name: str, kept: str) -> None:
+    """Register a file of the scene that ships: the page orders a lift of it, as of files that were brought."""
+
+    @router.get(f"/web/example/{name}", include_in_schema=False)
+    def content() -> Response:
+        stored = (EXAMPLE / kept).read_bytes()
+        if kept.endswith(".zst"):
+            stored = zstandard.ZstdDecompressor().decompress(stored)
+        return Response(stored, media_type="application/octet-stream")
+
+
+_serve_example("point_cloud.spz", "point_cloud.spz")
+_serve_example("cameras.json", "cameras.json")
+_serve_example("features.safetensors", "features.safetensors.zst")
 _serve("/web/page.js", WEB / "page.js", "text/javascript", KEPT)
 _serve("/web/page.css", WEB / "page.css", "text/css", KEPT)
 _serve("/web/LICENSES.txt", WEB / "LICENSES.txt", "text/plain; charset=utf-8")

@@ -11,13 +11,13 @@ const hash = createHash("sha256");
 for (const name of sources) hash.update(`${name}\0${read(name)}\0`);
 const digest = hash.digest("hex");
 
-const common = { absWorkingDir: here.pathname, bundle: true, minify: true, write: false, legalComments: "none", logLevel: "warning" };
+const common = { absWorkingDir: here.pathname, bundle: true, minify: true, write: false, legalComments: "none", logLevel: "warning", loader: { ".woff2": "dataurl" } };
 const [script, style] = await Promise.all([
   build({ ...common, entryPoints: ["src/main.js"], format: "esm", target: "es2022" }),
   build({ ...common, entryPoints: ["src/page.css"] }),
 ]);
 const banner = `/* splatlift's page, sources sha256:${digest}; licences in LICENSES.txt */\n`;
-const bundled = ["three", "@sparkjsdev/spark", "fflate"];
+const bundled = ["three", "@sparkjsdev/spark", "fflate", "@fontsource-variable/inter"];
 const licences = bundled.map(name => {
   const { version, license } = JSON.parse(read(`node_modules/${name}/package.json`));
   return `${name} ${version} (${license})\n\n${read(`node_modules/${name}/LICENSE`).trim()}\n`;
@@ -27,5 +27,5 @@ const write = (name, text) => writeFileSync(new URL(`built/${name}`, here), text
 write("page.js", banner + script.outputFiles[0].text);
 write("page.css", banner + style.outputFiles[0].text);
 write("page.html", read("src/index.html").replaceAll("{digest}", digest.slice(0, 16)));
-write("LICENSES.txt", `page.js holds these libraries.\n\n${licences.join("\n\n")}`);
+write("LICENSES.txt", `page.js and page.css hold these libraries and this font.\n\n${licences.join("\n\n")}`);
 console.log(`built ${(script.outputFiles[0].contents.length / 1e6).toFixed(1)} MB of ${sources.length} sources, ${digest.slice(0, 16)}`);

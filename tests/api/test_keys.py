@@ -41,6 +41,7 @@ from .test_problems import NO_ASSET, NOBODY, assert_problem
 PATIENCE_SECONDS = 60.0  # for what takes a quarter of a second
 DOCS = {"/openapi.json", "/docs", "/docs/swagger-ui-bundle.js", "/docs/swagger-ui.css"}
 PAGE = {"/", "/web/page.js", "/web/page.css", "/web/LICENSES.txt"}
+PAGE |= {f"/web/example/{name}" for name in ("point_cloud.spz", "cameras.json", "features.safetensors")}
 OPEN_ROUTES = {*PAGE, "/healthz", "/readyz", "/version", *DOCS}
 # Routes that name nothing of anybody: they show one's own things, or make new ones.
 NAMELESS = {("GET", "/metrics"), ("GET", "/assets"), ("PUT", "/assets/{asset}"), ("GET", "/jobs"), ("GET", "/lifts")}

@@ -264,7 +264,8 @@ def test_page_names_its_libraries_and_no_registry() -> None:
     licences = (WEB / "LICENSES.txt").read_text(encoding="utf-8")
     assert (
         all(name in licences for name in exact["dependencies"])
-        and licences.count("Permission is hereby granted") == 3
+        and licences.count("Permission is hereby granted") == 4
+        and "SIL Open Font License" in licences
     )
 
 

@@ -116,6 +116,39 @@ def test_question_is_taken_back_or_narrowed_while_it_is_asked(page: Browser) -> 
     assert page.value(WORDS) == ["lamp", "apple"]
 
 
+def test_box_completes_maps_and_suggests_words(page: Browser) -> None:
+    page.until("document.querySelectorAll('#here-words button').length === 3")  # the three things
+    page.write("#words", "app")
+    page.until("document.querySelector('#completions li')")
+    assert text_of(page, "#completions") == "apple"
+    page.key("ArrowDown")
+    page.key("Enter")
+    page.until(FOUND)
+    assert page.value(WORDS) == ["apple"] and page.value("document.querySelector('#advice').hidden") is True
+    ask(page, "two red apples")
+    assert text_of(page, "#advice") == "\u201ctwo red apples\u201d was asked as apple."
+    page.write("#words", "boook")
+    page.press("#query button.main")
+    page.until("splatlift.ask.now?.problem")
+    told = page.value("document.body.innerText")
+    assert "is not a word that can be asked here" in told and "text.0" not in told and ".safetensors" not in told
+    page.press("#advice button")
+    page.until(FOUND)
+    assert page.value(WORDS) == ["book"]
+
+
+def test_not_sure_names_words_that_compete_as_buttons(page: Browser) -> None:
+    ask(page, "lamp")
+    page.value("(() => { splatlift.ask.now.answer.rivals = ['book']; splatlift.ask.show(); })()")
+    assert "not sure" in text_of(page, "#chips") and "nearer" in text_of(page, "#advice")
+    page.press("#advice button:nth-of-type(2)")  # but not book
+    page.until(FOUND)
+    assert page.value("document.querySelector('#but').value") == "book"
+    assert "negatives=book" in page.value("location.search")
+    ask(page, "apple")  # another question does not keep it
+    assert "negatives" not in page.value("location.search")
+
+
 def test_click_asks_for_more_and_shift_for_less(page: Browser) -> None:
     page.press("#scene", *splat_at(page, APPLE))
     page.until(f"{EXAMPLES}.length === 1")
@@ -240,9 +273,9 @@ def test_example_that_nothing_understands_is_told_and_taken_back(page: Browser) 
 def test_words_of_users_never_become_markup(page: Browser) -> None:
     page.write("#words", "<img src=x onerror=alert(1)>")
     page.press("#query button.main")
-    page.until(TROUBLE)
-    assert "<img src=x" in text_of(page, "#toast")
-    assert page.value("document.querySelectorAll('#toast *, #chips img, #found img').length") == 0
+    page.until("splatlift.ask.now?.problem")
+    assert "<img src=x" in text_of(page, "#advice")
+    assert page.value("document.querySelectorAll('#advice img, #chips img, #found img').length") == 0
 
 
 def test_page_works_by_keyboard_alone(page: Browser) -> None:

@@ -4,8 +4,11 @@ import { countFrom, drawHistogram, histogram, passing } from "./histogram.js";
 import { COLOURS, rgb } from "./painter.js";
 import { asked, blank, linked, notation, read, search } from "./question.js";
 import { bytes, json, npy, words } from "./service.js";
+import { Completing } from "./completing.js";
 
 const MOST = COLOURS.length; // questions at a time
+const COMPLETIONS = 8;
+const HERE = 24; // words for what is in the scene
 const SOON = 350; // ms after the slider's last move, until the things are looked for anew
 
 export class Ask {
@@ -13,7 +16,9 @@ export class Ask {
   constructor({ changed, fly }) {
     Object.assign(this, { changed, fly, questions: [], active: 0, thing: -1, negatives: [], heat: false, turn: 0, lift: null });
     at("query").addEventListener("submit", event => { event.preventDefault(); this.fromForm(); });
-    Object.assign(at("example"), { maxLength: notation.maxLength, placeholder: notation.description, title: notation.description });
+    Object.assign(at("example"), { maxLength: notation.maxLength });
+    this.completing = new Completing(text => this.askable(text));
+    at("but").addEventListener("input", () => { this.butTyped = true; });
     at("by-example").addEventListener("submit", event => { event.preventDefault(); this.typed(false); });
     at("less").addEventListener("click", () => this.typed(true));
     at("clear").addEventListener("click", () => this.reset(true));
@@ -33,7 +38,10 @@ export class Ask {
   // Another lift: nothing of the old one's answers stays.
   of(lift) {
     this.lift = lift;
-    const wordless = Boolean(lift) && lift.text_space === "none";
+    this.known = new Map(); // of completions
+    this.here = [];
+    const wordless = Boolean(lift) && lift.text_space === "none" && !this.table;
+    if (lift && !wordless) this.askable("").then(({ here }) => { if (lift === this.lift) { this.here = here; this.advise(); } }).catch(() => {});
     at("words").disabled = at("but").disabled = wordless;
     at("words").placeholder = wordless ? "These features have no words: click a thing" : "What are you looking for?";
     this.reset(false);
@@ -51,8 +59,32 @@ export class Ask {
     if (changed) this.changed();
   }
 
+  // What can be asked: completions of a text that is typed, and words for what is here. A text is asked once.
+  askable(text) {
+    const { lift, known } = this;
+    if (!known.has(text)) known.set(text, json(`/query/words?${search({ lift: lift.id, text, limit: COMPLETIONS })}`));
+    return known.get(text);
+  }
+
+  // A word in place of one that was typed, or beside those that are asked.
+  word(word, question = null) {
+    if (question) Object.assign(question, { text: [word], threshold: "auto" });
+    else this.questions = [fresh({ text: [word] }, 0)];
+    at("words").value = this.questions.flatMap(({ text }) => text).join(", ");
+    this.active = Math.max(0, this.questions.indexOf(question));
+    return this.ask(question);
+  }
+
+  butNot(word) {
+    at("but").value = [...split(at("but").value), word].join(", ");
+    return this.ask();
+  }
+
   fromForm() {
+    this.completing.close();
     const texts = split(at("words").value);
+    if (!this.butTyped && String(texts) !== String(this.questions.map(({ text }) => text.join()))) at("but").value = ""; // it was of other words
+    this.butTyped = false;
     if (!texts.length) return this.questions.length ? this.ask() : undefined;
     if (texts.length > MOST) tell(`Only the first ${MOST} are asked at a time.`);
     // New words are a new question, also after a click.
@@ -140,7 +172,7 @@ export class Ask {
     this.show();
     this.changed();
     const wrong = anew.find(question => question.problem);
-    if (wrong) tell(words(wrong.problem), true);
+    if (wrong && !wrong.problem.nearest) tell(words(wrong.problem), true);
     await Promise.all(anew.map(question => this.things(question)));
   }
 
@@ -271,6 +303,7 @@ export class Ask {
     at("clear").hidden = !this.questions.length;
     at("start").hidden = Boolean(this.questions.length);
     at("found").hidden = !this.now;
+    this.advise();
     if (!this.now) return;
     const { now } = this;
     at("found").style.setProperty("--mine", now.colour);
@@ -292,8 +325,9 @@ export class Ask {
   }
 
   chip(question, place) {
-    const numbers = question.answer ? (lit(question) ? count(question.count) : question.answer.present === false ? "not here" : "unclear") : question.problem ? "!" : "\u2026";
-    return el("li", { className: question === this.now ? "chip now" : "chip", style: { "--mine": question.colour } },
+    const found = question.answer && lit(question) ? count(question.count) : "";
+    const numbers = question.answer ? (question.answer.present === false && !found ? "not here" : unsure(question) ? ["not sure", found].filter(Boolean).join(" \u00b7 ") : found) : question.problem ? (question.problem.nearest ? "not a word here" : "!") : "\u2026";
+    return el("li", { className: ["chip", question === this.now && "now", unsure(question) && "unsure"].filter(Boolean).join(" "), style: { "--mine": question.colour } },
       el("button", { type: "button", className: "pick", "aria-pressed": String(question === this.now),
         on: { click: () => { this.active = place; this.thing = -1; this.show(); this.changed(); } } },
       el("span", { className: "swatch", "aria-hidden": "true" }), label(question), " ", el("small", {}, numbers)),
@@ -316,15 +350,27 @@ export class Ask {
     return this.ask(this.now);
   }
 
+  // Below the box: what a word was asked as, words in place of one that is not known here, and those that compete.
+  advise() {
+    const { now } = this;
+    const lines = now ? advice(now, this) : [];
+    at("advice").hidden = !lines.length;
+    at("advice").replaceChildren(...lines);
+    at("advice").classList.toggle("unsure", Boolean(now && unsure(now)));
+    at("here").hidden = Boolean(this.questions.length) || !this.here.length;
+    at("here-words").replaceChildren(...this.here.slice(0, HERE).map(word => button(spoken(word), () => this.word(word))));
+  }
+
   // What was found and what decided it, in words.
   told() {
     const { now } = this;
     const answer = now.answer;
+    at("answer").classList.toggle("unsure", unsure(now));
     at("slider-value").textContent = answer && Number.isFinite(now.cut) ? now.cut.toFixed(3) : "";
     at("auto").disabled = !answer || now.threshold === "auto";
     at("nearest").hidden = !answer || lit(now);
     if (!answer) {
-      at("answer").textContent = now.problem ? words(now.problem) : "Looking\u2026";
+      at("answer").textContent = now.problem ? (now.problem.nearest ? `\u201c${now.text.join(", ")}\u201d is not a word that can be asked here.` : words(now.problem)) : "Looking\u2026";
       at("why").textContent = "";
     } else if (!lit(now) && answer.present === false) {
       at("answer").textContent = `${quoted(now)} is not here.`;
@@ -334,7 +380,7 @@ export class Ask {
       at("why").textContent = "Other words may help, or a click on an example.";
     } else {
       at("answer").textContent = now.count
-        ? `${plural(now.count, "splat")} of ${count(now.scores.length)} (${percent(now.count / now.scores.length)}).`
+        ? `${unsure(now) ? "Not sure: " : ""}${plural(now.count, "splat")} of ${count(now.scores.length)} (${percent(now.count / now.scores.length)}).`
         : "No splat scores that high.";
       at("why").textContent = decided(now);
     }
@@ -365,13 +411,38 @@ export const label = question => question.text.join(", ") || (question.like.leng
 const quoted = question => (question.text.length ? `\u201c${question.text.join(", ")}\u201d` : "Such a thing");
 const measures = ({ low, high }) => ` ${low.map((value, axis) => (high[axis] - value).toPrecision(2)).join(" \u00d7 ")}`;
 
-const reason = ({ why }) => why.replace(/^(?:'.*?'|".*?") is not there: (.)/, (_, first) => first.toUpperCase());
+const reason = ({ why }) => why.replace(/^(?:Whether )?(?:'.*?'|".*?") is not (?:there|sure): (.)/, (_, first) => first.toUpperCase())
+  .replace(/^Whether (?:'.*?'|".*?") is there is not sure: (.)/, (_, first) => first.toUpperCase()).replace(/reference words?/g, "other words");
+
+// It may be there, and other words compete for what was found.
+const unsure = ({ text, answer }) => Boolean(text.length && answer && answer.present !== false
+  && (!answer.clear || answer.rivals.length || (answer.present === null && answer.presence !== null)));
+const spoken = word => word.replace(/\s*\(.*\).*$/, "") || word;
+const button = (label, press, more = {}) => el("button", { type: "button", ...more, on: { click: press } }, label);
+const line = (...parts) => el("p", {}, ...parts);
+
+function advice(question, ask) {
+  const { answer, problem, text } = question;
+  const lines = (answer?.wording || []).map(one => line(`\u201c${one.text}\u201d was asked as `, el("b", {}, one.word), "."));
+  if (problem?.nearest) {
+    const near = problem.nearest.length ? problem.nearest : ask.here.slice(0, 5);
+    lines.push(line(`\u201c${text.join(", ")}\u201d is not a word that can be asked here. `, near.length ? "Try " : "Try another word.",
+      ...near.map(word => button(spoken(word), () => ask.word(word, question)))));
+  }
+  const rivals = (answer?.rivals || []).filter(word => !ask.negatives.includes(word));
+  if (answer?.present === false && rivals.length) lines.push(line(`\u201c${text.join(", ")}\u201d is not here. Closest is `, ...rivals.map(word => button(spoken(word), () => ask.word(word, question)))));
+  if (unsure(question) && rivals.length) {
+    lines.push(line(`Not sure: ${rivals.length > 1 ? "these are" : "this is"} nearer. `, ...rivals.flatMap(word => [button(spoken(word), () => ask.word(word, question)), button(`but not ${spoken(word)}`, () => ask.butNot(word))])));
+  } else if (unsure(question)) lines.push(line("Not sure: hardly anything stands apart for it."));
+  return lines;
+}
 
 function decided({ answer, threshold, anyway }) {
   if (answer.present === false) return `It is not here; this is what comes closest. ${reason(answer)}`;
+  if (answer.present === null && answer.presence !== null) return reason(answer);
   if (!answer.clear && threshold === "auto" && anyway) return "This is what comes closest; it hardly stands apart from the rest.";
-  if (typeof threshold === "number") return "You set this cut. The dashes mark the automatic one.";
+  if (typeof threshold === "number") return "You set this. The dashes mark what is chosen by itself.";
   const how = /least, in log-odds/.test(answer.threshold.explanation)
     ? "moving it a little changes least of what is found" : "no gap is clear, so it splits the scores into two groups";
-  return `The cut was found by itself: there, ${how}.`;
+  return `Chosen by itself: there, ${how}.`;
 }

@@ -3,11 +3,13 @@
 import { ago, at, count, el, plural, size, tell, twice } from "./dom.js";
 import { dropped, gathered, kindOf } from "./files.js";
 import { space } from "./lifts.js";
-import { events, json, patch, picture, post, remove, upload, words } from "./service.js";
+import { bytes, events, json, patch, picture, post, remove, upload, words } from "./service.js";
 
 const PAGE = 20; // of each list
 const LOOK = 15_000; // ms between looks for jobs of others, while the panel is open
 const AGAIN = 2000; // ms, within which the same order is a second click
+const EXAMPLE = { splats: "point_cloud.spz", cameras: "cameras.json", features: "features.safetensors" };
+const USUAL = /^(point_cloud|splat|splats|scene|iteration_\d+|\d+)$/i; // names that trainers give to every scene
 const ENDED = ["succeeded", "failed", "canceled"];
 const KINDS = { splats: "Splats", cameras: "Cameras", features: "Features" };
 const OTHERS = { photos: "Photos", lift: "Lift", masks: "Masks", table: "Words" };
@@ -80,6 +82,29 @@ export class Bring {
     }
     this.refreshAssets();
     for (const waiting of this.files) if (waiting.missing?.length) this.sendLift(waiting);
+  }
+
+  // The scene that ships with the service, lifted as one that was brought.
+  async example() {
+    const state = at("example-state");
+    const tellState = (text, share) => state.replaceChildren(text, el("progress", share === undefined ? { "aria-label": text } : { max: 1, value: share, "aria-label": text }));
+    at("open-example").disabled = true;
+    try {
+      tellState("Fetching the example\u2026");
+      const assets = {};
+      for (const [kind, name] of Object.entries(EXAMPLE)) {
+        assets[kind] = await upload(kind, new File([await bytes(`/web/example/${name}`)], name), () => {}).done;
+        tellState("Checking it\u2026");
+      }
+      const job = await post("/lift", { splats: assets.splats.id, cameras: assets.cameras.id, features: [assets.features.id], settings: {} });
+      this.jobs = [job, ...this.jobs.filter(known => known.id !== job.id)];
+      this.showJobs();
+      await this.follow(job, { ordered: true, name: "Example: things on a table", step: ({ stage, done, total }) => tellState(`${STAGES[stage] || stage}\u2026`, total ? done / total : undefined) });
+    } catch (problem) {
+      state.textContent = words(problem);
+    } finally {
+      at("open-example").disabled = false;
+    }
   }
 
   // A lift file of the command line goes up once its splats and cameras are here. Its cameras may have been a folder,
@@ -184,7 +209,15 @@ export class Bring {
   }
 
   body() {
-    return { splats: this.ids("splats").at(-1), cameras: this.ids("cameras").at(-1), features: this.ids("features"), settings: this.settings() };
+    const table = this.ids("table").at(-1);
+    return { splats: this.ids("splats").at(-1), cameras: this.ids("cameras").at(-1), features: this.ids("features"), settings: this.settings(), ...(table && { table }) };
+  }
+
+  // By the file of its splats, where that says more than a trainer's usual names do.
+  sceneName() {
+    const { name = "" } = this.files.findLast(one => one.kind === "splats" && one.asset) ?? {};
+    const stem = name.replace(/\.[^.]*$/, "");
+    return stem && !USUAL.test(stem) ? stem.slice(0, 100) : undefined;
   }
 
   // What the lift would do and need, before it is ordered.
@@ -203,6 +236,7 @@ export class Bring {
     const { settings } = body;
     if (path === "/tradeoff") {
       delete settings.speed;
+      delete body.table;
       body.budget_s = Number(at("budget").value);
     }
     // A double click orders once: the service takes the same order with the same key for the same job.
@@ -214,7 +248,7 @@ export class Bring {
       at("order-problem").hidden = true;
       this.jobs = [job, ...this.jobs.filter(known => known.id !== job.id)];
       this.showJobs();
-      this.follow(job, true, this.ids("photos").at(-1));
+      this.follow(job, { ordered: true, photos: this.ids("photos").at(-1), name: this.sceneName() });
       at("jobs").scrollIntoView({ block: "nearest" });
     } catch (problem) {
       at("order-problem").textContent = words(problem);
@@ -223,20 +257,20 @@ export class Bring {
   }
 
   // Live progress, until the job has ended. What was ordered here is opened when it is done.
-  async follow(job, ordered = false, photos = undefined) {
+  async follow(job, { ordered = false, photos, name, step } = {}) {
     if (this.followed.has(job.id) || ENDED.includes(job.state)) return;
     const end = new AbortController();
     this.followed.set(job.id, end);
     try {
       for await (const { event, data } of events(`/jobs/${job.id}/events`, end.signal)) {
-        if (event === "progress") job.progress = data;
+        if (event === "progress") { job.progress = data; step?.(data); }
         if (event === "plan") job.plan = data;
         if (event === "state") Object.assign(job, data);
         this.showJobs();
       }
       Object.assign(job, await json(`/jobs/${job.id}`));
       this.showJobs();
-      if (photos && job.state === "succeeded" && job.kind === "lift") await patch(`/lifts/${job.id}`, { photos });
+      if ((photos || name) && job.state === "succeeded" && job.kind === "lift") await patch(`/lifts/${job.id}`, { ...(photos && { photos }), ...(name && { name }) });
       if (ordered && job.state === "succeeded" && job.kind === "lift") this.opened(job.id);
       else if (job.state === "succeeded") this.gone();
     } catch (problem) {

@@ -7,7 +7,7 @@ import { Look, veiled } from "./look.js";
 import { Masks } from "./masks.js";
 import { Names } from "./names.js";
 import { COLOURS, rgb } from "./painter.js";
-import { bytes, json, keyOf, onRefused, picture, useKey, words } from "./service.js";
+import { bytes, json, keyOf, onHeard, onRefused, picture, useKey, words } from "./service.js";
 import { Take } from "./take.js";
 import { Things } from "./things.js";
 import { MOST, Viewer, webgl } from "./viewer.js";
@@ -80,7 +80,9 @@ function labels(boxes) {
 // After each frame: labels lie at the top of their boxes as these are seen, whole where a part of the box is.
 function placed(place) {
   if (viewer?.settled && !at("stage").classList.contains("ready")) appear(turn);
-  for (const shown of at("labels").children) {
+  const taken = []; // boxes of labels that stand, the chosen ones first: none covers another
+  const whole = [...at("labels").children].sort((one, other) => other.classList.contains("strong") - one.classList.contains("strong"));
+  for (const shown of whole) {
     const [low, high] = JSON.parse(shown.dataset.box);
     const corners = [0, 1, 2, 3, 4, 5, 6, 7].map(which => place([0, 1, 2].map(axis => (which >> axis & 1 ? high : low)[axis])));
     shown.hidden = corners.some(corner => !corner.before);
@@ -88,8 +90,13 @@ function placed(place) {
     const { clientWidth: width } = at("labels");
     const half = shown.offsetWidth / 2 + 4;
     const x = right < 0 || left > width ? (left + right) / 2 : Math.max(half, Math.min(width - half, (left + right) / 2));
-    const y = Math.min(...corners.map(corner => corner.y));
-    shown.style.transform = `translate(-50%, -100%) translate(${x.toFixed(1)}px, ${Math.max(18, y - 4).toFixed(1)}px)`;
+    const top = Math.max(18, Math.min(...corners.map(corner => corner.y)) - 4);
+    const tall = shown.offsetHeight + 2;
+    const free = y => !taken.some(one => Math.abs(one.x - x) < one.half + half - 4 && Math.abs(one.y - y) < tall);
+    const y = [0, -1, 1, -2, 2, -3].map(step => top + step * tall).find(one => one >= 18 && free(one));
+    shown.style.visibility = y === undefined ? "hidden" : "";
+    if (!shown.hidden && y !== undefined) taken.push({ x, y, half });
+    shown.style.transform = `translate(-50%, -100%) translate(${x.toFixed(1)}px, ${(y ?? top).toFixed(1)}px)`;
   }
 }
 
@@ -382,6 +389,13 @@ at("empty-bring").addEventListener("click", () => { tab("bring"); at("files").cl
 at("key-form").addEventListener("submit", event => { event.preventDefault(); useKey(at("key").value.trim()); });
 at("forget").addEventListener("click", () => useKey(""));
 for (const button of document.querySelectorAll("[data-close]")) button.addEventListener("click", () => button.closest("dialog").close());
+let away = 0; // the timer that asks a service which does not answer
+onHeard(answers => {
+  at("offline").hidden = answers;
+  if (answers || away) return;
+  away = setInterval(() => json("/healthz").then(() => { clearInterval(away); away = 0; bring.refresh(); if (!at("trouble").hidden) location.reload(); }).catch(() => {}), 3000);
+});
+at("open-example").addEventListener("click", () => bring.example());
 onRefused(() => { at("door-wrong").hidden = !keyOf(); if (!at("door").open) at("door").showModal(); });
 at("forget").hidden = !keyOf();
 dark.addEventListener("change", () => { viewer?.background(ground()); repaint(); ask.bars(); });

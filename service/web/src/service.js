@@ -10,6 +10,9 @@ export function useKey(secret) {
   location.reload(); // nothing of what another key showed stays
 }
 
+let heard = () => {}; // with whether the service answers
+export const onHeard = action => { heard = action; };
+
 const address = path => new URL(path.replace(/^\//, ""), document.baseURI); // also behind a proxy's prefix
 const headers = more => (keyOf() ? { ...more, Authorization: `Bearer ${keyOf()}` } : more);
 
@@ -23,9 +26,16 @@ async function problemOf(reply) {
 
 export async function call(path, { method = "GET", body, signal, more = {} } = {}) {
   const sent = body === undefined ? more : { ...more, "Content-Type": "application/json" };
-  const reply = await fetch(address(path), {
-    method, signal, headers: headers(sent), body: body === undefined ? undefined : JSON.stringify(body),
-  });
+  let reply;
+  try {
+    reply = await fetch(address(path), {
+      method, signal, headers: headers(sent), body: body === undefined ? undefined : JSON.stringify(body),
+    });
+  } catch (problem) {
+    if (problem.name !== "AbortError") heard(false);
+    throw problem;
+  }
+  heard(true);
   if (reply.ok) return reply;
   const problem = await problemOf(reply);
   if (reply.status === 401) refused();
@@ -127,15 +137,21 @@ export function upload(kind, file, progress, cameras) {
   return { done, end: () => request.abort() };
 }
 
-// What went wrong, as the problem says it, and what to try.
+// What went wrong, and what to try, in a reader's words: no field of a request, no digest, no address of ours.
 export function words(problem) {
-  if (problem.argument && problem.expected && problem.got) {
-    const hint = problem.hint ? ` ${sentence(problem.hint)}` : "";
-    return `${problem.title}: ${problem.argument}: expected ${problem.expected}, got ${problem.got}.${hint}`;
+  if (problem.expected && problem.got) {
+    const hint = problem.hint && !OURS.test(problem.hint) ? ` ${sentence(plainly(problem.hint))}` : "";
+    const named = problem.argument && !FIELD.test(problem.argument) ? `${plainly(problem.argument)}: ` : "";
+    return plainly(`${problem.title}. ${named}It needs ${problem.expected}, and got ${problem.got}.${hint}`);
   }
-  if (problem.title) return problem.detail ? `${problem.title}: ${problem.detail}` : problem.title;
-  return `The service does not answer (${problem.message || problem}). Is it running?`;
+  if (problem.title) return plainly(problem.detail ? `${problem.title}: ${problem.detail}` : problem.title);
+  return "The service does not answer. Is it running?";
 }
+
+const OURS = /\b(GET|PUT|POST|PATCH|DELETE) \/|SPLATLIFT_|\b\w+=[A-Z]|in the (body|query|path) of the request/;
+const FIELD = /^(text|like|unlike|negatives|settings|features|labels|words|query|lift|body)(\.|$)/;
+const plainly = text => text.replace(/(splats|cameras|features|table|masks|photos|lift) (sha256:)?[0-9a-f]{32,}/g, "the $1")
+  .replace(/sha256:[0-9a-f]{8,}/g, "a file").replace(/\b[0-9a-f]{32,}\b/g, "it").replace(/text table \S+\.safetensors/g, "the scene's vocabulary");
 
 const sentence = text => `${text[0].toUpperCase()}${text.slice(1)}${/[.!?]$/.test(text) ? "" : "."}`;
 
