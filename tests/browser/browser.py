@@ -21,7 +21,7 @@ OPTIONS = (
     "--enable-unsafe-swiftshader", "--force-prefers-reduced-motion", "--hide-scrollbars",
     "--window-size=900,700", "--remote-debugging-pipe",
 )  # fmt: skip
-SHIFT = 8  # DevTools' bit of the key
+ALT, CTRL, SHIFT = 1, 2, 8  # DevTools' bits of the keys
 KEYS = {"Enter": 13, "Escape": 27, "Tab": 9, "ArrowLeft": 37, "ArrowUp": 38, "ArrowRight": 39, "ArrowDown": 40}
 
 
@@ -96,28 +96,28 @@ class Browser:
             time.sleep(0.05)
         raise AssertionError(f"never true: {script}; the page: {self.value('document.body.innerText')}")
 
-    def press(self, selector: str, x: float = 0.5, y: float = 0.5, *, shift: bool = False) -> None:
+    def press(self, selector: str, x: float = 0.5, y: float = 0.5, *, shift: bool = False, alt: bool = False) -> None:
         """Click an element, x and y as shares of its box."""
-        self.drag(selector, (x, y), shift=shift)
+        self.drag(selector, (x, y), shift=shift, alt=alt)
 
-    def drag(self, selector: str, *places: tuple[float, float], shift: bool = False) -> None:
+    def drag(self, selector: str, *places: tuple[float, float], shift: bool = False, alt: bool = False) -> None:
         """Press the mouse at the first place, shares of an element's box, and let it go at the last."""
         self.value(f"document.querySelector({json.dumps(selector)}).scrollIntoView({{block: 'nearest'}})")
         box = self.value(f"document.querySelector({json.dumps(selector)}).getBoundingClientRect().toJSON()")
         points = [{"x": box["left"] + x * box["width"], "y": box["top"] + y * box["height"]} for x, y in places]
         moves = [("mouseMoved", point) for point in points[1:]]
         for kind, point in (("mousePressed", points[0]), *moves, ("mouseReleased", points[-1])):
-            mouse = {"button": "left", "buttons": 1, "clickCount": 1, "modifiers": SHIFT * shift}
+            mouse = {"button": "left", "buttons": 1, "clickCount": 1, "modifiers": SHIFT * shift + ALT * alt}
             self._call("Input.dispatchMouseEvent", type=kind, **mouse, **point)
 
-    def key(self, name: str, *, shift: bool = False) -> None:
+    def key(self, name: str, *, shift: bool = False, ctrl: bool = False) -> None:
         """Press a key and let it go."""
         told = {
             "key": name,
-            "modifiers": SHIFT * shift,
+            "modifiers": SHIFT * shift + CTRL * ctrl,
             "windowsVirtualKeyCode": KEYS.get(name, ord(name[0].upper())),
         }
-        text = {"text": "\r" if name == "Enter" else name} if name == "Enter" or len(name) == 1 else {}
+        text = {"text": "\r" if name == "Enter" else name} if name == "Enter" or (len(name) == 1 and not ctrl) else {}
         self._call("Input.dispatchKeyEvent", type="keyDown" if text else "rawKeyDown", **told, **text)
         self._call("Input.dispatchKeyEvent", type="keyUp", **told)
 

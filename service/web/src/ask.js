@@ -38,6 +38,7 @@ export class Ask {
   // Another lift: nothing of the old one's answers stays.
   of(lift) {
     this.lift = lift;
+    naming.clear();
     this.known = new Map(); // of completions
     this.here = [];
     const wordless = Boolean(lift) && lift.text_space === "none" && !this.table;
@@ -109,6 +110,15 @@ export class Ask {
     return this.ask(this.now);
   }
 
+  // Things or a selection, as they are.
+  hold(sets) {
+    at("words").value = at("but").value = "";
+    if (!sets.length) return this.reset(true);
+    this.questions = [fresh({ sets }, 0)];
+    this.active = 0;
+    return this.ask();
+  }
+
   // Another example in the place of one, such as a larger mask.
   swap(old, term) {
     for (const question of this.questions) {
@@ -132,8 +142,9 @@ export class Ask {
     at("words").value = given("text").join(", ");
     at("but").value = given("negatives").join(", ");
     if (given("like").length) terms.push({ like: given("like") });
+    if (given("sets").length) terms.push({ sets: given("sets") });
     if (!terms.length) return undefined;
-    terms.at(-1).unlike = given("unlike");
+    if (given("unlike").length) terms.at(-1).unlike = given("unlike");
     this.questions = terms.map((one, place) => fresh({ ...read(parameters, place), ...one }, place));
     at("heat").checked = this.heat = parameters.get("layer") === "attention" || parameters.has("heat");
     return this.ask();
@@ -148,7 +159,7 @@ export class Ask {
   // What the service is asked by a question.
   body(question) {
     const cut = question.threshold !== "auto" && !question.answer?.present; // which holds all the same
-    return { lift: this.lift.id, ...asked({ ...question, negatives: this.negatives, ...(cut && { absent: "keep" }) }) };
+    return { lift: this.lift.id, ...asked({ ...question, negatives: question.sets.length ? [] : this.negatives, ...(cut && { absent: "keep" }) }) };
   }
 
   // The same in an address.
@@ -181,8 +192,9 @@ export class Ask {
       const automatic = { ...question, threshold: "auto" };
       const [answer, scores, selected] = await Promise.all([
         json(`/query?${this.parameters(question, { top: 1 })}`),
-        bytes(`/query/scores?${this.parameters(automatic)}`).then(npy),
-        question.threshold === "auto" ? bytes(`/query/selection?${this.parameters(question)}`).then(npy) : null,
+        question.sets.length ? bytes(`/query/selection?${this.parameters(question)}`).then(content => Float32Array.from(npy(content)))
+          : bytes(`/query/scores?${this.parameters(automatic)}`).then(npy),
+        question.threshold === "auto" && !question.sets.length ? bytes(`/query/selection?${this.parameters(question)}`).then(npy) : null,
       ]);
       if (mine !== this.turn) return;
       const { min = 0, max = 0 } = answer.statistics;
@@ -308,7 +320,7 @@ export class Ask {
     const { now } = this;
     at("found").style.setProperty("--mine", now.colour);
     at("title").textContent = label(now);
-    at("scale").hidden = !now.answer;
+    at("scale").hidden = !now.answer || now.sets.length > 0;
     at("examples").replaceChildren(...["like", "unlike"].flatMap(kind => now[kind].map(term => el("li", {},
       el("button", { type: "button", title: "Take this example away", on: { click: () => this.drop(kind, term) } },
         `${kind === "like" ? "more of" : "less of"} ${shown(term)} \u00d7`)))));
@@ -393,9 +405,9 @@ export class Ask {
   list() {
     const { now } = this;
     const things = now.things || [];
-    at("stepping").hidden = !things.length;
+    at("stepping").hidden = !things.length || (now.sets.length === 1 && things.length === 1);
     at("which").textContent = this.thing < 0 ? plural(things.length, "thing") : `${this.thing + 1} of ${things.length}`;
-    at("things").replaceChildren(...things.map((thing, place) => el("li", {},
+    at("things").replaceChildren(...(now.sets.length ? [] : things).map((thing, place) => el("li", {},
       el("button", { type: "button", className: "thing", "aria-pressed": String(place === this.thing), on: { click: () => this.choose(now, place) } },
         el("b", {}, String(place + 1)), el("span", {}, plural(thing.splats, "splat"), el("small", {}, measures(thing.box))),
         el("span", { className: "score", title: "mean score" }, thing.score.toFixed(2))))));
@@ -407,7 +419,8 @@ const fresh = (terms, place) => ({ ...blank(), things: [], ...terms, colour: COL
 const split = text => text.split(",").map(word => word.trim()).filter(Boolean);
 const lit = question => question.anyway || question.threshold !== "auto" || (question.answer.clear && question.answer.present !== false);
 const shown = term => term.replace(/^splat:/, "splat ").replace(/^region:(.*):(\d+):(\d+)$/, "a mask of $1").replace(/^(.*):(box|stroke):[\d,\s]+$/, "a $2 of $1");
-export const label = question => question.text.join(", ") || (question.like.length > 1 ? `like ${question.like.length} examples` : `like ${shown(question.like[0] || "")}`);
+export const naming = new Map(); // what things and selections are called, by their terms
+export const label = question => question.text.join(", ") || question.sets.map(one => naming.get(one) || one.replace(/^object:(\d+)$/, (_, number) => `thing ${Number(number) + 1}`).replace(/^selection:.*/, "a selection")).join(", ") || (question.like.length > 1 ? `like ${question.like.length} examples` : `like ${shown(question.like[0] || "")}`);
 const quoted = question => (question.text.length ? `\u201c${question.text.join(", ")}\u201d` : "Such a thing");
 const measures = ({ low, high }) => ` ${low.map((value, axis) => (high[axis] - value).toPrecision(2)).join(" \u00d7 ")}`;
 
@@ -437,7 +450,8 @@ function advice(question, ask) {
   return lines;
 }
 
-function decided({ answer, threshold, anyway }) {
+function decided({ answer, threshold, anyway, sets }) {
+  if (sets.length) return "";
   if (answer.present === false) return `It is not here; this is what comes closest. ${reason(answer)}`;
   if (answer.present === null && answer.presence !== null) return reason(answer);
   if (!answer.clear && threshold === "auto" && anyway) return "This is what comes closest; it hardly stands apart from the rest.";

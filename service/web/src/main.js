@@ -1,7 +1,8 @@
 // The page: a lift on the stage, what is asked of it, and a link that opens the same again.
-import { Ask, label } from "./ask.js";
+import { Ask, label, naming } from "./ask.js";
 import { Bring } from "./bring.js";
 import { at, count, el, fill, size, tell } from "./dom.js";
+import { Hand } from "./hand.js";
 import { Lifts, title } from "./lifts.js";
 import { Look, veiled } from "./look.js";
 import { Masks } from "./masks.js";
@@ -17,9 +18,10 @@ const TURN = Math.PI / 24; // of an arrow key
 const TWICE = 260; // ms within which a second click makes a double one
 const POSTER_WAIT = 1000; // milliseconds that splats wait for that picture at most
 const POSTER = 960; // pixels of the service's picture that is shown until the splats are here
+const SLIDING = 600; // ms after the slider's last move, until that is an entry of the history
 const SHIFTED = 5; // pixels that the pointer may move in a click
 
-const started = new URLSearchParams(location.search);
+let started = new URLSearchParams(location.search);
 const dark = matchMedia("(prefers-color-scheme: dark)");
 let lift = null;
 let viewer = null;
@@ -33,7 +35,8 @@ const masks = new Masks({ pick: (term, less) => { tab("ask"); ask.example(term, 
 const take = new Take({ ask, look, names, shot });
 const bring = new Bring({ opened: id => open(id, true), gone: () => refreshLifts(), open: () => lift?.id ?? null, raised: () => tab("bring") });
 const lifts = new Lifts({ opened: id => open(id, true), changed: () => refreshLifts() });
-const things = new Things({ changed: () => repaint(), fly: (box, view) => (look.mode === "view" ? look.go(view) : viewer?.toBox(box, look.views.find(({ name }) => name === view))) });
+const hand = new Hand({ ask, label, look, naming, viewer: () => (viewer?.mesh ? viewer : null) });
+const things = new Things({ naming, held: () => ask.now?.sets || [], hold: sets => ask.hold(sets), fly: (box, view) => (look.mode === "view" ? look.go(view) : viewer?.toBox(box, look.views.find(({ name }) => name === view))) });
 
 look.asked = view => {
   const question = ask.painted().length ? ask.now : null;
@@ -47,10 +50,12 @@ let drawn = "";
 
 // After what is asked, or how it is shown, has changed.
 function changed() {
-  if (ask.questions.length) { things.rest(); names.rest(); }
+  if (ask.questions.length) names.rest();
+  things.show();
+  hand.follow();
   masks.list(look.examples());
   repaint();
-  link();
+  if (!sliding) link();
   take.show();
   const question = ask.now?.answer ? `${ask.parameters(ask.now)}` : names.shown ? JSON.stringify([names.asked, ...names.only]) : "";
   clearTimeout(changed.soon);
@@ -62,7 +67,7 @@ function repaint() {
   const begun = performance.now();
   const questions = ask.painted();
   viewer.paint(questions, { heat: ask.heated(), layer: names.painted() || look.painted(), hide: at("hide").checked });
-  const boxes = at("show-boxes").checked ? [...ask.boxes(), ...things.boxes(), ...names.boxes()] : [];
+  const boxes = at("show-boxes").checked ? [...ask.boxes(), ...names.boxes()] : [];
   viewer.outline(boxes);
   labels(boxes);
   document.body.dataset.painted = (performance.now() - begun).toFixed(1);
@@ -100,18 +105,62 @@ function placed(place) {
   }
 }
 
-// The address bar holds the link that opens the same question, camera and layer.
+let entry = null; // what is asked in the newest entry of the browser's history
+let going = false; // back or forth in it
+let sliding = 0;
+
+// The slider rests: what it was moved through is one entry.
+function slid() {
+  clearTimeout(sliding);
+  sliding = 0;
+  link();
+}
+
+// The address bar holds the link that opens the same question, camera and layer. What is asked anew is an entry of the
+// browser's history; a camera that moves is none.
 function link() {
-  if (!lift || busy) return;
+  if (!lift || busy || going) return;
   const parameters = new URLSearchParams({ lift: lift.id });
   if (look.view) parameters.set("view", look.view.name);
   ask.link(parameters);
+  hand.link(parameters);
   names.link(parameters);
   if (look.what !== "rgb") parameters.set("what", look.what);
   if (look.mode !== "scene" && !look.fallback) parameters.set("show", look.mode);
   if (at("hide").checked) parameters.set("hide", "1");
   if (viewer?.mesh) parameters.set("camera", viewer.place3d.map(value => Number(value.toPrecision(5))).join(","));
-  history.replaceState(null, "", `?${parameters}`);
+  const fixed = ["view", "what", "show", "hide", "camera", "heat"];
+  const now = String([...parameters].filter(([name]) => !fixed.includes(name)));
+  const waits = ask.questions.some(question => !question.answer && !question.problem);
+  if (entry !== null && entry !== now && waits) return; // it is an entry once it is answered
+  history[entry !== null && entry !== now ? "pushState" : "replaceState"](null, "", `?${parameters}`);
+  entry = now;
+}
+
+// Back and forth: what was asked then is asked again.
+addEventListener("popstate", async () => {
+  const parameters = new URLSearchParams(location.search);
+  if (parameters.get("lift") !== lift?.id) { started = parameters; entry = null; return parameters.has("lift") && open(parameters.get("lift")); }
+  going = true;
+  try {
+    at("hide").checked = parameters.has("hide");
+    ask.reset(false);
+    names.rest();
+    await restored(parameters);
+    if (!ask.questions.length) ask.reset(true);
+  } finally {
+    going = false;
+    entry = null;
+    link();
+  }
+  return undefined;
+});
+
+async function restored(parameters) {
+  const answered = ask.restore(parameters);
+  await hand.restore(parameters);
+  await answered;
+  if (parameters.has("named")) { tab("name"); names.restore(parameters); }
 }
 
 function tab(name) {
@@ -193,8 +242,7 @@ async function open(id, fresh = false) {
     at("hide").checked = parameters.has("hide");
     loading(null);
     busy = false;
-    await ask.restore(parameters);
-    if (parameters.has("named")) { tab("name"); names.restore(parameters); }
+    await restored(parameters);
     link();
   } catch (problem) {
     if (mine !== turn) return;
@@ -310,15 +358,18 @@ function pointing(canvas, built) {
       return;
     }
     last = event.timeStamp;
-    const less = event.shiftKey;
-    waiting = setTimeout(() => hit(at3d(event), less), TWICE);
+    const { shiftKey, altKey } = event;
+    waiting = setTimeout(() => hit(at3d(event), shiftKey, altKey), TWICE);
   });
   canvas.addEventListener("keydown", event => keyed(event, built));
 }
 
-function hit(found, less) {
+// A click takes the thing there, a second one or Alt a patch of it; Shift several things, or less of a patch.
+async function hit(found, shift, alt = false) {
   if (!found) return tell("There is no splat there.");
-  return pointed(`splat:${found.splat}`, less, found.at);
+  const patch = alt || !at("panel-name").hidden || (shift && ask.now && !ask.now.sets.length);
+  if (!patch && await things.at(found.splat, shift)) return undefined;
+  return pointed(`splat:${found.splat}`, shift && !ask.now?.sets.length, found.at);
 }
 
 // Somebody points at a thing: more of it, or with the panel of names what it is.
@@ -352,6 +403,13 @@ async function shot() {
   return new Promise(done => canvas.toBlob(done, "image/png"));
 }
 
+// Undo and redo: of the selection that is corrected, else of what was asked.
+addEventListener("keydown", event => {
+  if (event.key.toLowerCase() !== "z" || !(event.ctrlKey || event.metaKey) || event.target.matches("input[type=text], textarea")) return;
+  event.preventDefault();
+  if (!hand.go(event.shiftKey ? 1 : -1)) history.go(event.shiftKey ? 1 : -1);
+});
+
 // Keys that work wherever no text is typed.
 addEventListener("keydown", event => {
   if (event.target.matches("input:not([type=radio]):not([type=checkbox]):not([type=range]), select, textarea") || event.ctrlKey || event.metaKey || event.altKey) {
@@ -380,6 +438,8 @@ for (const button of document.querySelectorAll("[role=tab]")) {
   });
 }
 at("lift").addEventListener("change", () => at("lift").value && open(at("lift").value, true));
+at("cut").addEventListener("input", () => { clearTimeout(sliding); sliding = setTimeout(slid, SLIDING); });
+at("cut").addEventListener("change", slid);
 for (const id of ["hide", "show-boxes"]) at(id).addEventListener("change", () => { repaint(); link(); });
 at("again").addEventListener("click", () => location.reload());
 at("reset-view").addEventListener("click", () => look.view && viewer?.to(look.view));
@@ -401,7 +461,7 @@ at("forget").hidden = !keyOf();
 dark.addEventListener("change", () => { viewer?.background(ground()); repaint(); ask.bars(); });
 
 // For tests, and for the curious in the console.
-Object.assign(globalThis, { splatlift: { ask, look, bring, take, things, names, masks, get viewer() { return viewer; }, get lift() { return lift; }, label, COLOURS } });
+Object.assign(globalThis, { splatlift: { ask, look, bring, take, things, names, masks, hand, get viewer() { return viewer; }, get lift() { return lift; }, label, COLOURS } });
 
 async function begin() {
   if (look.fallback) fallBack();
