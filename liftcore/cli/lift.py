@@ -12,6 +12,7 @@ from liftcore.cli.options import Parser, add_settings, add_sources, add_verbose,
 from liftcore.cli.reply import reply, shown, smoothing_line
 from liftcore.errors import InvalidInput, InvalidSettings
 
+FEW_VIEWS = 26  # of masks: smooth features gain there, and hardly with 52 (docs/results.md)
 FILLED = 0.9  # of a ray, in a scene that was trained with its background
 
 if TYPE_CHECKING:
@@ -208,6 +209,10 @@ def _verdict(document: dict[str, Any], cameras: Path) -> Iterable[str]:
         yield f"splats fill {filled:.1%} of a ray, {usual}"
     if "candidates" in certificate.get("smoothing", {}):
         yield smoothing_line(certificate["smoothing"])
+    masks = certificate.get("reweighting", {}).get("masks")
+    if masks is not None and not document["settings"]["smoothness"] and (not masks or document["views"] <= FEW_VIEWS):
+        of = f"{document['views']} views of masks" if masks else "maps without masks"
+        yield f"of {of}: --set smoothness=auto would draw neighbours together as far as halves of views gain by it"
     if certificate["warnings"]:
         yield "look at the warnings: splatlift check says whether photos, cameras and splats belong together"
     space = document["text_space"]

@@ -1,4 +1,4 @@
-"""Speed against accuracy on a scene of the user's: the dial ``speed``, presets and aggregation, in a budget of time.
+"""Speed against accuracy on a scene of the user's: ``speed``, presets, smoothness, aggregation, in a budget of time.
 
 Each run is a process of its own (``python -m liftcore.evaluate.tradeoff``: a pickled `RunSpec` on stdin, figures as
 JSON on stdout), so that its memory is its own. Time is processor time: on a machine that others use too it says what
@@ -77,13 +77,14 @@ class Candidate:
 
 EXACT = Candidate("exact", "dial", {"speed": "exact"})  # the settings of the order as they are
 DRAFT = Candidate("draft", "dial", {"speed": "draft"})
-CANDIDATES = (  # in the order in which a budget is spent; the dial and aggregation keep the order's preset
+CANDIDATES = (  # in the order in which a budget is spent; others than presets keep the order's
     EXACT,
     Candidate("fast", "dial", {"speed": "fast"}),
     Candidate("default", "preset", {"preset": "default"}, 1.6),
     Candidate("row-sum", "preset", {"preset": "row-sum"}),
     Candidate("tikhonov", "preset", {"preset": "tikhonov"}),
     DRAFT,
+    Candidate("smooth", "preset", {"smoothness": "auto"}, 2.5),
     Candidate("aggregation", "preset", {"aggregation": True}, 2.5),
     Candidate("tikhonov + aggregation", "preset", {"preset": "tikhonov", "aggregation": True}, 2.5),
     Candidate("balanced", "dial", {"speed": "balanced"}),

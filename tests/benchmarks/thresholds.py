@@ -1,6 +1,7 @@
 """Masks on the tabletop scene: mean IoU in the views that were not lifted, a phrase at a time.
 
-    python -m tests.benchmarks.thresholds DIR [--lifts NAME ...] [--every N] [--still-life] [--alone] [--json]
+    python -m tests.benchmarks.thresholds DIR [--lifts NAME ...] [--every N] [--still-life] [--alone]
+        [--smoothness L] [--json]
 
 Each phrase is asked alone, no other phrase and no truth is known to the threshold. A column a method: masks of the
 objects that it finds; ``worst`` is the phrase that ``auto`` shows least well. ``rendered`` cuts the rendered scores
@@ -47,6 +48,7 @@ LIFTS: dict[str, dict[str, Any]] = {
     "tikhonov": {"preset": "tikhonov"},
     "robust": {"preset": "row-sum", "robust_steps": 1},
     "default": {"preset": "default"},
+    "smooth": {"preset": "default", "smoothness": "auto"},
     "aggregated": {"preset": "default", "aggregation": True},
 }
 
@@ -153,17 +155,23 @@ def measure_alone(scene: Scene, truth: Truth, encoder: TextEncoder, absent: Sequ
     }
 
 
-def rows_alone(folder: Path, packs: Iterable[str], every: int, still_life: bool) -> Iterator[dict[str, Any]]:
+def rows_alone(
+    folder: Path, packs: Iterable[str], every: int, still_life: bool, smoothness: str
+) -> Iterator[dict[str, Any]]:
     """One row a lift by `default`: of tabletop, and of the still life with five seeds of mistakes."""
     truth, table = tabletop(folder), TableEncoder.open(folder / "text_table.safetensors")
     others = [word for word in table.words if word not in truth.words]
+    how: dict[str, Any] = {
+        "preset": "default",
+        "smoothness": smoothness if smoothness == "auto" else float(smoothness),
+    }
     absent = np.random.default_rng(0).choice(others, ABSENT, replace=False).tolist()
     for pack in packs:
-        scene = truth.opened(truth.lift(read_pack(folder, pack), preset="default", view_stride=every))
+        scene = truth.opened(truth.lift(read_pack(folder, pack), view_stride=every, **how))
         yield {"scene": f"{pack}, {len(scene.metadata.views)} views"} | measure_alone(scene, truth, table, absent)
     for kind, seed in product(("usual", "hard"), range(7, 12) if still_life else ()):
         made, views = still_life_scene(kind, seed)
-        scene = made.opened(made.lift(views, preset="default"))
+        scene = made.opened(made.lift(views, **how))
         head = {"scene": f"still life, {kind} {seed}"}
         yield head | measure_alone(scene, made, open_encoder("minilm"), NOT_THERE)
 
@@ -179,10 +187,12 @@ def main() -> None:
         ("--still-life", {"action": "store_true", "help": "the still life too, which nothing was tuned on"}),
         ("--alone", {"action": "store_true", "help": "each phrase alone by auto, and words for what is not there"}),
         ("--every", {"type": int, "default": 1, "metavar": "N", "help": "tabletop's every N-th view alone"}),
+        ("--smoothness", {"default": "0", "metavar": "L", "help": "of the lifts for --alone; a number or auto"}),
     )
     options = parser.parse_args()
     if options.alone:
-        tell(rows_alone(options.folder, options.features, options.every, options.still_life), as_json=options.json)
+        given = options.folder, options.features, options.every, options.still_life, options.smoothness
+        tell(rows_alone(*given), as_json=options.json)
         return
     rows = list(rows_of(options.folder, options.features, options.lifts, options.every))
     rows += still_life_rows(options.lifts) if options.still_life else []

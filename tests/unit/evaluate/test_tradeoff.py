@@ -125,8 +125,10 @@ def test_the_dial_starts_from_the_preset_of_the_order():
     assert {"aggregation", "tikhonov"} <= set(names[0]) and "default" in names[1]
     # A setting that stands on the robust step leaves out presets that have none.
     assert [candidate.name for candidate in candidates_of({"reliability": True}) if candidate.kind == "preset"] == [
-        "aggregation"
+        "smooth",
+        "aggregation",
     ]
+    assert "smooth" not in [candidate.name for candidate in candidates_of({"smoothness": "auto"})]
 
 
 def test_cosines_count_splats_that_the_exact_run_saw():

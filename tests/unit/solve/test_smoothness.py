@@ -270,6 +270,16 @@ def test_refinement_that_cannot_be_is_refused_in_words(files: tuple[Path, Path, 
         LiftSettings.of(smoothness=2).check_blocks(masks=True)
 
 
+@pytest.mark.parametrize("smoothness", ["0", "auto"])
+def test_lift_of_few_views_tells_of_smoothness(
+    files: tuple[Path, Path, Path], smoothness: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "scene.lift.safetensors"
+    status, text, _ = run(capsys, "lift", *files, "-o", out, "--set", f"smoothness={smoothness}")
+    assert status == 0
+    assert ("3 views of masks: --set smoothness=auto would" in text) == (smoothness == "0")
+
+
 def test_command_refines_a_lift_that_is_there(
     plain: lc.LiftResult, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
