@@ -24,6 +24,7 @@ COMMANDS = {
     "check": "do splats, cameras, photos and features belong together",
     "lift": "lift features onto splats",
     "refine": "a finished lift with smooth features",
+    "transfer": "a finished lift on an edited copy of its splats",
     "plan": "what a lift would do and need",
     "query": "find words and examples in a lift",
     "segment": "name every splat of a lift by the best of many words",

@@ -23,7 +23,7 @@ WHAT = {".json": "masks", ".jsonl": "lines"}  # by the suffix; all others are sp
 def add_arguments(parser: Parser) -> None:
     """The options of the command."""
     add_lift(parser)
-    made = ".glb, .ply, .spz: splats with labels; .splat: without; .json: COCO masks in the views; .jsonl: objects"
+    made = ".glb, .usdz, .ply or .spz: splats with labels; .json: COCO masks in the views; .jsonl: objects"
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=made)
     source = parser.add_mutually_exclusive_group()
     source.add_argument("--text", action="append", default=[], metavar="TEXT", help="label what these words find")
@@ -66,7 +66,7 @@ def run(options: argparse.Namespace) -> int:
     if source is not None and not isinstance(source, int) and what != "object":
         labels = scene.labels(source)
         document |= {name: len(labels.document[name]) for name in ("classes", "instances")}
-    if suffix in (".glb", ".spz", ".splat") and scene.splats.kernel != "3dgs":
+    if suffix != ".ply" and what not in WHAT.values() and scene.splats.kernel != "3dgs":
         document["warnings"] = [
             f"{scene.splats.kernel} splats are written as the nearest Gaussians, all that the format has"
         ]

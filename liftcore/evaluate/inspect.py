@@ -110,6 +110,9 @@ def _refuse_code(path: Path) -> None:
     if found is SplatFormat.CHECKPOINT:
         got = "a checkpoint of a trainer, which is a Python pickle"
         raise InvalidSplats("splats", expected="a format that holds no code", got=got, hint=EXPORT_PLY)
+    if found is SplatFormat.USD:
+        got, hint = "a USD scene, which may lead to other files", "send the splats as .glb, .ply, .spz or .sog"
+        raise InvalidSplats("splats", expected="a format that holds all in itself", got=got, hint=hint)
     if isinstance(found, Plugin):
         raise InvalidSplats("splats", expected="a format of splatlift's own", got=found.value, hint=EXPORT_PLY)
 

@@ -72,6 +72,7 @@ class SplatFormat(StrEnum):
     SPZ = ".spz"
     SOG = ".sog"
     GLTF = ".glb"  # or .gltf, with KHR_gaussian_splatting
+    USD = "USD"  # .usdc, .usda or .usdz with particle fields, which may lead to other files
     CHECKPOINT = "checkpoint"  # of gsplat or nerfstudio: a pickle, if only of tensors
 
 
@@ -82,6 +83,7 @@ SUFFIX = {
     SplatFormat.SPZ: ".spz",
     SplatFormat.SOG: ".sog",
     SplatFormat.GLTF: ".glb",
+    SplatFormat.USD: ".usdc",
     SplatFormat.CHECKPOINT: ".pt",
 }
 PICKLED = (".pt", ".pth", ".ckpt", ".pkl")
@@ -112,7 +114,11 @@ _VIEWER = FileKind(
     "export them from SuperSplat's editor as .ply or .sog in place of the viewer",
 )
 _GLTF = FileKind(None, "a glTF model without splats (KHR_gaussian_splatting)", f"a mesh has none: {NOT_CONVERTED}")
-_USD = FileKind(None, "a USD scene", f"if it holds splats, {NOT_CONVERTED}; a mesh has none")
+_USD = FileKind(
+    None,
+    "a USD scene",
+    "if it holds splats, 'splatlift export' and read_splats open it here: send them as .glb or .ply",
+)
 _PICTURE = FileKind(None, "a picture")
 _VIDEO = FileKind(
     None, "a video", "take frames of it, reconstruct their cameras with COLMAP, and train splats on them"
@@ -412,7 +418,7 @@ def _by_magic(head: bytes) -> FileKind | None:
         found = FileKind(None, "a Python pickle, which may run code when it is opened", EXPORT_PLY)
     if found is _GLTF and b"KHR_gaussian_splatting" in head:
         return _splats_as(SplatFormat.GLTF)
-    return found
+    return _splats_as(SplatFormat.USD) if found is _USD else found
 
 
 def _is_ksplat(head: bytes, size: int) -> bool:
@@ -561,7 +567,7 @@ def _of_names_in_zip(names: list[str], head_of: Callable[[str], bytes]) -> Itera
     yield FileKind(None, "a zip without a file", "zip or export it again") if not names else None
     yield _splats_as(SplatFormat.SOG) if sog_folder(names) is not None else None
     yield _splats_as(SplatFormat.CHECKPOINT) if any(name.endswith("/data.pkl") for name in names) else None
-    yield _USD if names[0].lower().endswith((".usd", ".usda", ".usdc")) else None
+    yield _splats_as(SplatFormat.USD) if names[0].lower().endswith((".usd", ".usda", ".usdc")) else None
     hint = "save each as .npy; 'splatlift pack npy' makes a feature pack of them"
     yield FileKind(None, "NumPy arrays (.npz)", hint) if suffixes == {".npy"} else None
     yield _streamed(f"a zip of a streamed SOG ({LOD_META})", f"(unzipped) {LOD_META}") if LOD_META in lasts else None

@@ -24,7 +24,7 @@ class OutputType:
 
 
 OUTPUT_TYPES = {
-    "splats": OutputType("splats", (".ply", ".splat", ".spz", ".glb"), "splats"),
+    "splats": OutputType("splats", (".ply", ".splat", ".spz", ".glb", ".usdc", ".usdz"), "splats"),
     "ply": OutputType("a PLY", (".ply",), "splats"),
     "png": OutputType("a picture", (".png",), None, "a picture"),
     "npy": OutputType("an array", (".npy",), None, "a NumPy array"),

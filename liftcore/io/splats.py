@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +30,7 @@ from liftcore.io.remote import landing, local_path
 from liftcore.io.sog import is_bundled, read_sog, sog_files
 from liftcore.io.splat import ROW, read_splat, splat_blocks
 from liftcore.io.spz import read_spz, read_spz_document, spz_blocks
+from liftcore.io.usd import read_usd, read_usd_document, usd_blocks
 from liftcore.runtime.plugins import Plugin, find_plugin
 from liftcore.scene.harmonics import constant_terms
 from liftcore.scene.kernel import Kernel, kernel_named
@@ -42,8 +44,8 @@ if TYPE_CHECKING:
 
 
 PLUGINS = "splatlift.splat_formats"  # the entry points of other packages' readers, by suffix
-OWN_SUFFIXES = ("ply", "splat", "spz", "sog", "glb", "gltf", "ckpt", "pt")
-EXPECTED = "splats as PLY, compressed PLY, .splat, .spz, .sog, .glb or a checkpoint"
+OWN_SUFFIXES = ("ply", "splat", "spz", "sog", "glb", "gltf", "usdc", "usdz", "usda", "usd", "ckpt", "pt")
+EXPECTED = "splats as PLY, compressed PLY, .splat, .spz, .sog, .glb, .usdz or a checkpoint"
 _READERS: dict[SplatFormat, Callable[..., Fields]] = {
     SplatFormat.COMPRESSED_PLY: read_compressed_ply,
     SplatFormat.SPLAT: read_splat,
@@ -51,6 +53,7 @@ _READERS: dict[SplatFormat, Callable[..., Fields]] = {
     SplatFormat.SOG: read_sog,
     SplatFormat.CHECKPOINT: read_checkpoint,
     SplatFormat.GLTF: read_gltf,
+    SplatFormat.USD: read_usd,
 }
 Document = Mapping[str, Any]  # of `liftcore.io.labels`
 _WRITERS: dict[str, Callable[[Splats, Document | None], Iterator[bytes]]] = {
@@ -58,8 +61,10 @@ _WRITERS: dict[str, Callable[[Splats, Document | None], Iterator[bytes]]] = {
     ".splat": lambda splats, _: splat_blocks(splats),
     ".spz": spz_blocks,
     ".glb": gltf_blocks,
+    ".usdc": usd_blocks,
+    ".usdz": partial(usd_blocks, suffix=".usdz"),
 }
-WITH_COLUMNS = (".ply", ".glb", ".spz")  # formats that hold further numbers a splat
+WITH_COLUMNS = (".ply", ".glb", ".spz", ".usdc", ".usdz")  # formats that hold further numbers a splat
 
 
 def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool = True) -> Splats:
@@ -99,7 +104,7 @@ def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool
 
 
 def write_splats(path: Path | str, splats: Splats, columns: Mapping[str, Any] | None = None) -> None:
-    """Write splats whole or not at all, as a PLY, or as a ``.splat``, ``.spz`` or ``.glb`` where the path ends so.
+    """Write splats whole or not at all, as a PLY, or as the suffix says: .splat, .spz, .glb, .usdc or .usdz.
 
     A PLY keeps the layout and the further columns that the splats were read with.
 
@@ -351,6 +356,8 @@ def _document_of(path: Path) -> dict[str, Any]:
     match format_of(path):
         case SplatFormat.GLTF:
             return read_gltf_document(path)
+        case SplatFormat.USD:
+            return read_usd_document(path)
         case SplatFormat.SPZ:
             return read_spz_document(path)
         case SplatFormat.PLY:

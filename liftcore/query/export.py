@@ -35,7 +35,9 @@ FILES = {  # of what a file is made -> the files that there are of it
     "scene": ("rgb", "depth", "pca", "cluster", "confidence", "splats"),
 }
 
-BY_SUFFIX = {".glb": "labelled", ".json": "masks", ".jsonl": "lines"}  # what a name asks for of many things
+BY_SUFFIX = {  # what a name asks for of many things
+    **dict.fromkeys((".glb", ".usdc", ".usdz"), "labelled"), ".json": "masks", ".jsonl": "lines",
+}  # fmt: skip
 
 
 def blocks_of(
@@ -145,7 +147,7 @@ def object_splats(scene: OpenedLift, answer: Answer, suffix: str = ".ply") -> It
     """The splats of an answer's objects, as a file in blocks: a PLY with every property to the byte, or another.
 
     They are those that `objects` and masks show, without strays; of more than are grouped, all that were selected.
-    A ``.glb`` and an ``.spz`` have their labels, too.
+    All others but a ``.splat`` have their labels, too.
 
     Raises:
         InvalidQuery: none was selected, or nothing asked for is there: most viewers open no file without splats; or
@@ -167,7 +169,7 @@ def object_splats(scene: OpenedLift, answer: Answer, suffix: str = ".ply") -> It
         )
     whole = answer.count > MOST_SPLATS and not answer.query.keeps_some
     kept = answer.selected if whole else objects(scene, answer).numbers >= 0
-    if suffix in (".glb", ".spz") and not whole:
+    if suffix in (".glb", ".spz", ".usdc", ".usdz") and not whole:
         return labelled(scene.splat_file, labels(scene, answer), suffix, kept)
     return some_rows(scene.splat_file, kept, suffix)
 

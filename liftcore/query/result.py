@@ -160,6 +160,34 @@ class LiftResult(Lift):
         with shown_progress(progress) as reporter:
             return refine(self, splats, smoothness, reporter, threads)
 
+    def transferred(
+        self, old: Splats, new: Splats | Path | str, *, matrix: Any = None, progress: Progress | bool | None = None
+    ) -> LiftResult:
+        """The lift on other splats of its scene: cropped, reordered, compressed, decimated, moved, trained anew.
+
+        ``diagnostics["transfer"]`` has how many are rows of the old ones, are mixed of several, or found no partner,
+        and how the scene was moved (`liftcore.query.transfer`).
+
+        Args:
+            old: splats that were lifted. new: Q others, in any order, or their file, which the lift remembers.
+            matrix: [4, 4] or [3, 4], the similarity from the old frame to the new one; None: none, or one that is
+                found. progress: as `liftcore.lift` has it.
+
+        Raises:
+            InvalidSplats: other splats than were lifted, or no place of the new ones in the scene is clear.
+            InvalidInput: the matrix is no similarity.
+        """
+        from liftcore.io.splats import read_splats
+        from liftcore.query.transfer import transfer
+        from liftcore.runtime.progress import shown_progress
+        from liftcore.values.lift_file import input_file
+
+        with shown_progress(progress) as reporter:
+            if not isinstance(new, str | Path):
+                return transfer(self, old, new, matrix, reporter)
+            result = transfer(self, old, read_splats(new), matrix, reporter)
+        return replace(result, metadata=result.metadata.model_copy(update={"splats": input_file(Path(new))}))
+
     def arrays(self) -> dict[str, np.ndarray]:
         """Its tensors as arrays by their names, in the order of its file; those of a file are mapped, not read."""
         return {name: tensor.cpu().numpy() for name, tensor in tensors_of(self).items()}

@@ -156,9 +156,13 @@ class Lift:
         columns = {name: column[rows] for name, column in given.items() if column is not None}
         for labels, table in (("cluster", "cluster_features"), ("object", "object_views")):
             if labels in columns and (values := getattr(self, table)) is not None:
+<<<<<<< HEAD
                 columns[labels], columns[table] = _renumbered(columns[labels], values)
         if self.node is not None:
             columns |= _cropped_tree({name: getattr(self, name) for name in NODE_TENSORS}, rows)
+=======
+                columns[labels], columns[table] = renumbered(columns[labels], values)
+>>>>>>> 227d195 (Take lifts to edited copies, and write and read USD particle fields)
         places = {row: place for row, *place in self.metadata.landmarks}
         numbered = enumerate(rows.tolist())
         landmarks = tuple((new, *places[old]) for new, old in numbered if old in places)
@@ -252,7 +256,7 @@ class Lift:
         return self.to(torch.device("cpu"))
 
 
-def _renumbered(labels: Tensor, table: Tensor) -> tuple[Tensor, Tensor]:
+def renumbered(labels: Tensor, table: Tensor) -> tuple[Tensor, Tensor]:
     """Labels [n] of rows of a table [K, ..], -1 for none, and the table without rows that no label names."""
     import torch
 

@@ -40,7 +40,6 @@ OTHERS = {  # content, a word of its name and of what to do
     "error.ply": (b'{"error": "not found"}', "not found", "download"),
     "pointer.ply": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "Git LFS", "git lfs pull"),
     "model": (b"glTF\x02\0\0\0" + bytes(100), "glTF", "export"),
-    "scene.usdc": (b"PXR-USDC" + bytes(90), "USD", "export"),
     "scene.ksplat": (bytes(5000), "ksplat", "splat-transform"),
     "unnamed": (b"\0\1\0\0" + np.array([1, 1, 9, 9], "<u4").tobytes() + bytes(5000), "ksplat", "splat-transform"),
     "scene.rad": (b"RAD0" + bytes(60), ".rad", "export"),
@@ -130,7 +129,6 @@ def test_a_zip_is_what_is_in_it_and_names_the_file_to_give(tmp_path: Path) -> No
         assert kind_of(zipped(tmp_path / f"{kind}.zip", files)) == kind
     words = {
         "project.ssproj": ({"document.json": b"{}", "splat_0.ply": splats}, "SuperSplat"),
-        "scene.usdz": ({"scene.usdc": b"PXR-USDC"}, "USD"),
         "features.npz": ({"a.npy": b""}, r"\.npz"),
         "pack.zip": ({"pack.safetensors": b""}, r"unzip it and give pack\.safetensors"),
         "mesh.zip": ({"mesh.obj": b"v 0 0 0"}, "trained splats"),

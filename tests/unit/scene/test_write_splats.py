@@ -49,7 +49,7 @@ def test_the_suffix_names_the_format(suffix: str, tmp_path: Path) -> None:
     lc.write_splats(path, random_splats(3))
     assert lc.read_splats(path).count == P and not lc.read_splats(path).extras
     if suffix == ".splat":
-        with pytest.raises(lc.InvalidSplats, match=r"columns: expected a path that ends in \.ply or \.glb or \.spz"):
+        with pytest.raises(lc.InvalidSplats, match="columns: expected a path that ends in"):
             lc.write_splats(path, random_splats(3), COLUMNS)
         return
     lc.write_splats(path, random_splats(3), COLUMNS)
@@ -81,5 +81,5 @@ def test_other_formats_and_swapped_arguments_are_refused(tmp_path: Path) -> None
     swapped: Any = (random_splats(3), tmp_path / "s.ply")
     with pytest.raises(lc.InvalidSplats, match=r"splats: expected Splats, behind the path, .*write_splats\(path"):
         lc.write_splats(*swapped)
-    with pytest.raises(lc.InvalidSplats, match=r"path: expected one of \.ply, \.splat, \.spz, \.glb, got '\.obj'"):
+    with pytest.raises(lc.InvalidSplats, match=r"path: expected one of \.ply, .*, got '\.obj'"):
         lc.write_splats(tmp_path / "s.obj", random_splats(3))

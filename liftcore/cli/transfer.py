@@ -1,0 +1,62 @@
+"""``splatlift transfer``: a lift on an edited, compressed or retrained copy of its splats, without lifting again."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from liftcore.cli.options import Parser, add_splats, place
+from liftcore.cli.reply import reply
+from liftcore.errors import InvalidInput
+
+NUMBERS = (12, 16)  # of a matrix
+
+
+def add_arguments(parser: Parser) -> None:
+    """The options of the command."""
+    parser.add_argument("lift", type=place, help="a lift (.safetensors or .shards)")
+    parser.add_argument("edited", type=place, help="other splats of its scene, of any format")
+    parser.add_argument("-o", "--output", type=place, required=True, metavar="NEW", help="the lift to write")
+    moved = "how the scene was moved, a text file of 3 or 4 rows of 4 numbers; else it is found, if it was"
+    parser.add_argument("--matrix", type=Path, metavar="FILE", help=moved)
+    add_splats(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Write the lift of the other splats, and say what became of the rows."""
+    from liftcore import Scene, load_lift
+    from liftcore.files import check_output, writing
+
+    scene = Scene(options.lift, splats=options.splats)
+    file = check_output(options.output, [options.lift, scene.splat_file, options.edited], "lift")
+    matrix = None if options.matrix is None else _matrix(options.matrix)
+    result = load_lift(options.lift).transferred(scene.splats, options.edited, matrix=matrix, progress=True)
+    with writing(file):
+        result.save(options.output, progress=True)
+    facts = result.diagnostics["transfer"]
+    document: dict[str, Any] = {"out": str(options.output), "splats": len(result), **facts, "warnings": []}
+    if lost := facts["without_partner"]:
+        document["warnings"] = [f"{lost} of {len(result)} splats overlap with none of the lift, and have no feature"]
+    reply(document, as_json=options.json, lines=_lines(document))
+    return 0
+
+
+def _matrix(path: Path) -> list[list[float]]:
+    try:
+        numbers = [float(word) for word in path.read_text(encoding="utf-8").replace(",", " ").split()]
+    except (OSError, ValueError) as error:
+        raise InvalidInput("--matrix", expected="a file of 12 or 16 numbers", got=str(error)[:120]) from None
+    if len(numbers) not in NUMBERS:
+        raise InvalidInput("--matrix", expected="a file of 12 or 16 numbers", got=str(len(numbers)))
+    return [numbers[first : first + 4] for first in range(0, len(numbers), 4)]
+
+
+def _lines(document: dict[str, Any]) -> list[str]:
+    moved = document["moved"]
+    lines = [
+        f"{document['out']}: {document['splats']} splats, {document['rows']} of them rows of the lift, "
+        f"{document['mixed']} mixed of those that they overlap with, {document['without_partner']} without a partner"
+    ]
+    lines += [] if moved is None else [f"  the scene was moved: {moved['scale']:.6g} times as large"]
+    return lines + [f"warning: {warning}" for warning in document["warnings"]]

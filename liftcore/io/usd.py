@@ -1,0 +1,287 @@
+"""OpenUSD 26: ``ParticleField3DGaussianSplat`` of schema usdVol, with a subset of points an object.
+
+Positions, linear scales and opacities, quaternions with the real part first, and harmonics particle by particle, the
+constant term first, ordered as 3DGS has them. The frame that is written is right, up, back (+Y up); what is read is
+turned from the stage's up axis, and each particle field by its transform. Metres a unit are not known, and say 1.
+
+Columns of splats are primvars of the field. An object is a ``GeomSubset`` with the element type ``point`` and
+``SemanticsLabelsAPI:class``; it has no family, as validators know families of point-based geometry alone.
+
+Files are opened by ``usd-core`` (the extra ``formats``), which follows references to other files.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from liftcore.errors import InvalidInput, InvalidSplats, Unavailable
+from liftcore.io.labels import COLUMN, IDS, KINDS, rows_by_id
+from liftcore.io.ply import MODEL
+from liftcore.io.quantised import Fields, gaussian_rows, logits
+from liftcore.scene.harmonics import band_rotation, constant_terms
+from liftcore.scene.kernel import NORMALS
+from liftcore.scene.quaternions import product_matrix
+from liftcore.scene.similarity import Similarity
+
+if TYPE_CHECKING:
+    from liftcore.scene.splats import Splats
+
+TO_FILE = np.diag([1.0, -1.0, -1.0])  # RDF to RUB, and back
+Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # a frame with z up to one with y up
+MAX_DEGREE = 3
+MODULES = ("Gf", "Sdf", "Tf", "Usd", "UsdGeom", "UsdSemantics", "UsdUtils", "UsdVol", "Vt")
+FIELD = "ParticleField3DGaussianSplat"
+DOCUMENT = "splatlift"  # of the field's custom data: what labels mean, as JSON
+HINT = "export it again, or as PLY"
+
+
+def open_library() -> Any:
+    """The modules of OpenUSD, by their names.
+
+    Raises:
+        Unavailable: they are not installed.
+    """
+    try:
+        modules = SimpleNamespace(**{name: import_module(f"pxr.{name}") for name in MODULES})
+    except ImportError:
+        modules = None
+    if not hasattr(getattr(modules, "UsdVol", None), FIELD):
+        hint = "pip install 'splatlift[formats]'"
+        raise Unavailable("USD", expected="usd-core 26.3 or later", got="none", hint=hint)
+    return modules
+
+
+def usd_blocks(splats: Splats, document: Mapping[str, Any] | None = None, suffix: str = ".usdc") -> Iterator[bytes]:
+    """The bytes of a USD file of any splats (`gaussian_rows`), with their extras and what these mean.
+
+    Args:
+        splats: P. document: of `liftcore.io.labels`; None: splats without labels. suffix: .usdc, .usda or .usdz.
+
+    Raises:
+        Unavailable: usd-core is not installed.
+    """
+    pxr = open_library()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"scene{'.usdc' if suffix == '.usdz' else suffix}"
+        stage = pxr.Usd.Stage.CreateNew(str(path))
+        pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.y)
+        pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        root = pxr.UsdGeom.Xform.Define(stage, "/Scene")
+        stage.SetDefaultPrim(root.GetPrim())
+        if any(splats.origin):
+            pxr.UsdGeom.XformCommonAPI(root).SetTranslate(tuple((TO_FILE @ splats.origin).tolist()))
+        _write_field(stage, splats, document or {})
+        stage.GetRootLayer().Save()
+        del stage
+        if suffix == ".usdz":
+            package = path.with_suffix(".usdz")
+            if not pxr.UsdUtils.CreateNewUsdzPackage(pxr.Sdf.AssetPath(str(path)), str(package)):
+                raise InvalidSplats("splats", expected="a package", got="an error of usd-core", hint="write a .usdc")
+            path = package
+        yield path.read_bytes()
+
+
+def _write_field(stage: Any, splats: Splats, document: Mapping[str, Any]) -> None:
+    pxr = open_library()
+    rows = list(gaussian_rows(splats))
+
+    def joined(name: str) -> np.ndarray:
+        return np.concatenate([getattr(some, name) for some in rows])
+
+    means, colours = (joined("means") @ TO_FILE).astype("f4"), joined("colours")
+    sh = (
+        constant_terms(colours)[:, None] if splats.sh is None else splats.sh.cpu().numpy()[:, : (MAX_DEGREE + 1) ** 2]
+    )
+    turned = np.concatenate(
+        [
+            np.einsum("ij,njc->nic", band_rotation(band, TO_FILE), sh[:, band**2 : (band + 1) ** 2])
+            for band in range(round(sh.shape[1] ** 0.5))
+        ],
+        axis=1,
+    )
+    quats = np.roll(joined("quats") @ product_matrix(TO_FILE).T, -1, axis=1)  # in memory the real part is last
+    field = pxr.UsdVol.ParticleField3DGaussianSplat.Define(stage, "/Scene/Splats")
+
+    def vectors(values: np.ndarray) -> Any:
+        return pxr.Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, "f4"))
+
+    field.CreatePositionsAttr(vectors(means))
+    field.CreateScalesAttr(vectors(joined("scales")))
+    field.CreateOrientationsAttr(pxr.Vt.QuatfArray.FromNumpy(np.ascontiguousarray(quats, "f4")))
+    field.CreateOpacitiesAttr(pxr.Vt.FloatArray.FromNumpy(joined("opacities").astype("f4")))
+    field.CreateRadianceSphericalHarmonicsDegreeAttr(round(sh.shape[1] ** 0.5) - 1)
+    field.CreateRadianceSphericalHarmonicsCoefficientsAttr(vectors(turned.reshape(-1, 3)))
+    field.CreateSortingModeHintAttr("cameraDistance")
+    reach = 3 * joined("scales").max(axis=1, keepdims=True)
+    low, high = (means - reach).min(axis=0).tolist(), (means + reach).max(axis=0).tolist()
+    field.CreateExtentAttr(pxr.Vt.Vec3fArray([pxr.Gf.Vec3f(*low), pxr.Gf.Vec3f(*high)]))
+    primvars = pxr.UsdGeom.PrimvarsAPI(field)
+    for name, column in splats.extras.items():
+        if name not in NORMALS:
+            values, is_float = column.cpu().numpy(), column.is_floating_point()
+            kind = pxr.Sdf.ValueTypeNames.FloatArray if is_float else pxr.Sdf.ValueTypeNames.IntArray
+            array = pxr.Vt.FloatArray if is_float else pxr.Vt.IntArray
+            own = primvars.CreatePrimvar(name, kind, pxr.UsdGeom.Tokens.vertex)
+            own.Set(array.FromNumpy(np.ascontiguousarray(values.astype("f4" if is_float else "i4"))))
+    if document:
+        field.GetPrim().SetCustomDataByKey(DOCUMENT, json.dumps(document, ensure_ascii=False))
+    if IDS[0] in splats.extras:
+        _write_subsets(stage, splats.extras[IDS[0]].cpu().numpy(), rows_by_id(dict(document), KINDS[0]))
+
+
+def _write_subsets(stage: Any, instances: np.ndarray, rows: list[dict[str, Any]]) -> None:
+    pxr = open_library()
+    order = np.argsort(instances, kind="stable")
+    numbers, firsts = np.unique(instances[order], return_index=True)
+    for number, own in zip(numbers.tolist(), np.split(order, firsts[1:]), strict=True):
+        if number < 1:
+            continue
+        subset = pxr.UsdGeom.Subset.Define(stage, f"/Scene/Splats/instance_{number}")
+        subset.CreateElementTypeAttr(pxr.UsdGeom.Tokens.point)
+        subset.CreateIndicesAttr(pxr.Vt.IntArray.FromNumpy(own.astype("i4")))
+        if (name := rows[number].get("name") if number < len(rows) else None) is not None:
+            pxr.UsdSemantics.LabelsAPI.Apply(subset.GetPrim(), "class").CreateLabelsAttr([name])
+
+
+def read_usd(path: Path, *, colour: bool = True) -> Fields:
+    """The fields of all particle fields of a stage, in its order, in the frame of PLYs and cameras.
+
+    Subsets of points come as ``instance_id``, where no primvar has that name.
+
+    Raises:
+        InvalidSplats: it does not open, has no splats, or a transform is no similarity.
+        Unavailable: usd-core is not installed.
+    """
+    stage = _stage(path)
+    parts = [_field(prim, stage, path, colour=colour) for prim in _fields(stage, path)]
+    fields: Fields = {}
+    for name in parts[0]:
+        if name == "extras":
+            known = dict.fromkeys(key for part in parts for key in part["extras"])
+            fields[name] = {
+                key: np.concatenate([p["extras"].get(key, np.zeros(len(p["means"]), "i4")) for p in parts])
+                for key in known
+            }
+        else:
+            own = [part[name] for part in parts]
+            if name == "sh":
+                most = max(sh.shape[1] for sh in own)
+                own = [np.pad(sh, ((0, 0), (0, most - sh.shape[1]), (0, 0))) for sh in own]
+            fields[name] = own[0] if len(own) == 1 else np.concatenate(own)
+    return fields
+
+
+def read_usd_document(path: Path) -> dict[str, Any]:
+    """What the labels of a stage mean: our document, else the names of its subsets."""
+    pxr = open_library()
+    stage = _stage(path)
+    prim = _fields(stage, path)[0]
+    told = prim.GetCustomDataByKey(DOCUMENT)
+    if isinstance(told, str):
+        try:
+            document = json.loads(told)
+        except ValueError:
+            document = None
+        if isinstance(document, dict):
+            return document
+    rows = []
+    for number, subset in enumerate(pxr.UsdGeom.Subset.GetAllGeomSubsets(pxr.UsdGeom.Imageable(prim)), 1):
+        labels = pxr.UsdSemantics.LabelsAPI(subset.GetPrim(), "class").GetLabelsAttr().Get()
+        rows.append({"instance_id": number, "name": str(labels[0]) if labels else subset.GetPrim().GetName()})
+    return {"instances": rows} if rows else {}
+
+
+def _stage(path: Path) -> Any:
+    pxr = open_library()
+    try:
+        return pxr.Usd.Stage.Open(str(path))
+    except pxr.Tf.ErrorException:
+        got = "one that does not open"
+        raise InvalidSplats(str(path), expected="a USD scene", got=got, hint=HINT) from None
+
+
+def _fields(stage: Any, path: Path) -> list[Any]:
+    found = [prim for prim in stage.Traverse() if prim.GetTypeName() == FIELD]
+    if not found:
+        raise InvalidSplats(str(path), expected=f"splats ({FIELD})", got="a scene without any", hint=HINT)
+    return found
+
+
+def _field(prim: Any, stage: Any, path: Path, *, colour: bool) -> Fields:
+    pxr = open_library()
+    matrix = np.array(pxr.UsdGeom.Imageable(prim).ComputeLocalToWorldTransform(pxr.Usd.TimeCode.Default())).T
+    if pxr.UsdGeom.GetStageUpAxis(stage) == pxr.UsdGeom.Tokens.z:
+        matrix[:3] = Z_UP @ matrix[:3]
+    try:
+        move = Similarity.of(matrix)
+    except InvalidInput as error:
+        argument, hint = f"{path} transform of {prim.GetPath()}", "apply the transform to the splats"
+        raise InvalidSplats(argument, expected=error.expected, got=error.got, hint=hint) from None
+    places = _array(prim, "positions", path).astype(np.float64)
+    count, turn = len(places), TO_FILE @ move.rotation
+
+    def read(name: str, width: int) -> np.ndarray:
+        values = _array(prim, name, path).reshape(-1, width)
+        if len(values) != count:
+            raise InvalidSplats(f"{path} {name}", expected=f"{count} rows", got=str(len(values)), hint=HINT)
+        return values
+
+    quats = np.roll(read("orientations", 4).astype(np.float64), 1, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scales = np.log(read("scales", 3).astype(np.float64)) + np.log(move.scale)
+    fields: Fields = {
+        "means": places @ (move.scale * turn).T + TO_FILE @ move.translation,
+        "quats": (quats @ product_matrix(turn).T).astype(np.float32),
+        "log_scales": scales.astype(np.float32),
+        "opacity_logits": logits(read("opacities", 1)[:, 0]).astype(np.float32),
+        "extras": {},
+    }
+    if not colour:
+        return fields
+    coefficients = "radiance:sphericalHarmonicsCoefficients"
+    if not any(prim.GetAttribute(name).HasAuthoredValue() for name in (coefficients, f"{coefficients}h")):
+        return fields | {"extras": _extras(prim, count)}
+    degree = int(prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get())
+    rows = (degree + 1) ** 2
+    terms = read(coefficients, 3 * rows).reshape(count, rows, 3).astype(np.float32)
+    for band in range(degree + 1):
+        own = slice(band**2, (band + 1) ** 2)
+        terms[:, own] = np.einsum("ij,njc->nic", band_rotation(band, turn), terms[:, own])
+    return fields | {"sh": terms, "extras": _extras(prim, count)}
+
+
+def _array(prim: Any, name: str, path: Path) -> np.ndarray:
+    """An attribute, or its half of less precision, as an array."""
+    for own in (name, f"{name}h"):
+        values = prim.GetAttribute(own).Get()
+        if values is not None and len(values):
+            return np.array(values)
+    raise InvalidSplats(f"{path} {prim.GetPath()}", expected=f"values of {name}", got="none", hint=HINT)
+
+
+def _extras(prim: Any, count: int) -> dict[str, np.ndarray]:
+    pxr = open_library()
+    extras: dict[str, np.ndarray] = {}
+    for primvar in pxr.UsdGeom.PrimvarsAPI(prim).GetPrimvars():
+        name, values = str(primvar.GetPrimvarName()), primvar.Get()
+        if not COLUMN.fullmatch(name) or MODEL.fullmatch(name) or values is None:
+            continue
+        column = np.array(values)
+        if column.shape == (count,) and column.dtype.kind in "iuf":
+            extras[name] = column.astype(np.float32 if column.dtype.kind == "f" else np.int32)
+    subsets = pxr.UsdGeom.Subset.GetAllGeomSubsets(pxr.UsdGeom.Imageable(prim))
+    if subsets and IDS[0] not in extras:
+        numbers = np.zeros(count, np.int32)
+        for number, subset in enumerate(subsets, 1):
+            rows = np.array(subset.GetIndicesAttr().Get() or [], int)
+            numbers[rows[(rows >= 0) & (rows < count)]] = number
+        extras[IDS[0]] = numbers
+    return extras

@@ -1,0 +1,178 @@
+"""A lift on another set of splats of the same scene: cropped, reordered, compressed, decimated, moved, trained anew.
+
+Each new splat takes from the old ones that it overlaps. With the centres' difference d, covariances S_j and S_k with
+mean S, and base colours in 0..1, the weight of an old splat k at a new one j is the overlap of the two Gaussians
+(Bhattacharyya's coefficient) times their likeness in colour::
+
+    w_jk = (|S_j| |S_k|)^(1/4) / |S|^(1/2) exp(-d^T S^-1 d / 8) exp(-(|rgb_j - rgb_k| / 0.1)^2 / 2)
+
+A new splat that is nearly one of the old takes from that one alone, so rows that a file keeps come back as they were.
+All others take the mean of what is per splat by w^2 over the 16 nearest old ones, and the cluster and object of the
+largest sum. What overlaps with none has no feature.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+import torch
+
+from liftcore.runtime.progress import Progress, silent
+from liftcore.runtime.torch_modes import usual_modes
+from liftcore.scene.neighbours import COLOUR_WIDTH, base_colours
+from liftcore.scene.quaternions import rotation_matrices
+from liftcore.scene.registration import find_similarity
+from liftcore.scene.similarity import Similarity
+from liftcore.values.lift import NO_FILE, landmarks_of, renumbered
+
+if TYPE_CHECKING:
+    from liftcore.scene.splats import Splats
+    from liftcore.values.lift import Lift
+
+    AnyLift = TypeVar("AnyLift", bound=Lift)
+
+NEIGHBOURS = 16  # old splats that a new one may take from
+SAME = 0.9  # overlap and likeness from which two splats are one
+LEAST_OVERLAP = 0.05  # of a partner
+THINNEST = 0.02  # of a splat's largest scale, as which smaller ones count: flat ones overlap, too
+STILL = 0.5  # share of a sample that has partners where it lies, from which the scene was not moved
+SAMPLE = 4_000
+_BLOCK = 1 << 12  # new splats at once: [n, 16, F] features in f32
+_VALUES = ("evidence", "agreement", "confidence")
+
+
+@usual_modes()
+def transfer(lift: AnyLift, old: Splats, new: Splats, matrix: Any = None, progress: Progress = silent) -> AnyLift:
+    """Take a lift's features, evidence, clusters and objects to another set of splats of its scene.
+
+    Args:
+        lift: of any engine; it stays as it is. old: that were lifted. new: Q others, in any order and place.
+        matrix: [4, 4], the similarity from the old frame to the new one; None: none, or one that is found.
+        progress: told about a stage "transfer".
+
+    Returns:
+        The lift of the new splats, whose diagnostics have ``transfer``: how many are rows of the old ones, how many
+        are mixed, how many found no partner, and the similarity, None where the scene was not moved.
+
+    Raises:
+        InvalidSplats: other splats than were lifted, or no place of the new ones in the old scene is clear.
+        InvalidInput: the matrix is no similarity.
+    """
+    lift.require_splats(old)
+    move = None if matrix is None else Similarity.of(matrix)
+    index = _Index(old)
+    if move is None and index.share_of_partners(new) < STILL:
+        move = find_similarity(old, new)
+    seen_from = new if move is None else new.transformed(**_inverse(move))
+    fields, counts = _mixed(lift, index, seen_from, progress)
+    facts: dict[str, Any] = {"from_splats": lift.features.shape[0], **counts, "moved": None}
+    if move is not None:
+        facts["moved"] = {"scale": move.scale, "rotation": move.rotation.tolist()}
+        facts["moved"] |= {"translation": move.translation.tolist()}
+    certificate = lift.diagnostics | {"transfer": facts}
+    if isinstance(plan := certificate.get("plan"), dict):
+        certificate["plan"] = plan | {"kernel": str(new.kernel)}
+    changes: dict[str, Any] = {"certificate": certificate, "splats": NO_FILE, "landmarks": landmarks_of(new)}
+    changes |= {"origin": new.origin, "settings": lift.settings.model_copy(update={"kernel": str(new.kernel)})}
+    changes |= {} if move is None else {"cameras": NO_FILE, "poses": ""}
+    return replace(lift, **fields, metadata=lift.metadata.model_copy(update=changes))
+
+
+def _inverse(move: Similarity) -> dict[str, Any]:
+    turn = move.rotation.T
+    return {"scale": 1 / move.scale, "rotation": turn, "translation": -(turn @ move.translation) / move.scale}
+
+
+class _Index:
+    """The old splats, searched by place."""
+
+    def __init__(self, old: Splats) -> None:
+        from scipy.spatial import KDTree
+
+        self.means = old.positions().astype(np.float64)
+        self.tree = KDTree(self.means)
+        self.shapes, self.colours = _covariances(old), base_colours(old)
+
+    def partners(self, new: Splats) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+        """Blocks of new splats: their rows, their nearest old ones [n, k] and the weights w [n, k] f64."""
+        means, colours = new.positions().astype(np.float64), base_colours(new)
+        shapes = _covariances(new)
+        for first in range(0, len(means), _BLOCK):
+            rows = slice(first, min(first + _BLOCK, len(means)))
+            near = self.tree.query(means[rows], min(NEIGHBOURS, len(self.means)), workers=-1)[1]
+            near = near.reshape(rows.stop - first, -1)
+            weights = _overlaps(means[rows, None] - self.means[near], shapes[rows, None], self.shapes[near])
+            if colours is not None and self.colours is not None:
+                apart = ((colours[rows, None] - self.colours[near]) ** 2).sum(axis=2)
+                weights *= np.exp(-0.5 * apart / COLOUR_WIDTH**2)
+            yield rows, near, weights
+
+    def share_of_partners(self, new: Splats) -> float:
+        """The share of a sample of new splats that overlaps with an old one where it lies."""
+        some = new[np.linspace(0, new.count - 1, min(SAMPLE, new.count)).astype(int)]
+        return float(np.mean(np.concatenate([w.max(axis=1) >= LEAST_OVERLAP for _, _, w in self.partners(some)])))
+
+
+def _covariances(splats: Splats) -> np.ndarray:
+    """[P, 3, 3] f64, with scales of at least THINNEST of a splat's largest."""
+    logs = splats.log_scales.cpu().numpy().astype(np.float64).clip(-80, 80)
+    scales = np.exp(np.pad(logs, ((0, 0), (0, 3 - logs.shape[1])), constant_values=-80))
+    scales = np.maximum(scales, THINNEST * scales.max(axis=1, keepdims=True))
+    axes = rotation_matrices(splats.quats.cpu().numpy()) * scales[:, None]
+    return axes @ axes.swapaxes(1, 2)
+
+
+def _overlaps(apart: np.ndarray, own: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """[n, k] f64 in 0..1, Bhattacharyya's coefficients of Gaussians by their centres' differences and covariances."""
+    middle = (own + other) / 2
+    determinants = [np.linalg.det(shapes) for shapes in (own, other, middle)]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        sizes = (determinants[0] * determinants[1] / determinants[2] ** 2) ** 0.25
+        squares = (apart * np.linalg.solve(middle, apart[..., None])[..., 0]).sum(axis=2)
+        return np.nan_to_num(sizes * np.exp(-squares / 8))
+
+
+def _mixed(lift: Lift, index: _Index, new: Splats, progress: Progress) -> tuple[dict[str, Any], dict[str, int]]:
+    """The fields of the lift of the new splats, and how many of them are rows, mixed and without a partner."""
+    count = new.count
+    features = torch.zeros((count, lift.features.shape[1]), dtype=lift.features.dtype)
+    values = {name: np.zeros(count, np.float32) for name in _VALUES if getattr(lift, name) is not None}
+    labels = {name: np.full(count, -1, np.int32) for name in ("cluster", "object") if getattr(lift, name) is not None}
+    seen, rows_of, mixed = np.zeros(count, bool), 0, 0
+    old = {name: getattr(lift, name).cpu().numpy() for name in (*values, *labels, "seen")}
+    old_features = lift.features.cpu()
+    for rows, near, overlaps in index.partners(new):
+        best = overlaps.argmax(axis=1)
+        top = np.take_along_axis(overlaps, best[:, None], axis=1)
+        alone = np.arange(near.shape[1]) == best[:, None]
+        shares = np.where(top >= SAME, alone, overlaps**2 * (overlaps >= LEAST_OVERLAP))
+        rows_of += int((top >= SAME).sum())
+        mixed += int(((top < SAME) & (top >= LEAST_OVERLAP)).sum())
+        shares /= np.maximum(shares.sum(axis=1, keepdims=True), 1e-300)
+        known = shares * old["seen"][near]
+        sums = known.sum(axis=1, keepdims=True)
+        seen[rows] = sums[:, 0] >= 0.5
+        known = torch.from_numpy((known / np.maximum(sums, 1e-300)).astype(np.float32))
+        features[rows] = torch.einsum("nk,nkf->nf", known, old_features[near].float()).to(features.dtype)
+        for name, column in values.items():
+            column[rows] = (shares * old[name][near]).sum(axis=1)
+        for name, column in labels.items():
+            column[rows] = _elected(old[name][near], shares)
+        progress("transfer", rows.stop, count, "splats")
+    features[~torch.from_numpy(seen)] = 0
+    fields: dict[str, Any] = {"features": features, "seen": torch.from_numpy(seen)}
+    fields |= {name: torch.from_numpy(column) for name, column in (values | labels).items()}
+    for name, table in (("cluster", "cluster_features"), ("object", "object_views")):
+        if name in labels and (whole := getattr(lift, table)) is not None:
+            fields[name], fields[table] = renumbered(fields[name], whole.cpu())
+    return fields, {"rows": rows_of, "mixed": mixed, "without_partner": count - rows_of - mixed}
+
+
+def _elected(labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """[n] i32, the label of [n, k] with the largest sum of weights; -1 where all weights are zero."""
+    votes = (weights[:, :, None] * (labels[:, :, None] == labels[:, None, :])).sum(axis=1)
+    best = np.take_along_axis(labels, votes.argmax(axis=1)[:, None], axis=1)[:, 0]
+    return np.where(weights.any(axis=1), best, -1).astype(np.int32)

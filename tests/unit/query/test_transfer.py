@@ -1,0 +1,136 @@
+"""A lift on other splats of its scene: rows where they are kept, mixtures where not, and a moved scene found."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from liftcore.cli import main
+from liftcore.errors import InvalidSplats
+from liftcore.io.splats import write_splats
+from liftcore.query.question import Query
+from liftcore.query.result import LiftResult, load_lift
+from liftcore.query.scene import Scene
+from liftcore.query.terms import OneSplat
+from liftcore.scene.registration import find_similarity
+from liftcore.scene.splats import Splats
+from tests.api.tiny_scene import SPLATS_A_CLUSTER
+
+MOVE = {"scale": 2.5, "rotation": (0.8, 0.2, -0.4, 0.3), "translation": (10.0, -4.0, 7.0)}
+CLUSTER = np.repeat(np.arange(3), SPLATS_A_CLUSTER)
+
+
+@pytest.fixture
+def lifted(scene: Scene) -> tuple[LiftResult, Splats]:
+    """The tiny scene's lift and splats, which have colours that tell splats apart."""
+    sh = torch.from_numpy(np.random.default_rng(5).uniform(-1.5, 1.5, (scene.splats.count, 1, 3)).astype("f4"))
+    splats = Splats(
+        **{name: getattr(scene.splats, name) for name in ("means", "quats", "log_scales", "opacity_logits")}, sh=sh
+    )
+    return LiftResult.of(scene.lift), splats
+
+
+def test_rows_that_are_kept_come_back_as_they_were(lifted: tuple[LiftResult, Splats]) -> None:
+    result, splats = lifted
+    order = np.random.default_rng(1).permutation(splats.count)[:45]
+    found = result.transferred(splats, splats[order])
+    for name in ("features", "evidence", "agreement", "seen"):
+        assert torch.equal(getattr(found, name), getattr(result, name)[order]), name
+    expected = result[order]
+    assert expected.object is not None and found.object is not None and torch.equal(found.object, expected.object)
+    facts = found.diagnostics["transfer"]
+    assert (facts["rows"], facts["mixed"], facts["without_partner"], facts["moved"]) == (45, 0, 0, None)
+    found.require_splats(splats[order])
+
+
+def test_quantised_rows_are_still_rows(lifted: tuple[LiftResult, Splats], tmp_path: Path) -> None:
+    result, splats = lifted
+    write_splats(tmp_path / "s.spz", splats)
+    found = result.transferred(splats, tmp_path / "s.spz")
+    assert torch.equal(found.features, result.features) and found.metadata.splats.path == str(tmp_path / "s.spz")
+
+
+def test_splats_between_others_mix_what_these_have(lifted: tuple[LiftResult, Splats]) -> None:
+    result, splats = lifted
+    middles = Splats(
+        (splats.means[:-1] + splats.means[1:]) / 2,
+        splats.quats[1:],
+        splats.log_scales[1:] + 0.7,
+        splats.opacity_logits[1:],
+    )
+    inside = CLUSTER[:-1] == CLUSTER[1:]
+    found = result.transferred(splats, middles[inside])
+    old, new = result.features.float().numpy(), found.features.float().numpy()
+    centres = np.stack([old[one == CLUSTER].mean(axis=0) for one in range(3)])
+    assert (np.argmax(new @ centres.T, axis=1) == CLUSTER[:-1][inside]).all()
+    assert found.diagnostics["transfer"]["mixed"] > 0 and found.object is not None and result.object is not None
+    assert (found.object.numpy() == result.object.numpy()[:-1][inside]).all()
+
+
+def test_splats_of_elsewhere_find_no_partner_and_have_no_feature(lifted: tuple[LiftResult, Splats]) -> None:
+    result, splats = lifted
+    more = splats.means.clone()
+    more[:7] += 50
+    other = Splats(more, splats.quats, splats.log_scales, splats.opacity_logits, sh=splats.sh)
+    found = result.transferred(splats, other)
+    assert found.diagnostics["transfer"]["without_partner"] == 7
+    assert (
+        not found.seen[:7].any()
+        and not found.features[:7].any()
+        and (found.object is None or (found.object[:7] == -1).all())
+    )
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_a_moved_scene_is_found_or_told(given: bool, lifted: tuple[LiftResult, Splats]) -> None:
+    result, splats = lifted
+    order = np.random.default_rng(2).permutation(splats.count)
+    moved = splats[order].transformed(**MOVE)
+    matrix = np.eye(4)
+    found = find_similarity(splats, moved)
+    matrix[:3, :3], matrix[:3, 3] = found.scale * found.rotation, found.translation
+    assert found.scale == pytest.approx(2.5, rel=1e-4)
+    np.testing.assert_allclose(found.points(splats.positions()[order].astype(float)), moved.positions(), atol=1e-3)
+    other = result.transferred(splats, moved, matrix=matrix if given else None)
+    assert torch.equal(other.features, result.features[order]) and not other.metadata.cameras.path
+
+
+def test_another_scene_is_refused(lifted: tuple[LiftResult, Splats]) -> None:
+    result, splats = lifted
+    generator = np.random.default_rng(9)
+    other = Splats(
+        torch.from_numpy(generator.normal(size=(60, 3)).astype("f4")) + 100,
+        splats.quats,
+        splats.log_scales,
+        splats.opacity_logits,
+        sh=torch.from_numpy(generator.normal(size=(60, 1, 3)).astype("f4")),
+    )
+    with pytest.raises(InvalidSplats, match="give the similarity"):
+        result.transferred(splats, other)
+
+
+def test_the_command_writes_a_lift_that_is_asked_like_the_first(
+    lift_tiny: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lift = lift_tiny(tmp_path)
+    splats = Scene(lift).splats
+    write_splats(tmp_path / "edited.ply", splats[CLUSTER != 1])
+    new = tmp_path / "new.lift.safetensors"
+    assert main(["transfer", str(lift), str(tmp_path / "edited.ply"), "-o", str(new), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["rows"], facts["splats"]) == (2 * SPLATS_A_CLUSTER, 2 * SPLATS_A_CLUSTER)
+    scene = Scene(new)
+    assert torch.equal(load_lift(new).features, load_lift(lift).features[torch.from_numpy(CLUSTER != 1)])
+    assert len(scene.catalogue().objects) == 2 and scene.mask(Query.of((OneSplat(0),)), "middle").any()
+    (tmp_path / "m.txt").write_text("1 2 3")
+    assert (
+        main(
+            ["transfer", str(lift), str(tmp_path / "edited.ply"), "-o", str(new), "--matrix", str(tmp_path / "m.txt")]
+        )
+        == 2
+    )
