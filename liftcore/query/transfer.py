@@ -26,7 +26,8 @@ from liftcore.scene.neighbours import COLOUR_WIDTH, base_colours
 from liftcore.scene.quaternions import rotation_matrices
 from liftcore.scene.registration import find_similarity
 from liftcore.scene.similarity import Similarity
-from liftcore.values.lift import NO_FILE, landmarks_of, renumbered
+from liftcore.values.lift import NO_FILE, cropped_tree, landmarks_of, renumbered
+from liftcore.values.lift_file import NODE_TENSORS
 
 if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
@@ -140,9 +141,16 @@ def _mixed(lift: Lift, index: _Index, new: Splats, progress: Progress) -> tuple[
     count = new.count
     features = torch.zeros((count, lift.features.shape[1]), dtype=lift.features.dtype)
     values = {name: np.zeros(count, np.float32) for name in _VALUES if getattr(lift, name) is not None}
-    labels = {name: np.full(count, -1, np.int32) for name in ("cluster", "object") if getattr(lift, name) is not None}
+    kinds = [name for name in ("cluster", "object", "node") if getattr(lift, name) is not None]
+    tuples, own_tuple = np.unique(
+        np.stack([np.full(len(lift), -1), *(getattr(lift, name).cpu().numpy() for name in kinds)], axis=1),
+        axis=0,
+        return_inverse=True,
+    )  # a splat's cluster, object and node go together
+    elected = np.full(count, -1)
     seen, rows_of, mixed = np.zeros(count, bool), 0, 0
-    old = {name: getattr(lift, name).cpu().numpy() for name in (*values, *labels, "seen")}
+    old = {name: getattr(lift, name).cpu().numpy() for name in (*values, "seen")}
+    own_tuple = own_tuple.reshape(-1)
     old_features = lift.features.cpu()
     for rows, near, overlaps in index.partners(new):
         best = overlaps.argmax(axis=1)
@@ -159,15 +167,18 @@ def _mixed(lift: Lift, index: _Index, new: Splats, progress: Progress) -> tuple[
         features[rows] = torch.einsum("nk,nkf->nf", known, old_features[near].float()).to(features.dtype)
         for name, column in values.items():
             column[rows] = (shares * old[name][near]).sum(axis=1)
-        for name, column in labels.items():
-            column[rows] = _elected(old[name][near], shares)
+        elected[rows] = _elected(own_tuple[near], shares)
         progress("transfer", rows.stop, count, "splats")
     features[~torch.from_numpy(seen)] = 0
     fields: dict[str, Any] = {"features": features, "seen": torch.from_numpy(seen)}
-    fields |= {name: torch.from_numpy(column) for name, column in (values | labels).items()}
+    fields |= {name: torch.from_numpy(column) for name, column in values.items()}
+    labels = np.where(elected[:, None] >= 0, tuples[elected], -1).astype(np.int32)
+    fields |= {name: torch.from_numpy(labels[:, place].copy()) for place, name in enumerate(kinds, 1)}
     for name, table in (("cluster", "cluster_features"), ("object", "object_views")):
-        if name in labels and (whole := getattr(lift, table)) is not None:
+        if name in kinds and (whole := getattr(lift, table)) is not None:
             fields[name], fields[table] = renumbered(fields[name], whole.cpu())
+    if lift.node is not None:
+        fields |= cropped_tree({name: getattr(lift, name).cpu() for name in NODE_TENSORS} | {"node": fields["node"]})
     return fields, {"rows": rows_of, "mixed": mixed, "without_partner": count - rows_of - mixed}
 
 

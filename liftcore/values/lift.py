@@ -156,13 +156,10 @@ class Lift:
         columns = {name: column[rows] for name, column in given.items() if column is not None}
         for labels, table in (("cluster", "cluster_features"), ("object", "object_views")):
             if labels in columns and (values := getattr(self, table)) is not None:
-<<<<<<< HEAD
-                columns[labels], columns[table] = _renumbered(columns[labels], values)
-        if self.node is not None:
-            columns |= _cropped_tree({name: getattr(self, name) for name in NODE_TENSORS}, rows)
-=======
                 columns[labels], columns[table] = renumbered(columns[labels], values)
->>>>>>> 227d195 (Take lifts to edited copies, and write and read USD particle fields)
+        if self.node is not None:
+            tree = {name: getattr(self, name) for name in NODE_TENSORS}
+            columns |= cropped_tree(tree | {"node": self.node[rows]})
         places = {row: place for row, *place in self.metadata.landmarks}
         numbered = enumerate(rows.tolist())
         landmarks = tuple((new, *places[old]) for new, old in numbered if old in places)
@@ -265,11 +262,11 @@ def renumbered(labels: Tensor, table: Tensor) -> tuple[Tensor, Tensor]:
     return (numbers - none).clamp_min(-1).to(labels.dtype), table[used[none:].long()]
 
 
-def _cropped_tree(tree: dict[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
-    """The tree of some rows [n], without nodes of which no splat is left."""
+def cropped_tree(tree: dict[str, Tensor]) -> dict[str, Tensor]:
+    """A tree without the nodes that no splat of its ``node`` [n] is left of."""
     import torch
 
-    node, parents = tree["node"][rows], tree["node_parents"].long()
+    node, parents = tree["node"], tree["node_parents"].long()
     used = torch.zeros(len(parents) + 1, dtype=torch.bool, device=node.device)  # the last is of -1
     above = torch.unique(node).long()
     while len(above := above[above >= 0]):
