@@ -277,7 +277,8 @@ def gather(job: Job, piece: int, threads: int | None) -> Piece:
     none = torch.zeros(0, 3, dtype=torch.float64)
     bounds = torch.stack([means.amin(dim=0), means.amax(dim=0)]) if means.numel() else none
     arrays = {"indptr": W.indptr, "region": W.region, "weight": W.weight, "sums": sums}
-    totals = list(region_totals(W, threads)) if job.settings.robust_steps else []
+    summed = job.settings.robust_steps or job.settings.objects  # who reads the weight of each region
+    totals = list(region_totals(W, threads)) if summed else []
     return arrays | {"evidence": _evidence(job, ends), "bounds": bounds}, totals
 
 

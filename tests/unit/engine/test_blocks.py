@@ -104,7 +104,7 @@ def assert_same_metadata(one: lc.LiftResult, other: lc.LiftResult) -> None:
 @pytest.mark.parametrize(
     "asked",
     [
-        {"preset": "row-sum"},
+        {"preset": "row-sum", "objects": True},
         {"preset": "default", "robust_steps": 2, "loss": "huber"},
         {"preset": "default", "aggregation": True, "dtype": "float32"},
     ],
