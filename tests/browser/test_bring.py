@@ -179,7 +179,7 @@ def test_strangers_files_become_an_object_that_lights_up(browser: Browser, tmp_p
         page.give("#files", [tmp_path / "broken.ply", scene / "cameras.json"])
         page.until("document.querySelector('.file.bad')")
         assert "broken.ply" in text_of(page, ".file.bad .name")
-        assert "expected" in text_of(page, ".file.bad .state") and "got" in text_of(page, ".file.bad .state")
+        assert "It needs" in text_of(page, ".file.bad .state") and "got" in text_of(page, ".file.bad .state")
         assert page.value("document.querySelector('#lift-it').disabled") is True
         page.press(".file.bad .away")
         page.drop([scene / "point_cloud.ply", scene / "features.safetensors"])
@@ -201,3 +201,19 @@ def test_strangers_files_become_an_object_that_lights_up(browser: Browser, tmp_p
         page.press("#jobs button.danger")
         page.until("!document.querySelector('#empty').hidden")
         page.open("about:blank#")
+
+
+def test_dropped_scene_is_seen_planned_and_named_and_the_next_is_another_order(
+    empty: Browser, files: dict[str, Path], tmp_path: Path
+) -> None:
+    named = tmp_path / "my garden.ply"
+    named.write_bytes(files["splats"].read_bytes())
+    empty.drop([named, files["cameras"], files["features"]])
+    empty.until("splatlift.viewer?.draft && document.querySelector('#plan').textContent.includes('60 splats')")
+    assert empty.value("splatlift.viewer.cones.geometry.attributes.position.count") == 3 * 16  # three cameras
+    assert empty.value("document.querySelector('#empty').hidden") is True
+    empty.press("#lift-it")
+    empty.until(READY, LONG)
+    assert empty.value("document.querySelector('#lift option:checked').textContent") == "my garden"
+    empty.drop([files["splats"]])
+    empty.until("document.querySelectorAll('#sent .file').length === 1")

@@ -1,12 +1,15 @@
 // The panel of bringing: files by drag and drop, the settings of a lift from the schema, jobs as they run, and what
 // is here already.
 import { ago, at, count, el, plural, size, tell, twice } from "./dom.js";
-import { dropped, gathered, kindOf } from "./files.js";
+import { camerasOf, dropped, gathered, kindOf } from "./files.js";
 import { space } from "./lifts.js";
 import { bytes, events, json, patch, picture, post, remove, upload, words } from "./service.js";
 
 const PAGE = 20; // of each list
 const LOOK = 15_000; // ms between looks for jobs of others, while the panel is open
+const REST = 400; // ms without a change, after which it is planned
+const NAMED = 300; // files and jobs whose names are kept
+const OF_SCENE = ["splats", "cameras", "features", "photos", "table"];
 const AGAIN = 2000; // ms, within which the same order is a second click
 const EXAMPLE = { splats: "point_cloud.spz", cameras: "cameras.json", features: "features.safetensors" };
 const USUAL = /^(point_cloud|splat|splats|scene|iteration_\d+|\d+)$/i; // names that trainers give to every scene
@@ -28,8 +31,9 @@ const STAGES = { read: "Reading files", digest: "Reading files", compile: "Compi
 export class Bring {
   // opened: with a lift that is to be shown; gone: after lifts were deleted.
   // open: the id of the lift that is shown, or null; raised: to bring the panel to the front.
-  constructor({ opened, gone, open, raised }) {
-    Object.assign(this, { opened, gone, open, raised, files: [], followed: new Map(), charts: new Map(), jobs: [] });
+  // preview: with a file of splats and what cameras there are, to be seen before they are lifted.
+  constructor({ opened, gone, open, raised, preview }) {
+    Object.assign(this, { opened, gone, open, raised, preview, cameras: [], files: [], followed: new Map(), charts: new Map(), jobs: [] });
     const stop = event => { if ([...event.dataTransfer.types].includes("Files")) event.preventDefault(); };
     addEventListener("dragover", event => { stop(event); document.body.classList.add("dragging"); });
     addEventListener("dragleave", event => { if (!event.relatedTarget) document.body.classList.remove("dragging"); });
@@ -43,7 +47,7 @@ export class Bring {
     at("order").addEventListener("submit", event => { event.preventDefault(); this.order("/lift"); });
     at("compare").addEventListener("click", () => this.order("/tradeoff"));
     at("plan-it").addEventListener("click", () => this.plan());
-    at("order").addEventListener("change", () => { at("plan").hidden = true; });
+    at("order").addEventListener("change", () => this.show());
     at("preset").replaceChildren(...Object.entries(PRESETS).map(([name, [title, why]], place) => choice("preset", name, title, why, place === 0)));
     at("speed").replaceChildren(...Object.entries(SPEEDS).map(([name, why], place) => choice("speed", name, name, why, place === 0)));
     at("more-settings").addEventListener("toggle", () => { if (at("more-settings").open) this.schema(); });
@@ -51,9 +55,17 @@ export class Bring {
     this.show();
   }
 
+  // Files after an order, or splats with others of theirs, are of another scene: a new order.
   async add(files) {
-    for (const file of await gathered(files)) {
-      const { kind, needs, why } = await kindOf(file);
+    const all = await Promise.all((await gathered(files)).map(async file => ({ file, ...await kindOf(file) })));
+    const kinds = new Set(all.map(({ kind }) => kind));
+    const anew = this.ordered || (kinds.has("splats") && kinds.size > 1 && this.files.some(({ kind, asset }) => kind === "splats" && asset));
+    if (anew && all.some(({ kind }) => OF_SCENE.includes(kind))) {
+      for (const one of this.files) if (!one.asset && !one.problem) one.end?.();
+      Object.assign(this, { files: [], cameras: [], ordered: false });
+    }
+    this.look(all);
+    for (const { file, kind, needs, why } of all) {
       const one = { name: file.name, bytes: file.size, kind, needs, file, sent: 0, asset: null, problem: null };
       if (!kind) one.problem = { title: "Not sent", detail: why ?? (/\.bin$/i.test(file.name) ? "drop the folder of the COLMAP model, or a zip of it" : `it is none of ${Object.values(WANTED).join("; ")}; photos; or a lift file`) };
       if (kind && kind !== "features") this.files = this.files.filter(known => known.kind !== kind || !known.asset);
@@ -64,11 +76,21 @@ export class Bring {
     this.show();
   }
 
+  // What was dropped is seen at once.
+  async look(all) {
+    const cameras = all.find(({ kind }) => kind === "cameras");
+    const splats = all.find(({ kind }) => kind === "splats");
+    if (cameras) this.cameras = await camerasOf(cameras.file);
+    if (splats) this.seen = splats.file;
+    if ((splats || cameras) && this.seen) this.preview(this.seen, this.cameras);
+  }
+
   async send(one, cameras) {
     const sending = upload(one.kind, one.file, sent => { one.sent = sent; this.show(); }, cameras);
     one.end = sending.end;
     try {
       one.asset = await sending.done;
+      remember(one.asset.id, one.name);
     } catch (problem) {
       Object.assign(one, { problem, sent: 0 }); // a lift may go up again, with other cameras
     }
@@ -143,7 +165,7 @@ export class Bring {
   take(asset) {
     if (this.files.some(one => one.asset?.id === asset.id)) return;
     if (asset.kind !== "features") this.files = this.files.filter(one => one.kind !== asset.kind);
-    this.files.push({ name: `${KINDS[asset.kind]} from before`, bytes: asset.bytes, kind: asset.kind, sent: asset.bytes, asset, problem: null });
+    this.files.push({ name: named(asset.id) ?? `${KINDS[asset.kind]} from before`, bytes: asset.bytes, kind: asset.kind, sent: asset.bytes, asset, problem: null });
     this.show();
     at("drop").scrollIntoView({ block: "nearest" });
   }
@@ -157,7 +179,9 @@ export class Bring {
       el("b", {}, KINDS[kind]), ` ${has(kind) ? "ready" : WANTED[kind]}`)));
     at("lift-it").disabled = at("compare").disabled = at("plan-it").disabled = Boolean(missing.length) || busy;
     at("settings").hidden = missing.length === 3;
-    at("plan").hidden = at("order-problem").hidden = true; // of other files
+    at("order-problem").hidden = true; // of other files
+    if (missing.length || busy) at("plan").hidden = true;
+    else this.planSoon();
   }
 
   line(one) {
@@ -220,14 +244,25 @@ export class Bring {
     return stem && !USUAL.test(stem) ? stem.slice(0, 100) : undefined;
   }
 
+  // The plan of what is here, once it rests; the same is not planned twice.
+  planSoon() {
+    const order = JSON.stringify(this.body());
+    if (order === this.plannedFor) { at("plan").hidden = false; return; }
+    clearTimeout(this.planning);
+    this.planning = setTimeout(() => { if (!at("lift-it").disabled) this.plan(); }, REST);
+  }
+
   // What the lift would do and need, before it is ordered.
   async plan() {
+    const body = this.body();
+    const mine = this.plannedFor = JSON.stringify(body);
     at("plan").hidden = false;
     at("plan").replaceChildren(el("li", {}, "Planning\u2026"));
     try {
-      at("plan").replaceChildren(...lines(await post("/lift/plan", this.body())));
+      const told = lines(await post("/lift/plan", body));
+      if (mine === this.plannedFor) at("plan").replaceChildren(...told);
     } catch (problem) {
-      at("plan").replaceChildren(el("li", { className: "bad" }, words(problem)));
+      if (mine === this.plannedFor) at("plan").replaceChildren(el("li", { className: "bad" }, words(problem)));
     }
   }
 
@@ -246,6 +281,8 @@ export class Bring {
     try {
       const job = await post(path, body, { "Idempotency-Key": this.last.key });
       at("order-problem").hidden = true;
+      this.ordered = path === "/lift";
+      remember(job.id, this.sceneName() ?? this.ids("splats").map(named).at(-1));
       this.jobs = [job, ...this.jobs.filter(known => known.id !== job.id)];
       this.showJobs();
       this.follow(job, { ordered: true, photos: this.ids("photos").at(-1), name: this.sceneName() });
@@ -300,7 +337,7 @@ export class Bring {
     this.toldAssets = told;
     at("assets-count").textContent = assets.length ? `(${assets.length}${next ? "+" : ""})` : "(none)";
     at("assets").replaceChildren(...assets.map(asset => el("li", {},
-      el("span", { className: "name" }, KINDS[asset.kind] || OTHERS[asset.kind] || asset.kind), el("span", { className: "state" }, `${said(asset)} \u00b7 ${size(asset.bytes)} \u00b7 ${ago(asset.created)}`),
+      el("span", { className: "name" }, named(asset.id) ?? KINDS[asset.kind] ?? OTHERS[asset.kind] ?? asset.kind), el("span", { className: "state" }, `${said(asset)} \u00b7 ${size(asset.bytes)} \u00b7 ${ago(asset.created)}`),
       el("span", { className: "actions" },
         KINDS[asset.kind] ? el("button", { type: "button", on: { click: () => this.take(asset) } }, "Lift it again") : null,
         twice("Delete", () => remove(`/assets/${asset.id}`).then(() => this.refreshAssets()))))));
@@ -319,7 +356,8 @@ export class Bring {
   }
 
   job(job) {
-    const kind = job.kind === "tradeoff" ? `Comparison within ${job.parameters.budget_s} s` : `Lift, ${job.settings.preset}`;
+    const what = job.kind === "tradeoff" ? `Comparison within ${job.parameters.budget_s} s` : `Lift, ${job.settings.preset}`;
+    const kind = named(job.id) ? `${named(job.id)}: ${what.toLowerCase()}` : what;
     const parts = [el("span", { className: "name" }, kind), el("span", { className: `kind ${job.state}` }, job.state)];
     const step = job.progress;
     if (job.state === "running" && step) {
@@ -363,7 +401,19 @@ export class Bring {
   }
 }
 
-const lines = ({ summary, warnings }) => [...summary, ...warnings.map(warning => `Note: ${warning}`)].map(line => el("li", {}, line));
+const lines = ({ summary, warnings }) => [...warnings.map(warning => el("li", { className: "warning" }, warning)), ...summary.map(line => el("li", {}, line))];
+
+// Names of files, which the service does not keep: this browser does, the last ones.
+const NAMES = "splatlift-names";
+const names = () => { try { return JSON.parse(localStorage.getItem(NAMES)) ?? {}; } catch { return {}; } };
+export const named = id => names()[id];
+
+function remember(id, name) {
+  if (!name) return;
+  try {
+    localStorage.setItem(NAMES, JSON.stringify(Object.fromEntries([...Object.entries(names()).filter(([known]) => known !== id), [id, name]].slice(-NAMED))));
+  } catch { /* a browser that keeps nothing */ }
+}
 
 function choice(group, value, title, why, checked) {
   return el("label", { className: "choice" }, el("input", { type: "radio", name: group, value, checked }), el("span", {}, el("b", {}, title), el("small", {}, why)));

@@ -91,3 +91,26 @@ export async function gathered(files) {
   const name = photos.length > 1 ? `${photos.length} photos.zip` : `${photos[0].name}.zip`;
   return [...files.filter(file => !photos.includes(file)), await zipped(photos.map(file => ({ path: file.name, file })), name)];
 }
+
+// The cameras of a file, in the frame of the splats, to be drawn: those of Inria's cameras.json and of transforms.json.
+// Others are read by the service alone.
+export async function camerasOf(file) {
+  if (!/\.json$/i.test(file.name)) return [];
+  try {
+    const told = JSON.parse(await file.text());
+    if (Array.isArray(told)) return told.filter(one => one.rotation && one.position).map(one => view(one.rotation, one.position, one));
+    return (told.frames ?? []).map(one => {
+      const m = one.transform_matrix;
+      const { w, h, fl_x: fx, fl_y: fy } = { ...told, ...one };
+      return view(m.slice(0, 3).map(row => [row[0], -row[1], -row[2]]), m.slice(0, 3).map(row => row[3]), { width: w, height: h, fx, fy: fy ?? fx });
+    }).filter(one => one.fx > 0);
+  } catch {
+    return []; // the check of the upload says what is wrong with it
+  }
+}
+
+// From a camera's axes in the world, as columns, and its place there.
+function view(axes, place, { width, height, fx, fy, img_name: name }) {
+  const rows = [0, 1, 2].map(column => axes.map(row => row[column]));
+  return { name, width, height, fx, fy, viewmat: [...rows.map(row => [...row, -row.reduce((sum, value, axis) => sum + value * place[axis], 0)]), [0, 0, 0, 1]] };
+}

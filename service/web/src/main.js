@@ -14,6 +14,7 @@ import { Things } from "./things.js";
 import { MOST, Viewer, webgl } from "./viewer.js";
 
 const PAGE = 100; // lifts to choose from
+const PREVIEWED = 800e6; // bytes of a file that is drawn before it is lifted
 const TURN = Math.PI / 24; // of an arrow key
 const TWICE = 260; // ms within which a second click makes a double one
 const POSTER_WAIT = 1000; // milliseconds that splats wait for that picture at most
@@ -33,7 +34,7 @@ const look = new Look({ changed: () => { repaint(); link(); }, fly: view => view
 const names = new Names({ changed, centres: (values, most) => viewer?.mesh ? viewer.centres(values, most) : [], alone: () => ask.reset(true), more: term => { tab("ask"); ask.example(term, false); } });
 const masks = new Masks({ pick: (term, less) => { tab("ask"); ask.example(term, less); }, swap: (old, term) => ask.swap(old, term) });
 const take = new Take({ ask, look, names, shot });
-const bring = new Bring({ opened: id => open(id, true), gone: () => refreshLifts(), open: () => lift?.id ?? null, raised: () => tab("bring") });
+const bring = new Bring({ opened: id => open(id, true), gone: () => refreshLifts(), open: () => lift?.id ?? null, raised: () => tab("bring"), preview });
 const lifts = new Lifts({ opened: id => open(id, true), changed: () => refreshLifts() });
 const hand = new Hand({ ask, label, look, naming, viewer: () => (viewer?.mesh ? viewer : null) });
 const things = new Things({ naming, held: () => ask.now?.sets || [], hold: sets => ask.hold(sets), fly: (box, view) => (look.mode === "view" ? look.go(view) : viewer?.toBox(box, look.views.find(({ name }) => name === view))) });
@@ -203,7 +204,7 @@ async function refreshLifts() {
     tell("The scene that was open was deleted.");
   }
   if (!lift && !busy && known.length) open(known[0].id); // also the first one, when its job was followed here
-  at("empty").hidden = Boolean(known.length);
+  at("empty").hidden = Boolean(known.length || viewer?.draft);
   document.body.classList.toggle("no-lifts", !known.length);
   return known;
 }
@@ -237,6 +238,7 @@ async function open(id, fresh = false) {
     if (mine !== turn) return;
     if (content) await show(content, parameters);
     about();
+    warnings(lift);
     if (parameters.has("what")) await look.choose(parameters.get("what"));
     look.switch(parameters.get("show") || (look.fallback ? "view" : "scene"));
     at("hide").checked = parameters.has("hide");
@@ -324,6 +326,29 @@ function fallBack() {
   look.fallback = true;
   document.body.classList.add("flat");
   look.switch("view");
+}
+
+// Splats as they were dropped, where no scene is open.
+async function preview(file, cameras) {
+  if (lift || look.fallback || file.size > PREVIEWED) return;
+  try {
+    viewer ||= made();
+    await viewer?.preview(new Uint8Array(await file.arrayBuffer()), file.name, cameras);
+    if (lift || !viewer) return;
+    at("empty").hidden = true;
+    at("stage").classList.add("ready");
+  } catch (problem) {
+    console.warn(problem); // the service reads more kinds than this page draws
+  }
+}
+
+// What a lift warns of, and what its plan did.
+async function warnings(known) {
+  const { plan } = await json(`/jobs/${known.id}`).catch(() => ({}));
+  if (known !== lift) return;
+  const told = [...new Set([...(plan?.warnings ?? []), ...(known.certificate?.warnings ?? [])])];
+  at("warnings").hidden = !told.length;
+  at("warnings").replaceChildren(...told.map(warning => el("li", {}, warning)));
 }
 
 // What is said of the scene below it.

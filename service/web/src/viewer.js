@@ -146,7 +146,50 @@ export class Viewer {
     this.paint([]);
   }
 
+  // Splats of a file as it was dropped, before they are lifted, with the cameras that came with them.
+  async preview(content, name, views) {
+    this.clear();
+    const mesh = new SplatMesh({ fileBytes: content, fileName: name, lod: false });
+    await mesh.initialized;
+    const centres = [];
+    mesh.forEachSplat((_, centre) => { centres.push(centre.x, centre.y, centre.z, 0, 0, 0, 0, 0); });
+    Object.assign(this, { origin: [0, 0, 0], draft: mesh, floats: centres, count: centres.length / 8 });
+    this.scene.add(mesh);
+    this.measure();
+    this.frusta(views);
+    if (views.length) {
+      this.settle(views);
+      this.to(views[0], true);
+    } else {
+      this.camera.up.set(0, -1, 0);
+      this.camera.position.copy(this.middle).add(new THREE.Vector3(0, -0.6, -2.4).multiplyScalar(this.reach));
+      this.controls.target.copy(this.middle);
+    }
+    this.draw();
+  }
+
+  // The outlines of what cameras see, from where they stand.
+  frusta(views) {
+    const points = [];
+    for (const view of views) {
+      const { position, right, up, forward } = this.pose(view);
+      const far = this.reach / 6;
+      const corners = [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([x, y]) => position.clone().addScaledVector(forward, far)
+        .addScaledVector(right, x * far * view.width / 2 / view.fx).addScaledVector(up, y * far * view.height / 2 / view.fy));
+      corners.forEach((corner, place) => points.push(position, corner, corner, corners[(place + 1) % 4]));
+    }
+    this.cones = new THREE.LineSegments(new THREE.BufferGeometry().setFromPoints(points), new THREE.LineBasicMaterial({ color: 0xffb84d, depthTest: false, transparent: true, opacity: 0.7 }));
+    this.cones.renderOrder = 10;
+    this.scene.add(this.cones);
+  }
+
   clear() {
+    if (this.draft) {
+      this.scene.remove(this.draft, this.cones);
+      this.draft.dispose();
+      this.cones.geometry.dispose();
+      this.draft = null;
+    }
     if (this.mesh) {
       this.scene.remove(this.mesh);
       this.mesh.dispose();
