@@ -27,6 +27,10 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--vocabulary", type=Path, metavar="FILE", help=named)
     add_encoder(parser)
     parser.add_argument("--tree", action="store_true", help="their parts and groups of them, too")
+    lying = "with --tree: how objects lie to each other"
+    parser.add_argument("--relations", action="store_true", help=lying)
+    against = "against gravity, in the frame of the splats: which object is on, under or beside another"
+    parser.add_argument("--up", type=float, nargs=3, metavar=("X", "Y", "Z"), help=f"with --relations: {against}")
     parser.add_argument("--features", action="store_true", help="with --json: each one's mean feature, too")
     parser.add_argument("--csv", type=Path, metavar="CSV", help="write the list as a table")
     parser.add_argument("--splats", type=Path, metavar="FOLDER", help="write one PLY an object, object-ID.ply")
@@ -77,7 +81,8 @@ def _tree(options: argparse.Namespace, scene: Scene) -> int:
     if options.csv or options.features:
         named = "--csv" if options.csv else "--features"
         raise InvalidQuery(named, expected="the list of objects", got="--tree", hint="--json has the tree")
-    answer = scene.tree(words, encoder=encoder)
+    up = None if options.up is None else tuple(options.up)
+    answer = scene.tree(words, encoder=encoder, relations=options.relations or up is not None, up=up)
     files, exports = dict[str, Any](), dict[str, Any]()
     for one in answer.nodes if options.splats else ():
         name = "-".join(["object", *map(str, one.path)])
@@ -102,6 +107,8 @@ def _tree_lines(answer: dict[str, Any], files: dict[str, str]) -> Iterable[str]:
             f"of the evidence, a mask of it in {one['confidence']:.0%} of the views that see it"
         )
         waiting += one["parts"][::-1]
+    for one in answer["relations"]:
+        yield f"  {one['node']} is {one['relation']} {one['other']}: {one['gap']:.4g} apart"
     yield from (f"  {kind}: {path}" for kind, path in files.items())
 
 

@@ -22,7 +22,8 @@ import numpy as np
 from liftcore.errors import InvalidQuery
 from liftcore.query.objects import largest_box
 from liftcore.query.opened import OpenedLift, as_numpy
-from liftcore.query.question import ListedObjects, SceneNode, SceneObject, SceneTree
+from liftcore.query.question import ListedObjects, Point, SceneNode, SceneObject, SceneTree
+from liftcore.query.relations import relations as related
 from liftcore.query.scores import cosines, norms_of
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.origin import MAP_REACH
@@ -82,11 +83,21 @@ def catalogue(scene: OpenedLift, words: Sequence[str] = (), vectors: Any = None)
     return Catalogue(tuple(SceneObject(**one) for one in facts), told, features)
 
 
-def tree(scene: OpenedLift, words: Sequence[str] = (), vectors: Any = None) -> SceneTree:
-    """The objects of a lift with their parts and groups, named by the nearest of some words; arguments as above.
+def tree(
+    scene: OpenedLift,
+    words: Sequence[str] = (),
+    vectors: Any = None,
+    *,
+    relations: bool = False,
+    up: Point | None = None,
+) -> SceneTree:
+    """The objects of a lift with their parts and groups, named by the nearest of some words.
+
+    Args:
+        scene, words, vectors: as of `catalogue`. relations, up: as of `Scene.tree`.
 
     Raises:
-        InvalidQuery, InvalidLift: as `catalogue`.
+        InvalidQuery, InvalidLift: as `catalogue`; or up has no direction.
     """
     if scene.object is None or scene.object_views is None:
         return SceneTree(explanation=NOT_LOOKED_FOR, count=0, nodes=())
@@ -110,7 +121,11 @@ def tree(scene: OpenedLift, words: Sequence[str] = (), vectors: Any = None) -> S
         nodes.append(SceneNode(**one | more, parent=parent, confidence=confidence))
     counts = {kind: sum(one.kind == kind for one in nodes) for kind in ("object", "part", "group")}
     told = f"{counts['object']} objects with {counts['part']} parts, in {counts['group']} groups"
-    return SceneTree(explanation=told if nodes else NONE_FOUND, count=len(nodes), nodes=tuple(nodes))
+    answer = SceneTree(explanation=told if nodes else NONE_FOUND, count=len(nodes), nodes=tuple(nodes))
+    if not relations:
+        return answer
+    members = [np.flatnonzero(scene.members(node)) for node in range(objects)]
+    return answer.model_copy(update={"up": up, "relations": related(scene.splats, members, scene.evidence, up)})
 
 
 def _described(

@@ -564,12 +564,24 @@ class SceneNode(SceneObject):
     confidence: float = Field(description="of the views that see it, the share that has a mask of the whole")
 
 
+class Relation(Value):
+    """How two objects lie to each other (`liftcore.query.relations`)."""
+
+    node: int
+    relation: Literal["touching", "inside", "on", "under", "beside"]
+    other: int
+    gap: float = Field(description="scene units; below zero where one sinks into the other")
+    overlap: float | None = Field(description="0 to 1, of what it comes from; null of touching")
+
+
 class SceneTree(Value):
     """Objects, their parts and groups of them, or some of these; the first are the objects."""
 
     explanation: str = Field(description="why there are so many; or why there are none")
     count: int = Field(description="of all pages")
     nodes: tuple[SceneNode, ...]
+    up: Point | None = Field(default=None, description="that relations were asked with; null: not known")
+    relations: tuple[Relation, ...] = Field(default=(), description="of the objects, where they are asked for")
 
 
 class CoveringRegion(Value):

@@ -208,18 +208,27 @@ class Scene(OpenedLift):
         return catalogue(self, words, vectors)
 
     def tree(
-        self, words: Sequence[str] = (), vectors: Any = None, *, encoder: TextEncoder | str | Path | None = None
+        self,
+        words: Sequence[str] = (),
+        vectors: Any = None,
+        *,
+        encoder: TextEncoder | str | Path | None = None,
+        relations: bool = False,
+        up: tuple[float, float, float] | None = None,
     ) -> SceneTree:
         """The objects of `catalogue` with their parts and groups of them: a node's parts are nodes, too.
 
         Args:
             words, vectors, encoder: as in `catalogue`.
+            relations: whether to say how the objects lie to each other (`liftcore.query.relations`).
+            up: the direction against gravity in the frame of the splats; None: not known, and no object is on
+                another.
         """
         from liftcore.query.catalogue import tree
 
         if words and vectors is None:
             vectors = self.encoder(encoder).encode(words)
-        return tree(self, words, vectors)
+        return tree(self, words, vectors, relations=relations, up=up)
 
     def segment(
         self,

@@ -53,6 +53,16 @@ def touching_pairs(splats: Splats, rows: np.ndarray, threads: int | None = None)
     return np.concatenate(own), np.concatenate(near)
 
 
+def touch_pairwise(splats: Splats, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """[n] bool, whether the splats of rows [n] i64 touch those of other rows [n] i64, each its own."""
+    means = [splats.means.cpu().numpy()[rows].astype(np.float64) for rows in (one, other)]
+    first, second = (
+        np.concatenate([places, _covariances(splats, rows)], axis=1)
+        for places, rows in zip(means, (one, other), strict=True)
+    )
+    return _touch(first, second[:, None])[:, 0]
+
+
 def _touch(own: np.ndarray, near: np.ndarray) -> np.ndarray:
     """[m, k] bool, which of its neighbours ``near`` [m, k, 9] each splat of ``own`` [m, 9] touches; centre, Sigma."""
     own = own[:, None]

@@ -80,6 +80,22 @@ def test_parts_have_paths_places_and_names_of_what_their_own_masks_say(scene: Sc
         opened.members(5)
 
 
+def test_the_command_lists_the_tree_and_writes_its_nodes_by_their_paths(
+    scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with_parts(scene).save(tmp_path / "parts.lift.safetensors")
+    command = ["objects", str(tmp_path / "parts.lift.safetensors"), "--tree", "--splats", str(tmp_path / "things")]
+    assert main([*command, "--up", "0", "-1", "0"]) == 0
+    told = capsys.readouterr().out
+    assert "3 objects with 2 parts, in 0 groups" in told and "3, part: " in told
+    names = ["object-0", "object-0-3", "object-0-4", "object-1", "object-2"]
+    assert sorted(path.stem for path in (tmp_path / "things").iterdir()) == names
+    assert main([*command, "--relations", "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)["answer"]
+    assert answer["up"] is None and {one["relation"] for one in answer["relations"]} <= {"touching", "inside"}
+    assert main([*command, "--features"]) != 0
+
+
 def test_rows_of_a_lift_keep_their_part_of_the_tree(scene: Scene) -> None:
     lift = with_parts(scene)
     assert lift.node is not None

@@ -1,0 +1,73 @@
+"""How things lie to each other, on a table of boxes of splats that are known by construction."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from liftcore.errors import InvalidQuery
+from liftcore.query.relations import relations
+from liftcore.scene.splats import Splats
+
+STEP = 0.1
+
+
+def shell(low: tuple[float, ...], high: tuple[float, ...], *, lid: bool = True) -> np.ndarray:
+    """The surface of a box, as points STEP apart; without a lid the top is open."""
+    axes = [np.arange(a, b + STEP / 2, STEP) for a, b in zip(low, high, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    faces = (np.abs(points - low) < 1e-6) | (np.abs(points - high) < 1e-6)
+    if not lid:
+        faces[:, 2] = np.abs(points[:, 2] - low[2]) < 1e-6
+    return points[faces.any(axis=1)]
+
+
+THINGS = {
+    "table": shell((0, 0, 0), (6, 4, 0.2)),
+    "bowl": shell((1, 1, 0.3), (2.5, 2.5, 1.2), lid=False),
+    "apple": shell((1.5, 1.5, 0.45), (2.0, 2.0, 0.95)),
+    "book": shell((3, 1, 0.3), (4, 2, 0.6)),
+    "lamp": shell((1, 1, 3), (4, 3, 3.5)),
+    "tree": shell((30, 30, 0), (31, 31, 5)),
+}
+ROWS = np.split(np.arange(sum(map(len, THINGS.values()))), np.cumsum([len(one) for one in THINGS.values()])[:-1])
+
+
+def found(turn: np.ndarray, up: tuple[float, float, float] | None) -> set[tuple[str, str, str]]:
+    means = np.concatenate(list(THINGS.values())) @ turn.T
+    count = len(means)
+    splats = Splats(
+        means=torch.tensor(means).float(),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        log_scales=torch.full((count, 3), float(np.log(STEP / 3))),
+        opacity_logits=torch.zeros(count),
+        sh=torch.zeros(count, 1, 3),
+    )
+    names = list(THINGS)
+    return {(names[r.node], r.relation, names[r.other]) for r in relations(splats, ROWS, np.ones(count), up)}
+
+
+LEFT = np.array([[0, 0, -1.0], [0, 1, 0], [1, 0, 0]])  # the table's up is the frame's -x
+
+
+@pytest.mark.parametrize(("turn", "up"), [(np.eye(3), (0, 0, 2.0)), (LEFT, (-3.0, 0, 0))])
+def test_things_lie_as_they_were_put(turn: np.ndarray, up: tuple[float, float, float]) -> None:
+    told = found(turn, up)
+    assert {
+        ("bowl", "on", "table"), ("book", "on", "table"), ("table", "under", "bowl"), ("apple", "inside", "bowl"),
+        ("table", "under", "lamp"), ("book", "under", "lamp"), ("bowl", "beside", "book"),
+    } <= told  # fmt: skip
+    assert not any("tree" in one for one in told) and ("lamp", "on", "table") not in told
+    assert ("apple", "beside", "bowl") not in told and ("table", "on", "bowl") not in told
+
+
+def test_without_up_nothing_is_on_another() -> None:
+    told = found(np.eye(3), None)
+    assert {relation for _, relation, _ in told} == {"touching", "inside"}
+    assert ("table", "touching", "bowl") in told and ("table", "touching", "lamp") not in told
+
+
+def test_an_up_without_a_direction_is_refused() -> None:
+    with pytest.raises(InvalidQuery, match="up: expected"):
+        found(np.eye(3), (0.0, 0.0, 0.0))
