@@ -9,7 +9,7 @@ Of thing a and thing b, with heights along ``up`` and the ground at right angles
 | a is inside b | its splats lie in b's box, and b lies on SIDES of the six sides of its middle |
 | a is on b | b lies below COVERED of its footprint, and it touches b or begins NEAR above |
 | b is under a | a is on it, or begins higher above it |
-| a is beside b | their heights overlap by half, and on the ground they are no farther apart than the smaller is wide |
+| a is beside b | their heights overlap by half, and on the ground they are less apart than the smaller is wide |
 
 ``gap`` is between the nearest centres; of on and under between heights, of beside on the ground. ``overlap`` is the
 share of a's splats in b's box, of its footprint above b, or of heights.
