@@ -25,7 +25,6 @@ from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from liftcore.errors import InvalidQuery
 from liftcore.query.objects import trimmed_box
@@ -135,7 +134,9 @@ def _of_pair(splats: Splats, a: int, b: int, one: _Thing, other: _Thing, *, know
 
 def _nearest(splats: Splats, one: _Thing, other: _Thing) -> tuple[float, bool]:
     """The distance of the nearest centres, and whether any of the nearest pairs of splats touch."""
-    distances, near = KDTree(other.places).query(one.places)
+    from scipy.spatial import KDTree
+
+    distances, near = map(np.asarray, KDTree(other.places).query(one.places))
     closest = np.argsort(distances, kind="stable")[:PAIRS]
     touches = touch_pairwise(splats, one.rows[closest], other.rows[near[closest]])
     return float(distances[closest[0]]), bool(touches.any())
