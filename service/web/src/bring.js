@@ -1,14 +1,13 @@
 // The panel of bringing: files by drag and drop, the settings of a lift from the schema, jobs as they run, and what
 // is here already.
 import { ago, at, count, el, plural, size, tell, twice } from "./dom.js";
-import { camerasOf, dropped, gathered, kindOf } from "./files.js";
+import { camerasOf, dropped, gathered, kindOf, named, remember } from "./files.js";
 import { space } from "./lifts.js";
 import { bytes, events, json, patch, picture, post, remove, upload, words } from "./service.js";
 
 const PAGE = 20; // of each list
 const LOOK = 15_000; // ms between looks for jobs of others, while the panel is open
 const REST = 400; // ms without a change, after which it is planned
-const NAMED = 300; // files and jobs whose names are kept
 const OF_SCENE = ["splats", "cameras", "features", "photos", "table"];
 const AGAIN = 2000; // ms, within which the same order is a second click
 const EXAMPLE = { splats: "point_cloud.spz", cameras: "cameras.json", features: "features.safetensors" };
@@ -402,18 +401,6 @@ export class Bring {
 }
 
 const lines = ({ summary, warnings }) => [...warnings.map(warning => el("li", { className: "warning" }, warning)), ...summary.map(line => el("li", {}, line))];
-
-// Names of files, which the service does not keep: this browser does, the last ones.
-const NAMES = "splatlift-names";
-const names = () => { try { return JSON.parse(localStorage.getItem(NAMES)) ?? {}; } catch { return {}; } };
-export const named = id => names()[id];
-
-function remember(id, name) {
-  if (!name) return;
-  try {
-    localStorage.setItem(NAMES, JSON.stringify(Object.fromEntries([...Object.entries(names()).filter(([known]) => known !== id), [id, name]].slice(-NAMED))));
-  } catch { /* a browser that keeps nothing */ }
-}
 
 function choice(group, value, title, why, checked) {
   return el("label", { className: "choice" }, el("input", { type: "radio", name: group, value, checked }), el("span", {}, el("b", {}, title), el("small", {}, why)));

@@ -114,3 +114,16 @@ function view(axes, place, { width, height, fx, fy, img_name: name }) {
   const rows = [0, 1, 2].map(column => axes.map(row => row[column]));
   return { name, width, height, fx, fy, viewmat: [...rows.map(row => [...row, -row.reduce((sum, value, axis) => sum + value * place[axis], 0)]), [0, 0, 0, 1]] };
 }
+
+// Names of files, which the service does not keep: this browser does, the last ones.
+const NAMED = 300; // files and jobs whose names are kept
+const NAMES = "splatlift-names";
+const names = () => { try { return JSON.parse(localStorage.getItem(NAMES)) ?? {}; } catch { return {}; } };
+export const named = id => names()[id];
+
+export function remember(id, name) {
+  if (!name) return;
+  try {
+    localStorage.setItem(NAMES, JSON.stringify(Object.fromEntries([...Object.entries(names()).filter(([known]) => known !== id), [id, name]].slice(-NAMED))));
+  } catch { /* a browser that keeps nothing */ }
+}

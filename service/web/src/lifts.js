@@ -1,11 +1,12 @@
 // The list of lifts: names that people give, what to open, what to delete.
 import { ago, at, count, el, tell, twice } from "./dom.js";
+import { named } from "./files.js";
 import { patch, remove, words } from "./service.js";
 
-export const title = lift => lift.name || `${count(lift.count)} splats, ${ago(lift.created)}, ${space(lift)}`;
+export const title = lift => lift.name || `${named(lift.id) ?? `${count(lift.count)} splats`}, ${ago(lift.created)}`;
 
 const SPACES = { none: "no words", prompts: "own words", "": "words of no known encoder" };
-export const space = ({ text_space: name }) => SPACES[name] || `words of ${name}`;
+export const space = ({ text_space: name }) => SPACES[name] || "asked in words";
 
 export class Lifts {
   // opened: with the lift to show; changed: after one was named or deleted.
