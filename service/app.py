@@ -26,7 +26,7 @@ from service.errand import revive
 from service.errors import Busy
 from service.observe import Metrics, access, chosen_id, versions, working_for
 from service.problems import CLOSE, answer_to
-from service.queries.client import QueryClient, QueryLimits
+from service.query_client import QueryClient, QueryLimits
 from service.requests import KnownParameters
 from service.routes import assets, jobs, lifts, operations, queries, selections
 from service.settings import ServiceSettings

@@ -35,7 +35,7 @@ from prometheus_client.registry import Collector
 from liftcore import __version__
 from service import models
 from service.models import JobState
-from service.queries.client import QueryClient
+from service.query_client import QueryClient
 from service.store.database import VERSION
 from service.store.store import Store
 

@@ -23,7 +23,7 @@ from service.errand import ErrandLimits
 from service.errors import NotReady
 from service.models import Version
 from service.observe import Metrics
-from service.queries.client import QueryClient
+from service.query_client import QueryClient
 from service.settings import ServiceSettings
 from service.store.owners import Owner
 from service.store.store import Store

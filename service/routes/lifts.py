@@ -13,11 +13,20 @@ from liftcore.errors import NotFound
 from liftcore.files import in_camera_orientation
 from service import models
 from service.content import FILE, TAGGED, Cursor, Limit, file_answer, kept, listed, unchanged
-from service.queries import questions
-from service.queries.requests import NO_ENCODER, Ask, made, scene_request, tagged_answer, with_encoder, with_packs
 from service.requests import JsonRoute
 from service.routes.assets import RAW_BODY, Sha256, taken
-from service.routes.queries import NPY, PLY, PNG
+from service.routes.queries import (
+    NO_ENCODER,
+    NPY,
+    PLY,
+    PNG,
+    Ask,
+    made,
+    scene_request,
+    tagged_answer,
+    with_encoder,
+    with_packs,
+)
 from service.settings import encoder_label
 from service.state import AppState, Deps
 from service.store.lifts import LiftRecord, TradeoffRecord
@@ -181,12 +190,12 @@ def views(lift: str, deps: Deps, ask: Ask, limit: Limit = models.PAGE, cursor: V
     return models.Views(views=told, next=cursor + limit if answer["more"] else None)
 
 
-@router.get("/lifts/{lift}/regions", response_model=questions.CoveringRegions, tags=["lifts"])
-def regions(lift: str, view: View, x: Pixel, y: Pixel, deps: Deps, ask: Ask) -> questions.CoveringRegions:
+@router.get("/lifts/{lift}/regions", response_model=models.CoveringRegions, tags=["lifts"])
+def regions(lift: str, view: View, x: Pixel, y: Pixel, deps: Deps, ask: Ask) -> models.CoveringRegions:
     """The regions of the lift's feature packs that cover a pixel of a view's photo: each is an example to ask by."""
     found = deps.store.lifts.get(deps.owner, lift)
     wanted = with_packs(scene_request("regions", found, deps), found, deps, "lift") | {"view": view, "x": x, "y": y}
-    return questions.CoveringRegions(lift=found.id, view=view, **ask(wanted).header)
+    return models.CoveringRegions(lift=found.id, view=view, **ask(wanted).header)
 
 
 @router.get("/lifts/{lift}/regions/mask", responses=PNG | TAGGED, response_class=Response, tags=["lifts"])
@@ -200,9 +209,9 @@ def region_mask(
     return tagged_answer(request, deps, wanted, found, ask)
 
 
-@router.get("/lifts/{lift}/objects", response_model=questions.SceneObjects, tags=["lifts"])
+@router.get("/lifts/{lift}/objects", response_model=models.SceneObjects, tags=["lifts"])
 def scene_objects(
-    lift: str, deps: Deps, ask: Ask, asked: Annotated[questions.AskedForSceneObjects, Query()]
+    lift: str, deps: Deps, ask: Ask, asked: Annotated[models.AskedForSceneObjects, Query()]
 ) -> Response:
     """The things in the scene, found by masks alone when it was lifted; a vocabulary names them."""
     things = list(deps.store.selections.things(deps.owner, deps.store.lifts.get(deps.owner, lift).id).items())
@@ -210,13 +219,13 @@ def scene_objects(
     return _nodes("catalogue", lift, deps, ask, asked, **more)
 
 
-@router.get("/lifts/{lift}/tree", response_model=questions.LiftTree, tags=["lifts"])
-def scene_tree(lift: str, deps: Deps, ask: Ask, asked: Annotated[questions.AskedForNodes, Query()]) -> Response:
+@router.get("/lifts/{lift}/tree", response_model=models.LiftTree, tags=["lifts"])
+def scene_tree(lift: str, deps: Deps, ask: Ask, asked: Annotated[models.AskedForNodes, Query()]) -> Response:
     """The same things with their parts and groups of them, objects first; a node's splats are an object's."""
     return _nodes("tree", lift, deps, ask, asked)
 
 
-def _nodes(operation: str, lift: str, deps: Deps, ask: Ask, asked: questions.AskedForNodes, **more: Any) -> Response:
+def _nodes(operation: str, lift: str, deps: Deps, ask: Ask, asked: models.AskedForNodes, **more: Any) -> Response:
     found = deps.store.lifts.get(deps.owner, lift)
     wanted: dict[str, Any] = scene_request(operation, found, deps) | NO_ENCODER | {"words": None}
     if asked.table is not None or asked.encoder is not None:

@@ -11,12 +11,12 @@ from fastapi import APIRouter, Header, Path, Query, Response
 from fastapi.responses import JSONResponse
 
 from liftcore.errors import NotFound
+from service import models
 from service.content import kept
 from service.errors import InvalidRequest
-from service.queries import questions
-from service.queries.requests import NO_ENCODER, Ask, bits_of, query_request, scene_request
 from service.requests import JsonRoute
 from service.routes.lifts import ObjectId
+from service.routes.queries import NO_ENCODER, Ask, bits_of, query_request, scene_request
 from service.state import AppState, Deps
 from service.store.lifts import LiftRecord
 from service.store.selections import SelectionRecord, SplatSet
@@ -31,16 +31,16 @@ IfMatch = Annotated[
 router = APIRouter(tags=["selections"], route_class=JsonRoute)
 
 
-@router.get("/lifts/{lift}/selections", response_model=questions.Selections)
-def list_selections(lift: str, deps: Deps) -> questions.Selections:
+@router.get("/lifts/{lift}/selections", response_model=models.Selections)
+def list_selections(lift: str, deps: Deps) -> models.Selections:
     """The selections of a lift, newest first."""
     found = deps.store.lifts.get(deps.owner, lift)
     selections = deps.store.selections.all(deps.owner, found.id)
-    return questions.Selections(selections=[_listed(one) for one in selections])
+    return models.Selections(selections=[_listed(one) for one in selections])
 
 
-@router.post("/lifts/{lift}/selections", response_model=questions.Selection, status_code=201)
-def create_selection(lift: str, asked: questions.NewSelection, deps: Deps, ask: Ask) -> Response:
+@router.post("/lifts/{lift}/selections", response_model=models.Selection, status_code=201)
+def create_selection(lift: str, asked: models.NewSelection, deps: Deps, ask: Ask) -> Response:
     """Begin a selection, with the splats of an edit or with none. Questions name it as `sets=selection:ID`."""
     found = deps.store.lifts.get(deps.owner, lift)
     splats = _edited(asked.edit, found, deps, ask, bytes(-(-found.count // 8)))
@@ -48,7 +48,7 @@ def create_selection(lift: str, asked: questions.NewSelection, deps: Deps, ask: 
     return _answer(made, deps, 201, {"Location": f"/lifts/{found.id}/selections/{made.id}"})
 
 
-@router.get(ONE, response_model=questions.Selection)
+@router.get(ONE, response_model=models.Selection)
 def get_selection(
     lift: str,
     selection: SelectionId,
@@ -60,9 +60,9 @@ def get_selection(
     return _answer(deps.store.selections.get(deps.owner, found.id, selection), deps, bits=bits)
 
 
-@router.post(ONE + "/edits", response_model=questions.Selection)
+@router.post(ONE + "/edits", response_model=models.Selection)
 def edit_selection(
-    lift: str, selection: SelectionId, asked: questions.AskedEdit, deps: Deps, ask: Ask, match: IfMatch = None
+    lift: str, selection: SelectionId, asked: models.AskedEdit, deps: Deps, ask: Ask, match: IfMatch = None
 ) -> Response:
     """Add, take away, grow, shrink or set: a step of its history, which PATCH goes back."""
     found = deps.store.lifts.get(deps.owner, lift)
@@ -75,9 +75,9 @@ def edit_selection(
     )
 
 
-@router.patch(ONE, response_model=questions.Selection)
+@router.patch(ONE, response_model=models.Selection)
 def change_selection(
-    lift: str, selection: SelectionId, change: questions.SelectionChange, deps: Deps, match: IfMatch = None
+    lift: str, selection: SelectionId, change: models.SelectionChange, deps: Deps, match: IfMatch = None
 ) -> Response:
     """Give it another name, or go to another step of its history: undo and redo."""
     found = deps.store.lifts.get(deps.owner, lift)
@@ -94,8 +94,8 @@ def delete_selection(lift: str, selection: SelectionId, deps: Deps, match: IfMat
     return Response(status_code=204)
 
 
-@router.patch("/lifts/{lift}/objects/{thing}", response_model=questions.Thing)
-def change_thing(lift: str, thing: ObjectId, change: questions.ThingChange, deps: Deps, ask: Ask) -> questions.Thing:
+@router.patch("/lifts/{lift}/objects/{thing}", response_model=models.Thing)
+def change_thing(lift: str, thing: ObjectId, change: models.ThingChange, deps: Deps, ask: Ask) -> models.Thing:
     """Give a thing of a lift a name of your own, or hide it from lists; what is left out stays."""
     found = deps.store.lifts.get(deps.owner, lift)
     listed = ask(scene_request("count_objects", found, deps)).header["count"]
@@ -103,10 +103,10 @@ def change_thing(lift: str, thing: ObjectId, change: questions.ThingChange, deps
         raise NotFound("thing", expected=f"one of the lift's {listed} objects", got=str(thing))
     deps.store.selections.change_thing(found.id, thing, change.model_dump(exclude_unset=True))
     name, hidden = deps.store.selections.things(deps.owner, found.id).get(thing, (None, False))
-    return questions.Thing(id=thing, name=name, hidden=hidden)
+    return models.Thing(id=thing, name=name, hidden=hidden)
 
 
-def _edited(asked: questions.AskedEdit | None, lift: LiftRecord, deps: AppState, ask: Ask, before: bytes) -> SplatSet:
+def _edited(asked: models.AskedEdit | None, lift: LiftRecord, deps: AppState, ask: Ask, before: bytes) -> SplatSet:
     """The splats after an edit of those before, by the query process; without one those."""
     if asked is None:
         return SplatSet({"how": "set"}, 0, None, before)
@@ -141,14 +141,14 @@ def _answer(
 ) -> Response:
     more: dict[str, Any] = {"history": deps.store.selections.history(found)}
     more["bits"] = base64.b64encode(deps.store.selections.bits(found)).decode() if bits else None
-    made = questions.Selection(**_listed(found).model_dump(), **more)
+    made = models.Selection(**_listed(found).model_dump(), **more)
     content = made.model_dump(mode="json")
     return JSONResponse(content, status, headers=kept(f'"{found.version}"') | (headers or {}))
 
 
-def _listed(found: SelectionRecord) -> questions.ListedSelection:
+def _listed(found: SelectionRecord) -> models.ListedSelection:
     own, asked = f"/lifts/{found.lift}/selections/{found.id}", f"lift={found.lift}&sets=selection:{found.id}"
     links = {"self": own, "edits": f"{own}/edits", "query": f"/query?{asked}"}
     links |= {"splats": f"/query/splats?{asked}", "selection": f"/query/selection?{asked}"}
     told: dict[str, Any] = vars(found) | {"links": links}
-    return questions.ListedSelection(**{name: told[name] for name in questions.ListedSelection.model_fields})
+    return models.ListedSelection(**{name: told[name] for name in models.ListedSelection.model_fields})

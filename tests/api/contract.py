@@ -25,7 +25,7 @@ import httpx
 
 from service.app import create_app, job_limits, query_limits
 from service.errand import TaskResult
-from service.queries.client import QueryClient
+from service.query_client import QueryClient
 from service.settings import ServiceSettings
 from service.store.keys import Quota
 from service.store.owners import Scope

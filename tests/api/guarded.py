@@ -15,7 +15,7 @@ from starlette.routing import Route
 
 from service.app import create_app
 from service.models import JobKind
-from service.queries.client import QueryClient
+from service.query_client import QueryClient
 from service.settings import ServiceSettings
 from service.store.jobs import JobOrder
 from service.store.keys import Quota

@@ -30,10 +30,9 @@ from service.commands.serve import AnnouncingServer
 from service.content import EventStreams
 from service.errand import ErrandLimits
 from service.errors import Busy, NoSpace
-from service.models import BODY_BRACKETS, BODY_COMMAS, PACKS, SETTINGS, AssetKind
+from service.models import BODY_BRACKETS, BODY_COMMAS, PACKS, SETTINGS, AssetKind, Question
 from service.observe import SAME_A_MINUTE, JsonLines, Sparing, TextLines, working_for
-from service.queries.client import Frame
-from service.queries.questions import Question
+from service.query_client import Frame
 from service.state import Stopping
 from service.store.assets import SHOWN_CHARACTERS
 from service.store.database import Database

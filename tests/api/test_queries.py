@@ -19,11 +19,11 @@ from starlette.requests import ClientDisconnect
 from liftcore.text.table import TableEncoder
 from liftcore.values.pack import write_pack
 from liftcore.values.views import Regions
+from service import query_worker as answers
 from service.content import BINARY, BLOCK_BYTES, Draft
 from service.errors import NoSpace
 from service.models import AssetKind
-from service.queries import answers
-from service.queries.client import Frame
+from service.query_client import Frame
 from service.store.files import DataDirectory
 
 from .conftest import Uploaded, parts_of, put

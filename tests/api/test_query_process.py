@@ -23,11 +23,13 @@ from liftcore.query.objects import objects
 from liftcore.query.presence import NOT_IN_WORDS
 from liftcore.query.question import Answer, Query, Threshold
 from liftcore.query.terms import Vector
+from service import query_client as client
+from service import query_worker as answers
 from service.auth import EVERYBODY
 from service.errors import Busy, ClientLeft, TimedOut, TooMany
-from service.queries import answers, client, questions
-from service.queries.answers import Answers, bytes_of, reply_to
-from service.queries.client import Frame, QueryClient, QueryLimits, Waiter
+from service.models import Question
+from service.query_client import Frame, QueryClient, QueryLimits, Waiter
+from service.query_worker import Answers, bytes_of, reply_to
 from service.routes.queries import query_request
 from tests.crash.conftest import address_of, until
 from tests.crash.server import NoQueries
@@ -42,7 +44,7 @@ STAND_IN = """
 import json, sys, time
 from multiprocessing.connection import Connection
 from pathlib import Path
-from service.queries.client import Frame, send_frame
+from service.query_client import Frame, send_frame
 folder, server = Path(sys.argv[1]), Connection(int(sys.argv[2]))
 while True:
     first, *others = json.loads(server.recv_bytes())
@@ -258,7 +260,7 @@ def request_of(client: TestClient, lift: dict[str, Any]) -> Callable[..., dict[s
     record = here.store.lifts.get(here.owner, lift["id"])
 
     def make(operation: str = "scores", **asked: Any) -> dict[str, Any]:
-        body = questions.Question.model_validate({"lift": lift["id"], **asked})
+        body = Question.model_validate({"lift": lift["id"], **asked})
         return query_request(operation, body, record, here) | {"view": "left", "top": 3}
 
     return make
@@ -365,7 +367,7 @@ def test_calls_of_a_worker_that_dies_are_answered_by_the_next(
     client: TestClient, lift: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # a process that is seen stopped is replaced before it is asked
-    monkeypatch.setattr("service.queries.client.is_stopped", lambda pid: False)
+    monkeypatch.setattr("service.query_client.is_stopped", lambda pid: False)
     worker = parts_of(client).queries
     process = worker._process
     assert process is not None

@@ -17,7 +17,7 @@ import uvicorn
 
 from service.app import create_app, job_limits
 from service.models import AssetKind
-from service.queries.client import QueryClient
+from service.query_client import QueryClient
 from service.settings import ServiceSettings
 from service.store.store import Store
 from service.supervisor import Supervisor

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from service.app import create_app, job_limits
 from service.commands.serve import keep_pauses_short, server_of
-from service.queries.client import Frame, QueryClient
+from service.query_client import Frame, QueryClient
 from service.settings import ServiceSettings
 from service.store.files import DataDirectory
 from service.store.jobs import JobStore

@@ -36,7 +36,6 @@ from liftcore.values.pack import read_features, write_pack
 from service import models
 from service.auth import OPEN
 from service.commands.demo import find_scene
-from service.queries import questions
 from service.routes import assets, jobs, lifts, operations, queries, selections
 from tests.api.tiny_scene import HEIGHT, WIDTH, WORDS, cameras_document, codebook, colmap_zip, labels, make_scene
 from tests.run_lengths import sam_records
@@ -47,8 +46,8 @@ ROUTES: tuple[ModuleType, ...] = (operations, assets, jobs, lifts, queries, sele
 SHAPES: dict[str, type[BaseModel]] = {  # a field that no other answer has -> the answer
     "counts": models.Asset,
     "attempt": models.Job,
-    "statistics": questions.QueryAnswer,
-    "strays": questions.ObjectsAnswer,
+    "statistics": models.QueryAnswer,
+    "strays": models.ObjectsAnswer,
     "detail": models.Problem,
 }
 

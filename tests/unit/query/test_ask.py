@@ -24,7 +24,7 @@ from liftcore.query.scene import Scene
 from liftcore.query.terms import Example, OneSplat, Pixel, PixelBox, Region, Stroke, Vector, parse_example
 from liftcore.query.threshold import find_threshold
 from liftcore.values.lift_file import save_lift
-from service.queries.answers import open_scene
+from service.query_worker import open_scene
 from tests.api.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH
 
 COUNT = 3 * SPLATS_A_CLUSTER

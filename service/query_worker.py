@@ -1,6 +1,6 @@
 """The query process: answers, scores, masks, maps, renders and splats over open scenes, as its server asks for them.
 
-Run as ``python -m service.queries.answers SOCKET SCENES CACHE_BYTES ENCODER``. The socket, a connection of
+Run as ``python -m service.query_worker SOCKET SCENES CACHE_BYTES ENCODER``. The socket, a connection of
 multiprocessing's, brings JSON lists of requests: the first of each is answered, the others wait behind it. When its
 stdin closes it ends by itself. The compiled kernels and the encoder named are loaded beside the first requests, which
 wait for no more than they need.
@@ -45,7 +45,7 @@ from liftcore.models import Edit, Found, OwnCamera, SceneTree, Seen
 from liftcore.text import OWN_WORDS
 from service.child import end_with_parent, fault_of
 from service.errors import NoSpace
-from service.queries.client import PIPE_BYTES, Frame, send_frame
+from service.query_client import PIPE_BYTES, Frame, send_frame
 from service.settings import encoder_version
 
 WARM_UP_TEXT = "something"

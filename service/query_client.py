@@ -295,7 +295,7 @@ class QueryClient:
     def _spawn(self) -> None:
         self._reap()
         ours, theirs = socket.socketpair()
-        command = [sys.executable, "-m", "service.queries.answers", str(theirs.fileno())]
+        command = [sys.executable, "-m", "service.query_worker", str(theirs.fileno())]
         command += [str(self._limits.scenes), str(self._limits.cache_bytes), self._limits.encoder]
         self._spawned += 1
         with ours, theirs:
