@@ -86,6 +86,9 @@ function labels(boxes) {
 // After each frame: labels lie at the top of their boxes as these are seen, whole where a part of the box is.
 function placed(place) {
   if (viewer?.settled && !at("stage").classList.contains("ready")) appear(turn);
+  const box = at("query").getBoundingClientRect(); // which labels stay clear of
+  const stage = at("labels").getBoundingClientRect();
+  const roof = x => (x > box.left - stage.left && x < box.right - stage.left ? Math.max(0, box.bottom - stage.top) : 0) + 26;
   const taken = []; // boxes of labels that stand, the chosen ones first: none covers another
   const whole = [...at("labels").children].sort((one, other) => other.classList.contains("strong") - one.classList.contains("strong"));
   for (const shown of whole) {
@@ -96,10 +99,10 @@ function placed(place) {
     const { clientWidth: width } = at("labels");
     const half = shown.offsetWidth / 2 + 4;
     const x = right < 0 || left > width ? (left + right) / 2 : Math.max(half, Math.min(width - half, (left + right) / 2));
-    const top = Math.max(18, Math.min(...corners.map(corner => corner.y)) - 4);
+    const top = Math.max(roof(x), Math.min(...corners.map(corner => corner.y)) - 4);
     const tall = shown.offsetHeight + 2;
     const free = y => !taken.some(one => Math.abs(one.x - x) < one.half + half - 4 && Math.abs(one.y - y) < tall);
-    const y = [0, -1, 1, -2, 2, -3].map(step => top + step * tall).find(one => one >= 18 && free(one));
+    const y = [0, -1, 1, -2, 2, -3].map(step => top + step * tall).find(one => one >= roof(x) && free(one));
     shown.style.visibility = y === undefined ? "hidden" : "";
     if (!shown.hidden && y !== undefined) taken.push({ x, y, half });
     shown.style.transform = `translate(-50%, -100%) translate(${x.toFixed(1)}px, ${(y ?? top).toFixed(1)}px)`;
