@@ -432,6 +432,7 @@ class Version(BaseModel):
 
 # Questions: what liftcore declares, with the lift that is asked, its encoder, and bounds of HTTP
 
+QUESTIONS = 16  # that are exported together
 THE_LIFT = "the lift; may be left out when there is exactly one"
 
 
@@ -499,6 +500,26 @@ class AskedToSegment(Words, Seen):
     """Every splat's best word."""
 
     model_config = BUILT
+
+
+class NamedQuestion(Question):
+    """A question to a lift, and what files call its answer."""
+
+    model_config = BUILT
+    name: str | None = Field(None, min_length=1, max_length=LIFT_NAME_CHARACTERS, description="else its words")
+
+
+class AskedToExport(Words):
+    """What to take: the answers of questions, every splat's best word, or the things of the lift."""
+
+    model_config = BUILT
+    of: Literal["questions", "words", "things"] = Field("things", description="what the labels are")
+    questions: Annotated[list[NamedQuestion], Field(max_length=QUESTIONS, fail_fast=True)] = Field(
+        [], description="of `questions`: each is a class of the labels"
+    )
+    view: str | None = Field(
+        None, min_length=1, max_length=VIEW_CHARACTERS, description="whose masks alone are made; else of all"
+    )
 
 
 class AskedWhat(Words):

@@ -18,6 +18,7 @@ import threading
 import traceback
 import zlib
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -89,6 +90,7 @@ class Answers:
             "regions": self._regions,
             "device": self._device,
             "edit": self._edit,
+            "export": self._export,
             "count_objects": self._count_objects,
         }
 
@@ -336,6 +338,22 @@ class Answers:
         count, box = int(selection.splats.sum()), selection.box
         told = None if box is None else {"low": box.low, "high": box.high}
         return Frame({"edit": edit.described(), "count": count, "box": told}, zlib.compress(selection.bits))
+
+    def _export(self, request: dict[str, Any]) -> Frame:
+        """A ZIP of answers, of words or of things, in the draft."""
+        source: Any
+        if request["of"] == "questions":
+            source = {part["name"]: self._answer(part["request"]) for part in request["parts"]}
+        elif request["of"] == "words":
+            source = self._named(request)
+        else:
+            found = self._named_objects(request)
+            given = {thing: {"name": name} for thing, (name, _) in request["things"] if name is not None}
+            things = [one.model_copy(update=given.get(one.id)) for one in found.objects]
+            source = replace(found, objects=tuple(things))
+        blocks = self._scene(request).blocks_of(source, "bundle", view=request["of_view"])
+        write_draft(blocks, Path(request["draft"]))
+        return Frame({})
 
     def _count_objects(self, request: dict[str, Any]) -> Frame:
         views = self._scene(request).object_views

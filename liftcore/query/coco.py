@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,11 +16,20 @@ if TYPE_CHECKING:
     from liftcore.io.labels import Labels
 
 
-def masks_json(scene: OpenedLift, labels: Labels) -> Iterator[bytes]:
-    """The masks of all instances in the views that were lifted, in blocks, a view at a time.
+def masks_json(
+    scene: OpenedLift,
+    labels: Labels,
+    views: Sequence[str] | None = None,
+    on_view: Callable[[str, np.ndarray], None] | None = None,
+) -> Iterator[bytes]:
+    """The masks of all instances in views, in blocks, a view at a time.
 
     A pixel is of the instance with the most weight on its ray, in the photo's own pixels. Masks are uncompressed run
     lengths, column by column. ``image_id`` counts from 1, ``category_id`` is the class, 0 without a name.
+
+    Args:
+        views: their names; None: those that were lifted. on_view: is given each with the instances [H, W] i32 of its
+            pixels, 0 for none, before its block.
 
     Raises:
         InvalidQuery: the labels have no instances.
@@ -36,16 +45,24 @@ def masks_json(scene: OpenedLift, labels: Labels) -> Iterator[bytes]:
         "info": {"description": "instances of a lift in its views", "contributor": labels.document["made_by"]},
         "categories": [{"id": number, "name": name} for number, name in sorted(kinds.items())],
     }
-    return _blocks(scene, labels.columns["instance_id"], instances, head)
+    chosen = scene.metadata.views if views is None else views
+    return _blocks(scene, labels.columns["instance_id"], instances, head, chosen, on_view)
 
 
 def _blocks(
-    scene: OpenedLift, numbers: np.ndarray, instances: dict[int, dict[str, Any]], head: dict[str, Any]
+    scene: OpenedLift,
+    numbers: np.ndarray,
+    instances: dict[int, dict[str, Any]],
+    head: dict[str, Any],
+    views: Sequence[str],
+    on_view: Callable[[str, np.ndarray], None] | None,
 ) -> Iterator[bytes]:
     images, count = [], 0
     yield json.dumps(head, ensure_ascii=False)[:-1].encode() + b', "annotations": ['
-    for place, view in enumerate(scene.metadata.views, 1):
+    for place, view in enumerate(views, 1):
         shown = value_map(scene, numbers, view)
+        if on_view is not None:
+            on_view(view, shown)
         height, width = shown.shape
         images.append({"id": place, "file_name": view, "width": width, "height": height})
         for number in np.unique(shown[shown > 0]).tolist():

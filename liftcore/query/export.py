@@ -7,7 +7,7 @@ file opens them, and they can be lifted again.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,9 +26,10 @@ if TYPE_CHECKING:  # these load torch
     from liftcore.query.segment import Segmentation
     from liftcore.scene.cameras import Camera
 
-OF_LABELS = ("labelled", "names", "lines", "masks")  # files of what every splat is
+OF_LABELS = ("labelled", "names", "lines", "masks", "bundle")  # files of what every splat is
 FILES = {  # of what a file is made -> the files that there are of it
     "answer": ("object", "coloured", "scores", "selection", "mask", "attention", "overlay", *OF_LABELS),
+    "answers": OF_LABELS,
     "segmentation": ("coloured", "labels", "picture", "splat_labels", *OF_LABELS),
     "object": ("object",),
     "catalogue": ("csv", *OF_LABELS),
@@ -37,12 +38,13 @@ FILES = {  # of what a file is made -> the files that there are of it
 
 BY_SUFFIX = {  # what a name asks for of many things
     **dict.fromkeys((".glb", ".usdc", ".usdz"), "labelled"), ".json": "masks", ".jsonl": "lines",
+    ".zip": "bundle",
 }  # fmt: skip
 
 
 def blocks_of(
     scene: OpenedLift,
-    source: Answer | Segmentation | Catalogue | int | None,
+    source: Answer | Mapping[str, Answer] | Segmentation | Catalogue | int | None,
     what: str = "",
     *,
     view: str | Camera | None = None,
@@ -55,14 +57,15 @@ def blocks_of(
     Arguments and errors are those of `Scene.blocks_of`; ``what`` is one of FILES.
     """
     kind = "object" if isinstance(source, int) else "scene" if source is None else type(source).__name__.lower()
-    usual = BY_SUFFIX.get(suffix) if kind in ("segmentation", "catalogue") else None
+    kind = "answers" if isinstance(source, Mapping) else kind
+    usual = BY_SUFFIX.get(suffix) if kind in ("segmentation", "catalogue", "answers") or suffix == ".zip" else None
     what = what or usual or FILES[kind][0]
     if what not in FILES[kind]:
         raise InvalidQuery("what", expected=f"one of {', '.join(FILES[kind])}", got=repr(what))
     if isinstance(source, int):
         return one_object_splats(scene, source, suffix or ".ply")
-    if source is not None and what in OF_LABELS:
-        return _of_labels(scene, source, what, suffix)
+    if isinstance(source, Mapping) or (source is not None and what in OF_LABELS):
+        return _of_labels(scene, source, what, suffix, view)
     if source is None:
         return _of_scene(scene, what, view, suffix)
     if isinstance(source, Catalogue):
@@ -121,13 +124,21 @@ def _of_words(scene: OpenedLift, found: Segmentation, what: str, view: str | Cam
 
 
 def _of_labels(
-    scene: OpenedLift, source: Answer | Segmentation | Catalogue, what: str, suffix: str
+    scene: OpenedLift,
+    source: Answer | Mapping[str, Answer] | Segmentation | Catalogue,
+    what: str,
+    suffix: str,
+    view: str | Camera | None,
 ) -> Iterable[bytes]:
     from liftcore.io.labels import document_bytes, document_lines
     from liftcore.io.splats import labelled
     from liftcore.query.labels import labels
 
     made = labels(scene, source)
+    if what == "bundle":
+        from liftcore.query.bundle import bundle
+
+        return bundle(scene, made, view if isinstance(view, str) else None)
     if what == "labelled":
         return labelled(scene.splat_file, made, suffix or ".ply")
     if what == "masks":

@@ -7,7 +7,7 @@ answer its texts as the one class and its objects as instances, a catalogue the 
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,27 +32,32 @@ FRAMES = {
 }
 
 
-def labels(scene: OpenedLift, source: Segmentation | Answer | Catalogue) -> Labels:
-    """The labels of a segmentation, of an answer, or of the objects of a lift.
+def labels(scene: OpenedLift, source: Segmentation | Answer | Mapping[str, Answer] | Catalogue) -> Labels:
+    """The labels of a segmentation, of answers, or of the objects of a lift.
 
     Of a segmentation ``class_id`` is the value of a splat's word (`Segmentation.values`), ``instance_id`` counts
     groups of splats of one word that touch (`liftcore.scene.touching`), with the most evidence first; groups with
     less than a twentieth of the evidence of their word's largest have a class alone. Of an answer every selected
-    splat has class 1, and the instances are its objects. Of a catalogue the instances are its objects, and the
-    classes their names; without names there are none. 0 is none of both. ``score`` is the cosine to the word, or the
-    answer's score. ``confidence`` is the lift's, where it was reweighted; other lifts have none.
+    splat has class 1, and the instances are its objects. Of several answers, by names, each is a class; a splat that
+    several select is of the one whose threshold it passes by most. Of a catalogue the instances are its objects, and
+    the classes their names; without names there are none. 0 is none of both. ``score`` is the cosine to the word, or
+    the answer's score. ``confidence`` is the lift's, where it was reweighted; other lifts have none.
 
     Raises:
         InvalidQuery: nothing was found, or more splats than objects are made of.
         InvalidLift: the splats moved or changed since the lift.
     """
     if scene.labelled is None or scene.labelled[0] is not source:
-        if isinstance(source, Answer):
-            made = _of_answer(scene, source)
+        if isinstance(source, Answer | Mapping):
+            made = _of_answers(scene, {_name(source): source} if isinstance(source, Answer) else source)
         else:
             made = _of_catalogue(scene, source) if isinstance(source, Catalogue) else _of_words(scene, source)
         scene.labelled = source, made
     return scene.labelled[1]  # type: ignore[no-any-return]
+
+
+def _name(answer: Answer) -> str:
+    return ", ".join(map(str, (*answer.query.positives, *answer.query.sets)))
 
 
 def _of_words(scene: OpenedLift, segmentation: Segmentation) -> Labels:
@@ -83,20 +88,32 @@ def _of_words(scene: OpenedLift, segmentation: Segmentation) -> Labels:
     return _labels(scene, values, instances, segmentation.score, classes, told)
 
 
-def _of_answer(scene: OpenedLift, answer: Answer) -> Labels:
-    if answer.dropped or not answer.count:
-        got = answer.why.rstrip(".") if answer.dropped else "none above the threshold"
+def _of_answers(scene: OpenedLift, answers: Mapping[str, Answer]) -> Labels:
+    found = {name: (one, objects(scene, one)) for name, one in answers.items() if one.count and not one.dropped}
+    if not found:
+        first = next(iter(answers.values()))
+        got = first.why.rstrip(".") if first.dropped else "none above the threshold"
         raise InvalidQuery("source", expected="an answer that found splats", got=got, hint="ask in other words")
-    found = objects(scene, answer)
-    name = ", ".join(map(str, answer.query.positives))
-    colours = cluster_colours(len(found.objects)).tolist()
-    told = []
-    for number in range(len(found.objects)):
-        one = {"instance_id": number + 1, "class_id": 1, "name": name, "question": name, "colour": colours[number]}
-        told.append(one | _facts(scene, np.flatnonzero(found.numbers == number), answer.scores))
-    classes = [{"class_id": 1, "name": name, "splats": answer.count, "question": name}]
-    chosen = answer.selected.astype(np.int32)
-    return _labels(scene, chosen, found.numbers + 1, np.where(answer.selected, answer.scores, 0), classes, told)
+    count = len(scene.features)
+    chosen, best = np.zeros(count, np.int32), np.full(count, -np.inf)
+    scores, instances = np.zeros(count, np.float32), np.zeros(count, np.int32)
+    for value, (answer, _) in enumerate(found.values(), 1):
+        cut = answer.threshold.value
+        over = (answer.scores - cut) / max(float(answer.scores.max()) - cut, 1e-9)  # as the page colours them
+        better = answer.selected & ((over > best) | (chosen == 0))
+        chosen[better], best[better], scores[better] = value, over[better], answer.scores[better]
+    colours = cluster_colours(sum(len(things.objects) for _, things in found.values())).tolist()
+    told, classes = list[dict[str, Any]](), list[dict[str, Any]]()
+    for value, (name, (answer, things)) in enumerate(found.items(), 1):
+        classes.append({"class_id": value, "name": name, "splats": int((chosen == value).sum()), "question": name})
+        for number in range(len(things.objects)):
+            rows = np.flatnonzero((things.numbers == number) & (chosen == value))
+            if not rows.size:
+                continue
+            instances[rows] = len(told) + 1
+            one = {"instance_id": len(told) + 1, "class_id": value, "name": name, "question": name}
+            told.append(one | {"colour": colours[len(told)]} | _facts(scene, rows, answer.scores))
+    return _labels(scene, chosen, instances, scores, classes, told)
 
 
 def _of_catalogue(scene: OpenedLift, catalogue: Catalogue) -> Labels:

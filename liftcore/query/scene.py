@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -35,7 +35,9 @@ if TYPE_CHECKING:  # these load torch
     from liftcore.scene.kernel import Kernel
     from liftcore.text import TextEncoder
 
-Source: TypeAlias = "Query | str | Answer | Segmentation | Catalogue | np.ndarray | int | None"  # of a file
+Source: TypeAlias = (  # of a file
+    "Query | str | Answer | Mapping[str, Answer] | Segmentation | Catalogue | np.ndarray | int | None"
+)
 
 
 class Scene(OpenedLift):
@@ -367,13 +369,14 @@ class Scene(OpenedLift):
         """Make a file, in blocks.
 
         Args:
-            source: a question or its answer, a segmentation, a catalogue, the id of an object of it, or an array;
-                None: the scene.
+            source: a question or its answer, answers by names, a segmentation, a catalogue, the id of an object of
+                it, or an array; None: the scene.
             what: of an answer object, coloured, scores, selection, mask, attention or overlay; of a segmentation
                 coloured, labels, picture or splat_labels; of a catalogue csv; of all three labelled (splats with
-                labels), names (what these mean), lines (an object a line, JSON) or masks (COCO's JSON, in the views);
-                of the scene what `render` draws, or splats; of an array npy, or mask of booleans [H, W]. Empty: the
-                first of these; of a segmentation or a catalogue as a .glb labelled, .json masks, .jsonl lines.
+                labels), names (what these mean), lines (an object a line, JSON), masks (COCO's JSON, in the views) or
+                bundle (all of it in a ZIP); of the scene what `render` draws, or splats; of an array npy, or mask of
+                booleans [H, W]. Empty: the first of these; of a segmentation or a catalogue as a .glb labelled, .json
+                masks, .jsonl lines; as a .zip the bundle.
             view: of pictures, as in `look`. suffix: of its name, where there are several formats.
             seen: the answer as the view shows it, where that is known. photo: of the view, for an overlay.
 

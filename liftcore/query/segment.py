@@ -263,16 +263,21 @@ def map_png(values: np.ndarray, segmentation: Segmentation) -> bytes:
 
     More than 255 words make a grey picture of 16 bits.
     """
+    return palette_png(values, [named.word for named in segmentation.found], segmentation.colours)
+
+
+def palette_png(values: np.ndarray, names: Sequence[str], colours: np.ndarray) -> bytes:
+    """The same of values [H, W] with their names, from 1, and colours [n + 1, 3] u8, from 0."""
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
     text, content = PngInfo(), io.BytesIO()
-    text.add_text("legend", json.dumps({place: named.word for place, named in enumerate(segmentation.found, 1)}))
-    if len(segmentation.found) > 255:
+    text.add_text("legend", json.dumps(dict(enumerate(names, 1))))
+    if len(names) > 255:
         picture = Image.fromarray(values.astype(np.uint16))
     else:
         picture = Image.fromarray(values.astype(np.uint8))
-        colours = segmentation.colours.copy()
+        colours = colours.copy()
         colours[0] = 0
         picture.putpalette(colours.tobytes())
     picture.save(content, format="PNG", pnginfo=text)

@@ -17,14 +17,14 @@ from liftcore.query.opened import OpenedLift
 from liftcore.query.question import Answer, Box, Query
 from liftcore.query.terms import PixelBox, SplatSet, Stroke
 from liftcore.runtime.one_line import one_line
-from liftcore.scene.touching import REACH, touching_pairs
+from liftcore.scene.touching import REACH, spreads_along, touching_pairs
 
 if TYPE_CHECKING:
     from liftcore.query.scene import Scene
     from liftcore.scene.cameras import Camera
 
 MOST_HISTORY = 100  # steps that are kept of a selection
-SEEN_BEFORE = 0.75  # of a ray's light: what lies behind so much is hidden by it
+SEEN_BEFORE = 0.75  # of a ray's light: where so much is lost, it meets a surface
 RAYS = 1 << 15  # that are looked along at once
 NEAR = 0.01  # in front of a camera, scene units
 BESIDE = 0.25  # of a selection's box, on each side: where splats that it may grow by are looked for,
@@ -208,8 +208,8 @@ def area_mask(area: PixelBox | Stroke, size: tuple[int, int], radius: float) -> 
 def splats_under(scene: OpenedLift, camera: Camera, mask: np.ndarray, *, through: bool = False) -> np.ndarray:
     """[P] bool, the splats whose centres a camera shows in a mask [H, W] bool of its image.
 
-    A splat is hidden where the ray through its centre has lost `SEEN_BEFORE` of its light before it; ``through``
-    takes hidden ones too.
+    A splat is hidden where it lies wholly, to `REACH` standard deviations, behind the splat at which the ray through
+    its centre has lost `SEEN_BEFORE` of its light; ``through`` takes hidden ones too.
 
     Raises:
         InvalidLift: the splats moved or changed since the lift.
@@ -234,8 +234,7 @@ def splats_under(scene: OpenedLift, camera: Camera, mask: np.ndarray, *, through
         found[ahead] = True
         return found
     rays, own = np.unique(pixels, return_inverse=True)
-    ray_of = np.full(len(found), -1, np.int64)
-    ray_of[ahead] = own
+    surface = np.full(len(rays), np.inf)  # depths
     for first in range(0, len(rays), RAYS):
         some = rays[first : first + RAYS]
         asked = np.stack([some % pinhole.width, some // pinhole.width], axis=1).astype(np.int32)
@@ -243,8 +242,10 @@ def splats_under(scene: OpenedLift, camera: Camera, mask: np.ndarray, *, through
         ends, splats, weights = (part.cpu().numpy() for part in (row.indptr, row.splats, row.weights))
         ray = np.repeat(np.arange(len(some)), np.diff(ends))
         sums = np.concatenate([[0.0], np.cumsum(weights, dtype=np.float64)])
-        before = sums[:-1] - sums[ends[:-1]][ray]
-        found[splats[(ray_of[splats] == ray + first) & (before < SEEN_BEFORE)]] = True
+        lost = np.flatnonzero(sums[1:] - sums[ends[:-1]][ray] >= SEEN_BEFORE)
+        np.minimum.at(surface, first + ray[lost], depth[splats[lost]])
+    reach = REACH * spreads_along(scene.splats, ahead, local.viewmat[2, :3])
+    found[ahead[depth[ahead] - reach <= surface[own]]] = True
     return found
 
 

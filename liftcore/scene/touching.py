@@ -77,6 +77,12 @@ def _touch(own: np.ndarray, near: np.ndarray) -> np.ndarray:
     return squares[0] + squares[1] + squares[2] <= reach
 
 
+def spreads_along(splats: Splats, rows: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """[n] f64, the standard deviations of splats [n] along a unit vector [3] of their frame."""
+    x, y, z = direction
+    return np.sqrt(np.maximum(_covariances(splats, rows) @ (x * x, y * y, z * z, x * y, x * z, y * z), 0.0))
+
+
 def _covariances(splats: Splats, rows: np.ndarray) -> np.ndarray:
     """[n, 6] f64, Sigma of each splat: xx, yy, zz, and twice xy, xz, yz."""
     scales = np.exp(splats.log_scales.cpu().numpy()[rows].astype(np.float64).clip(-MAX_LOG_SCALE, MAX_LOG_SCALE))

@@ -6,6 +6,7 @@ import asyncio
 import base64
 import hashlib
 import json
+import re
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -21,6 +22,7 @@ from service.content import BINARY, Draft, kept, unchanged
 from service.errors import InvalidRequest
 from service.models import (
     AskedForWords,
+    AskedToExport,
     AskedToRender,
     AskedToSegment,
     AskedWhat,
@@ -42,6 +44,8 @@ from service.store.lifts import LiftRecord
 
 # What routes ask of the query process: requests with the files of a lift and an encoder, and answers with a tag
 
+MASKED_VIEWS = 200  # of an export: more take minutes of the process that answers everybody
+EXPORT_BYTES = 16  # of a splat's labels
 ROW_BYTES, SCORE_BYTES = 32, 4  # of a splat in the .splat format, and in an array
 NUMBER_BYTES = 24  # of a number in JSON, at most
 NO_ENCODER: dict[str, Any] = {"encoder": None, "encoder_version": None}  # of a question without words
@@ -52,6 +56,7 @@ MEDIA_TYPES = {
     **dict.fromkeys(("mask", "attention", "render", "word_map", "word_picture", "region_mask"), PNG_TYPE),
     **dict.fromkeys(("catalogue", "segment", "tree"), JSON_TYPE),
     **dict.fromkeys(("splats", "scene"), BINARY),
+    "export": "application/zip",
 }
 
 
@@ -100,6 +105,9 @@ def made(deps: AppState, wanted: dict[str, Any], lift: LiftRecord, ask: Ask, hea
     match wanted["operation"]:
         case "splats":
             name, size = f"{wanted['what']}-{lift.id}.ply", deps.store.assets.get(deps.owner, lift.splats).bytes
+        case "export":
+            name = f"{wanted['name'] or 'splats'}-{lift.id}.zip"
+            size = deps.store.assets.get(deps.owner, lift.splats).bytes + EXPORT_BYTES * lift.count
         case "scene":
             name, size = f"scene-{lift.id}.splat", ROW_BYTES * lift.count
         case "scores" | "selection" | "layer" | "word_labels" if SCORE_BYTES * lift.count > PIPE_BYTES:
@@ -393,6 +401,33 @@ def picture(asked: AskedToSegment, deps: Deps, ask: Ask) -> Response:
     """A view tinted with the colours of its words, beside a drawn legend: a PNG."""
     lift = find_lift(asked.lift, deps)
     return made(deps, _word_request("word_picture", asked, lift, deps) | seen_from(asked), lift, ask, {})
+
+
+@router.post("/query/export", responses=bytes_of("application/zip"), response_class=Response)
+def export(asked: AskedToExport, deps: Deps, ask: Ask) -> Response:
+    """All of it in one ZIP: splats with labels, names, colours, boxes and counts, and masks of the views.
+
+    It holds `labels.ply`, `labels.json`, `instances.csv`, `legend.png`, `masks/VIEW.png`, `masks.json` (COCO) and
+    `truth.safetensors` (masks for a trade-off).
+    """
+    lift = find_lift(asked.lift, deps)
+    if asked.view is None and lift.view_count > MASKED_VIEWS:
+        expected, got = f"a view, of a lift with more than {MASKED_VIEWS}", f"none, and {lift.view_count} views"
+        raise InvalidRequest("view", expected=expected, got=got)
+    wanted: dict[str, Any] = scene_request("export", lift, deps) | NO_ENCODER | {"words": None}
+    title = [asked.of]
+    if asked.of == "questions":
+        if not asked.questions or any(one.lift not in (None, lift.id) for one in asked.questions):
+            raise InvalidRequest("questions", expected="a question or more, to the same lift", got="none, or others")
+        named = {one.name or ", ".join(map(shown, (*one.text, *one.like, *one.sets))): one for one in asked.questions}
+        parts = [{"name": name, "request": query_request("query", one, lift, deps)} for name, one in named.items()]
+        wanted, title = wanted | {"parts": parts}, list(named)
+    elif asked.of == "words" or asked.encoder is not None or asked.table is not None:
+        wanted = _word_request("export", asked, lift, deps)
+    name = "-".join(re.findall(r"[A-Za-z0-9]+", " ".join(title)))[:80]
+    things = list(deps.store.selections.things(deps.owner, lift.id).items())
+    wanted |= {"of": asked.of, "of_view": asked.view, "name": name, "things": things}
+    return made(deps, wanted, lift, ask, {})
 
 
 @router.post("/query/what", response_model=WhatAnswer)

@@ -115,8 +115,10 @@ def naming(method: str, path: str, job: str, asset: str, house: Guarded) -> list
         if path == "/tradeoff":
             wrong.append({"labels": {"masks": asset, "table": asset, "classes": ["apple"]}})
         return [{"json": house.body() | place} for place in wrong]
-    if method == "POST" and (path in ("/render", "/query/what") or path.startswith("/query/segment")):
-        own = {"/render": {"view": "left"}, "/query/what": {"example": "splat:1"}}
+    if method == "POST" and (
+        path in ("/render", "/query/what", "/query/export") or path.startswith("/query/segment")
+    ):
+        own = {"/render": {"view": "left"}, "/query/what": {"example": "splat:1"}, "/query/export": {"of": "things"}}
         return [{"json": own.get(path, {"words": ["apple"], "view": "left"}) | {"lift": job}}]
     if path.startswith("/query") or path == "/render":
         without_view = dict.fromkeys(

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import base64
+import csv
+import io
+import json
 import sqlite3
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,6 +15,9 @@ from typing import Any
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
+from PIL import Image
+from plyfile import PlyData
+from safetensors.numpy import load
 
 from service.store import selections as module
 from service.store.database import DATABASE, OF_0_4, TABLES_OF_0_4
@@ -202,3 +209,32 @@ def test_database_of_release_0_4_gets_the_tables_of_selections(tmp_path: Path) -
         with store.database.read() as connection:
             assert connection.execute("SELECT count(*) FROM selections").fetchone()[0] == 0
         store.close()
+
+
+def test_everything_comes_in_one_zip(client: TestClient, lift: dict[str, Any], route: str) -> None:
+    selection = begun(client, route, query={"sets": ["object:0"]})
+    asked = [{"text": [WORDS[2]], "threshold": 0.5}, {"name": "mine", "sets": [f"selection:{selection['id']}"]}]
+    reply = client.post("/query/export", json={"of": "questions", "questions": asked})
+    assert reply.status_code == 200 and 'filename="lamp-mine-' in reply.headers["content-disposition"]
+    with zipfile.ZipFile(io.BytesIO(reply.content)) as archive:
+        assert archive.testzip() is None
+        document = json.loads(archive.read("labels.json"))
+        assert [one["name"] for one in document["classes"]] == ["lamp", "mine"]
+        rows = PlyData.read(io.BytesIO(archive.read("labels.ply")))["vertex"].data
+        coco = json.loads(archive.read("masks.json"))
+        assert len(coco["images"]) == 3
+        table = list(csv.DictReader(io.StringIO(archive.read("instances.csv").decode())))
+        assert {row["name"]: int(row["splats"]) for row in table}["mine"] == (rows["class_id"] == 2).sum() > 0
+        with Image.open(io.BytesIO(archive.read("masks/middle.png"))) as picture:
+            mask, legend = np.asarray(picture), json.loads(picture.info["legend"])
+        (own,) = [one for one in coco["annotations"] if one["image_id"] == 2 and one["category_id"] == 1]
+        assert own["area"] == (mask == own["instance_id"]).sum() > 0 and legend[str(own["instance_id"])][:4] == "lamp"
+        truth = load(archive.read("truth.safetensors"))["middle/mask"]
+        assert ((truth == 0) == (mask == own["instance_id"])).all() and truth.min() == -1
+    assert client.patch(f"/lifts/{lift['id']}/objects/0", json={"name": "the mug"}).status_code == 200
+    things = client.post("/query/export", json={"view": "left"})
+    with zipfile.ZipFile(io.BytesIO(things.content)) as archive:
+        assert b"the mug" in archive.read("instances.csv")
+        assert [name for name in archive.namelist() if name.startswith("masks/")] == ["masks/left.png"]
+    client.patch(f"/lifts/{lift['id']}/objects/0", json={"name": None})
+    assert client.post("/query/export", json={"of": "questions"}).status_code == 422

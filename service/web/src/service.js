@@ -156,10 +156,10 @@ const plainly = text => text.replace(/(splats|cameras|features|table|masks|photo
 const sentence = text => `${text[0].toUpperCase()}${text.slice(1)}${/[.!?]$/.test(text) ? "" : "."}`;
 
 // What a link leads to, saved under its name.
-export async function save(path, fallback, body) {
+export async function save(path, fallback, body, ours = false) {
   const reply = await call(path, body && { method: "POST", body });
   const named = /filename="([^"]+)"/.exec(reply.headers.get("Content-Disposition") || "");
-  saveBlob(await reply.blob(), named ? named[1] : fallback);
+  saveBlob(await reply.blob(), named && !ours ? named[1] : fallback);
 }
 
 export function saveBlob(blob, name) {

@@ -1,5 +1,6 @@
 // The panel of taking away: files of the question on the screen, and the lines that ask it elsewhere.
 import { at, el, tell } from "./dom.js";
+import { label } from "./ask.js";
 import { search } from "./question.js";
 import { keyOf, save, saveBlob, words } from "./service.js";
 
@@ -8,6 +9,7 @@ export class Take {
     Object.assign(this, { ask, look, names, shot });
     for (const button of document.querySelectorAll("[data-take]")) button.addEventListener("click", () => this.take(button.dataset.take));
     at("shot").addEventListener("click", async () => saveBlob(await this.shot(), "splatlift.png"));
+    for (const [id, all] of [["take-everything", false], ["take-things", true]]) at(id).addEventListener("click", () => this.everything(all));
     at("copy-link").addEventListener("click", () => copied(location.href));
     for (const name of ["curl", "python"]) at(`copy-${name}`).addEventListener("click", () => copied(at(name).textContent));
   }
@@ -20,15 +22,31 @@ export class Take {
     return `${path}?${this.ask.parameters(question, more)}`;
   }
 
+  // One ZIP of all that is asked or named, or of the things of the scene.
+  async everything(things) {
+    const { questions, lift } = this.ask;
+    const named = this.names.shown ? { of: "words", ...this.names.asked } : { of: "questions", questions: questions.filter(({ answer }) => answer).map(one => ({ ...this.ask.body(one), name: label(one).slice(0, 100) })) };
+    const space = lift.text_space === "none" ? {} : { encoder: lift.text_space };
+    const body = { lift: lift.id, ...(things ? { of: "things", ...space } : named) };
+    tell("Making the ZIP: masks of all views take a while.");
+    try {
+      await save("/query/export", "splats.zip", body).catch(problem => (problem.argument === "encoder" ? save("/query/export", "splats.zip", { lift: lift.id, of: "things" }) : Promise.reject(problem)));
+      tell("The ZIP is here.");
+    } catch (problem) {
+      tell(words(problem), true);
+    }
+  }
+
   async take(what) {
     const view = this.look.view?.name;
     const [path, body, own] = {
       labels: ["/query/segment/labels", this.named(), "words.npy"], map: ["/query/segment/map", this.named(view), `words-${view}.png`],
       legend: ["/query/segment/picture", this.named(view), `legend-${view}.png`],
     }[what] || [];
-    const name = own || { scores: "scores.npy", mask: `mask-${this.look.view?.name}.png`, object: "object.ply", coloured: "scene.ply", boxes: "boxes.json" }[what];
+    const word = this.ask.now ? label(this.ask.now) : "scene";
+    const name = own || { scores: `${word}-scores.npy`, mask: `${word}-${this.look.view?.name}.png`, object: `${word}.ply`, coloured: `${word}-scores.ply`, boxes: `${word}-boxes.json` }[what];
     try {
-      await save(path || this.address(what), name.replaceAll("/", "-"), body);
+      await save(path || this.address(what), name.replaceAll(/[/\\:*?"<>|]/g, "-"), body, true);
     } catch (problem) {
       tell(words(problem), true);
     }
@@ -48,6 +66,8 @@ export class Take {
     at("take-none").hidden = ready;
     at("take-question").hidden = !ready;
     at("take-answer").hidden = named;
+    at("take-everything").hidden = !ready;
+    at("take-things").hidden = !lift?.links.objects;
     at("take-names").hidden = !named;
     if (!ready) return;
     const key = keyOf() ? ' -H "Authorization: Bearer $KEY"' : "";

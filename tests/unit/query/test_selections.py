@@ -12,6 +12,7 @@ from liftcore.errors import InvalidQuery, NotFound
 from liftcore.query.question import Query
 from liftcore.query.scene import Scene
 from liftcore.raster.reference import ReferenceRaster
+from liftcore.scene.cameras import Camera
 from liftcore.scene.touching import touching_pairs
 from tests.api.tiny_scene import SPLATS_A_CLUSTER as OF_A_CLUSTER
 
@@ -50,10 +51,11 @@ def test_edits_are_undone_and_redone_one_by_one(scene: Scene) -> None:
     assert not selection.undo().undo().undo().splats.any() and selection.history == ()
 
 
-@pytest.mark.parametrize("area", ["middle:box:4,2,15,20", "middle:stroke:4,4,28,20"])
+@pytest.mark.parametrize("area", ["camera:box:12,2,19,20", "camera:stroke:14,4,17,22"])
 def test_area_takes_the_splats_whose_centres_are_seen_there(area: str, scene: Scene) -> None:
-    # By the definition in float64: light is lost by all that a dense A has on the ray before the splat.
-    camera = scene.cameras["middle"]
+    # By the definition in float64: a dense A tells at which splat a ray has lost its light.
+    from_the_left = [[0, 0, 1, 4], [0, -1, 0, 0], [1, 0, 0, 5], [0, 0, 0, 1]]  # one cluster behind the other
+    camera = Camera.pinhole("camera", 32, 24, 60, 60, 16, 12, from_the_left)
     numbers = [int(one) for one in area.split(":")[2].split(",")]
     x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     if "box" in area:
@@ -62,7 +64,7 @@ def test_area_takes_the_splats_whose_centres_are_seen_there(area: str, scene: Sc
         ends = np.array(numbers, np.float64).reshape(2, 2)
         way = ends[1] - ends[0]
         share = np.clip(((x - ends[0, 0]) * way[0] + (y - ends[0, 1]) * way[1]) / (way @ way), 0, 1)
-        mask = np.hypot(x - ends[0, 0] - share * way[0], y - ends[0, 1] - share * way[1]) <= 4
+        mask = np.hypot(x - ends[0, 0] - share * way[0], y - ends[0, 1] - share * way[1]) <= 3
     places = scene.splats.means.numpy().astype(np.float64) @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     columns = np.floor(places[:, 0] / places[:, 2] * camera.fx + camera.cx).astype(int)
     lines = np.floor(places[:, 1] / places[:, 2] * camera.fy + camera.cy).astype(int)
@@ -74,12 +76,13 @@ def test_area_takes_the_splats_whose_centres_are_seen_there(area: str, scene: Sc
             continue
         through.append(int(splat))
         ray = slice(int(rays.indptr[splat]), int(rays.indptr[splat + 1]))
-        on_ray = rays.splats[ray].numpy()
-        before = float(rays.weights[ray].double().numpy()[places[on_ray, 2] < places[splat, 2]].sum())
-        expected += [int(splat)] if before < 0.75 else []
-    selection = scene.select("mine").edit("set", area=area, radius=4)
+        on_ray, weights = rays.splats[ray].numpy(), rays.weights[ray].double().numpy()
+        deep = [at for at in places[on_ray, 2] if weights[places[on_ray, 2] <= at].sum() >= 0.75]
+        near = places[splat, 2] - 2 * np.exp(scene.splats.log_scales[splat, 0].item())  # they are round
+        expected += [int(splat)] if near <= min(deep, default=np.inf) else []
+    selection = scene.select("mine").edit("set", area=area, radius=3, camera=camera)
     assert rows_of(selection.splats) == expected and 0 < len(expected) < len(through) < len(ALL)
-    assert rows_of(selection.edit("set", area=area, radius=4, through=True).splats) == through
+    assert rows_of(selection.edit("set", area=area, radius=3, camera=camera, through=True).splats) == through
 
 
 def test_selection_grows_and_shrinks_by_splats_that_touch(scene: Scene) -> None:
