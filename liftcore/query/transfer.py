@@ -8,7 +8,8 @@ mean S, and base colours in 0..1, the weight of an old splat k at a new one j is
 
 A new splat that is nearly one of the old takes from that one alone, so rows that a file keeps come back as they were.
 All others take the mean of what is per splat by w^2 over the 16 nearest old ones, and the cluster and object of the
-largest sum. What overlaps with none has no feature.
+largest sum. The evidence of an old splat is divided among those that take from it, so that decimated splats have that
+of all that they stand for. What overlaps with none has no feature.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ THINNEST = 0.02  # of a splat's largest scale, as which smaller ones count: flat
 STILL = 0.5  # share of a sample that has partners where it lies, from which the scene was not moved
 SAMPLE = 4_000
 _BLOCK = 1 << 12  # new splats at once: [n, 16, F] features in f32
-_VALUES = ("evidence", "agreement", "confidence")
+_VALUES = ("agreement", "confidence")
 
 
 @usual_modes()
@@ -149,6 +150,7 @@ def _mixed(lift: Lift, index: _Index, new: Splats, progress: Progress) -> tuple[
     )  # a splat's cluster, object and node go together
     elected = np.full(count, -1)
     seen, rows_of, mixed = np.zeros(count, bool), 0, 0
+    taken: list[tuple[np.ndarray, np.ndarray]] = []  # of each block
     old = {name: getattr(lift, name).cpu().numpy() for name in (*values, "seen")}
     own_tuple = own_tuple.reshape(-1)
     old_features = lift.features.cpu()
@@ -160,6 +162,7 @@ def _mixed(lift: Lift, index: _Index, new: Splats, progress: Progress) -> tuple[
         rows_of += int((top >= SAME).sum())
         mixed += int(((top < SAME) & (top >= LEAST_OVERLAP)).sum())
         shares /= np.maximum(shares.sum(axis=1, keepdims=True), 1e-300)
+        taken.append((near.astype(np.int32), shares.astype(np.float32)))
         known = shares * old["seen"][near]
         sums = known.sum(axis=1, keepdims=True)
         seen[rows] = sums[:, 0] >= 0.5
@@ -170,6 +173,7 @@ def _mixed(lift: Lift, index: _Index, new: Splats, progress: Progress) -> tuple[
         elected[rows] = _elected(own_tuple[near], shares)
         progress("transfer", rows.stop, count, "splats")
     features[~torch.from_numpy(seen)] = 0
+    values["evidence"] = _divided(lift.evidence.cpu().numpy(), *map(np.concatenate, zip(*taken, strict=True)))
     fields: dict[str, Any] = {"features": features, "seen": torch.from_numpy(seen)}
     fields |= {name: torch.from_numpy(column) for name, column in values.items()}
     labels = np.where(elected[:, None] >= 0, tuples[elected], -1).astype(np.int32)
@@ -187,3 +191,10 @@ def _elected(labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
     votes = (weights[:, :, None] * (labels[:, :, None] == labels[:, None, :])).sum(axis=1)
     best = np.take_along_axis(labels, votes.argmax(axis=1)[:, None], axis=1)[:, 0]
     return np.where(weights.any(axis=1), best, -1).astype(np.int32)
+
+
+def _divided(evidence: np.ndarray, near: np.ndarray, shares: np.ndarray) -> np.ndarray:
+    """[Q] f32: the evidence [P] of each old splat, divided among the new ones by their shares [Q, k] in it."""
+    whole = np.bincount(near.ravel(), shares.ravel().astype(np.float64), len(evidence))
+    each = np.divide(evidence, whole, out=np.zeros(len(evidence)), where=whole > 0)
+    return (shares * each[near]).sum(axis=1).astype(np.float32)
