@@ -278,7 +278,7 @@ def _numbers(word: str) -> Iterator[str]:
 def _heads(text: str) -> Iterator[str]:
     """Parts of a phrase that may name its thing, the likeliest first."""
     parts = [part.strip(_AROUND) for part in plain(text).split()]
-    while parts and parts[-1] in _LAST:
+    while parts and (parts[-1] in _LAST or (len(parts) > 1 and parts[-1] in _PARTS)):
         parts.pop()
     # A question's own words come before its thing: of "where is the cat" the last words are tried alone.
     behind = next((place for place, part in enumerate(parts) if part in _BEHIND and place > 0), len(parts))

@@ -40,7 +40,7 @@ def test_every_word_of_a_table_is_asked_as_it_is() -> None:
         ("cherries", "cherry", "number"), ("trouser", "trousers", "number"), ("donuts", "doughnut", "synonym"),
         ("the red cup", "cup", "head"), ("a small toy car", "car (automobile)", "head"),
         ("my old sneakers", "shoe", "head"), ("a photo of two cows", "cow", "head"), ("cup of tea", "cup", "head"),
-        ("slice of pizza", "pizza", "head"), ("man with a hat", "person", "head"),
+        ("slice of pizza", "pizza", "head"), ("a pizza slice", "pizza", "head"), ("man with a hat", "person", "head"),
         ("the cat on the mat", "cat", "head"), ("where is the cat?", "cat", "head"),
         ("is there a dog here", "dog", "head"), ("the fish's tail", "fish", "head"),
         ("wooden boat", "boat", "head"),
