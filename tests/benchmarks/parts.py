@@ -68,22 +68,27 @@ def best_nodes(scene: Scene, truth: Truth, owners: np.ndarray) -> np.ndarray:
 def click_ious(scene: Scene, truth: Truth, owners: np.ndarray) -> dict[str, list[float]]:
     """What one click a part and held-out view finds."""
     found: dict[str, list[float]] = {"best": [], "best thing": [], "alone": []}
-    of_parts = np.stack([owners == one for one in range(int(owners.max()) + 1)], axis=1)
+    assert scene.node_parents is not None
+    parts, nodes = int(owners.max()) + 1, range(len(scene.node_parents))
+    of_parts = np.stack([owners == one for one in range(parts)], axis=1)
+    of_nodes = np.stack([scene.members(node) for node in nodes], axis=1)
     for view, classes in truth.held_out.items():
-        true, shown = masks(scene, of_parts, view), classes.numpy()
-        for one in range(of_parts.shape[1]):
-            if truth.words[one // PARTS] in CLOTHS or true[..., one].sum() < LEAST_PIXELS:
-                continue
-            x, y = innermost(true[..., one])
-            query = Query(like=[f"{view}:{x},{y}"], top=0)
-            sets = [scene.members(node.id) for node in candidates(scene, query)]
-            sets.append(ask(scene, query).selected)
-            seen = masks(scene, np.stack(sets, axis=1), view)
-            ious = [mask_iou(seen[..., k], true[..., one]) for k in range(len(sets))]
-            things = [mask_iou(seen[..., k], shown == one // PARTS) for k in range(len(sets) - 1)]
-            found["best"].append(max(ious[:-1], default=0.0))
+        seen = masks(scene, np.concatenate([of_parts, of_nodes], axis=1), view)
+        true, meant, shown = seen[..., :parts], seen[..., parts:], classes.numpy()
+        clicked = [
+            one
+            for one in range(parts)
+            if truth.words[one // PARTS] not in CLOTHS and true[..., one].sum() >= LEAST_PIXELS
+        ]
+        clicks = [Query(like=["{}:{},{}".format(view, *innermost(true[..., one]))], top=0) for one in clicked]
+        alone = masks(scene, np.stack([ask(scene, query).selected for query in clicks], axis=1), view)
+        for place, (one, query) in enumerate(zip(clicked, clicks, strict=True)):
+            sets = [node.id for node in candidates(scene, query)]
+            ious = [mask_iou(meant[..., node], true[..., one]) for node in sets]
+            things = [mask_iou(meant[..., node], shown == one // PARTS) for node in sets]
+            found["best"].append(max(ious, default=0.0))
             found["best thing"].append(max(things, default=0.0))
-            found["alone"].append(ious[-1])
+            found["alone"].append(mask_iou(alone[..., place], true[..., one]))
     return found
 
 
