@@ -94,6 +94,14 @@ def change_lift(lift: str, change: models.LiftChange, deps: Deps) -> models.Lift
     return shape_lift(deps.store.lifts.change(deps.owner, lift, change.model_dump(exclude_unset=True)))
 
 
+@router.delete("/lifts/{lift}", status_code=204, tags=["lifts"])
+def delete_lift(lift: str, deps: Deps) -> Response:
+    """Forget a lift, its selections and its job; what it was made of stays."""
+    found = deps.store.lifts.get(deps.owner, lift)
+    deps.store.jobs.delete(deps.owner, found.id, given_up=(models.JobKind.LIFT,))
+    return Response(status_code=204)
+
+
 @router.get("/lifts/{lift}", response_model=models.LiftResult, tags=["lifts"])
 def get_lift(lift: str, deps: Deps) -> models.LiftResult:
     """One lift: its settings, certificate and timings."""

@@ -184,7 +184,9 @@ def test_selection_belongs_to_whom_its_lift_does_and_goes_with_it(hers: Guarded)
     for method, path in (("GET", route), ("GET", own), ("DELETE", own), ("PATCH", own), ("POST", f"{own}/edits")):
         body = {"how": "grow"} if method == "POST" else {} if method == "PATCH" else None
         assert hers.ask("bob", method, path, json=body).status_code == 404
-    assert hers.ask("alice", "DELETE", f"/jobs/{hers.done}?with_lift=true").status_code == 204
+    assert hers.ask("bob", "DELETE", f"/lifts/{hers.done}").status_code == 404
+    assert hers.ask("alice", "DELETE", f"/lifts/{hers.done}").status_code == 204
+    assert hers.ask("alice", "GET", f"/jobs/{hers.done}").status_code == 404
     with hers.store.database.read() as connection:
         assert connection.execute("SELECT count(*) FROM selection_steps").fetchone()[0] == 0
 
