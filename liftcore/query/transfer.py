@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 import torch
 
+from liftcore.errors import InvalidSplats
 from liftcore.runtime.progress import Progress, silent
 from liftcore.runtime.torch_modes import usual_modes
 from liftcore.scene.neighbours import COLOUR_WIDTH, base_colours
@@ -40,7 +41,9 @@ NEIGHBOURS = 16  # old splats that a new one may take from
 SAME = 0.9  # overlap and likeness from which two splats are one
 LEAST_OVERLAP = 0.05  # of a partner
 THINNEST = 0.02  # of a splat's largest scale, as which smaller ones count: flat ones overlap, too
-STILL = 0.5  # share of a sample that has partners where it lies, from which the scene was not moved
+STILL = 0.9  # share of a sample that has partners where it lies, from which no move is looked for
+UNLIKELY = 0.5  # share below which the scene must have been moved
+GAIN = 0.1  # of that share, by which a move must do better than none
 SAMPLE = 4_000
 _BLOCK = 1 << 12  # new splats at once: [n, 16, F] features in f32
 _VALUES = ("agreement", "confidence")
@@ -66,8 +69,7 @@ def transfer(lift: AnyLift, old: Splats, new: Splats, matrix: Any = None, progre
     lift.require_splats(old)
     move = None if matrix is None else Similarity.of(matrix)
     index = _Index(old)
-    if move is None and index.share_of_partners(new) < STILL:
-        move = find_similarity(old, new)
+    move = _found_move(index, old, new) if move is None else move
     seen_from = new if move is None else new.transformed(**_inverse(move))
     fields, counts = _mixed(lift, index, seen_from, progress)
     facts: dict[str, Any] = {"from_splats": lift.features.shape[0], **counts, "moved": None}
@@ -81,6 +83,24 @@ def transfer(lift: AnyLift, old: Splats, new: Splats, matrix: Any = None, progre
     changes |= {"origin": new.origin, "settings": lift.settings.model_copy(update={"kernel": str(new.kernel)})}
     changes |= {} if move is None else {"cameras": NO_FILE, "poses": ""}
     return replace(lift, **fields, metadata=lift.metadata.model_copy(update=changes))
+
+
+def _found_move(index: _Index, old: Splats, new: Splats) -> Similarity | None:
+    """The similarity that brings clearly more new splats to partners than lie beside one; None if none does.
+
+    Raises:
+        InvalidSplats: few have a partner where they lie, and no similarity is clear.
+    """
+    share = index.share_of_partners(new)
+    if share >= STILL:
+        return None
+    try:
+        move = find_similarity(old, new)
+    except InvalidSplats:
+        if share < UNLIKELY:
+            raise
+        return None
+    return move if index.share_of_partners(new, move) > share + GAIN else None
 
 
 def _inverse(move: Similarity) -> dict[str, Any]:
@@ -106,35 +126,64 @@ class _Index:
             rows = slice(first, min(first + _BLOCK, len(means)))
             near = self.tree.query(means[rows], min(NEIGHBOURS, len(self.means)), workers=-1)[1]
             near = near.reshape(rows.stop - first, -1)
-            weights = _overlaps(means[rows, None] - self.means[near], shapes[rows, None], self.shapes[near])
+            weights = _overlaps(means[rows, None] - self.means[near], shapes[:, rows, None], self.shapes[:, near])
             if colours is not None and self.colours is not None:
                 apart = ((colours[rows, None] - self.colours[near]) ** 2).sum(axis=2)
                 weights *= np.exp(-0.5 * apart / COLOUR_WIDTH**2)
             yield rows, near, weights
 
-    def share_of_partners(self, new: Splats) -> float:
-        """The share of a sample of new splats that overlaps with an old one where it lies."""
+    def share_of_partners(self, new: Splats, move: Similarity | None = None) -> float:
+        """The share of a sample of new splats that overlaps with an old one, where it lies or before it was moved."""
         some = new[np.linspace(0, new.count - 1, min(SAMPLE, new.count)).astype(int)]
+        some = some if move is None else some.transformed(**_inverse(move))
         return float(np.mean(np.concatenate([w.max(axis=1) >= LEAST_OVERLAP for _, _, w in self.partners(some)])))
 
 
 def _covariances(splats: Splats) -> np.ndarray:
-    """[P, 3, 3] f64, with scales of at least THINNEST of a splat's largest."""
+    """[6, P] f64, xx xy xz yy yz zz, with scales of at least THINNEST of a splat's largest."""
     logs = splats.log_scales.cpu().numpy().astype(np.float64).clip(-80, 80)
     scales = np.exp(np.pad(logs, ((0, 0), (0, 3 - logs.shape[1])), constant_values=-80))
     scales = np.maximum(scales, THINNEST * scales.max(axis=1, keepdims=True))
     axes = rotation_matrices(splats.quats.cpu().numpy()) * scales[:, None]
-    return axes @ axes.swapaxes(1, 2)
+    return np.stack([(axes[:, i] * axes[:, j]).sum(axis=1) for i in range(3) for j in range(i, 3)])
 
 
 def _overlaps(apart: np.ndarray, own: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """[n, k] f64 in 0..1, Bhattacharyya's coefficients of Gaussians by their centres' differences and covariances."""
+    """[n, k] f64 in 0..1, Bhattacharyya's coefficients of Gaussians.
+
+    Args:
+        apart: [n, k, 3], differences of centres. own: [6, n, 1] and other: [6, n, k], covariances (`_covariances`).
+    """
     middle = (own + other) / 2
-    determinants = [np.linalg.det(shapes) for shapes in (own, other, middle)]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        sizes = (determinants[0] * determinants[1] / determinants[2] ** 2) ** 0.25
-        squares = (apart * np.linalg.solve(middle, apart[..., None])[..., 0]).sum(axis=2)
+        determinant = _determinants(middle)
+        sizes = (_determinants(own) * _determinants(other) / determinant**2) ** 0.25
+        squares = (_cofactors(middle) * _products(np.moveaxis(apart, -1, 0))).sum(axis=0) / determinant
         return np.nan_to_num(sizes * np.exp(-squares / 8))
+
+
+def _determinants(shapes: np.ndarray) -> np.ndarray:
+    return (_cofactors(shapes)[:3] * shapes[:3]).sum(axis=0)
+
+
+def _cofactors(shapes: np.ndarray) -> np.ndarray:
+    """[6, ...], of symmetric matrices [6, ...]: their inverses times their determinants."""
+    xx, xy, xz, yy, yz, zz = shapes
+    sides = (
+        yy * zz - yz**2,
+        xz * yz - xy * zz,
+        xy * yz - xz * yy,
+        xx * zz - xz**2,
+        xy * xz - xx * yz,
+        xx * yy - xy**2,
+    )
+    return np.stack(sides)
+
+
+def _products(vectors: np.ndarray) -> np.ndarray:
+    """[6, ...], what symmetric matrices are weighted by in v^T S v, of vectors [3, ...]."""
+    x, y, z = vectors
+    return np.stack([x * x, 2 * x * y, 2 * x * z, y * y, 2 * y * z, z * z])
 
 
 def _mixed(lift: Lift, index: _Index, new: Splats, progress: Progress) -> tuple[dict[str, Any], dict[str, int]]:
@@ -159,18 +208,23 @@ def _mixed(lift: Lift, index: _Index, new: Splats, progress: Progress) -> tuple[
         top = np.take_along_axis(overlaps, best[:, None], axis=1)
         alone = np.arange(near.shape[1]) == best[:, None]
         shares = np.where(top >= SAME, alone, overlaps**2 * (overlaps >= LEAST_OVERLAP))
-        rows_of += int((top >= SAME).sum())
-        mixed += int(((top < SAME) & (top >= LEAST_OVERLAP)).sum())
         shares /= np.maximum(shares.sum(axis=1, keepdims=True), 1e-300)
         taken.append((near.astype(np.int32), shares.astype(np.float32)))
         known = shares * old["seen"][near]
-        sums = known.sum(axis=1, keepdims=True)
-        seen[rows] = sums[:, 0] >= 0.5
-        known = torch.from_numpy((known / np.maximum(sums, 1e-300)).astype(np.float32))
-        features[rows] = torch.einsum("nk,nkf->nf", known, old_features[near].float()).to(features.dtype)
+        sums = known.sum(axis=1)
+        seen[rows] = sums >= 0.5
+        is_row, is_mixed = top[:, 0] >= SAME, (top[:, 0] < SAME) & (top[:, 0] >= LEAST_OVERLAP)
+        rows_of, mixed = rows_of + int(is_row.sum()), mixed + int(is_mixed.sum())
+        own = near[is_row, best[is_row]]
+        features[rows.start + np.flatnonzero(is_row)] = old_features[own]
+        elected[rows][is_row] = own_tuple[own]
+        several = rows.start + np.flatnonzero(is_mixed)
+        known = torch.from_numpy((known[is_mixed] / np.maximum(sums[is_mixed, None], 1e-300)).astype(np.float32))
+        mixture = torch.einsum("nk,nkf->nf", known, old_features[near[is_mixed]].float())
+        features[several] = mixture.to(features.dtype)
+        elected[several] = _elected(own_tuple[near[is_mixed]], shares[is_mixed])
         for name, column in values.items():
             column[rows] = (shares * old[name][near]).sum(axis=1)
-        elected[rows] = _elected(own_tuple[near], shares)
         progress("transfer", rows.stop, count, "splats")
     features[~torch.from_numpy(seen)] = 0
     values["evidence"] = _divided(lift.evidence.cpu().numpy(), *map(np.concatenate, zip(*taken, strict=True)))
