@@ -15,6 +15,7 @@ from typing import Any, Self
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 PATIENCE_SECONDS = 60.0  # for what takes a second; the machine may be busy
+AXE = (Path(__file__).parent / "axe.min.js").read_text(encoding="utf-8")
 OPTIONS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
     "--disable-background-networking", "--disable-component-update", "--disable-dev-shm-usage",
@@ -130,6 +131,12 @@ class Browser:
         self._call("Emulation.setEmulatedMedia", features=[
             {"name": "prefers-color-scheme", "value": scheme}, {"name": "prefers-reduced-motion", "value": "reduce"},
         ])  # fmt: skip
+
+    def violations(self) -> dict[str, list[str]]:
+        """What axe finds on the page that is not minor: elements by rule."""
+        self.value(f"(() => {{ {AXE}; }})()")
+        found = self.value("axe.run(document).then(all => all.violations)")
+        return {rule["id"]: [node["html"] for node in rule["nodes"]] for rule in found if rule["impact"] != "minor"}
 
     def give(self, selector: str, files: list[Path]) -> None:
         """Choose files in an input for them."""

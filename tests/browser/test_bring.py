@@ -49,6 +49,12 @@ def empty(browser: Browser, files: dict[str, Path], tmp_path: Path) -> Iterator[
         browser.open("about:blank#")
 
 
+@pytest.mark.parametrize("scheme", ["dark", "light"])
+def test_accessibility_check_finds_nothing_serious_on_the_first_screen(empty: Browser, scheme: str) -> None:
+    empty.window(1280, 800, scheme)
+    assert empty.violations() == {}
+
+
 def test_dropped_files_are_planned_compared_and_cancelled(empty: Browser, files: dict[str, Path]) -> None:
     empty.drop([files[kind] for kind in ("splats", "cameras", "features")])
     empty.until("!document.querySelector('#plan-it').disabled")

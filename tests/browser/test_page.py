@@ -17,7 +17,6 @@ from .browser import Browser
 from .conftest import Served, browsing
 from .looking import AMBER, FOUND, READY, SKY, TROUBLE, ask, columns, splat_at, text_of
 
-AXE = (Path(__file__).parent / "axe.min.js").read_text(encoding="utf-8")
 EXAMPLES = "splatlift.ask.questions.flatMap(asked => [...asked.like, ...asked.unlike.map(term => `not ${term}`)])"
 SETS = "splatlift.ask.questions.flatMap(asked => asked.sets)"
 WORDS = "splatlift.ask.questions.flatMap(asked => asked.text)"
@@ -462,15 +461,13 @@ def test_page_without_webgl_shows_the_views(served: Served, tmp_path: Path) -> N
 def test_accessibility_check_finds_nothing_serious(page: Browser, scheme: str) -> None:
     page.window(1280, 800, scheme)
     ask(page, "lamp")
-    page.value(f"(() => {{ {AXE}; }})()")
+    page.value("(() => { splatlift.ask.now.answer.rivals = ['book']; splatlift.ask.show(); })()")  # not sure
     for tab in ("ask", "name", "look", "bring", "take"):
         page.press(f"#tab-{tab}")
         if tab == "name":
             page.press("#naming button.main")
             page.until("document.querySelector('#legend button')")
-        found = page.value("axe.run(document).then(all => all.violations)")
-        told = {rule["id"]: [node["html"] for node in rule["nodes"]] for rule in found if rule["impact"] != "minor"}
-        assert told == {}, tab
+        assert page.violations() == {}, tab
 
 
 def test_nothing_is_wider_than_the_window(page: Browser) -> None:
