@@ -122,54 +122,50 @@ def smooth(
     has_evidence, has_feature = weights > 0, weights > 0
     for rows, _ in rings:
         has_feature[rows] = True
-    order, (count, channels) = torch.from_numpy(graph.order).long(), X.shape
+    count, channels = X.shape
     squares, steps, residual = np.zeros((2, channels)), list[Step](), 0.0
     card = None if device.kind == "cpu" else system.on_card(device.place)
-    block = BLOCK if card is None else card.channels
+    block = BLOCK if card is None else min(card.channels, channels)
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         if smoothness and has_evidence.any():
-            _, steps, residual = _conjugate_gradients(system, _probe(X, order, has_evidence, pool), pool)
+            _, steps, residual = _conjugate_gradients(system, _probe(X, graph.order, has_evidence, pool), pool)
+            staged = torch.empty(count, block, dtype=X.dtype)  # a block in the graph's order, in X's dtype
+            source, target = _in_words(X, staged)
+            values, *iterates = (np.zeros((count, block), np.float32) for _ in range(3 if card is None else 1))
         for begin in range(0, channels if smoothness and has_evidence.any() else 0, block):
-            columns = X[:, begin : begin + block]
-            width = columns.shape[1]
-            values = np.zeros((count, BLOCK if card is None else width), np.float32)
+            width = min(block, channels - begin)
 
-            def read(rows: slice, columns: Tensor = columns, values: np.ndarray = values) -> tuple[Any, Any]:
+            def read(rows: slice, begin: int = begin, width: int = width) -> tuple[np.ndarray, np.ndarray]:
                 """Take rows of X in the graph's order; their least and greatest value in each channel."""
-                own, part = has_evidence[rows], values[rows, : columns.shape[1]]
-                part[:] = columns.index_select(0, order[rows]).float().numpy()
-                part[~own] = 0.0
-                supported = part[own]
-                return supported.min(axis=0, initial=np.inf), supported.max(axis=0, initial=-np.inf)
+                take_rows(rows.start, rows.stop, graph.order, source, begin // block * target.shape[1], target)
+                torch.from_numpy(values[rows, :width]).copy_(staged[rows, :width])
+                low, high = np.full(width, np.inf, np.float32), np.full(width, -np.inf, np.float32)
+                bound_rows(rows.start, rows.stop, has_evidence, values, low, high)
+                for iterate in iterates:
+                    iterate[rows] = values[rows]
+                return low, high
 
             lows, highs = zip(*_map_rows(read, count, pool), strict=True)
             low, high = np.min(lows, axis=0), np.max(highs, axis=0)
             if card is None:
-                solution = _descend(system, values, steps, pool)
+                solution = _descend(system, values, iterates, steps, pool)
             else:
-                start = torch.from_numpy(values).to(device.place).double()
+                start = torch.from_numpy(values[:, :width]).to(device.place).double()
                 solution = card.descend(start, [(float(length), float(turn)) for length, turn in steps])
                 solution = solution.float().cpu().numpy()
-
-            def clip(
-                rows: slice, low: np.ndarray = low, high: np.ndarray = high, values: np.ndarray = solution
-            ) -> None:
-                part = values[rows, : low.size]
-                np.clip(part, low, high, out=part)
-
-            _map_rows(clip, count, pool)
-            squares[:, begin : begin + block] = _movement(system.weights, values, solution, pool)[:, :width]
+            arguments = system.weights, values, low, high, solution
+            squares[:, begin : begin + width] = _row_sums(clip_rows, arguments, (2, width), count, pool)
             for rows, shares in rings:
                 solution[rows] = shares @ solution
 
-            def write(rows: slice, columns: Tensor = columns, values: np.ndarray = solution) -> None:
+            def write(rows: slice, begin: int = begin, width: int = width, solution: np.ndarray = solution) -> None:
                 """Put rows into their places in X."""
-                own = has_feature[rows]
-                part = torch.from_numpy(values[rows][own, : columns.shape[1]]).to(X.dtype)
-                columns.index_copy_(0, order[rows][torch.from_numpy(own)], part)
+                staged[rows, :width].copy_(torch.from_numpy(solution[rows, :width]))
+                first_word = begin // block * target.shape[1]
+                put_rows(rows.start, rows.stop, graph.order, has_feature, target, first_word, source)
 
             _map_rows(write, count, pool)
-            progress("smooth", min(begin + block, channels), channels, "channels")
+            progress("smooth", begin + width, channels, "channels")
     moved, whole = squares.sum(axis=1).tolist()
     facts: dict[str, Any] = {
         "smoothness": smoothness,
@@ -204,7 +200,8 @@ def warm_up_smoothing() -> None:
     """Compile the kernels, or load them from the disk cache."""
     graph = SplatGraph.of(Splats(torch.eye(3), torch.zeros(3, 4), torch.zeros(3, 3), torch.zeros(3)), 1)
     ones = torch.ones(3)
-    smooth(torch.eye(3), graph, ones, None, ones > 0, 1.0, threads=1)
+    for X in (torch.eye(3), torch.eye(3).half()):
+        smooth(X, graph, ones, None, ones > 0, 1.0, threads=1)
 
 
 def smoothing_weights(evidence: Tensor, confidence: Tensor | None) -> np.ndarray:
@@ -250,12 +247,12 @@ def _rings(graph: SplatGraph, weights: np.ndarray) -> list[tuple[np.ndarray, Any
     return rings
 
 
-def _probe(X: Tensor, order: Tensor, known: np.ndarray, pool: Executor) -> np.ndarray:
+def _probe(X: Tensor, order: np.ndarray, known: np.ndarray, pool: Executor) -> np.ndarray:
     """[P, PROBES] f32, in the graph's order: sums of X's channels with random signs, zero where not known [P]."""
     signs = torch.from_numpy(np.random.default_rng(0).choice(np.array([-1.0, 1.0], np.float32), (X.shape[1], PROBES)))
 
     def add(rows: slice) -> np.ndarray:
-        return (X.index_select(0, order[rows]).float() @ signs).numpy()
+        return (X.index_select(0, torch.from_numpy(order[rows])).float() @ signs).numpy()
 
     sums = np.concatenate(_map_rows(add, len(X), pool))
     return np.where(known[:, None] & np.isfinite(sums), sums, np.float32(0.0))
@@ -294,9 +291,11 @@ def _conjugate_gradients(system: _System, start: np.ndarray, pool: Executor) -> 
     return X, steps, float(np.sqrt(slope / first)) if first > 0 else 0.0
 
 
-def _descend(system: _System, start: np.ndarray, steps: Sequence[Step], pool: Executor) -> np.ndarray:
-    """Take steps that are known from X0 [P, BLOCK] f32 on; [P, BLOCK] f32."""
-    graph, X, before = system.graph, start.copy(), start.copy()
+def _descend(
+    system: _System, start: np.ndarray, iterates: Sequence[np.ndarray], steps: Sequence[Step], pool: Executor
+) -> np.ndarray:
+    """Take steps that are known from X0 [P, BLOCK] f32 on; the one of two copies of it that is the last iterate."""
+    graph, (X, before) = system.graph, iterates
     arrays = graph.starts, graph.neighbours, system.couplings, system.weights, system.inverse, start.reshape(-1)
 
     def take(step: Step, X: np.ndarray, before: np.ndarray, rows: slice) -> None:
@@ -368,9 +367,65 @@ def turn_rows(first, last, inverse, turn, rest, direction, dots):
             direction[j, c] = inverse[j] * rest[j, c] + turn * direction[j, c]
 
 
-def _movement(weights: np.ndarray, before: np.ndarray, after: np.ndarray, pool: Executor) -> np.ndarray:
-    """[2, C] f64: ``sum_j w_j (x_j - x0_j)^2`` and ``sum_j w_j x0_j^2`` of each channel."""
-    return _row_sums(add_movement, (weights, before, after), (2, before.shape[1]), len(before), pool)
+def _in_words(*tables: Tensor) -> list[np.ndarray]:
+    """The same memory as integers: of 64 bits, where rows are a number of these, else of 16. They copy faster."""
+    arrays = [table.numpy() for table in tables]
+    whole = all(
+        size % 8 == 0
+        for array in arrays
+        for size in (array.ctypes.data, array.strides[0], array.shape[1] * array.itemsize)
+    )
+    return [array.view(np.int64 if whole else np.int16) for array in arrays]
+
+
+@kernel
+def take_rows(first, last, order, source, begin, target):
+    """Copy rows of X, in the graph's order, to rows first..last of a block; both in words, X's from ``begin`` on."""
+    for j in range(first, last):
+        row = order[j]
+        for word in range(min(target.shape[1], source.shape[1] - begin)):
+            target[j, word] = source[row, begin + word]
+
+
+@kernel
+def put_rows(first, last, order, has_feature, source, begin, target):
+    """Copy rows first..last of a block that have a feature back to their places in X, as `take_rows` took them."""
+    for j in range(first, last):
+        if has_feature[j]:
+            row = order[j]
+            for word in range(min(source.shape[1], target.shape[1] - begin)):
+                target[row, begin + word] = source[j, word]
+
+
+@kernel
+def bound_rows(first, last, has_evidence, values, low, high):
+    """Set rows first..last without evidence to zero; widen low and high [C] f32 by the others. NaN stays NaN."""
+    for j in range(first, last):
+        if not has_evidence[j]:
+            values[j] = 0.0
+            continue
+        for c in range(low.size):
+            value = values[j, c]
+            low[c] = value if value < low[c] or value != value else low[c]
+            high[c] = value if value > high[c] or value != value else high[c]
+
+
+@kernel
+def clip_rows(first, last, weights, before, low, high, after, sums):
+    """Clip rows first..last of ``after`` to low..high [C] f32; add what they moved, and what they were, to sums.
+
+    Sums [2, C] f64 are ``sum_j w_j (x_j - x0_j)^2`` and ``sum_j w_j x0_j^2`` of each channel.
+    """
+    for j in range(first, last):
+        for c in range(low.size):
+            value = after[j, c]
+            value = low[c] if value < low[c] or low[c] != low[c] else value
+            after[j, c] = high[c] if value > high[c] or high[c] != high[c] else value
+        for c in range(low.size):
+            value = np.float64(before[j, c])
+            apart = after[j, c] - value
+            sums[0, c] += weights[j] * apart * apart
+            sums[1, c] += weights[j] * value * value
 
 
 def _map_rows(work: Callable[[slice], Any], count: int, pool: Executor) -> list[Any]:
@@ -392,14 +447,3 @@ def _row_sums(
     for part in _map_rows(add, count, pool):
         total += part
     return total
-
-
-@kernel
-def add_movement(first, last, weights, before, after, sums):
-    """Add what rows first..last moved, and what they were, to sums [2, C] f64."""
-    for j in range(first, last):
-        for c in range(before.shape[1]):
-            value = np.float64(before[j, c])
-            apart = after[j, c] - value
-            sums[0, c] += weights[j] * apart * apart
-            sums[1, c] += weights[j] * value * value

@@ -27,8 +27,8 @@ class SmoothingSystem:
 
     @property
     def channels(self) -> int:
-        """How many are solved at a time."""
-        return max(TABLE_BYTES // (8 * max(len(self.weights), 1)), 1)
+        """How many are solved at a time: a multiple of four, which are at least 64 bits."""
+        return 4 * max(TABLE_BYTES // (32 * max(len(self.weights), 1)), 1)
 
     def descend(self, start: Tensor, steps: Sequence[tuple[float, float]]) -> Tensor:
         """Take steps that are known from X0 [P, C] f64 on; [P, C] f64."""
