@@ -1,6 +1,6 @@
 """Real networks on real photos: masks by HED, words by CenterNet, dense features by EfficientNet-Lite2.
 
-    python -m tests.benchmarks.real_chain ../shared/data/plush OUT [--every N] [--json]
+    python -m tests.benchmarks.real_chain ../shared/data/plush OUT [--every N] [--smoothness L ...] [--json]
 
 **A closed vocabulary: the 80 words of COCO are all that can be asked.** No CLIP is in it. CenterNet was trained to
 find these 80 classes, so a region's vector is its 80 scores, and a word's is the one-hot vector of its class.
@@ -28,6 +28,7 @@ import tarfile
 import tempfile
 import venv
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -338,8 +339,10 @@ def _picture(photo: Path, mask: np.ndarray, peak: tuple[int, int], boxes: Sequen
 def main() -> None:
     """Bring the networks, make the packs, lift them, ask, judge and print the table."""
     every = {"type": int, "default": 3, "metavar": "N", "help": "lift every Nth photo that is not held out"}
+    strengths = {"nargs": "+", "default": ["0"], "metavar": "L", "help": "of smooth features: numbers or auto"}
     places = (("folder", {"type": Path}), ("out", {"type": Path}))
-    options = command_line("tests.benchmarks.real_chain", __doc__, *places, ("--every", every)).parse_args()
+    given = *places, ("--every", every), ("--smoothness", strengths)
+    options = command_line("tests.benchmarks.real_chain", __doc__, *given).parse_args()
     folder, out = options.folder, options.out
     (out / "masks").mkdir(parents=True, exist_ok=True)
     networks = environment()
@@ -352,9 +355,11 @@ def main() -> None:
     save_file(table, out / "coco_words.safetensors", metadata={"words": json.dumps(COCO)})
     words = TableEncoder.open(out / "coco_words.safetensors")
     rows = [*of_photos(seen, photos)]
-    for name in PACKS:
-        _splatlift("lift", *scene_files(folder)[:2], _pack(out, name), "-o", out / f"{name}.lift.safetensors")
-        rows += of_lift(name, BY_WORD if name == "words" else BY_EXAMPLE, words, photos, out)
+    for pack, strength in product(PACKS, options.smoothness):
+        name = pack if strength == "0" else f"{pack}-smooth-{strength}"
+        lifted_to = "-o", out / f"{name}.lift.safetensors", "--set", f"smoothness={strength}"
+        _splatlift("lift", *scene_files(folder)[:2], _pack(out, pack), *lifted_to)
+        rows += of_lift(name, BY_WORD if pack == "words" else BY_EXAMPLE, words, photos, out)
     note = f"A closed vocabulary: the 80 words of COCO. {len(lifted)} photos lifted, {len(BOXES)} others judged."
     tell(rows, as_json=options.json, note=note, columns=("features", "asked", "box", "least", "inside", "points"))
 
