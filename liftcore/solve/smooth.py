@@ -406,8 +406,8 @@ def bound_rows(first, last, has_evidence, values, low, high):
             continue
         for c in range(low.size):
             value = values[j, c]
-            low[c] = value if value < low[c] or value != value else low[c]
-            high[c] = value if value > high[c] or value != value else high[c]
+            low[c] = value if value < low[c] or np.isnan(value) else low[c]
+            high[c] = value if value > high[c] or np.isnan(value) else high[c]
 
 
 @kernel
@@ -419,8 +419,8 @@ def clip_rows(first, last, weights, before, low, high, after, sums):
     for j in range(first, last):
         for c in range(low.size):
             value = after[j, c]
-            value = low[c] if value < low[c] or low[c] != low[c] else value
-            after[j, c] = high[c] if value > high[c] or high[c] != high[c] else value
+            value = low[c] if value < low[c] or np.isnan(low[c]) else value
+            after[j, c] = high[c] if value > high[c] or np.isnan(high[c]) else value
         for c in range(low.size):
             value = np.float64(before[j, c])
             apart = after[j, c] - value
