@@ -132,40 +132,42 @@ def smooth(
             staged = torch.empty(count, block, dtype=X.dtype)  # a block in the graph's order, in X's dtype
             source, target = _in_words(X, staged)
             values, *iterates = (np.zeros((count, block), np.float32) for _ in range(3 if card is None else 1))
-        for begin in range(0, channels if smoothness and has_evidence.any() else 0, block):
-            width = min(block, channels - begin)
+            for begin in range(0, channels, block):
+                width = min(block, channels - begin)
 
-            def read(rows: slice, begin: int = begin, width: int = width) -> tuple[np.ndarray, np.ndarray]:
-                """Take rows of X in the graph's order; their least and greatest value in each channel."""
-                take_rows(rows.start, rows.stop, graph.order, source, begin // block * target.shape[1], target)
-                torch.from_numpy(values[rows, :width]).copy_(staged[rows, :width])
-                low, high = np.full(width, np.inf, np.float32), np.full(width, -np.inf, np.float32)
-                bound_rows(rows.start, rows.stop, has_evidence, values, low, high)
-                for iterate in iterates:
-                    iterate[rows] = values[rows]
-                return low, high
+                def read(rows: slice, begin: int = begin, width: int = width) -> tuple[np.ndarray, np.ndarray]:
+                    """Take rows of X in the graph's order; their least and greatest value in each channel."""
+                    take_rows(rows.start, rows.stop, graph.order, source, begin // block * target.shape[1], target)
+                    torch.from_numpy(values[rows, :width]).copy_(staged[rows, :width])
+                    low, high = np.full(width, np.inf, np.float32), np.full(width, -np.inf, np.float32)
+                    bound_rows(rows.start, rows.stop, has_evidence, values, low, high)
+                    for iterate in iterates:
+                        iterate[rows] = values[rows]
+                    return low, high
 
-            lows, highs = zip(*_map_rows(read, count, pool), strict=True)
-            low, high = np.min(lows, axis=0), np.max(highs, axis=0)
-            if card is None:
-                solution = _descend(system, values, iterates, steps, pool)
-            else:
-                start = torch.from_numpy(values[:, :width]).to(device.place).double()
-                solution = card.descend(start, [(float(length), float(turn)) for length, turn in steps])
-                solution = solution.float().cpu().numpy()
-            arguments = system.weights, values, low, high, solution
-            squares[:, begin : begin + width] = _row_sums(clip_rows, arguments, (2, width), count, pool)
-            for rows, shares in rings:
-                solution[rows] = shares @ solution
+                lows, highs = zip(*_map_rows(read, count, pool), strict=True)
+                low, high = np.min(lows, axis=0), np.max(highs, axis=0)
+                if card is None:
+                    solution = _descend(system, values, iterates, steps, pool)
+                else:
+                    start = torch.from_numpy(values[:, :width]).to(device.place).double()
+                    solution = card.descend(start, [(float(length), float(turn)) for length, turn in steps])
+                    solution = solution.float().cpu().numpy()
+                arguments = system.weights, values, low, high, solution
+                squares[:, begin : begin + width] = _row_sums(clip_rows, arguments, (2, width), count, pool)
+                for rows, shares in rings:
+                    solution[rows] = shares @ solution
 
-            def write(rows: slice, begin: int = begin, width: int = width, solution: np.ndarray = solution) -> None:
-                """Put rows into their places in X."""
-                staged[rows, :width].copy_(torch.from_numpy(solution[rows, :width]))
-                first_word = begin // block * target.shape[1]
-                put_rows(rows.start, rows.stop, graph.order, has_feature, target, first_word, source)
+                def write(
+                    rows: slice, begin: int = begin, width: int = width, solution: np.ndarray = solution
+                ) -> None:
+                    """Put rows into their places in X."""
+                    staged[rows, :width].copy_(torch.from_numpy(solution[rows, :width]))
+                    first_word = begin // block * target.shape[1]
+                    put_rows(rows.start, rows.stop, graph.order, has_feature, target, first_word, source)
 
-            _map_rows(write, count, pool)
-            progress("smooth", begin + width, channels, "channels")
+                _map_rows(write, count, pool)
+                progress("smooth", begin + width, channels, "channels")
     moved, whole = squares.sum(axis=1).tolist()
     facts: dict[str, Any] = {
         "smoothness": smoothness,
