@@ -12,6 +12,11 @@ from liftcore.cli.reply import reply
 if TYPE_CHECKING:
     from liftcore import LiftSettings
 
+NO_LOOK = (
+    "smoothness adds no look: these shares are of what photos show, and splats that none of them sees take their "
+    "neighbours' features, still counted as unseen"
+)
+
 
 def add_arguments(parser: Parser) -> None:
     """The options of the command."""
@@ -48,5 +53,8 @@ def _photos(options: argparse.Namespace, settings: LiftSettings) -> int:
 
     splats = read_splats(options.splats, settings.kernel, colour=False)
     plan = plan_photos(splats, read_cameras(options.cameras), settings, threads=options.threads, progress=True)
-    reply(plan.facts(), as_json=options.json, lines=plan.lines(verbose=options.verbose))
+    lines = [*plan.lines(verbose=options.verbose)]
+    if settings.smoothness:
+        lines.append(NO_LOOK)
+    reply(plan.facts(), as_json=options.json, lines=lines)
     return 0
