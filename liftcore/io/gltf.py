@@ -29,7 +29,7 @@ from liftcore.errors import InvalidInput, InvalidSplats
 from liftcore.io.files import open_regular
 from liftcore.io.labels import COLUMN, IDS, KINDS
 from liftcore.io.ply import MODEL
-from liftcore.io.quantised import MOST_GROWTH, Fields, logits
+from liftcore.io.quantised import MOST_GROWTH, Fields, joined_fields, logits
 from liftcore.scene.harmonics import band_rotation
 from liftcore.scene.quaternions import product_matrix, rotation_matrices
 from liftcore.scene.render_mode import mode_of_word
@@ -71,26 +71,7 @@ def read_gltf(path: Path, *, colour: bool = True) -> Fields:
             files; or a node has a scale for each axis.
     """
     asset = _Asset(path)
-    parts = [asset.fields(matrix, primitive, colour=colour) for matrix, primitive in asset.splats()]
-    fields: Fields = {}
-    degrees = [part["sh"].shape[1] for part in parts if "sh" in part]
-    for name in parts[0]:
-        if name not in ("extras", "warnings", "render_mode"):
-            own = [part[name] for part in parts]
-            if name == "sh":
-                own = [np.pad(sh, ((0, 0), (0, max(degrees) - sh.shape[1]), (0, 0))) for sh in own]
-            fields[name] = own[0] if len(own) == 1 else np.concatenate(own)
-    fields["warnings"] = tuple(dict.fromkeys(text for part in parts for text in part["warnings"]))
-    fields["render_mode"] = parts[0]["render_mode"]
-    names = dict.fromkeys(name for part in parts for name in part["extras"])
-    counts = [len(part["means"]) for part in parts]
-    fields["extras"] = {
-        name: np.concatenate(
-            [part["extras"].get(name, np.zeros(n, np.int32)) for part, n in zip(parts, counts, strict=True)]
-        )
-        for name in names
-    }
-    return fields
+    return joined_fields([asset.fields(matrix, primitive, colour=colour) for matrix, primitive in asset.splats()])
 
 
 def read_gltf_document(path: Path) -> dict[str, Any]:

@@ -31,12 +31,12 @@ from liftcore.io.shards import INDEX
 from liftcore.io.sog import META, is_sog_document, sog_folder
 from liftcore.io.splat import looks_like_splat
 from liftcore.io.spz import begins_like_spz
+from liftcore.io.streamed_sog import LOD_META, is_streamed_document, streamed_folder
 from liftcore.io.transforms import FRAME_FILE
 from liftcore.scene.views import IMAGE_SUFFIXES
 
 LIFT_KEY = "splatlift"  # of the metadata of a lift
 PARTS = {"labels", "codebook", "grid"}  # of a feature pack's views
-LOD_META = "lod-meta.json"  # of a streamed SOG
 CAMERA_FILES = re.compile(
     r"(^|/)((cameras|images|frames|rigs)\.(bin|txt)|(dataparser_)?transforms[^/]*\.json|cameras\.json)$"
 )
@@ -71,6 +71,7 @@ class SplatFormat(StrEnum):
     SPLAT = ".splat"
     SPZ = ".spz"
     SOG = ".sog"
+    STREAMED_SOG = "streamed SOG"  # lod-meta.json and what it names, or a zip of them
     GLTF = ".glb"  # or .gltf, with KHR_gaussian_splatting
     USD = "USD"  # .usdc, .usda or .usdz with particle fields, which may lead to other files
     CHECKPOINT = "checkpoint"  # of gsplat or nerfstudio: a pickle, if only of tensors
@@ -82,6 +83,7 @@ SUFFIX = {
     SplatFormat.SPLAT: ".splat",
     SplatFormat.SPZ: ".spz",
     SplatFormat.SOG: ".sog",
+    SplatFormat.STREAMED_SOG: ".sog",
     SplatFormat.GLTF: ".glb",
     SplatFormat.USD: ".usdc",
     SplatFormat.CHECKPOINT: ".pt",
@@ -501,8 +503,7 @@ def _list_rules(document: list[Any]) -> Iterator[FileKind | None]:
 def _object_rules(document: dict[str, Any], path: Path) -> Iterator[FileKind | None]:
     keys = document.keys()
     yield _splats_as(SplatFormat.SOG) if is_sog_document(document) else None
-    is_streamed = keys >= {"tree", "filenames"} or path.name == LOD_META
-    yield _streamed(f"a streamed SOG ({LOD_META})", path) if is_streamed else None
+    yield _splats_as(SplatFormat.STREAMED_SOG) if is_streamed_document(document) else None
     frames = document.get("frames")
     first = frames[0] if isinstance(frames, list) and frames and isinstance(frames[0], dict) else {}
     yield _cameras_of("sdfstudio") if {"rgb_path", "camtoworld"} <= first.keys() else None
@@ -526,10 +527,6 @@ def _object_rules(document: dict[str, Any], path: Path) -> Iterator[FileKind | N
     yield FileKind(None, f"an answer of a server ({str(document)[:TEXT_SHOWN]!r})", DOWNLOAD) if is_answer else None
     some = ", ".join(map(str, list(keys)[:5]))[:TEXT_SHOWN]
     yield FileKind(None, f"a JSON object with {some or 'nothing'}", recognised=False)
-
-
-def _streamed(name: str, path: Path | str) -> FileKind:
-    return FileKind(None, name, f"make one file of it: npx @playcanvas/splat-transform {path} OUT.ply")
 
 
 def _is_sog(path: Path) -> bool:
@@ -565,12 +562,12 @@ def _of_names_in_zip(names: list[str], head_of: Callable[[str], bytes]) -> Itera
     lasts = {name.rpartition("/")[2] for name in names}
     suffixes = {PurePosixPath(last).suffix.lower() for last in lasts}
     yield FileKind(None, "a zip without a file", "zip or export it again") if not names else None
+    yield _splats_as(SplatFormat.STREAMED_SOG) if streamed_folder(names) is not None else None
     yield _splats_as(SplatFormat.SOG) if sog_folder(names) is not None else None
     yield _splats_as(SplatFormat.CHECKPOINT) if any(name.endswith("/data.pkl") for name in names) else None
     yield _splats_as(SplatFormat.USD) if names[0].lower().endswith((".usd", ".usda", ".usdc")) else None
     hint = "save each as .npy; 'splatlift pack npy' makes a feature pack of them"
     yield FileKind(None, "NumPy arrays (.npz)", hint) if suffixes == {".npy"} else None
-    yield _streamed(f"a zip of a streamed SOG ({LOD_META})", f"(unzipped) {LOD_META}") if LOD_META in lasts else None
     yield _BY_SUFFIX[".ssproj"] if "document.json" in lasts and ".ply" in suffixes else None
     splats = _splat_files(names, lambda name: _begins_with_splats(head_of(name)))
     is_cameras = any(CAMERA_FILES.search(name.replace("\\", "/")) for name in names)
@@ -624,8 +621,7 @@ def _folder_rules(path: Path) -> Iterator[FileKind | None]:
     yield _splats_as(SplatFormat.SOG) if (path / META).is_file() and _is_sog(path / META) else None
     yield FileKind("lift", "lift") if (path / INDEX).is_file() else None
     yield _splats_as(SplatFormat.CHECKPOINT) if len(rank_files(path)) > 1 else None
-    is_streamed = (path / LOD_META).is_file()
-    yield _streamed(f"a folder of a streamed SOG ({LOD_META})", path / LOD_META) if is_streamed else None
+    yield _splats_as(SplatFormat.STREAMED_SOG) if (path / LOD_META).is_file() else None
     names = _names_below(path)
     splats = _splat_files(names, lambda name: _has_splats(path / name))
     named = _folder_name(names, splats)

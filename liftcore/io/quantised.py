@@ -7,7 +7,7 @@ splats as 3D Gaussians (`gaussian_rows`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -52,6 +52,35 @@ def field_shapes(sh_rows: int) -> dict[str, tuple[int, ...]]:
     """The fields of splats with K rows of harmonics, none of which are read where K is 0."""
     shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": ()}
     return shapes | ({"sh": (sh_rows, 3)} if sh_rows else {})
+
+
+def joined_fields(parts: Sequence[Fields]) -> Fields:
+    """The fields of several sets of splats as those of one, in their order.
+
+    Harmonics have the largest degree, and further columns are 0 where a part has none. What the parts say of their
+    training is of the first.
+    """
+    fields: Fields = {}
+    for name in parts[0]:
+        own = [part[name] for part in parts]
+        if name == "warnings":
+            fields[name] = tuple(dict.fromkeys(text for texts in own for text in texts))
+        elif name == "render_mode":
+            fields[name] = own[0]
+        elif name == "extras":
+            counts = [len(part["means"]) for part in parts]
+            names = dict.fromkeys(key for some in own for key in some)
+            zeros = [np.zeros(count, np.int32) for count in counts]
+            fields[name] = {
+                key: np.concatenate([some.get(key, none) for some, none in zip(own, zeros, strict=True)])
+                for key in names
+            }
+        else:
+            if name == "sh":
+                most = max(sh.shape[1] for sh in own)
+                own = [np.pad(sh, ((0, 0), (0, most - sh.shape[1]), (0, 0))) for sh in own]
+            fields[name] = own[0] if len(own) == 1 else np.concatenate(own)
+    return fields
 
 
 def logits(alpha: np.ndarray) -> np.ndarray:

@@ -44,14 +44,28 @@ def read_sog(path: Path, *, colour: bool = True) -> Fields:
         if not is_bundled(path):
             meta, folder = _meta_of(path), _meta_of(path).parent
             size = sum(file.stat().st_size for file in sog_files(path))
-            return _Pictures(_in_folder(folder), meta.name, path, size).fields(colour=colour)
+            return decode_sog(_in_folder(folder), path, size, meta=meta.name, colour=colour)
         with open_zip(path) as archive:
             prefix = sog_folder(archive.namelist()) or ""
-            pictures = _Pictures(partial(_in_archive, archive, prefix), META, path, path.stat().st_size)
-            return pictures.fields(colour=colour)
+            return decode_sog(partial(read_in_archive, archive, prefix), path, path.stat().st_size, colour=colour)
     except BROKEN_ZIP as error:
         got = f"one that does not open ({str(error)[:120]})"
         raise InvalidSplats(str(path), expected="a .sog file", got=got, hint=HINT) from None
+
+
+def decode_sog(
+    read: Callable[[str, int], bytes | None], path: Path, size: int, *, meta: str = META, colour: bool = True
+) -> Fields:
+    """The fields of a SOG whose files are read one by one.
+
+    Args:
+        read: name, most bytes -> the first bytes of that file; None where there is none. path: what errors name.
+        size: bytes of all files as they are stored. meta: the name of its description.
+
+    Raises:
+        InvalidSplats: it is malformed, of another version, or has more splats than its size can be of.
+    """
+    return _Pictures(read, meta, path, size).fields(colour=colour)
 
 
 def is_sog_document(document: Any) -> bool:
@@ -115,7 +129,8 @@ def _in_folder(folder: Path) -> Callable[[str, int], bytes | None]:
     return read
 
 
-def _in_archive(archive: zipfile.ZipFile, prefix: str, name: str, most: int) -> bytes | None:
+def read_in_archive(archive: zipfile.ZipFile, prefix: str, name: str, most: int) -> bytes | None:
+    """The first bytes of a member of an archive, below a folder with a slash; None where there is none."""
     try:
         with archive.open(prefix + name) as member:
             return member.read(most)

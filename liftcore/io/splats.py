@@ -30,6 +30,7 @@ from liftcore.io.remote import landing, local_path
 from liftcore.io.sog import is_bundled, read_sog, sog_files
 from liftcore.io.splat import ROW, read_splat, splat_blocks
 from liftcore.io.spz import read_spz, read_spz_document, spz_blocks
+from liftcore.io.streamed_sog import read_streamed_sog, streamed_files
 from liftcore.io.usd import read_usd, read_usd_document, usd_blocks
 from liftcore.runtime.plugins import Plugin, find_plugin
 from liftcore.scene.harmonics import constant_terms
@@ -51,6 +52,7 @@ _READERS: dict[SplatFormat, Callable[..., Fields]] = {
     SplatFormat.SPLAT: read_splat,
     SplatFormat.SPZ: read_spz,
     SplatFormat.SOG: read_sog,
+    SplatFormat.STREAMED_SOG: read_streamed_sog,
     SplatFormat.CHECKPOINT: read_checkpoint,
     SplatFormat.GLTF: read_gltf,
     SplatFormat.USD: read_usd,
@@ -259,8 +261,13 @@ def splat_files(path: Path) -> list[Path]:
     """
     if path.is_dir() and format_of(path) is SplatFormat.CHECKPOINT:
         return rank_files(path)
-    is_one = format_of(path) is not SplatFormat.SOG or is_bundled(path)
-    return [path] if is_one else sog_files(path)
+    match format_of(path):
+        case SplatFormat.SOG if not is_bundled(path):
+            return sog_files(path)
+        case SplatFormat.STREAMED_SOG if not is_bundled(path):
+            return streamed_files(path)
+        case _:
+            return [path]
 
 
 def require_kernel(path: Path, kernel: Kernel, source: str) -> None:

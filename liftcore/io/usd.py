@@ -25,7 +25,7 @@ import numpy as np
 from liftcore.errors import InvalidInput, InvalidSplats, Unavailable
 from liftcore.io.labels import COLUMN, IDS, KINDS, rows_by_id
 from liftcore.io.ply import MODEL
-from liftcore.io.quantised import Fields, gaussian_rows, logits
+from liftcore.io.quantised import Fields, gaussian_rows, joined_fields, logits
 from liftcore.scene.harmonics import band_rotation, constant_terms
 from liftcore.scene.kernel import NORMALS
 from liftcore.scene.quaternions import product_matrix
@@ -161,22 +161,7 @@ def read_usd(path: Path, *, colour: bool = True) -> Fields:
         Unavailable: usd-core is not installed.
     """
     stage = _stage(path)
-    parts = [_field(prim, stage, path, colour=colour) for prim in _fields(stage, path)]
-    fields: Fields = {}
-    for name in parts[0]:
-        if name == "extras":
-            known = dict.fromkeys(key for part in parts for key in part["extras"])
-            fields[name] = {
-                key: np.concatenate([p["extras"].get(key, np.zeros(len(p["means"]), "i4")) for p in parts])
-                for key in known
-            }
-        else:
-            own = [part[name] for part in parts]
-            if name == "sh":
-                most = max(sh.shape[1] for sh in own)
-                own = [np.pad(sh, ((0, 0), (0, most - sh.shape[1]), (0, 0))) for sh in own]
-            fields[name] = own[0] if len(own) == 1 else np.concatenate(own)
-    return fields
+    return joined_fields([_field(prim, stage, path, colour=colour) for prim in _fields(stage, path)])
 
 
 def read_usd_document(path: Path) -> dict[str, Any]:

@@ -45,7 +45,6 @@ OTHERS = {  # content, a word of its name and of what to do
     "scene.rad": (b"RAD0" + bytes(60), ".rad", "export"),
     "scene.lcc": (b'{"version": "5.0", "guid": "0"}', ".lcc", "splat-transform"),
     "scene.psht": (b"\x01\x02\x03\x04" * 20, "Postshot", "export"),
-    "lod-meta.json": (b'{"tree": {}, "filenames": []}', "streamed SOG", "splat-transform"),
     "mesh.obj": (b"mtllib a.mtl\nv 0 0 0\n", "mesh", "trained splats"),
     "mesh.ply": (CLOUD + b"element face 0\nproperty list uchar int a\nend_header\n", "mesh", "trained splats"),
     "cloud.ply": (CLOUD + b"end_header\n", "point cloud", "trained splats"),

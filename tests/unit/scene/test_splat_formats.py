@@ -29,6 +29,7 @@ from liftcore.io.splats import (
     recoloured,
     require_kernel,
     some_rows,
+    splat_files,
     write_splats,
 )
 from liftcore.io.spz import FRAME_EXTENSION, FRAMES, RDF, spz_blocks
@@ -46,6 +47,7 @@ FORMATS = {
     "degree3.compressed.ply": SplatFormat.COMPRESSED_PLY,
     "degree3.sog": SplatFormat.SOG,
     "degree3.splat": SplatFormat.SPLAT,
+    "degree3.streamed.zip": SplatFormat.STREAMED_SOG,
     **{f"degree3.v{version}.spz": SplatFormat.SPZ for version in (1, 2, 3, 4)},
 }
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
@@ -71,20 +73,64 @@ def test_every_format_is_read_as_its_own_tool_reads_it(name: str, tmp_path: Path
     for path in (FILES / name, unnamed):
         assert format_of(path) is FORMATS[name]
         assert_alike(read_splats(path), expected)
-    if FORMATS[name] is SplatFormat.SOG:  # whose files may lie in a folder
+    document = {SplatFormat.SOG: "meta.json", SplatFormat.STREAMED_SOG: "lod-meta.json"}.get(FORMATS[name])
+    if document is not None:  # whose files may lie in a folder
         with zipfile.ZipFile(FILES / name) as archive:
             archive.extractall(tmp_path / "folder")
-        assert kind_of(tmp_path / "folder") == "splats" and format_of(tmp_path / "folder") is SplatFormat.SOG
-        assert_alike(read_splats(tmp_path / "folder"), expected)
+        for path in (tmp_path / "folder", tmp_path / "folder" / document):
+            assert kind_of(path) == "splats" and format_of(path) is FORMATS[name]
+            assert_alike(read_splats(path), expected)
         before = input_file(tmp_path / "folder").sha256
         (tmp_path / "folder" / "others").mkdir()  # which are none of it
         assert input_file(tmp_path / "folder").sha256 == before
-        (tmp_path / "folder" / "meta.json").write_text("{}")
+        parts = splat_files(tmp_path / "folder")
+        assert tmp_path / "folder" / document in parts and len(parts) > 4
+        (tmp_path / "folder" / "others" / "more.json").write_text("{}")
+        assert splat_files(tmp_path / "folder") == parts
+        (tmp_path / "folder" / document).write_text("{}")
         assert input_file(tmp_path / "folder").sha256 != before
     bare, whole = read_splats(unnamed, colour=False), read_splats(unnamed)
     assert bare.sh is None and torch.equal(bare.means, whole.means) and torch.equal(bare.quats, whole.quats)
     assert np.array_equal(read_places(unnamed), whole.means.numpy())
     assert np.array_equal(read_places(FILES / f"{name}.decoded.ply"), expected.means.numpy())
+
+
+def test_the_finest_level_of_each_leaf_of_a_streamed_sog_is_one_scene(tmp_path: Path) -> None:
+    for name in ("degree1.sog", "degree3.sog"):
+        with zipfile.ZipFile(FILES / name) as archive:
+            archive.extractall(tmp_path / name.removesuffix(".sog"))
+    fine, coarse = read_splats(FILES / "degree1.sog"), read_splats(FILES / "degree3.sog")
+
+    def leaf(**levels: tuple[int, int, int]) -> dict[str, Any]:
+        rows = {level[1:]: dict(zip(("file", "offset", "count"), own, strict=True)) for level, own in levels.items()}
+        return {"lods": rows}
+
+    def read(*leaves: dict[str, Any], names: Any = ("degree3/meta.json", "degree1/meta.json"), **more: Any) -> Splats:
+        document = {"filenames": names, "tree": {"children": [{"children": leaves[:1]}, *leaves[1:]]}, **more}
+        (tmp_path / "lod-meta.json").write_text(json.dumps(document))
+        return read_splats(tmp_path / "lod-meta.json")
+
+    whole = read(leaf(_1=(0, 9, 5), _0=(1, 200, 100)), leaf(_2=(0, 30, 10)), leaf(_0=(1, 0, 40)), environment="env")
+    assert torch.equal(whole.means, torch.cat([coarse.means[30:], fine.means[:40], fine.means[200:]]))
+    assert whole.sh is not None and whole.sh_degree == 3 and not whole.sh[10:, 4:].any()
+    assert any("environment" in warning for warning in whole.warnings)
+    wrong: dict[str, tuple[tuple[Any, ...], dict[str, Any]]] = {
+        "rows of their own": ((leaf(_0=(1, 0, 40)), leaf(_0=(1, 39, 2))), {}),
+        "rows within the 300": ((leaf(_0=(1, 0, 301)),), {}),
+        "one of 2 files": ((leaf(_0=(2, 0, 1)),), {}),
+        "levels of detail": ((leaf(_x=(0, 0, 1)),), {}),
+        "none that a leaf has": ((leaf(),), {}),
+        "nodes that are objects": (([],), {}),
+        "each once": ((leaf(_0=(0, 0, 1)), leaf(_0=(1, 0, 1))), {"names": ["degree1/meta.json"] * 2}),
+        "beside it": ((leaf(_0=(0, 0, 1)),), {"names": ["none/meta.json"]}),
+    }
+    outside = ("../degree1/meta.json", "/etc/meta.json", "https://a/meta.json", "a\\meta.json", 7)
+    wrong |= {
+        f"in the folder.*{number}": ((leaf(_0=(0, 0, 1)),), {"names": [one]}) for number, one in enumerate(outside)
+    }
+    for match, (leaves, more) in wrong.items():
+        with pytest.raises(InvalidSplats, match=match.split(".*")[0]):
+            read(*leaves, **more)
 
 
 @pytest.mark.parametrize("name", FORMATS)
