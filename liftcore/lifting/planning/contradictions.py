@@ -52,7 +52,10 @@ LEAST_GAIN = 1.25  # of another scale's agreement over the given one's: cameras 
 CONVINCING = 0.55  # agreement at another scale, for it to be named as the cause
 LEAST_ROW_SUM = 0.05  # in the mean: a scene of one object before nothing has a fifth or so
 LEAST_IN_VIEW = 0.05  # of the splats
-FRAME = "cameras and splats must share a frame: look for the trainer's transform, a scale or another scene"
+FRAME = (
+    "cameras and splats must share a frame: look for the trainer's transform, a scale or another scene; an .spz that "
+    "declares no frame may be half a turn about x away"
+)
 MANY_CAUSES = (
     "cameras (their frame, scale or principal points) are not those of the splats, or features not of the photos as "
     "their cameras have them (other photos, crops, turned by EXIF, masks missing)"
