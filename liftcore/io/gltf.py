@@ -17,6 +17,7 @@ from __future__ import annotations
 import base64
 import binascii
 import json
+import re
 import struct
 from collections.abc import Mapping
 from itertools import pairwise
@@ -46,14 +47,17 @@ MAX_JSON_BYTES = 64 << 20
 MAX_DEGREE = 3  # of harmonics
 MAX_NODES = 100_000
 MAX_TABLE_CELLS = 1 << 22  # of a property table
-MAX_ATTRIBUTES = 256  # of a primitive
+MAX_ATTRIBUTES = 1 << 10  # of a primitive
 SPLAT_BYTES = 56  # of a decoded splat without its colours
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 TO_FILE = np.diag([-1.0, -1.0, 1.0])  # RDF to LUF, and back
+TRANSFORM = {"matrix", "rotation", "scale", "translation"}  # of a node
 RENDER_MODE = "SplatRenderMode"
 SRGB = "srgb_rec709_display"
-BOXES = ("box_low", "box_high", "oriented_box_centre", "oriented_box_axes", "oriented_box_half_sizes")
+BOXES = {  # numbers of each
+    "box_low": 3, "box_high": 3, "oriented_box_centre": 3, "oriented_box_axes": 9, "oriented_box_half_sizes": 3,
+}  # fmt: skip
 TABLE_TYPES = {"UINT8": "<u1", "INT8": "<i1", "UINT16": "<u2", "INT16": "<i2", "UINT32": "<u4", "INT32": "<i4",
                "UINT64": "<u8", "INT64": "<i8", "FLOAT32": "<f4", "FLOAT64": "<f8"}  # fmt: skip
 TABLE_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -133,13 +137,15 @@ class _Asset:
         roots = [place for place in range(len(nodes)) if place not in inner]
         if scenes:
             roots = self._list(self._at(scenes, chosen, "scene"), "nodes")
-        found, queue, visited = [], [(root, np.eye(4)) for root in reversed(roots)], 0
+        found, queue, visited = [], [(root, np.eye(4)) for root in reversed(roots)], set[int]()
         while queue:
             place, above = queue.pop()
-            node, visited = self._at(nodes, place, "node"), visited + 1
-            if visited > min(len(nodes), MAX_NODES):
-                raise self._broken(f"a tree of at most {MAX_NODES} nodes", "one that meets a node twice, or more")
-            matrix = above @ self._matrix(node, place)
+            node = self._at(nodes, place, "node")
+            if place in visited or max(len(visited), len(found)) >= MAX_NODES:
+                got = "one that meets a node twice, or more"
+                raise self._broken(f"a tree of at most {MAX_NODES} nodes with splats", got)
+            visited.add(place)
+            matrix = above @ self._matrix(node, place) if TRANSFORM & node.keys() else above
             queue += [(child, matrix) for child in reversed(self._list(node, "children"))]
             if "mesh" in node:
                 mesh = self._at(meshes, node["mesh"], "mesh")
@@ -276,7 +282,7 @@ class _Asset:
         plain = (
             int(name[12:])
             for name in primitive["attributes"]
-            if name.startswith("_FEATURE_ID_") and name[12:].isdecimal()
+            if name.startswith("_FEATURE_ID_") and re.fullmatch("[0-9]{1,9}", name[12:])
         )
         for one in [*of_attributes, *({"attribute": place} for place in sorted(plain) if place not in named)]:
             label, place = f"{one.get('label')}_id", one["attribute"]
@@ -406,6 +412,7 @@ def _is_of_splats(primitive: Any) -> bool:
 def _document_row(row: Mapping[str, Any]) -> dict[str, Any]:
     """A row of a property table as the document has it, with its boxes in the frame of PLYs."""
     one = {key: value for key, value in row.items() if key not in BOXES}
+    row = {key: value for key, value in row.items() if np.size(value) == BOXES.get(key)}  # others' may be anything
     if {"box_low", "box_high"} <= row.keys():
         corners = np.array([row["box_low"], row["box_high"]]) @ TO_FILE
         one["box"] = {"low": corners.min(axis=0).tolist(), "high": corners.max(axis=0).tolist()}

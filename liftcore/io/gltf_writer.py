@@ -27,11 +27,11 @@ from liftcore.io.gltf import (
     WIDTHS,
     harmonic_name,
 )
-from liftcore.io.labels import IDS, KINDS, rows_by_id
+from liftcore.io.labels import IDS, KINDS, rows_by_id, stored_columns
 from liftcore.io.quantised import gaussian_rows
 from liftcore.runtime.version import __version__
 from liftcore.scene.harmonics import band_rotation, constant_terms
-from liftcore.scene.kernel import NORMALS, Kernel
+from liftcore.scene.kernel import Kernel
 from liftcore.scene.origin import FILE_ORIGIN
 from liftcore.scene.quaternions import product_matrix
 
@@ -59,11 +59,11 @@ def gltf_blocks(splats: Splats, document: Mapping[str, Any] | None = None) -> It
         splats: P. document: of `liftcore.io.labels`; None: splats without labels.
 
     Raises:
-        InvalidSplats: the file would take more bytes than the format counts.
+        InvalidSplats: the file would take more bytes than the format counts, or it does not hold the columns.
     """
-    binary = _Binary()
-    sets = [name for name in IDS if name in splats.extras]
-    primitive = _primitive(binary, splats, sets)
+    binary, columns = _Binary(), stored_columns(splats)
+    sets = [name for name in IDS if name in columns]
+    primitive = _primitive(binary, splats, columns, sets)
     node: dict[str, Any] = {"mesh": 0, "name": "splats"}
     if splats.origin != FILE_ORIGIN:
         node["translation"] = (TO_FILE @ splats.origin).tolist()
@@ -72,8 +72,8 @@ def gltf_blocks(splats: Splats, document: Mapping[str, Any] | None = None) -> It
         asset["extras"] = {"note": NEAREST.format(kernel=splats.kernel)}
     gltf: dict[str, Any] = {"asset": asset, "extensionsUsed": [EXTENSION]}
     if sets:
-        primitive["extensions"][FEATURES] = {"featureIds": [_feature_set(splats, name, sets) for name in sets]}
-        gltf["extensions"] = {METADATA: _add_tables(binary, splats, document or {}, sets)}
+        primitive["extensions"][FEATURES] = {"featureIds": [_feature_set(columns, name, sets) for name in sets]}
+        gltf["extensions"] = {METADATA: _add_tables(binary, columns, document or {}, sets)}
         gltf["extensionsUsed"] += [FEATURES, METADATA]
     gltf |= {"scene": 0, "scenes": [{"nodes": [0]}], "nodes": [node], "meshes": [{"primitives": [primitive]}]}
     gltf |= {"accessors": binary.accessors, "bufferViews": binary.views, "buffers": [{"byteLength": binary.size}]}
@@ -118,7 +118,9 @@ class _Binary:
         return len(self.accessors) - 1
 
 
-def _primitive(binary: _Binary, splats: Splats, sets: Sequence[str]) -> dict[str, Any]:
+def _primitive(
+    binary: _Binary, splats: Splats, columns: Mapping[str, np.ndarray], sets: Sequence[str]
+) -> dict[str, Any]:
     rows = list(gaussian_rows(splats))
 
     def joined(name: str) -> np.ndarray:
@@ -148,11 +150,13 @@ def _primitive(binary: _Binary, splats: Splats, sets: Sequence[str]) -> dict[str
         own = np.einsum("ij,njc->nic", band_rotation(band, TO_FILE), sh[:, band**2 : (band + 1) ** 2])
         for place in range(2 * band + 1):
             attributes[harmonic_name(band, place)] = binary.attribute(own[:, place].astype("<f4"))
-    for name, column in splats.extras.items():
-        if name not in NORMALS:
-            plain = f"_{name.upper() if name == name.lower() else name}"
-            attribute = f"_FEATURE_ID_{sets.index(name)}" if name in sets else plain
-            attributes[attribute] = binary.attribute(_attribute_values(name, column.cpu().numpy()))
+    for name, column in columns.items():
+        plain = f"_{name.upper() if name == name.lower() else name}"
+        attribute = f"_FEATURE_ID_{sets.index(name)}" if name in sets else plain
+        if attribute in attributes:
+            expected = "names that differ in more than their case, and are no feature_id_0"
+            raise InvalidSplats("columns", expected=expected, got=f"a second {attribute}")
+        attributes[attribute] = binary.attribute(_attribute_values(name, column))
     kind = {"kernel": "ellipse", "colorSpace": SRGB, "projection": "perspective", "sortingMethod": "cameraDistance"}
     primitive: dict[str, Any] = {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: kind}}
     if splats.antialiased:
@@ -178,20 +182,22 @@ def _attribute_values(name: str, column: np.ndarray) -> np.ndarray:
     return column.astype("<f4")
 
 
-def _feature_set(splats: Splats, name: str, sets: Sequence[str]) -> dict[str, Any]:
-    count = int((splats.extras[name].unique() != 0).sum())
+def _feature_set(columns: Mapping[str, np.ndarray], name: str, sets: Sequence[str]) -> dict[str, Any]:
+    count = np.unique(columns[name][columns[name] > 0]).size
     place = sets.index(name)
     ids = {"featureCount": max(count, 1), "nullFeatureId": 0, "attribute": place, "propertyTable": place}
     return ids | {"label": name.removesuffix("_id")}
 
 
-def _add_tables(binary: _Binary, splats: Splats, document: Mapping[str, Any], sets: Sequence[str]) -> dict[str, Any]:
+def _add_tables(
+    binary: _Binary, columns: Mapping[str, np.ndarray], document: Mapping[str, Any], sets: Sequence[str]
+) -> dict[str, Any]:
     """The property tables of instances and classes: a row an id, the first of which is that of none."""
     tables, classes = [], {}
     for name, kind in zip(IDS, KINDS, strict=True):
         if name not in sets:
             continue
-        count = int(splats.extras[name].max()) + 1
+        count = int(columns[name].max()) + 1
         rows = [_table_row(one) for one in rows_by_id(dict(document), kind)]
         rows += [{}] * (count - len(rows))
         label, present = name.removesuffix("_id"), {key for row in rows for key in row}

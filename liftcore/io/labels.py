@@ -12,15 +12,21 @@ import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from liftcore.errors import InvalidSplats
 from liftcore.io.files import open_regular
+from liftcore.scene.kernel import NORMALS
+
+if TYPE_CHECKING:
+    from liftcore.scene.splats import Splats
 
 FORMAT = "splatlift-labels/1"
 COLUMN = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]{0,63}")  # a name that readers of PLY take
 IDS = ("instance_id", "class_id")  # columns of whole numbers, 0 for none
+MAX_COLUMNS = 256  # of a file that is not a PLY
 MAX_DOCUMENT_BYTES = 64 << 20
 KINDS = ("instances", "classes")  # of the document, by the columns above
 
@@ -41,6 +47,35 @@ class Labels:
             if name in left:
                 document[kind] = [one for one in self.document.get(kind, []) if one.get(name) in left[name]]
         return Labels(columns, document)
+
+
+def id_column(values: np.ndarray) -> np.ndarray:
+    """[P] i32, ids [P] of any type; what is no number from 1 to 2^31 - 1 is 0, none."""
+    return np.where((values >= 1) & (values <= np.iinfo(np.int32).max), values, 0).astype(np.int32)
+
+
+def stored_columns(splats: Splats) -> dict[str, np.ndarray]:
+    """The extras of splats without normals, each [P] i32 or f32, as formats with columns of 32 bits hold them.
+
+    Raises:
+        InvalidSplats: whole numbers need more bits, or the columns are too many.
+    """
+    columns: dict[str, np.ndarray] = {}
+    for name, column in splats.extras.items():
+        values = column.cpu().numpy()
+        if name in NORMALS:
+            continue
+        if name in IDS:
+            values = id_column(values)
+        elif values.dtype.kind in "iu" and not -(2**31) <= int(values.min()) <= int(values.max()) < 2**31:
+            got = f"{values.min()}..{values.max()}"
+            raise InvalidSplats(f"columns[{name!r}]", expected="whole numbers of 32 bits", got=got)
+        with np.errstate(over="ignore"):
+            columns[name] = values.astype(np.float32 if values.dtype.kind == "f" else np.int32)
+    if len(columns) > MAX_COLUMNS:
+        hint = "write a PLY, which has any number of them"
+        raise InvalidSplats("columns", expected=f"at most {MAX_COLUMNS}", got=str(len(columns)), hint=hint)
+    return columns
 
 
 def document_bytes(labels: Labels) -> bytes:

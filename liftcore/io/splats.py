@@ -23,7 +23,7 @@ from liftcore.io.files import whole_file
 from liftcore.io.gltf import read_gltf, read_gltf_document
 from liftcore.io.gltf_writer import gltf_blocks
 from liftcore.io.kinds import CONVERT, SplatFormat, identify, wrong_kind
-from liftcore.io.labels import COLUMN, IDS, Labels, read_document
+from liftcore.io.labels import COLUMN, IDS, Labels, id_column, read_document
 from liftcore.io.quantised import Fields
 from liftcore.io.ranks import rank_files
 from liftcore.io.remote import landing, local_path
@@ -355,7 +355,7 @@ def read_labels(path: Path | str) -> Labels:
     if not set(IDS) & columns.keys():
         hint = "splatlift export writes such files"
         raise InvalidSplats(str(path), expected=f"a column {' or '.join(IDS)}", got="none", hint=hint)
-    columns = {name: values.astype(np.int32) if name in IDS else values for name, values in columns.items()}
+    columns = {name: id_column(values) if name in IDS else values for name, values in columns.items()}
     return Labels(columns, _document_of(path))
 
 

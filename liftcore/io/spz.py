@@ -17,13 +17,13 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from liftcore.errors import InvalidSplats
+from liftcore.io.labels import stored_columns
 from liftcore.io.quantised import (
     MOST_GROWTH,
     OTHERS,
@@ -37,7 +37,6 @@ from liftcore.io.quantised import (
 )
 from liftcore.io.spz_labels import label_record, read_label_record, records
 from liftcore.scene.harmonics import SH_C0, band_rotation
-from liftcore.scene.kernel import NORMALS
 from liftcore.scene.render_mode import RenderMode, RenderModel
 
 if TYPE_CHECKING:
@@ -165,10 +164,9 @@ def spz_blocks(splats: Splats, document: Mapping[str, Any] | None = None) -> Ite
         for section, part in zip(sections, _encoded(some, bits, (degree + 1) ** 2 - 1), strict=True):
             section.append(part.tobytes())
     flags = ANTIALIASED if splats.antialiased else 0
-    labelled = replace(splats, extras={name: own for name, own in splats.extras.items() if name not in NORMALS})
-    if labelled.extras:
+    if columns := stored_columns(splats):
         head = (MAGIC, 4, splats.count, degree, bits, flags | HAS_EXTENSIONS)
-        yield from _version_4(head, label_record(labelled, document), [b"".join(section) for section in sections])
+        yield from _version_4(head, label_record(columns, document), [b"".join(section) for section in sections])
         return
     packing = zlib.compressobj(wbits=31)
     header = struct.pack(HEADER, MAGIC, WRITTEN_VERSION, splats.count, degree, bits, flags, 0)

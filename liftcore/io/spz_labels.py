@@ -9,29 +9,25 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from liftcore.io.labels import COLUMN, FORMAT, IDS, Labels
+from liftcore.io.labels import COLUMN, FORMAT, IDS, MAX_COLUMNS, Labels, id_column
 from liftcore.io.ply import MODEL
 
-if TYPE_CHECKING:
-    from liftcore.scene.splats import Splats
-
 EXTENSION = 0x51F70001  # vendor 0x51F7, its first
-MAX_COLUMNS = 16
 TYPES = ("i4", "f4")
 
 
-def label_record(splats: Splats, document: Mapping[str, Any] | None) -> bytes:
-    """The extension's record for the extras of splats, and what these mean."""
+def label_record(stored: Mapping[str, np.ndarray], document: Mapping[str, Any] | None) -> bytes:
+    """The extension's record for columns [P] (`liftcore.io.labels.stored_columns`), and what these mean."""
     import zstandard
 
     columns, streams = [], []
-    for name, column in splats.extras.items():
-        code = "f4" if column.is_floating_point() else "i4"
-        streams.append(zstandard.ZstdCompressor().compress(column.cpu().numpy().astype(f"<{code}").tobytes()))
+    for name, column in stored.items():
+        code = f"{column.dtype.kind}4"
+        streams.append(zstandard.ZstdCompressor().compress(column.astype(f"<{code}").tobytes()))
         columns.append({"name": name, "type": code, "bytes": len(streams[-1])})
     text = json.dumps({"format": FORMAT, **(document or {}), "columns": columns}, ensure_ascii=False).encode()
     payload = struct.pack("<I", len(text)) + text + b"".join(streams)
@@ -83,5 +79,6 @@ def _read(payload: bytes, count: int) -> Labels:
         if len(values) != 4 * count:
             raise ValueError("a column of another size")
         if COLUMN.fullmatch(name) and not MODEL.fullmatch(name):
-            columns[name] = np.frombuffer(values, f"<{code}").astype(np.int32 if name in IDS else f"<{code}")
+            own = np.frombuffer(values, f"<{code}")
+            columns[name] = id_column(own) if name in IDS else own.astype(code)
     return Labels(columns, document | {"columns": list(columns)})

@@ -23,11 +23,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from liftcore.errors import InvalidInput, InvalidSplats, Unavailable
-from liftcore.io.labels import COLUMN, IDS, KINDS, rows_by_id
+from liftcore.io.labels import COLUMN, IDS, KINDS, id_column, rows_by_id, stored_columns
 from liftcore.io.ply import MODEL
 from liftcore.io.quantised import Fields, gaussian_rows, joined_fields, logits
 from liftcore.scene.harmonics import band_rotation, constant_terms
-from liftcore.scene.kernel import NORMALS
 from liftcore.scene.quaternions import product_matrix
 from liftcore.scene.similarity import Similarity
 
@@ -36,7 +35,8 @@ if TYPE_CHECKING:
 
 TO_FILE = np.diag([1.0, -1.0, -1.0])  # RDF to RUB, and back
 Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # a frame with z up to one with y up
-MAX_DEGREE = 3
+MAX_DEGREE = 3  # of harmonics that are written
+MOST_DEGREE = 4  # and read
 MODULES = ("Gf", "Sdf", "Tf", "Usd", "UsdGeom", "UsdSemantics", "UsdUtils", "UsdVol", "Vt")
 FIELD = "ParticleField3DGaussianSplat"
 DOCUMENT = "splatlift"  # of the field's custom data: what labels mean, as JSON
@@ -66,9 +66,10 @@ def usd_blocks(splats: Splats, document: Mapping[str, Any] | None = None, suffix
         splats: P. document: of `liftcore.io.labels`; None: splats without labels. suffix: .usdc, .usda or .usdz.
 
     Raises:
+        InvalidSplats: the format does not hold the columns.
         Unavailable: usd-core is not installed.
     """
-    pxr = open_library()
+    pxr, columns = open_library(), stored_columns(splats)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"scene{'.usdc' if suffix == '.usdz' else suffix}"
         stage = pxr.Usd.Stage.CreateNew(str(path))
@@ -78,7 +79,7 @@ def usd_blocks(splats: Splats, document: Mapping[str, Any] | None = None, suffix
         stage.SetDefaultPrim(root.GetPrim())
         if any(splats.origin):
             pxr.UsdGeom.XformCommonAPI(root).SetTranslate(tuple((TO_FILE @ splats.origin).tolist()))
-        _write_field(stage, splats, document or {})
+        _write_field(stage, splats, columns, document or {})
         stage.GetRootLayer().Save()
         del stage
         if suffix == ".usdz":
@@ -89,7 +90,7 @@ def usd_blocks(splats: Splats, document: Mapping[str, Any] | None = None, suffix
         yield path.read_bytes()
 
 
-def _write_field(stage: Any, splats: Splats, document: Mapping[str, Any]) -> None:
+def _write_field(stage: Any, splats: Splats, columns: Mapping[str, np.ndarray], document: Mapping[str, Any]) -> None:
     pxr = open_library()
     rows = list(gaussian_rows(splats))
 
@@ -124,17 +125,18 @@ def _write_field(stage: Any, splats: Splats, document: Mapping[str, Any]) -> Non
     low, high = (means - reach).min(axis=0).tolist(), (means + reach).max(axis=0).tolist()
     field.CreateExtentAttr(pxr.Vt.Vec3fArray([pxr.Gf.Vec3f(*low), pxr.Gf.Vec3f(*high)]))
     primvars = pxr.UsdGeom.PrimvarsAPI(field)
-    for name, column in splats.extras.items():
-        if name not in NORMALS:
-            values, is_float = column.cpu().numpy(), column.is_floating_point()
-            kind = pxr.Sdf.ValueTypeNames.FloatArray if is_float else pxr.Sdf.ValueTypeNames.IntArray
-            array = pxr.Vt.FloatArray if is_float else pxr.Vt.IntArray
-            own = primvars.CreatePrimvar(name, kind, pxr.UsdGeom.Tokens.vertex)
-            own.Set(array.FromNumpy(np.ascontiguousarray(values.astype("f4" if is_float else "i4"))))
+    for name, column in columns.items():
+        if not pxr.Sdf.Path.IsValidIdentifier(name):
+            raise InvalidSplats("columns", expected="names of letters, digits and underscores", got=repr(name))
+        is_float = column.dtype.kind == "f"
+        kind = pxr.Sdf.ValueTypeNames.FloatArray if is_float else pxr.Sdf.ValueTypeNames.IntArray
+        array = pxr.Vt.FloatArray if is_float else pxr.Vt.IntArray
+        own = primvars.CreatePrimvar(name, kind, pxr.UsdGeom.Tokens.vertex)
+        own.Set(array.FromNumpy(column))
     if document:
         field.GetPrim().SetCustomDataByKey(DOCUMENT, json.dumps(document, ensure_ascii=False))
-    if IDS[0] in splats.extras:
-        _write_subsets(stage, splats.extras[IDS[0]].cpu().numpy(), rows_by_id(dict(document), KINDS[0]))
+    if IDS[0] in columns:
+        _write_subsets(stage, columns[IDS[0]], rows_by_id(dict(document), KINDS[0]))
 
 
 def _write_subsets(stage: Any, instances: np.ndarray, rows: list[dict[str, Any]]) -> None:
@@ -173,7 +175,7 @@ def read_usd_document(path: Path) -> dict[str, Any]:
     if isinstance(told, str):
         try:
             document = json.loads(told)
-        except ValueError:
+        except (ValueError, RecursionError):
             document = None
         if isinstance(document, dict):
             return document
@@ -210,14 +212,15 @@ def _field(prim: Any, stage: Any, path: Path, *, colour: bool) -> Fields:
     except InvalidInput as error:
         argument, hint = f"{path} transform of {prim.GetPath()}", "apply the transform to the splats"
         raise InvalidSplats(argument, expected=error.expected, got=error.got, hint=hint) from None
-    places = _array(prim, "positions", path).astype(np.float64)
+    places = _array(prim, "positions", path).reshape(-1, 3).astype(np.float64)
     count, turn = len(places), TO_FILE @ move.rotation
 
     def read(name: str, width: int) -> np.ndarray:
-        values = _array(prim, name, path).reshape(-1, width)
-        if len(values) != count:
-            raise InvalidSplats(f"{path} {name}", expected=f"{count} rows", got=str(len(values)), hint=HINT)
-        return values
+        values = _array(prim, name, path)
+        if values.size != count * width:
+            expected = f"{count} rows of {width} numbers"
+            raise InvalidSplats(f"{path} {name}", expected=expected, got=f"{values.size} numbers", hint=HINT)
+        return values.reshape(count, width)
 
     quats = np.roll(read("orientations", 4).astype(np.float64), 1, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -234,7 +237,10 @@ def _field(prim: Any, stage: Any, path: Path, *, colour: bool) -> Fields:
     coefficients = "radiance:sphericalHarmonicsCoefficients"
     if not any(prim.GetAttribute(name).HasAuthoredValue() for name in (coefficients, f"{coefficients}h")):
         return fields | {"extras": _extras(prim, count)}
-    degree = int(prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get())
+    degree = prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get()
+    if not isinstance(degree, int) or not 0 <= degree <= MOST_DEGREE:
+        expected = f"harmonics of a degree from 0 to {MOST_DEGREE}"
+        raise InvalidSplats(f"{path} {prim.GetPath()}", expected=expected, got=repr(degree)[:40], hint=HINT)
     rows = (degree + 1) ** 2
     terms = read(coefficients, 3 * rows).reshape(count, rows, 3).astype(np.float32)
     for band in range(degree + 1):
@@ -261,7 +267,8 @@ def _extras(prim: Any, count: int) -> dict[str, np.ndarray]:
             continue
         column = np.array(values)
         if column.shape == (count,) and column.dtype.kind in "iuf":
-            extras[name] = column.astype(np.float32 if column.dtype.kind == "f" else np.int32)
+            kind = np.float32 if column.dtype.kind == "f" else np.int32
+            extras[name] = id_column(column) if name in IDS else column.astype(kind)
     subsets = pxr.UsdGeom.Subset.GetAllGeomSubsets(pxr.UsdGeom.Imageable(prim))
     if subsets and IDS[0] not in extras:
         numbers = np.zeros(count, np.int32)

@@ -175,6 +175,7 @@ WRONG: dict[str, tuple[str, Any, str]] = {  # where, what, and what is said of i
     "a count": ("accessors.0.count", 1 << 30, "as many splats"),
     "other counts": ("accessors.4.count", P - 1, "rows of 1 plain numbers"),
     "a bomb of nodes": ("nodes", MANY, "as many splats"),
+    "a bomb of children": ("nodes", [{"children": [1] * 50_000}, *({"children": [1]} for _ in MANY)], "a node twice"),
     "a circle of nodes": ("nodes", [{"mesh": 0, "children": [0]}], "meets a node twice"),
     "a mesh": (f"{PRIMITIVE}.extensions", {}, "without any"),
     "a scale for each axis": ("nodes.0.scale", [1, 2, 1], "a proper rotation"),
@@ -214,6 +215,40 @@ def test_damaged_bytes_are_refused_or_read_and_nothing_else(suffix: str, tmp_pat
             read_labels(tmp_path / "t")
         except InvalidSplats:
             continue
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".spz"])
+def test_columns_come_back_or_are_refused(suffix: str, tmp_path: Path) -> None:
+    path, splats = tmp_path / f"s{suffix}", some_splats()
+    columns = {f"c{number}": np.full(P, number / 4, np.float32) for number in range(40)}
+    write_splats(path, splats, columns)
+    extras = read_splats(path).extras
+    assert {name: extras[name].tolist() for name in columns} == {name: own.tolist() for name, own in columns.items()}
+    ids = np.tile([3.0, np.nan, -1.0, 4e9], P // 4)  # as editors may leave them
+    write_splats(path, splats, {"instance_id": ids})
+    assert read_labels(path).columns["instance_id"].tolist() == [3, 0, 0, 0] * (P // 4)
+    with pytest.raises(InvalidSplats, match="whole numbers"):
+        write_splats(path, splats, {"tag": np.full(P, 4_000_000_000, np.uint32)})
+    with pytest.raises(InvalidSplats, match="at most"):
+        write_splats(path, splats, {f"c{number}": np.zeros(P) for number in range(300)})
+
+
+def test_columns_that_would_share_an_attribute_are_refused(tmp_path: Path) -> None:
+    for names in (("A", "a"), ("instance_id", "feature_id_0")):
+        with pytest.raises(InvalidSplats, match="more than their case"):
+            write_splats(tmp_path / "s.glb", some_splats(), {name: np.arange(P) for name in names})
+
+
+def test_tables_and_numbers_of_others_may_be_anything(tmp_path: Path) -> None:
+    write_splats(tmp_path / "s.glb", some_splats(), {"instance_id": np.arange(P) % 3})
+    document, binary = parts_of(tmp_path / "s.glb")
+    document["meshes"][0]["primitives"][0]["attributes"]["_FEATURE_ID_" + "9" * 5000] = 0
+    metadata = document["extensions"]["EXT_structural_metadata"]
+    member = {"type": "SCALAR", "componentType": "FLOAT32"}
+    metadata["schema"]["classes"]["instance"]["properties"] = {"box_low": member, "box_high": member}
+    metadata["propertyTables"][0]["properties"] = {name: {"values": 0} for name in ("box_low", "box_high")}
+    found = read_labels(join(tmp_path / "t.glb", document, binary))
+    assert [set(one) for one in found.document["instances"]] == [{"instance_id"}] * 2
 
 
 def parts_begin(content: bytes) -> int:

@@ -92,3 +92,25 @@ def test_stages_of_others_are_turned_and_their_subsets_are_instances(tmp_path: P
     turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) @ np.diag([1.0, -1.0, -1.0])
     assert_same(found, some_splats().transformed(rotation=turn, translation=[1.0, -3.0, 2.0]))
     assert sorted(np.unique(found.extras["instance_id"], return_counts=True)[1].tolist()) == [13, 13, 14]
+
+
+@needs_usd
+@pytest.mark.parametrize("degree", [-1, 2, 100_000, None])
+def test_harmonics_that_do_not_fit_their_degree_are_refused(degree: int | None, tmp_path: Path) -> None:
+    pxr = open_library()
+    write_splats(tmp_path / "s.usdc", some_splats())
+    stage = pxr.Usd.Stage.Open(str(tmp_path / "s.usdc"))
+    attribute = stage.GetPrimAtPath("/Scene/Splats").GetAttribute("radiance:sphericalHarmonicsDegree")
+    attribute.Block() if degree is None else attribute.Set(degree)
+    stage.GetRootLayer().Export(str(tmp_path / "t.usdc"))
+    with pytest.raises(InvalidSplats, match=r"harmonics|sphericalHarmonics"):
+        read_splats(tmp_path / "t.usdc")
+
+
+@needs_usd
+def test_columns_come_back_or_are_refused(tmp_path: Path) -> None:
+    ids = np.tile([3.0, np.nan, -1.0, 4e9], P // 4)
+    write_splats(tmp_path / "s.usdc", some_splats(), {"instance_id": ids})
+    assert read_labels(tmp_path / "s.usdc").columns["instance_id"].tolist() == [3, 0, 0, 0] * (P // 4)
+    with pytest.raises(InvalidSplats, match="letters, digits and underscores"):
+        write_splats(tmp_path / "s.usdc", some_splats(), {"a.b": np.zeros(P)})
