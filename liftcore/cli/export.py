@@ -59,7 +59,8 @@ def run(options: argparse.Namespace) -> int:
         what, source = "splats", None
     files, exports = {"output": options.output}, {"output": partial(scene.export, source=source, what=what)}
     if what == "labelled" and suffix == ".ply":
-        files["names"] = options.output.with_name(f"{options.output.name}.json")
+        names = options.output.with_name(f"{options.output.name}.json")
+        files["names"] = Path(check_output(names, [*given, *made_from(scene)], "json"))
         exports["names"] = partial(scene.export, source=source, what="names")
     files = write_files(files, exports)
     document: dict[str, Any] = {"files": files, "splats": len(scene.features), "what": what}

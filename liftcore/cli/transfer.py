@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _matrix(path: Path) -> list[list[float]]:
     try:
-        numbers = [float(word) for word in path.read_text(encoding="utf-8").replace(",", " ").split()]
+        numbers = [float(word) for word in path.read_text(encoding="utf-8-sig").replace(",", " ").split()]
     except (OSError, ValueError) as error:
         raise InvalidInput("--matrix", expected="a file of 12 or 16 numbers", got=str(error)[:120]) from None
     if len(numbers) not in NUMBERS:

@@ -79,8 +79,8 @@ def catalogue(scene: OpenedLift, words: Sequence[str] = (), vectors: Any = None)
     number = len(scene.object_views)
     features = object_features(scene)
     facts = _described(scene, scene.object, np.arange(number), scene.object_views, _named(features, words, vectors))
-    told = f"{number} objects, which masks of three or more views keep together" if number else NONE_FOUND
-    return Catalogue(tuple(SceneObject(**one) for one in facts), told, features)
+    told = f"{len(facts)} objects, which masks of three or more views keep together" if facts else NONE_FOUND
+    return Catalogue(tuple(SceneObject(**one) for one in facts), told, features[[one["id"] for one in facts]])
 
 
 def tree(
@@ -111,10 +111,10 @@ def tree(
     place[order], place[-1] = np.arange(len(parents)), -1
     splats, above = place[scene.node], place[parents[order]]
     facts = _described(scene, splats, above, scene.node_views[order], _named(features[order], words, vectors))
-    nodes = []
-    for one, node in sorted(zip(facts, order.tolist(), strict=True), key=lambda pair: pair[1]):
+    nodes, listed = [], {int(order[one["id"]]): one for one in facts}
+    for node, one in sorted(listed.items()):
         path = scene.node_path(node)
-        under = np.flatnonzero(parents == node).tolist()
+        under = [part for part in np.flatnonzero(parents == node).tolist() if part in listed]
         more = {"id": node, "kind": scene.node_kind(node), "path": path, "parts": tuple(under)}
         parent = int(parents[node]) if parents[node] >= 0 else None
         confidence = float(scene.node_confidence[node])
@@ -137,6 +137,8 @@ def _described(
 ) -> list[dict[str, Any]]:
     """The fields of a `SceneObject` of each of some nodes, whose splats are also those of the nodes above them.
 
+    Nodes without splats, which lifts of other programs may have, are left out.
+
     Args:
         labels: [P] i32, the smallest node of each splat, -1 for none. above: [N], the node above each, which comes
             before it; -1 or itself: none. views: [N, V] i32. named: name and score of each.
@@ -151,6 +153,8 @@ def _described(
     whole, known = evidence.sum() or 1.0, scene.metadata.views
     found = []
     for one, (name, score, mixed) in enumerate(zip(*named, rows_of, strict=True)):
+        if not mixed.size:
+            continue
         rows = np.sort(mixed)
         weights = evidence[rows] if evidence[rows].any() else np.ones(rows.size)
         box = largest_box(scene.splats, rows, weights)

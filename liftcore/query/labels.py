@@ -47,13 +47,18 @@ def labels(scene: OpenedLift, source: Segmentation | Answer | Mapping[str, Answe
         InvalidQuery: nothing was found, or more splats than objects are made of.
         InvalidLift: the splats moved or changed since the lift.
     """
-    if scene.labelled is None or scene.labelled[0] is not source:
+    parts = dict(source) if isinstance(source, Mapping) else {None: source}  # a copy: theirs may change
+    if scene.labelled is None or not _are_same(scene.labelled[0], parts):
         if isinstance(source, Answer | Mapping):
             made = _of_answers(scene, {_name(source): source} if isinstance(source, Answer) else source)
         else:
             made = _of_catalogue(scene, source) if isinstance(source, Catalogue) else _of_words(scene, source)
-        scene.labelled = source, made
+        scene.labelled = parts, made
     return scene.labelled[1]  # type: ignore[no-any-return]
+
+
+def _are_same(parts: Mapping[Any, Any], others: Mapping[Any, Any]) -> bool:
+    return list(parts) == list(others) and all(part is others[name] for name, part in parts.items())
 
 
 def _name(answer: Answer) -> str:
@@ -117,12 +122,12 @@ def _of_answers(scene: OpenedLift, answers: Mapping[str, Answer]) -> Labels:
 
 
 def _of_catalogue(scene: OpenedLift, catalogue: Catalogue) -> Labels:
-    if not catalogue.objects or scene.object is None:
+    if not catalogue.objects or scene.object is None or scene.object_views is None:
         raise InvalidQuery("source", expected="a lift with objects", got=catalogue.explanation, hint="export words")
     names = list(dict.fromkeys(one.name for one in catalogue.objects if one.name is not None))
-    colours = cluster_colours(len(catalogue.objects)).tolist()
-    numbers, told = np.zeros(len(catalogue.objects) + 1, np.int32), []  # the last is of -1
-    scores = np.zeros(len(catalogue.objects) + 1, np.float32)
+    colours = cluster_colours(len(scene.object_views)).tolist()
+    numbers, told = np.zeros(len(scene.object_views) + 1, np.int32), []  # the last is of -1
+    scores = np.zeros(len(scene.object_views) + 1, np.float32)
     for one in catalogue.objects:
         numbers[one.id] = 0 if one.name is None else names.index(one.name) + 1
         scores[one.id] = one.score or 0.0

@@ -82,8 +82,11 @@ def _turn(up: Point | None) -> np.ndarray:
     """[3, 3], rows are two directions on the ground and up."""
     if up is None:
         return np.eye(3)
-    axis = np.asarray(up, np.float64)
-    length = np.linalg.norm(axis)
+    try:
+        axis = np.asarray(up, np.float64)
+        length = np.linalg.norm(axis)
+    except (TypeError, ValueError):
+        axis, length = np.zeros(0), 0.0
     if axis.shape != (3,) or not np.isfinite(length) or length == 0:
         raise InvalidQuery("up", expected="a direction x y z, finite and not zero", got=repr(up)[:80])
     axis = axis / length

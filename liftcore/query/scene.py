@@ -329,7 +329,7 @@ class Scene(OpenedLift):
 
         return layer_colours(self, what)
 
-    def labels(self, source: Answer | Segmentation | Catalogue) -> Labels:
+    def labels(self, source: Answer | Mapping[str, Answer] | Segmentation | Catalogue) -> Labels:
         """Numbers a splat and what they mean, as files of labels have them (`liftcore.query.labels.labels`)."""
         from liftcore.query.labels import labels
 

@@ -143,3 +143,18 @@ def test_the_command_lists_names_and_writes_them(
     assert main(["objects", str(tiny_lift), "--json"]) == 0
     plain = json.loads(capsys.readouterr().out)
     assert [one.keys() for one in plain["objects"]] == [one.keys() - {"feature"} for one in told["objects"]]
+
+
+def test_objects_without_splats_are_left_out(scene: Scene, tmp_path: Path) -> None:
+    lift = scene.lift
+    assert lift.object_views is not None
+    tree = {
+        "node": lift.object, "node_parents": torch.tensor([-1, -1, -1, -1, 0], dtype=torch.int32),
+        "node_views": lift.object_views[[0, 1, 2, 0, 0]], "node_confidence": torch.ones(5),
+        "node_features": torch.zeros(5, lift.features.shape[1], dtype=torch.float16),
+    }  # fmt: skip
+    save_lift(replace(lift, object_views=lift.object_views[[0, 1, 2, 0]], **tree), tmp_path / "l.safetensors")
+    other = Scene(tmp_path / "l.safetensors")
+    assert [one.id for one in other.catalogue().objects] == [0, 1, 2] and len(other.catalogue().features) == 3
+    assert [(one.id, one.parts) for one in other.tree(relations=True).nodes] == [(0, ()), (1, ()), (2, ())]
+    assert len(other.labels(other.catalogue()).document["instances"]) == 3

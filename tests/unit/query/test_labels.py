@@ -112,3 +112,18 @@ def test_the_command_writes_what_the_suffix_says(
     for wrong in (["-o", "s.obj"], ["-o", "s.glb", "--only"], ["-o", "s.glb", "--object", "9"]):
         assert main(["export", str(tiny_lift), *wrong]) == 2
     assert not Path("s.glb").exists()
+    cameras = '{"camera_model": "PINHOLE", "frames": []}'  # of another program, where the names would go
+    (tmp_path / "mine.ply.json").write_text(cameras)
+    assert main(["export", str(tiny_lift), "-o", str(tmp_path / "mine.ply"), *words]) == 2
+    assert (tmp_path / "mine.ply.json").read_text() == cameras and not (tmp_path / "mine.ply").exists()
+    assert export("scene.ply", *words).exists()  # its own file of names is replaced
+
+
+def test_answers_that_were_added_are_labelled_too(scene: Scene) -> None:
+    answers = {
+        name: scene.ask(Query.of((Region("left", 0, row),), threshold=0.5)) for row, name in ((1, "a"), (2, "b"))
+    }
+    some = dict(list(answers.items())[:1])
+    assert [one["name"] for one in scene.labels(some).document["classes"]] == ["a"]
+    some["b"] = answers["b"]
+    assert [one["name"] for one in scene.labels(some).document["classes"]] == ["a", "b"]
