@@ -58,7 +58,7 @@ class NodeSplats:
     begins: np.ndarray  # [n + 1], where the splats of each node begin
     splats: np.ndarray  # i32, ascending in a node
     starts: np.ndarray  # [s + 1], where the nodes of each splat begin
-    members: np.ndarray  # i32, numbers of nodes, ascending in a splat
+    members: np.ndarray  # u16 (fewer bytes to read), numbers of nodes, ascending in a splat
     counts: np.ndarray  # [s] f64, how much each splat counts: sqrt(t_j)
 
 
@@ -154,7 +154,7 @@ def node_splats(W: RegionWeights, members: Memberships, nodes: np.ndarray, threa
     blocks = W.blocks(1 << 16, BLOCK_ENTRIES << 2)
     run_each(lambda a, b: count_nodes(a, b, indptr, region, members.own, number, starts), blocks, threads)
     np.cumsum(starts, out=starts)
-    found = np.empty(starts[-1], np.int32)
+    found = np.empty(starts[-1], np.uint16)
     run_each(lambda a, b: list_nodes(a, b, indptr, region, members.own, number, starts, found), blocks, threads)
     return NodeSplats(*by_node(starts, found, nodes.size), starts, found, np.sqrt(members.totals))
 
@@ -194,7 +194,7 @@ def sampled_nodes(
     parts = tuples.starts, tuples.tuples, tuples.parents, tuples.members, number
     count_tuple_nodes(*[*parts, starts])
     np.cumsum(starts, out=starts)
-    members = np.empty(starts[-1], np.int32)
+    members = np.empty(starts[-1], np.uint16)
     list_tuple_nodes(*[*parts, starts, members])
     return NodeSplats(begins, splats.astype(np.int32), starts, members, np.sqrt(totals))
 
