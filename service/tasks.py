@@ -182,8 +182,8 @@ def _of_another_kind(kind: UploadKind, path: Path) -> InvalidInput | None:
     """What to say of a file that belongs elsewhere; None where it looks like what it was sent as, or like nothing."""
     looks = identify(path)
     found = looks.kind
-    if looks.suffix == ".sog" and not zipfile.is_zipfile(path):
-        got, hint = "the meta.json of a SOG without its pictures", "zip it with them as one .sog file, and send that"
+    if looks.suffix in (".sog", ".zip") and not zipfile.is_zipfile(path):
+        got, hint = "the document of a SOG without its pictures", "zip it with them, and send that"
         return INVALID[kind](kind, expected=f"a file of {kind}", got=got, hint=hint)
     if found is None:
         return wrong_kind(path, kind, INVALID[kind], argument=kind, expected=f"a file of {kind}")

@@ -83,7 +83,7 @@ SUFFIX = {
     SplatFormat.SPLAT: ".splat",
     SplatFormat.SPZ: ".spz",
     SplatFormat.SOG: ".sog",
-    SplatFormat.STREAMED_SOG: ".sog",
+    SplatFormat.STREAMED_SOG: ".zip",
     SplatFormat.GLTF: ".glb",
     SplatFormat.USD: ".usdc",
     SplatFormat.CHECKPOINT: ".pt",

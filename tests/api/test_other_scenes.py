@@ -124,7 +124,9 @@ def test_a_scene_in_map_coordinates_answers_in_them(client: TestClient, uploaded
         assert client.delete(f"/assets/{asset}").status_code == 204
 
 
-@pytest.mark.parametrize("name", ["degree3.compressed.ply", "degree3.v4.spz", "degree3.sog", "degree3.glb"])
+@pytest.mark.parametrize(
+    "name", ["degree3.compressed.ply", "degree3.v4.spz", "degree3.sog", "degree3.streamed.zip", "degree3.glb"]
+)
 def test_formats_that_hold_no_code_are_assets(client: TestClient, name: str) -> None:
     content = (FILES / name).read_bytes()
     asset = client.put("/assets/splats", content=content).json()

@@ -100,6 +100,27 @@ def test_a_moved_scene_is_found_or_told(given: bool, lifted: tuple[LiftResult, S
     assert torch.equal(other.features, result.features[order]) and not other.metadata.cameras.path
 
 
+def test_a_scene_that_stays_with_new_splats_added_is_not_moved(lifted: tuple[LiftResult, Splats]) -> None:
+    result, splats = lifted
+    places = splats.means.clone()
+    places[::4] += 20  # a quarter of the copy is of elsewhere
+    copy = Splats(places, splats.quats, splats.log_scales, splats.opacity_logits, sh=splats.sh)
+    found = result.transferred(splats, copy)
+    assert found.diagnostics["transfer"]["moved"] is None
+    assert torch.equal(found.features[1::4], result.features[1::4])
+
+
+def test_a_file_whose_frame_is_undeclared_is_found_half_a_turn_away(
+    lifted: tuple[LiftResult, Splats], tmp_path: Path
+) -> None:
+    result, splats = lifted
+    write_splats(tmp_path / "undeclared.spz", splats.transformed(rotation=(0.0, 1.0, 0.0, 0.0)))
+    found = result.transferred(splats, tmp_path / "undeclared.spz")
+    assert torch.equal(found.features, result.features)
+    rotation = np.array(found.diagnostics["transfer"]["moved"]["rotation"])
+    np.testing.assert_allclose(rotation, np.diag([1.0, -1.0, -1.0]), atol=1e-3)
+
+
 def test_another_scene_is_refused(lifted: tuple[LiftResult, Splats]) -> None:
     result, splats = lifted
     generator = np.random.default_rng(9)
