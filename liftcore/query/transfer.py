@@ -24,7 +24,7 @@ import torch
 from liftcore.errors import InvalidSplats
 from liftcore.runtime.progress import Progress, silent
 from liftcore.runtime.torch_modes import usual_modes
-from liftcore.scene.neighbours import COLOUR_WIDTH, base_colours
+from liftcore.scene.neighbours import COLOUR_WIDTH, base_colours, set_apart
 from liftcore.scene.quaternions import rotation_matrices
 from liftcore.scene.registration import find_similarity
 from liftcore.scene.similarity import Similarity
@@ -115,7 +115,7 @@ class _Index:
         from scipy.spatial import KDTree
 
         self.means = old.positions().astype(np.float64)
-        self.tree = KDTree(self.means)
+        self.tree = KDTree(set_apart(self.means))
         self.shapes, self.colours = _covariances(old), base_colours(old)
 
     def partners(self, new: Splats) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:

@@ -20,7 +20,7 @@ COLOUR_WIDTH = 0.1  # standard deviation of colours in 0..1, over all three chan
 LEAST_AFFINITY = 1e-6  # of pairs in the graph: weaker ones move nothing
 PATCH = 1 << 12  # splats that lie together
 _PIECE = 1 << 12  # points whose neighbours are worked on at once: what is made of them stays in the cache
-_TOLD_APART = 1e-12  # of the farthest coordinate
+_APART = 1e-12  # of the farthest coordinate
 
 T = TypeVar("T")
 
@@ -41,9 +41,7 @@ def map_nearest(
     """
     from scipy.spatial import KDTree
 
-    # Points at one place make a leaf that no search can divide: told apart by less than float32 can, they are.
-    extent = float(np.abs(means).max()) or 1.0
-    places = means + _TOLD_APART * extent * np.random.default_rng(0).random(means.shape)
+    places = set_apart(means)
     tree = KDTree(places)
     # Leaf by leaf: points that are worked on one after the other have the same neighbours.
     order, most = tree.indices.astype(np.int32), min(NEIGHBOURS + 1, len(means))
@@ -55,6 +53,15 @@ def map_nearest(
 
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         return list(pool.map(work_piece, range(0, len(means), _PIECE)))
+
+
+def set_apart(points: np.ndarray) -> np.ndarray:
+    """Points [n, d] f64, moved by less than float32 can tell.
+
+    Those at one place would make a leaf of a tree that no search can divide.
+    """
+    extent = float(np.abs(points).max()) or 1.0
+    return points + _APART * extent * np.random.default_rng(0).random(points.shape)
 
 
 @dataclass(frozen=True)

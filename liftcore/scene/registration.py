@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from liftcore.errors import InvalidSplats
-from liftcore.scene.neighbours import base_colours
+from liftcore.scene.neighbours import base_colours, set_apart
 from liftcore.scene.origin import extent_of_most
 from liftcore.scene.similarity import Similarity
 
@@ -24,6 +24,7 @@ TRIALS = 4_000  # triples of matches
 NEAR = 0.01  # of the scene's extent: matches that lie so near after the move agree with it
 LEAST_AGREEING = 30  # matches, fewer of which are an accident
 CLEAR = 0.7  # of the second nearest's distance, that a match's is at most
+SAME = 1e-9  # distance of splats that look alike
 ROUNDS = 5  # of fitting to the matches that agree
 _WIDTHS = (0.02, 0.02, 0.02, 0.05, 0.1, 0.1)  # of colours, opacity, and ratios of scales as logs
 
@@ -41,8 +42,8 @@ def find_similarity(old: Splats, new: Splats) -> Similarity:
 
     generator = np.random.default_rng(0)
     rows = np.sort(generator.permutation(new.count)[:SAMPLES])
-    distances, nearest = KDTree(_descriptors(old)).query(_descriptors(new)[rows], 2)
-    clear = (distances[:, 0] < CLEAR * distances[:, 1]) | (distances[:, 0] == 0)
+    distances, nearest = KDTree(set_apart(_descriptors(old))).query(_descriptors(new)[rows], 2)
+    clear = (distances[:, 0] < CLEAR * distances[:, 1]) | (distances[:, 0] < SAME)
     targets = new.positions(rows[clear]).astype(np.float64)
     sources = old.positions(np.asarray(nearest)[clear, 0]).astype(np.float64)
     best, agreeing = None, np.zeros(len(sources), bool)

@@ -113,6 +113,11 @@ class Vocabulary:
         order = sorted(self.words, key=lambda word: ("(food)" in word) - ("(animal)" in word))
         return {_key(base_of(word)): word for word in reversed(order)}
 
+    @cached_property
+    def _parted(self) -> list[tuple[str, list[str]]]:
+        parted = ((word, plain(base_of(word)).split()) for word in self.words)
+        return [(word, parts) for word, parts in parted if len(parts) > 1]
+
     def __contains__(self, text: str) -> bool:
         """Whether a text is one of the words itself."""
         return plain(text) in self._exact
@@ -245,9 +250,8 @@ class Vocabulary:
     def _with_token(self, text: str) -> list[str]:
         """Words of several parts, one of which is the text; those that end with it come first."""
         forms = {form for form in _forms(text) if form}
-        parted = [(word, plain(base_of(word)).split()) for word in self.words]
-        ends = [word for word, parts in parted if len(parts) > 1 and parts[-1] in forms]
-        return ends + [word for word, parts in parted if len(parts) > 1 and forms & set(parts[:-1])]
+        ends = [word for word, parts in self._parted if parts[-1] in forms]
+        return ends + [word for word, parts in self._parted if not forms.isdisjoint(parts[:-1])]
 
 
 def _forms(text: str) -> Iterator[str]:

@@ -155,3 +155,13 @@ def test_the_command_writes_a_lift_that_is_asked_like_the_first(
         )
         == 2
     )
+
+
+def test_splats_at_one_place_that_look_alike_take_from_one_another(lifted: tuple[LiftResult, Splats]) -> None:
+    result, splats = lifted
+    rows = np.zeros(60, np.int64)  # all as the first
+    alike = splats[rows]
+    found = result[rows].transferred(alike, alike[:40])
+    assert torch.equal(found.features, result.features[rows[:40]]) and found.diagnostics["transfer"]["rows"] == 40
+    with pytest.raises(InvalidSplats, match="agree on one"):
+        find_similarity(alike, alike.transformed(**MOVE))
