@@ -502,11 +502,14 @@ class AskedToSegment(Words, Seen):
     model_config = BUILT
 
 
+SelectionName = Annotated[str, Field(min_length=1, max_length=LIFT_NAME_CHARACTERS, pattern=PRINTABLE)]
+
+
 class NamedQuestion(Question):
     """A question to a lift, and what files call its answer."""
 
     model_config = BUILT
-    name: str | None = Field(None, min_length=1, max_length=LIFT_NAME_CHARACTERS, description="else its words")
+    name: SelectionName | None = Field(None, description="else its words")
 
 
 class AskedToExport(Words):
@@ -586,9 +589,6 @@ class CoveringRegions(OfLift):
 
     view: str
     regions: list[CoveringRegion] = Field(description="one a level at most, the smallest first")
-
-
-SelectionName = Annotated[str, Field(min_length=1, max_length=LIFT_NAME_CHARACTERS, pattern=PRINTABLE)]
 
 
 class AskedEdit(Edit):

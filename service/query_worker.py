@@ -120,6 +120,8 @@ class Answers:
         Raises:
             SplatliftError: what was asked cannot be answered.
         """
+        if request.get("lift") in self._scenes:  # a selection is what each request says of it, whatever others said
+            self._scenes[request["lift"]].selections.clear()
         if "query" in request and _key(request) not in self._cache:
             self._answer_together([request, *ahead])
         return self._operations.get(request["operation"], self._file)(request)
@@ -133,7 +135,8 @@ class Answers:
         )
         asked: dict[str, Any] = {}
         for request in requests:
-            if request["lift"] != requests[0]["lift"] or "query" not in request or _key(request) in self._cache:
+            same = all(request.get(name) == requests[0].get(name) for name in ("lift", "selections"))
+            if not same or "query" not in request or _key(request) in self._cache:
                 continue
             with contextlib.suppress(SplatliftError):
                 found = self._question(request)
@@ -344,6 +347,8 @@ class Answers:
         source: Any
         if request["of"] == "questions":
             source = {part["name"]: self._answer(part["request"]) for part in request["parts"]}
+            for part in request["parts"]:  # their sets, of answers that were kept too
+                self._scene(part["request"])
         elif request["of"] == "words":
             source = self._named(request)
         else:

@@ -8,7 +8,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
 from liftcore.errors import InvalidQuery
 from liftcore.query.question import MOST_CHARACTERS, Box, OwnCamera, Query, as_own_camera
-from liftcore.query.terms import PixelBox, Stroke, parse_example
+from liftcore.query.terms import PixelBox, Stroke, Vector, parse_example
 from liftcore.runtime.fields import Body, NoBoolean
 
 AREAS = "VIEW:box:x0,y0,x1,y1 or VIEW:stroke:x0,y0,x1,y1,..."
@@ -71,5 +71,9 @@ class Edit(Body):
         return area
 
     def described(self) -> dict[str, Any]:
-        """What a history says of it: all but the bits, as JSON."""
-        return self.model_dump(mode="json", exclude_defaults=True, exclude={"bits", "camera"})
+        """What a history says of it, as JSON: all but the bits, and of a vector its length."""
+        told = self.model_dump(mode="json", exclude_defaults=True, exclude={"bits", "camera"})
+        query = told.get("query", {})
+        for name in query.keys() & {"like", "unlike"}:
+            query[name] = [one if isinstance(one, str) else str(Vector(tuple(one))) for one in query[name]]
+        return told

@@ -299,8 +299,8 @@ class Box(NamedTuple):
 class Corners(BaseModel):
     """An axis-aligned box, world frame, as JSON has it."""
 
-    low: Point = Field(description="x y z")
-    high: Point
+    low: tuple[Coordinate, Coordinate, Coordinate] = Field(description="x y z")
+    high: tuple[Coordinate, Coordinate, Coordinate]
 
 
 class Value(Shown):

@@ -419,7 +419,7 @@ def export(asked: AskedToExport, deps: Deps, ask: Ask) -> Response:
     if asked.of == "questions":
         if not asked.questions or any(one.lift not in (None, lift.id) for one in asked.questions):
             raise InvalidRequest("questions", expected="a question or more, to the same lift", got="none, or others")
-        named = {one.name or ", ".join(map(shown, (*one.text, *one.like, *one.sets))): one for one in asked.questions}
+        named = _by_name(asked.questions)
         parts = [{"name": name, "request": query_request("query", one, lift, deps)} for name, one in named.items()]
         wanted, title = wanted | {"parts": parts}, list(named)
     elif asked.of == "words" or asked.encoder is not None or asked.table is not None:
@@ -428,6 +428,19 @@ def export(asked: AskedToExport, deps: Deps, ask: Ask) -> Response:
     things = list(deps.store.selections.things(deps.owner, lift.id).items())
     wanted |= {"of": asked.of, "of_view": asked.view, "name": name, "things": things}
     return made(deps, wanted, lift, ask, {})
+
+
+def _by_name(questions: list[models.NamedQuestion]) -> dict[str, models.NamedQuestion]:
+    """Questions by what files call them; one whose name another has gets a number."""
+    named = dict[str, models.NamedQuestion]()
+    for one in questions:
+        name = first = one.name or ", ".join(map(shown, (*one.text, *one.like, *one.sets)))
+        number = 1
+        while name in named:
+            number += 1
+            name = f"{first} {number}"
+        named[name] = one
+    return named
 
 
 @router.post("/query/what", response_model=WhatAnswer)

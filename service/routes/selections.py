@@ -67,7 +67,8 @@ def edit_selection(
     """Add, take away, grow, shrink or set: a step of its history, which PATCH goes back."""
     found = deps.store.lifts.get(deps.owner, lift)
     before = deps.store.selections.get(deps.owner, found.id, selection)
-    versions = _versions(match) or frozenset({before.version})
+    versions = _versions(match)
+    versions = frozenset({before.version}) if versions is None else versions
     splats = _edited(asked, found, deps, ask, deps.store.selections.bits(before))
     # What was worked on is the version that was read: another that came meanwhile is not overwritten.
     return _answer(

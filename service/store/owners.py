@@ -64,7 +64,8 @@ def stored_bytes(connection: sqlite3.Connection, owner: Owner) -> int:
     lifts = "SELECT total(lifts.bytes) FROM lifts JOIN jobs USING (id) WHERE owner = :owner"
     tradeoffs = "SELECT total(tradeoffs.bytes) FROM tradeoffs JOIN jobs USING (id) WHERE owner = :owner"
     selections = (
-        "SELECT total(length(splats)) FROM selection_steps JOIN selections ON selections.id = selection"
+        "SELECT total(length(splats) + length(edit)) FROM selection_steps"
+        " JOIN selections ON selections.id = selection"
         " JOIN (SELECT id AS job, owner FROM jobs) ON job = lift WHERE owner = :owner"
     )
     total = f"SELECT ({assets}) + ({lifts}) + ({tradeoffs}) + ({selections})"

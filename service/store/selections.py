@@ -7,6 +7,8 @@ import secrets
 import sqlite3
 import time
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -68,11 +70,12 @@ class SelectionStore:
         """Keep a new selection; the lift is one that the owner sees.
 
         Raises:
+            NotFound: the lift was deleted meanwhile.
             OverLimit: the lift has as many as it may.
             OverQuota, NoSpace: there is no room for it.
         """
         selection, now = secrets.token_hex(8), time.time()
-        with self._database.write(counted=True) as connection:
+        with _lift_there(lift), self._database.write(counted=True) as connection:
             number = connection.execute("SELECT count(*) FROM selections WHERE lift = ?", (lift,)).fetchone()[0]
             if number >= MOST:
                 hint = "delete one that is of no use any more"
@@ -177,10 +180,12 @@ class SelectionStore:
         """Give an object of a lift, which the owner sees, another ``name``, None for its own, or have it ``hidden``.
 
         Raises:
-            OverLimit: too many of the lift have been changed.
+            NotFound: the lift was deleted meanwhile.
+            OverLimit: too many others of the lift have been changed.
         """
-        with self._database.write(counted=True) as connection:
-            number = connection.execute("SELECT count(*) FROM things WHERE lift = ?", (lift,)).fetchone()[0]
+        with _lift_there(lift), self._database.write(counted=True) as connection:
+            others = "SELECT count(*) FROM things WHERE lift = ? AND thing != ?"
+            number = connection.execute(others, (lift, thing)).fetchone()[0]
             if number >= MOST_THINGS:
                 raise OverLimit("thing", expected=f"at most {MOST_THINGS} changed objects of a lift", got="more")
             insert(connection, "things", {"lift": lift, "thing": thing, "hidden": 0}, known="IGNORE")
@@ -201,10 +206,11 @@ class SelectionStore:
         self, connection: sqlite3.Connection, owner: Owner, selection: str, number: int, splats: SplatSet
     ) -> None:
         packed = zlib.compress(splats.bits)
-        self._files.require_room(len(packed))
-        require_quota(connection, owner, len(packed))
-        box = None if splats.box is None else json.dumps(splats.box)
-        row = {"selection": selection, "number": number, "edit": json.dumps(splats.edit), "count": splats.count}
+        edit, box = json.dumps(splats.edit), None if splats.box is None else json.dumps(splats.box)
+        coming = len(packed) + len(edit)
+        self._files.require_room(coming)
+        require_quota(connection, owner, coming)
+        row = {"selection": selection, "number": number, "edit": edit, "count": splats.count}
         insert(connection, "selection_steps", row | {"box": box, "splats": packed})
 
     def _update(self, connection: sqlite3.Connection, selection: str, **changes: Any) -> None:
@@ -214,6 +220,17 @@ class SelectionStore:
             f"UPDATE selections SET {columns}version = version + 1, changed = :changed WHERE id = :id",
             values | {"changed": time.time(), "id": selection},
         )
+
+
+@contextmanager
+def _lift_there(lift: str) -> Iterator[None]:
+    """Say of rows that reference no lift that it is not there."""
+    try:
+        yield
+    except sqlite3.IntegrityError as error:
+        if error.sqlite_errorcode != sqlite3.SQLITE_CONSTRAINT_FOREIGNKEY:
+            raise
+        raise NotFound("lift", expected="the id of a lift", got=lift, hint="it was deleted meanwhile") from None
 
 
 def _found(connection: sqlite3.Connection, owner: Owner, lift: str, selection: str) -> SelectionRecord:

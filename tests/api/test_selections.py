@@ -19,8 +19,10 @@ from PIL import Image
 from plyfile import PlyData
 from safetensors.numpy import load
 
+from liftcore.errors import NotFound
 from service.store import selections as module
 from service.store.database import DATABASE, OF_0_4, TABLES_OF_0_4
+from service.store.owners import SERVICE, stored_bytes
 from service.store.store import Store
 
 from .conftest import parts_of
@@ -103,6 +105,8 @@ def test_edit_of_an_older_version_is_refused(client: TestClient, route: str) -> 
     for method, path, body in (("POST", edits, {"how": "grow"}), ("PATCH", own, {"step": 0}), ("DELETE", own, None)):
         late = client.request(method, path, json=body, headers={"If-Match": tag})
         assert (late.status_code, late.json()["type"]) == (412, "/problems/changed")
+    for tag in ("", "another", '"another"'):
+        assert client.post(edits, json={"how": "grow"}, headers={"If-Match": tag}).status_code == 412
     assert client.patch(own, json={"step": 0}, headers={"If-Match": f"W/{first.headers['etag']}"}).status_code == 200
     assert client.delete(own, headers={"If-Match": "*"}).status_code == 204
 
@@ -171,6 +175,52 @@ def test_splat_tells_its_thing(client: TestClient, lift: dict[str, Any]) -> None
     assert client.get(objects, params={"splat": ALL}).json()["objects"] == []
 
 
+@pytest.mark.parametrize("corner", ["NaN", "Infinity", "1e400"])
+def test_box_without_end_is_a_problem(client: TestClient, route: str, corner: str) -> None:
+    selection = begun(client, route)
+    body = f'{{"how": "add", "box": {{"low": [0, 0, 0], "high": [1, 1, {corner}]}}}}'
+    reply = client.post(selection["links"]["edits"], content=body, headers={"Content-Type": "application/json"})
+    assert (reply.status_code, reply.json()["argument"][:3]) == (422, "box")
+
+
+def test_history_has_no_vectors(client: TestClient, lift: dict[str, Any], route: str) -> None:
+    query = {"like": [[1.0] * lift["channels"], "splat:0"], "threshold": 0.5}
+    (step,) = begun(client, route, query=query)["history"]
+    assert step["edit"]["query"]["like"] == [f"a vector of {lift['channels']} channels", "splat:0"]
+
+
+def test_export_takes_the_step_that_is_shown(client: TestClient, lift: dict[str, Any], route: str) -> None:
+    selection = begun(client, route, query={"sets": ["object:0"]})
+    client.get(selection["links"]["query"])  # whose answer is kept
+    other = client.post(selection["links"]["edits"], json={"how": "set"}).json()
+    assert client.get(other["links"]["query"]).json()["count"] == 0
+    assert client.patch(selection["links"]["self"], json={"step": 0}).status_code == 200
+    mine = {"name": "mine", "sets": [f"selection:{selection['id']}"]}
+    assert exported_counts(client, mine) == {"mine": selection["count"]}
+
+
+def test_questions_of_one_name_are_both_exported(client: TestClient, lift: dict[str, Any]) -> None:
+    objects = [{"name": "mine", "sets": [f"object:{number}"]} for number in (0, 1)]
+    assert set(exported_counts(client, *objects)) == {"mine", "mine 2"}
+
+
+def exported_counts(client: TestClient, *questions: dict[str, Any]) -> dict[str, int]:
+    """The splats of each question's answer, by its name in the table of an export."""
+    reply = client.post("/query/export", json={"of": "questions", "questions": questions, "view": "left"})
+    with zipfile.ZipFile(io.BytesIO(reply.content)) as archive:
+        table = list(csv.DictReader(io.StringIO(archive.read("instances.csv").decode())))
+    return {row["name"]: int(row["splats"]) for row in table}
+
+
+def test_lift_that_is_deleted_meanwhile_takes_no_selection_and_no_name(client: TestClient) -> None:
+    selections = parts_of(client).store.selections
+    nothing = module.SplatSet({"how": "set"}, 0, None, b"\0")
+    with pytest.raises(NotFound):
+        selections.create(SERVICE, "0" * 32, "mine", nothing)
+    with pytest.raises(NotFound):
+        selections.change_thing("0" * 32, 0, {"name": "the mug"})
+
+
 @pytest.fixture
 def hers(tmp_path: Path) -> Iterator[Guarded]:
     with guarded(tmp_path / "data") as made:
@@ -192,8 +242,6 @@ def test_selection_belongs_to_whom_its_lift_does_and_goes_with_it(hers: Guarded)
 
 
 def test_selections_count_for_the_quota(client: TestClient, lift: dict[str, Any], route: str) -> None:
-    from service.store.owners import SERVICE, stored_bytes
-
     with parts_of(client).store.database.read() as connection:
         before = stored_bytes(connection, SERVICE)
         begun(client, route, **LAMP)
