@@ -19,7 +19,7 @@ import numpy as np
 
 from liftcore.errors import InvalidSplats
 from liftcore.io.files import BROKEN_ZIP, open_regular, open_zip
-from liftcore.io.quantised import Fields, joined_fields
+from liftcore.io.quantised import MOST_GROWTH, Fields, joined_fields
 from liftcore.io.sog import HINT, META, decode_sog, is_bundled, read_in_archive, read_sog, sog_files
 
 LOD_META = "lod-meta.json"
@@ -38,7 +38,8 @@ def read_streamed_sog(path: Path, *, colour: bool = True) -> Fields:
             return _joined(document, partial(_chunk_in_folder, _meta_of(path).parent, colour=colour), path)
         with open_zip(path) as archive:
             prefix = streamed_folder(archive.namelist()) or ""
-            document = json.loads(read_in_archive(archive, prefix, LOD_META, MAX_DOCUMENT_BYTES) or b"")
+            most = min(MAX_DOCUMENT_BYTES, MOST_GROWTH * path.stat().st_size)
+            document = json.loads(read_in_archive(archive, prefix, LOD_META, most) or b"")
             return _joined(document, partial(_chunk_in_archive, archive, prefix, path, colour=colour), path)
     except (*BROKEN_ZIP, RecursionError) as error:
         raise _refused(path, LOD_META, f"one that does not open ({str(error)[:120]})") from None
@@ -150,7 +151,8 @@ def _whole_number(value: Any) -> int:
 
 def _is_below(name: str) -> bool:
     return (
-        name.endswith((META, ".sog"))
+        (PurePosixPath(name).name == META or name.endswith(".sog"))
+        and str(PurePosixPath(name)) == name  # one name a file
         and not name.startswith("/")
         and ".." not in PurePosixPath(name).parts
         and not {"\\", "\0", ":"} & {*name}
@@ -165,7 +167,7 @@ def _chunk_in_folder(folder: Path, name: str, *, colour: bool) -> Fields:
 
 def _chunk_in_archive(archive: zipfile.ZipFile, prefix: str, path: Path, name: str, *, colour: bool) -> Fields:
     inside = (prefix + name).removesuffix(META)
-    size = sum(info.compress_size for info in archive.infolist() if info.filename.startswith(inside))
+    size = sum(info.compress_size for info in archive.infolist() if info.filename.rpartition("/")[0] == inside[:-1])
     return decode_sog(partial(read_in_archive, archive, inside), path / name, size, colour=colour)
 
 

@@ -124,7 +124,14 @@ def test_the_finest_level_of_each_leaf_of_a_streamed_sog_is_one_scene(tmp_path: 
         "each once": ((leaf(_0=(0, 0, 1)), leaf(_0=(1, 0, 1))), {"names": ["degree1/meta.json"] * 2}),
         "beside it": ((leaf(_0=(0, 0, 1)),), {"names": ["none/meta.json"]}),
     }
-    outside = ("../degree1/meta.json", "/etc/meta.json", "https://a/meta.json", "a\\meta.json", 7)
+    outside = (
+        "../degree1/meta.json",
+        "/etc/meta.json",
+        "https://a/meta.json",
+        "degree1/./meta.json",
+        "a\\meta.json",
+        7,
+    )
     wrong |= {
         f"in the folder.*{number}": ((leaf(_0=(0, 0, 1)),), {"names": [one]}) for number, one in enumerate(outside)
     }
