@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -54,12 +55,19 @@ class Twice(LocalEngine):
                 yield piece
 
 
-def halves_and_quarters(rng: np.random.Generator) -> np.ndarray:
-    """[2, 12, 16] i32: the halves of an image and, on another level, its quarters, with pixels astray and without."""
-    y, x = np.mgrid[:12, :16]
-    labels = np.stack([x // 8, 2 + x // 8 + 2 * (y // 6)])
-    astray = rng.random(labels.shape) < 0.05
-    return np.where(astray, rng.integers(-1, 6, labels.shape), labels).astype(np.int32)
+def halves_and_quarters(camera: lc.Camera, rng: np.random.Generator) -> np.ndarray:
+    """[2, 12, 16] i32: the halves of the plane z = 0 that a camera sees and, on another level, its quarters.
+
+    Some pixels are astray or without. Views agree on what is one thing, and on what its parts are.
+    """
+    v, u = np.mgrid[1:24:2, 1:32:2]
+    rays = np.stack([u, v, np.ones(u.shape)], axis=-1) @ np.linalg.inv(camera.K).T
+    pose = camera.viewmat
+    along, centre = rays @ pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]
+    x, y, _ = np.moveaxis(centre - along * (centre[2] / along[..., 2:]), -1, 0)
+    labels = np.stack([x > 0, 2 + (x > 0) + 2 * (y > 0)])
+    others = np.stack([rng.integers(-1, 2, u.shape), rng.choice([-1, 2, 3, 4, 5], u.shape)])  # of the same level
+    return np.where(rng.random(labels.shape) < 0.05, others, labels).astype(np.int32)
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +75,7 @@ def scene() -> dict[str, Any]:
     """Splats of which a view sees a part, in three blocks, and views of regions and of grids."""
     rng = np.random.default_rng(1)
     splats = random_splats(3, COUNT, spread=6.0)
+    splats = replace(splats, means=splats.means * torch.tensor([1.0, 1.0, 0.05]))  # a sheet: views see the same
     cameras = {
         name: look_at(name, rng.normal((0, 0, -4), 1), 32, 24, 30.0) for name in map("v{}".format, range(VIEWS))
     }
@@ -74,7 +83,7 @@ def scene() -> dict[str, Any]:
     for number, name in enumerate(cameras):
         book = torch.from_numpy(rng.normal(0, 1, (6, 4)).astype(np.float32))
         if number % 2:
-            views[name] = lc.Regions(halves_and_quarters(rng), book)
+            views[name] = lc.Regions(halves_and_quarters(cameras[name], rng), book)
         else:
             views[name] = lc.FeatureGrid(rng.normal(0, 1, (6, 8, 4)).astype(np.float32))
     return {"splats": splats, "cameras": lc.Cameras(cameras), "views": views}
@@ -112,6 +121,7 @@ def assert_same_metadata(one: lc.LiftResult, other: lc.LiftResult) -> None:
 def test_blocks_give_the_bits_of_a_lift_in_memory(scene: dict[str, Any], asked: dict[str, Any]) -> None:
     settings = LiftSettings.of(certificate_rays=200, **asked)
     whole = lc.lift(scene["splats"], scene["cameras"], scene["views"], settings)
+    assert whole.node_parents is not None and int((whole.node_parents >= 0).sum()) == 4  # the quarters, of two halves
     for engine in (Twice(1), Shuffled(2)):
         found = in_blocks(engine, scene, settings)
         assert_same(found, whole)
