@@ -144,7 +144,8 @@ def tensor_bytes(tensor: "Tensor") -> memoryview:
 
     if not tensor.numel():  # an empty one of numpy's may have strides of zero, of which torch makes no bytes
         return memoryview(b"")
-    return tensor.cpu().contiguous().flatten().view(torch.uint8).numpy().data
+    flat = tensor.cpu().contiguous().flatten()
+    return flat.as_strided(flat.shape, (1,)).view(torch.uint8).numpy().data  # a single number may have any stride
 
 
 def map_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:

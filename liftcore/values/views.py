@@ -22,6 +22,7 @@ LARGEST = 1e15  # of a feature; float32 sums of squares over all channels stay f
 MAX_CHANNELS = 1 << 16
 PLANES = "masks [M, h, w], a plane for each row of vectors, are Regions.from_masks(masks.astype(bool), vectors)"
 MAX_LEVELS = 32  # a hierarchy of four partitions, with masks 1 to 4 pixels over their neighbours, took 13 to 18
+MOST_LEVELS = 127  # of label maps; a level's number takes a byte
 INTEGERS = (torch.int32, torch.int16, torch.int64, torch.int8, torch.uint8)
 WIDENED = (torch.uint16, torch.uint32)  # of pictures of 16 bits; torch does hardly anything with these
 Array = Tensor | np.ndarray
@@ -284,6 +285,9 @@ def _labels(values: object, rows: int, where: str) -> Tensor:
     if found.ndim not in (2, 3) or not found.numel() or found.dtype not in INTEGERS:
         hint = PLANES if found.dtype == torch.bool else ""
         raise InvalidFeatures(where, expected="integers [L, h, w], no side empty", got=_kind(found), hint=hint)
+    if found.ndim == 3 and len(found) > MOST_LEVELS:
+        hint = "put maps whose labels do not overlap together, or lift some of them"
+        raise InvalidFeatures(where, expected=f"at most {MOST_LEVELS} levels", got=_kind(found), hint=hint)
     low, high = (int(value) for value in torch.aminmax(found))
     if found.ndim == 3 and len(found) == rows > 2 and (low, high) == (0, 1):  # would be of the first two rows alone
         got = f"{_kind(found)} of zeros and ones, a plane for each of the {rows} rows"

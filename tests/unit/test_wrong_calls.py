@@ -69,6 +69,7 @@ CALLS: list[tuple[str, Call]] = [
     (r"view: .* got 'v9'; nearest: v0", lambda s: s.cameras["v9"]),
     # views
     (r"labels: expected integers \[L, h, w\].* got float64", lambda s: lc.Regions(np.ones((4, 4)), np.eye(2))),
+    (r"labels: expected at most 127 levels", lambda s: lc.Regions(np.zeros((128, 4, 4), np.int32), np.eye(2))),
     (r"labels: .* rows of its codebook \(0\.\.1\) or -1", lambda s: lc.Regions(np.full((4, 4), 7), np.eye(2))),
     (r"grid: expected floats \[h, w, F\], got int64", lambda s: lc.FeatureGrid(np.ones((2, 2, 2), int))),
     # lifts

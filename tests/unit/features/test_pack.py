@@ -93,9 +93,11 @@ def test_values_that_cannot_be_right_are_refused(make, message: str) -> None:
 
 def test_tensors_of_any_order_are_stored_in_row_order(tmp_path) -> None:
     turned = torch.from_numpy(MAP).permute(1, 2, 0)
-    write_tensors(tmp_path / "t", {"turned": turned, "every other": turned[:, ::2]}, {})
+    single = torch.arange(6).as_strided((1,), (2,))  # as a slice of one number may be
+    write_tensors(tmp_path / "t", {"turned": turned, "every other": turned[:, ::2], "single": single}, {})
     found = load_file(tmp_path / "t")
     assert torch.equal(found["turned"], turned) and torch.equal(found["every other"], turned[:, ::2])
+    assert torch.equal(found["single"], single)
 
 
 def sources(tmp_path) -> dict[str, Views]:
