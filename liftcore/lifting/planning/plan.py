@@ -112,6 +112,7 @@ class Plan(PlannedScene):
     spare: tuple[str, ...]  # of those lifted: what they show, WELL_COVERED of the others show too
     seen_share: float  # of the splats, that some view can see, before occlusion
     splats_a_view: float  # that a view can see, before occlusion
+    levels: tuple[int, int] | None  # the one that the setting levels takes alone, and how many maps have; None: all
     channels: int  # F
     dtype: str  # that X is stored as, when it can hold the codebooks
     memory: Mapping[str, int]  # bytes a part at the peak, about
@@ -152,6 +153,7 @@ class Plan(PlannedScene):
             "views_left_out": len(self.left_out),
             "view_cosine": self.view_cosine,
             "spare_views": list(self.spare),
+            "levels": None if self.levels is None else {"alone": self.levels[0], "of": self.levels[1]},
             "channels": self.channels,
             "dtype": self.dtype,
             "memory_bytes": self.memory_bytes,
@@ -165,7 +167,8 @@ class Plan(PlannedScene):
         seen = f"{self.seen_share:.1%} in some view's field"
         spare = f", {len(self.spare)} of them see nothing that {WELL_COVERED} others do not" if self.spare else ""
         yield f"{self.splats} splats ({self.rendered}), {seen}; {len(self.views)} of {self.there} views{spare}"
-        yield f"{self.channels} channels, stored as {self.dtype}"
+        level = f", level {self.levels[0]} alone of {self.levels[1]}, as the settings choose" if self.levels else ""
+        yield f"{self.channels} channels, stored as {self.dtype}{level}"
         files = f", {self.in_files / MIB:.0f} MiB of region weights in files" if self.in_files else ""
         yield f"about {self.memory_bytes / MIB:.0f} MiB at the peak{files}, on {self.device.name}"
 
@@ -244,6 +247,7 @@ def plan_lift(
         spare=tuple(names[k] for k in spare_views(seen)),
         seen_share=seen.seen_share,
         splats_a_view=seen.splats_a_view,
+        levels=_level_alone(features, names, settings),
         channels=features.channels,
         dtype=settings.dtype,
         memory=parts,
@@ -368,8 +372,19 @@ def _tiles(seen: Visibility) -> float:
 def _parts_a_tile(features: Views, view: str, settings: LiftSettings) -> int:
     if not features.is_regions(view):
         return 4  # nearest reads fewer, but fine cells are smaller than a tile
-    shape = features.specs(view)["labels"].shape
-    return shape[0] if len(shape) == 3 and not isinstance(settings.levels, int) else 1
+    return 1 if isinstance(settings.levels, int) else _levels(features, view)
+
+
+def _levels(features: Views, view: str) -> int:
+    """The levels of a view's region map; one of a grid."""
+    shape = features.specs(view)["labels"].shape if features.is_regions(view) else ()
+    return shape[0] if len(shape) == 3 else 1
+
+
+def _level_alone(features: Views, names: Sequence[str], settings: LiftSettings) -> tuple[int, int] | None:
+    """The level that the settings take alone, and how many the maps have; None where nothing is left out."""
+    there = max(_levels(features, name) for name in names) if isinstance(settings.levels, int) else 1
+    return (settings.levels, there) if isinstance(settings.levels, int) and there > 1 else None
 
 
 def _codebook(features: Views, view: str) -> tuple[int, ...]:

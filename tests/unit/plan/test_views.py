@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+import liftcore as lc
 from liftcore.lifting.files import lift_files
 from liftcore.lifting.planning.views import (
     SIDES,
@@ -117,3 +118,15 @@ def test_a_lift_with_coverage_is_the_lift_of_the_chosen_views(tmp_path):
     whole = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(preset="row-sum"))
     assert not torch.equal(made.features, whole.features)
     assert bool((made.evidence <= whole.evidence + 1e-4).all())
+
+
+def test_plan_and_lift_say_which_level_is_taken_alone_of_how_many():
+    names = [f"v{k}" for k in range(3)]
+    cameras = {name: random_camera(k, name=name) for k, name in enumerate(names)}
+    scene = random_splats(3, 60), cameras, {name: random_regions(k, levels=4) for k, name in enumerate(names)}
+    settings = LiftSettings.of(preset="row-sum", levels=2, certificate_rays=0)
+    plan = lc.plan(*scene, settings)
+    assert plan.facts()["levels"] == {"alone": 2, "of": 4}
+    assert any("level 2 alone of 4" in line for line in plan.summary())
+    assert lc.lift(*scene, settings).diagnostics["plan"]["levels"] == {"alone": 2, "of": 4}
+    assert lc.plan(*scene, "row-sum").facts()["levels"] is None
