@@ -63,7 +63,8 @@ def run(options: argparse.Namespace) -> int:
         files["names"] = Path(check_output(names, [*given, *made_from(scene)], "json"))
         exports["names"] = partial(scene.export, source=source, what="names")
     files = write_files(files, exports)
-    document: dict[str, Any] = {"files": files, "splats": len(scene.features), "what": what}
+    splats = int(scene.members(source).sum()) if isinstance(source, int) else len(scene.features)
+    document: dict[str, Any] = {"files": files, "splats": splats, "what": what}
     if source is not None and not isinstance(source, int) and what != "object":
         labels = scene.labels(source)
         document |= {name: len(labels.document[name]) for name in ("classes", "instances")}

@@ -109,6 +109,8 @@ def test_the_command_writes_what_the_suffix_says(
     found = read_labels(export("lamp.glb", "--text", "lamp", "--only", *words[1:]))
     assert {one["name"] for one in found.document["instances"]} == {"lamp"} and (found.columns["class_id"] == 1).all()
     capsys.readouterr()
+    export("object.ply", "--object", "1", "--json")
+    assert json.loads(capsys.readouterr().out)["splats"] == SPLATS_A_CLUSTER  # that are in the file
     for wrong in (["-o", "s.obj"], ["-o", "s.glb", "--only"], ["-o", "s.glb", "--object", "9"]):
         assert main(["export", str(tiny_lift), *wrong]) == 2
     assert not Path("s.glb").exists()

@@ -220,7 +220,7 @@ def test_damaged_bytes_are_refused_or_read_and_nothing_else(suffix: str, tmp_pat
 @pytest.mark.parametrize("suffix", [".glb", ".spz"])
 def test_columns_come_back_or_are_refused(suffix: str, tmp_path: Path) -> None:
     path, splats = tmp_path / f"s{suffix}", some_splats()
-    columns = {f"c{number}": np.full(P, number / 4, np.float32) for number in range(40)}
+    columns = {f"c{number}": np.full(P, number / 4, np.float32) for number in range(256)}
     write_splats(path, splats, columns)
     extras = read_splats(path).extras
     assert {name: extras[name].tolist() for name in columns} == {name: own.tolist() for name, own in columns.items()}
