@@ -190,6 +190,16 @@ def test_thing_takes_a_name_and_is_hidden_for_good(page: Browser, served: Served
         httpx.patch(f"{served.address}/lifts/{served.lift}/objects/0", json=change).raise_for_status()
 
 
+def test_empty_selection_says_how_to_add_to_it(page: Browser, served: Served) -> None:
+    route = f"{served.address}/lifts/{served.lift}/selections"
+    selection = httpx.post(route, json={"name": "<b>mine</b>"}).raise_for_status().json()
+    page.open(f"{served.address}/?lift={served.lift}&sets=selection:{selection['id']}")
+    page.until(f"{READY} && !document.querySelector('#hand').hidden && splatlift.ask.now.answer")
+    assert text_of(page, "#title") == "<b>mine</b>" and "brush" in text_of(page, "#why")
+    assert selection["id"] not in text_of(page, "#found") and page.value("document.querySelector('#nearest').hidden")
+    httpx.delete(f"{route}/{selection['id']}").raise_for_status()
+
+
 def test_answer_is_corrected_by_hand_and_undone(page: Browser) -> None:
     done = f"splatlift.hand.selection?.step === {{}} && !splatlift.hand.busy && {FOUND}"
     ask(page, "lamp")

@@ -338,7 +338,7 @@ export class Ask {
 
   chip(question, place) {
     const found = question.answer && lit(question) ? count(question.count) : "";
-    const numbers = question.answer ? (question.answer.present === false && !found ? "not here" : unsure(question) ? ["not sure", found].filter(Boolean).join(" \u00b7 ") : found) : question.problem ? (question.problem.nearest ? "not a word here" : "!") : "\u2026";
+    const numbers = question.answer ? (question.sets.length ? count(question.count) : question.answer.present === false && !found ? "not here" : unsure(question) ? ["not sure", found].filter(Boolean).join(" \u00b7 ") : found) : question.problem ? (question.problem.nearest ? "not a word here" : "!") : "\u2026";
     return el("li", { className: ["chip", question === this.now && "now", unsure(question) && "unsure"].filter(Boolean).join(" "), style: { "--mine": question.colour } },
       el("button", { type: "button", className: "pick", "aria-pressed": String(question === this.now),
         on: { click: () => { this.active = place; this.thing = -1; this.show(); this.changed(); } } },
@@ -380,10 +380,13 @@ export class Ask {
     at("answer").classList.toggle("unsure", unsure(now));
     at("slider-value").textContent = answer && Number.isFinite(now.cut) ? now.cut.toFixed(3) : "";
     at("auto").disabled = !answer || now.threshold === "auto";
-    at("nearest").hidden = !answer || lit(now);
+    at("nearest").hidden = !answer || lit(now) || now.sets.length > 0;
     if (!answer) {
       at("answer").textContent = now.problem ? (now.problem.nearest ? `\u201c${now.text.join(", ")}\u201d is not a word that can be asked here.` : words(now.problem)) : "Looking\u2026";
       at("why").textContent = "";
+    } else if (now.sets.length && !now.count) {
+      at("answer").textContent = "Nothing is selected.";
+      at("why").textContent = "Add to it with the brush or the box.";
     } else if (!lit(now) && answer.present === false) {
       at("answer").textContent = `${quoted(now)} is not here.`;
       at("why").textContent = reason(answer);
