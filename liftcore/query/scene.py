@@ -173,8 +173,11 @@ class Scene(OpenedLift):
         from liftcore.query.terms import parse_set
 
         parse_set(f"selection:{name}", "name")
-        found = self.selections.setdefault(name, Selection(self, name))
-        return found if source is None else found.edit("set", source)
+        found = self.selections.get(name) or Selection(self, name)
+        if source is not None:
+            found.edit("set", source)  # what cannot be selected leaves no selection
+        self.selections[name] = found
+        return found
 
     def render(self, view: str | Camera, what: str = "rgb") -> np.ndarray:
         """A view: [H, W, 3] u8 sRGB of ``rgb``, ``pca``, ``cluster`` or ``confidence``; [H, W] f32 of ``depth``.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.errors import InvalidQuery, NotFound
+from liftcore.errors import InvalidQuery, NotFound, SplatliftError
 from liftcore.query.question import Query
 from liftcore.query.scene import Scene
 from liftcore.raster.reference import ReferenceRaster
@@ -136,3 +136,10 @@ def test_edits_without_a_source_or_with_two_are_refused(scene: Scene) -> None:
     with pytest.raises(InvalidQuery, match="without texts and examples"):
         Query(text=["apple"], sets=["object:1"])
     assert rows_of(selection.splats) == rows_of(cluster(0)) and len(selection.history) == 1
+
+
+def test_what_cannot_be_selected_leaves_no_selection(scene: Scene) -> None:
+    for source in (99, np.zeros(3, np.bool_), Query(sets=["selection:new"])):
+        with pytest.raises(SplatliftError):
+            scene.select("new", source)
+    assert not scene.selections
