@@ -13,7 +13,7 @@ import numpy as np
 from liftcore.errors import InvalidQuery, NotFound
 from liftcore.query.edits import Edit
 from liftcore.query.objects import MOST_SPLATS, largest_box, objects
-from liftcore.query.opened import OpenedLift
+from liftcore.query.opened import MOST_PIXELS, OpenedLift
 from liftcore.query.question import Answer, Box, Query
 from liftcore.query.terms import PixelBox, SplatSet, Stroke
 from liftcore.runtime.one_line import one_line
@@ -167,6 +167,10 @@ def _source(scene: OpenedLift, edit: Edit, answer: Answer | None) -> np.ndarray:
     if edit.area is not None:
         area = edit.parsed_area()
         camera = scene.camera(area.view) if edit.camera is None else edit.camera.camera()
+        if np.prod(camera.photo_size) > MOST_PIXELS:
+            width, height = camera.photo_size
+            expected = f"an image of at most {MOST_PIXELS} pixels to take an area of"
+            raise InvalidQuery("camera", expected=expected, got=f"{width}x{height}", hint="take a smaller camera")
         return splats_under(scene, camera, area_mask(area, camera.photo_size, edit.radius), through=edit.through)
     if edit.box is not None:
         low, high = (np.array(corner)[:, None] for corner in edit.box)

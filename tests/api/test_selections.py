@@ -183,6 +183,13 @@ def test_box_without_end_is_a_problem(client: TestClient, route: str, corner: st
     assert (reply.status_code, reply.json()["argument"][:3]) == (422, "box")
 
 
+def test_area_of_a_vast_camera_is_a_problem(client: TestClient, lift: dict[str, Any], route: str) -> None:
+    (view,) = client.get(f"/lifts/{lift['id']}/views", params={"limit": 1}).json()["views"]
+    vast = {"area": "vast:stroke:0,0,9,9", "camera": view | {"width": 32768, "height": 32768}}
+    reply = client.post(begun(client, route)["links"]["edits"], json={"how": "add", **vast})
+    assert (reply.status_code, reply.json()["argument"]) == (422, "camera")
+
+
 def test_history_has_no_vectors(client: TestClient, lift: dict[str, Any], route: str) -> None:
     query = {"like": [[1.0] * lift["channels"], "splat:0"], "threshold": 0.5}
     (step,) = begun(client, route, query=query)["history"]
