@@ -56,8 +56,16 @@ def save_lift(lift: Lift, path: Path | str) -> None:
 
     Raises:
         InvalidInput: it lies elsewhere and cannot be sent there.
+        InvalidLift: features and those of its nodes have other channels, as after features were replaced by others.
     """
     from liftcore.io.safetensors_file import write_tensors
+
+    nodes, channels = lift.node_features, lift.features.shape[1]
+    if nodes is not None and nodes.shape[1] != channels:
+        expected, got = f"node_features of {channels} channels, as features have", f"{nodes.shape[1]}"
+        raise InvalidLift(
+            "node_features", expected=expected, got=got, hint=f"replace {', '.join(NODE_TENSORS)} by None"
+        )
 
     metadata = lift.metadata.model_dump_json()
     tensors = tensors_of(lift)

@@ -78,7 +78,7 @@ def test_slider_repaints_without_a_request(page: Browser) -> None:
     lit, asked = len(columns(page, AMBER)), len(page.asked)
     page.value("document.querySelector('#cut').value = 9")  # the most there is
     page.value("document.querySelector('#cut').dispatchEvent(new Event('input'))")
-    assert len(page.asked) == asked and "You set this cut" in text_of(page, "#why")
+    assert len(page.asked) == asked and "You set this." in text_of(page, "#why")
     assert page.value("document.querySelectorAll('#things button').length") == 0  # those of the cut before
     assert text_of(page, ".chip small") == str(page.value("splatlift.ask.now.count"))
     assert len(columns(page, AMBER)) < lit

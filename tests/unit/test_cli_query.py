@@ -13,13 +13,13 @@ from PIL import Image
 from safetensors.numpy import save_file
 
 from liftcore import cli
-from liftcore.errors import InvalidInput
+from liftcore.errors import InvalidInput, InvalidLift
 from liftcore.io.splats import read_splats
 from liftcore.query.question import Query
 from liftcore.query.result import load_lift
 from liftcore.query.scene import Scene
 from liftcore.text import BUILT_IN, open_encoder
-from liftcore.values.lift_file import save_lift
+from liftcore.values.lift_file import NODE_TENSORS, save_lift
 
 from .command_line import assert_one_line, lift_arguments, run, write_toy_scene
 
@@ -102,7 +102,10 @@ def test_the_table_that_ships_answers_where_weights_of_its_space_cannot_be_had(
     lift = load_lift(scene / "lift.safetensors")
     metadata = lift.metadata.model_copy(update={"text_space": BUILT_IN["lvis"]})
     words = torch.from_numpy(open_encoder("lvis").encode(["mug", "cat"]))
-    save_lift(replace(lift, features=words.half(), metadata=metadata), scene / "clip.safetensors")
+    lift = replace(lift, features=words.half(), metadata=metadata)
+    with pytest.raises(InvalidLift, match="node_features: expected node_features of 512 channels"):
+        save_lift(lift, scene / "clip.safetensors")
+    save_lift(replace(lift, **dict.fromkeys(NODE_TENSORS)), scene / "clip.safetensors")
     status, out, _ = run(capsys, "query", scene / "clip.safetensors", "cat", "--json")
     document, name = json.loads(out), open_encoder("lvis").name
     assert (status, document["encoder"], document["statistics"]["max"]) == (0, name, pytest.approx(1.0, abs=1e-3))
