@@ -244,7 +244,8 @@ class _Asset:
             return [text[low:high].decode("utf-8", "replace") for low, high in pairwise(ends.tolist())]
         width, code = TABLE_WIDTHS[member["type"]], TABLE_TYPES.get(str(member.get("componentType")), "<f4")
         numbers = self._typed(values, code, count * width).reshape(count, width)
-        return numbers[:, 0].tolist() if width == 1 else numbers.tolist()  # type: ignore[no-any-return]
+        rows: list[Any] = (numbers[:, 0] if width == 1 else numbers).tolist()
+        return rows
 
     def _typed(self, values: np.ndarray, code: str, count: int) -> np.ndarray:
         needed = count * np.dtype(code).itemsize
@@ -390,7 +391,8 @@ class _Asset:
     def _at(self, values: list[Any], place: Any, what: str) -> dict[str, Any]:
         if type(place) is not int or not 0 <= place < len(values) or not isinstance(values[place], dict):
             raise self._broken(f"a {what}", f"the number {place!r}"[:60])
-        return values[place]  # type: ignore[no-any-return]
+        item: dict[str, Any] = values[place]
+        return item
 
     def _at_key(self, owner: Any, key: Any) -> dict[str, Any]:
         own = owner.get(key) if isinstance(owner, dict) and isinstance(key, str) else None

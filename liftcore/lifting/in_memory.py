@@ -132,7 +132,7 @@ class InMemory(Steps[SceneWeights]):
         return replace(W, consensus=torch.from_numpy(shares))
 
     def reweight(self, W: SceneWeights) -> tuple[SceneWeights, float | None]:
-        def agreed(weights: RegionWeights, on_card: bool) -> tuple[SceneWeights, float | None]:
+        def apply_agreement(weights: RegionWeights, on_card: bool) -> tuple[SceneWeights, float | None]:
             agreement = agreement_factors(
                 weights, W.geometry.codebook, self.settings.robust_steps, self.timings.progress,
                 means=self.splats.means, threads=self.threads, on_card=on_card,
@@ -142,14 +142,14 @@ class InMemory(Steps[SceneWeights]):
             return result, agreement.reliability
 
         if W.device.kind == "cpu" or W.weights.device != W.device.place:
-            return agreed(W.on_processor, False)
+            return apply_agreement(W.on_processor, False)
         try:
-            return agreed(W.weights, True)
+            return apply_agreement(W.weights, True)
         except RuntimeError as error:
             if not out_of_memory(error):
                 raise
         give_back_memory()  # out here the error holds nothing any more
-        return agreed(W.on_processor, False)
+        return apply_agreement(W.on_processor, False)
 
     def discount_distance(self, W: SceneWeights) -> SceneWeights:
         weights, how = W.on_processor, {"means": self.splats.means, "threads": self.threads}

@@ -54,7 +54,8 @@ def labels(scene: OpenedLift, source: Segmentation | Answer | Mapping[str, Answe
         else:
             made = _of_catalogue(scene, source) if isinstance(source, Catalogue) else _of_words(scene, source)
         scene.labelled = parts, made
-    return scene.labelled[1]  # type: ignore[no-any-return]
+    columns: Labels = scene.labelled[1]
+    return columns
 
 
 def _are_same(parts: Mapping[Any, Any], others: Mapping[Any, Any]) -> bool:

@@ -74,18 +74,18 @@ class ViewConsistencyOnCard:
         add: Callable[[PieceSums], None],
     ) -> Tensor:
         """``c_jm`` of each entry, [nnz] f32 on the device; see `ViewConsistency.cosines`."""
-        found, squares = torch.zeros_like(self.W.weight), torch.zeros_like(self.W.weight)
+        products, squares = torch.zeros_like(self.W.weight), torch.zeros_like(self.W.weight)
         for columns in directions.slices():
             table = directions.table(columns).to(self.place)
             for first, last in self.blocks:
-                self._compare(self._block(first, last, factors), table, found, squares)
+                self._compare(self._block(first, last, factors), table, products, squares)
         count = len(self.view)
         sums = torch.zeros(2, count + 1, dtype=torch.float64, device=self.place)
         for first, last in self.blocks:
             block = self._block(first, last, factors)
-            products, lengths = found[block.entries], squares[block.entries].sqrt()
-            cosines = torch.where(lengths > NO_CONSENSUS, products / lengths, 0.0).clamp(0.0, 1.0)
-            found[block.entries] = cosines
+            lengths = squares[block.entries].sqrt()
+            cosines = torch.where(lengths > NO_CONSENSUS, products[block.entries] / lengths, 0.0).clamp(0.0, 1.0)
+            products[block.entries] = cosines
             wide = cosines.double()
             sums[0, count] += (block.weight * wide).sum()
             sums[1, count] += block.weight.sum()
@@ -94,7 +94,7 @@ class ViewConsistencyOnCard:
                 others = block.weight * own * (1.0 - block.own)
                 sums[:, :count] += self._by_region(block.region, torch.stack([others * wide, others]))
         add(PieceSums.of(sums.cpu().numpy()))
-        return found
+        return products
 
     def weigh(
         self, cosines: Tensor, factors: Tensor | None, scene: SceneAgreement, consensus: Tensor | None
@@ -105,15 +105,15 @@ class ViewConsistencyOnCard:
         for first, last in self.blocks:
             block = self._block(first, last, factors)
             cosine = cosines[block.entries].double()
-            agreed = (1.0 - block.own) * cosine + block.own * scene.usual
-            kept = agreed * reliable.index_select(0, block.region)
+            blended = (1.0 - block.own) * cosine + block.own * scene.usual
+            unscaled = blended * reliable.index_select(0, block.region)
             if consensus is not None:
-                kept *= consensus[block.entries].to(self.place).double() ** scene.power
-            before, after = block.row_sums(block.weight), block.row_sums(block.weight * kept)
+                unscaled *= consensus[block.entries].to(self.place).double() ** scene.power
+            before, after = block.row_sums(block.weight), block.row_sums(block.weight * unscaled)
             gain, has_entries = torch.where(after > 0, before / after, 0.0)[block.row], block.row_starts.diff() > 0
-            cosines[block.entries] = torch.where(gain > 0, kept * gain, 1.0).float()
-            for score, values, other in ((scores[0], cosine, 0.0), (scores[1], agreed, scene.usual)):
-                sums = block.row_sums(block.weight * kept * values)
+            cosines[block.entries] = torch.where(gain > 0, unscaled * gain, 1.0).float()
+            for score, values, other in ((scores[0], cosine, 0.0), (scores[1], blended, scene.usual)):
+                sums = block.row_sums(block.weight * unscaled * values)
                 score[block.rows] = torch.where(after > 0, sums / after, other) * has_entries
         return scores.float().cpu()
 
@@ -152,9 +152,11 @@ class ViewConsistencyOnCard:
             if begin == end:
                 continue
             region, starts = block.region[begin:end], block.starts[at : to + 1] - begin
-            said = bag_sums(region, table, starts, block.share[begin:end].float()).double()
-            every = bag_sums(torch.arange(to - at, device=self.place), said, block.row_starts[first : last + 1] - at)
-            others = (every[block.segment_row[at:to] - first] - said).float()
+            view_sums = bag_sums(region, table, starts, block.share[begin:end].float()).double()
+            totals = bag_sums(
+                torch.arange(to - at, device=self.place), view_sums, block.row_starts[first : last + 1] - at
+            )
+            others = (totals[block.segment_row[at:to] - first] - view_sums).float()
             segment = block.segment[begin:end] - at
             lengths = others.square().sum(dim=1)
             for part in range(0, end - begin, step):  # of a row with more entries than that
