@@ -278,6 +278,10 @@ def _parsed(examples: list[Any], field: str) -> list[Example]:
     ]
 
 
+def _is_pair(value: Any) -> bool:
+    return isinstance(value, tuple | list) and len(value) == 2
+
+
 class Box(NamedTuple):
     """An axis-aligned box, world frame."""
 
@@ -288,7 +292,7 @@ class Box(NamedTuple):
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         """In JSON an object with ``low`` and ``high``."""
         return core_schema.no_info_before_validator_function(
-            lambda given: given if isinstance(given, dict) else {"low": given[0], "high": given[1]},
+            lambda given: cls(*given)._asdict() if _is_pair(given) else given,
             core_schema.no_info_after_validator_function(lambda box: cls(**vars(box)), handler(Corners)),
             serialization=core_schema.plain_serializer_function_ser_schema(
                 lambda box: Corners(low=box.low, high=box.high), return_schema=handler(Corners)
