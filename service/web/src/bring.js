@@ -15,7 +15,6 @@ const USUAL = /^(point_cloud|splat|splats|scene|iteration_\d+|\d+)$/i; // names 
 const ENDED = ["succeeded", "failed", "canceled"];
 const KINDS = { splats: "Splats", cameras: "Cameras", features: "Features" };
 const OTHERS = { photos: "Photos", lift: "Lift", masks: "Masks", table: "Words" };
-const KNOWN = 1000; // assets among which those of a lift file are looked for
 const WANTED = { splats: ".ply, .splat, .spz, .sog or .glb", cameras: "cameras.json, transforms.json, or a COLMAP model: its folder or a .zip", features: ".safetensors packs" };
 const PRESETS = {
   default: ["Careful", "Masks that other views contradict count less; splats get a confidence."],
@@ -102,7 +101,7 @@ export class Bring {
       return;
     }
     this.refreshAssets();
-    for (const waiting of this.files) if (waiting.missing?.length) this.sendLift(waiting);
+    for (const other of this.files) if (other.kind === "lift" && !other.asset) this.sendLift(other);
   }
 
   // The scene that ships with the service, lifted as one that was brought.
@@ -128,26 +127,34 @@ export class Bring {
     }
   }
 
-  // A lift file of the command line goes up once its splats and cameras are here. Its cameras may have been a folder,
-  // of which there is no file: then those that were dropped stand for them, if they see the same.
+  // A lift file goes up once what it was made of is here. One look at a time, as a late answer would hide a newer one;
+  // what comes in meanwhile asks for one more.
   async sendLift(one) {
-    try {
-      const here = (await json(`/assets?limit=${KNOWN}`)).assets.map(({ id }) => id);
-      const waited = one.missing;
-      one.missing = one.needs.filter(({ id }) => !here.includes(id));
-      this.show();
-      if (!one.missing.length && !one.sent && (waited === undefined || waited.length)) {
-        one.problem = null;
-        await this.send(one);
+    one.again = true;
+    if (one.looking) return;
+    for (one.looking = true; one.again && this.files.includes(one);) {
+      one.again = false;
+      try {
+        await this.sendOnceComplete(one);
+      } catch (problem) {
+        one.problem = problem;
+        this.show();
       }
-      const others = this.ids("cameras").at(-1);
-      if (one.missing.length !== 1 || one.missing[0].kind !== "cameras" || !others || others === one.tried) return;
-      Object.assign(one, { tried: others, problem: null });
-      await this.send(one, others);
-    } catch (problem) {
-      one.problem = problem;
-      this.show();
     }
+    one.looking = false;
+  }
+
+  // Its cameras may have been a folder, of which there is no file: then those that were dropped stand for them, if they
+  // see the same.
+  async sendOnceComplete(one) {
+    const absent = need => json(`/assets/${need.id}`).then(() => [], problem => { if (problem.status === 404) return [need]; throw problem; });
+    one.missing = (await Promise.all(one.needs.map(absent))).flat();
+    this.show();
+    const others = one.missing.length === 1 && one.missing[0].kind === "cameras" ? this.ids("cameras").at(-1) : undefined;
+    const cameras = one.missing.length ? others : ""; // none: its own
+    if (cameras === undefined || cameras === one.tried) return;
+    Object.assign(one, { tried: cameras, problem: null });
+    await this.send(one, cameras);
   }
 
   // Photos beside the lift that is open.
