@@ -106,9 +106,9 @@ class InUse(ServiceError):
 
 
 class Conflict(ServiceError):
-    """A job whose state does not allow what was asked."""
+    """What is in a state that does not allow what was asked."""
 
-    kind, status, title = "conflict", 409, "The job's state does not allow that"
+    kind, status, title = "conflict", 409, "Its state does not allow that"
 
 
 class Changed(ServiceError):

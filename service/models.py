@@ -595,6 +595,7 @@ class AskedEdit(Edit):
     """One change of a selection."""
 
     model_config = BUILT
+    error_type: ClassVar = None
     query: Question | None = Field(None, description="a question: the splats that answer it")  # pyright: ignore[reportIncompatibleVariableOverride]
 
 

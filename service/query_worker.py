@@ -13,6 +13,7 @@ import errno
 import hashlib
 import itertools
 import json
+import math
 import sys
 import threading
 import traceback
@@ -41,6 +42,7 @@ from liftcore import (
     choose_device,
     open_encoder,
 )
+from liftcore.errors import InvalidQuery
 from liftcore.files import cameras_of_views
 from liftcore.models import Edit, Found, OwnCamera, SceneTree, Seen
 from liftcore.text import OWN_WORDS
@@ -57,6 +59,8 @@ PRODUCT_BYTES = 128 << 20  # of the cosines that one pass over a lift's features
 COSINE_BYTES = 4  # of a splat and a direction
 ANSWER_BYTES = 6  # of a splat: its score, whether it was seen, whether it was selected
 ENTRY_BYTES = 2 << 10  # of what is kept, beside its tensors and its question
+WORD_COSINES = 1 << 31  # of splats and the words that may name them: about a minute and a half of a core
+MASK_PIXELS = 1 << 26  # of the views of an export: a minute, as of the largest picture
 NUMBER_BYTES = 32  # of a number of a question: a Python float and the place in its tuple
 
 
@@ -264,6 +268,10 @@ class Answers:
     def _named(self, request: dict[str, Any]) -> Segmentation:
         def make() -> Segmentation:
             words, encoder = self._words(request)
+            most = max(1, WORD_COSINES // len(self._scene(request).features))
+            if len(words) > most:
+                expected, got = f"at most {most} words for the splats of this lift", f"{len(words)} of them"
+                raise InvalidQuery("words", expected=expected, got=got, hint="ask for some of them at a time")
             return self._scene(request).segment(words, encoder=encoder)
 
         made = self._kept((_key(request), "words"), make)
@@ -344,6 +352,12 @@ class Answers:
 
     def _export(self, request: dict[str, Any]) -> Frame:
         """A ZIP of answers, of words or of things, in the draft."""
+        scene = self._scene(request)
+        views = scene.metadata.views if request["of_view"] is None else (request["of_view"],)
+        pixels = sum(math.prod(scene.cameras[view].photo_size) for view in views)
+        if pixels > MASK_PIXELS:
+            expected, got = f"views of at most {MASK_PIXELS} pixels together", f"{pixels} in {len(views)} views"
+            raise InvalidQuery("view", expected=expected, got=got, hint="export the masks of a view at a time")
         source: Any
         if request["of"] == "questions":
             source = {part["name"]: self._answer(part["request"]) for part in request["parts"]}
@@ -356,7 +370,7 @@ class Answers:
             given = {thing: {"name": name} for thing, (name, _) in request["things"] if name is not None}
             things = [one.model_copy(update=given.get(one.id)) for one in found.objects]
             source = replace(found, objects=tuple(things))
-        blocks = self._scene(request).blocks_of(source, "bundle", view=request["of_view"])
+        blocks = scene.blocks_of(source, "bundle", view=request["of_view"])
         write_draft(blocks, Path(request["draft"]))
         return Frame({})
 

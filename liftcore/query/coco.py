@@ -57,6 +57,8 @@ def _blocks(
     views: Sequence[str],
     on_view: Callable[[str, np.ndarray], None] | None,
 ) -> Iterator[bytes]:
+    from scipy.ndimage import find_objects
+
     images, count = [], 0
     yield json.dumps(head, ensure_ascii=False)[:-1].encode() + b', "annotations": ['
     for place, view in enumerate(views, 1):
@@ -65,19 +67,18 @@ def _blocks(
             on_view(view, shown)
         height, width = shown.shape
         images.append({"id": place, "file_name": view, "width": width, "height": height})
-        for number in np.unique(shown[shown > 0]).tolist():
-            one, mask = instances[number], shown == number
-            rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-            box = [columns[0], rows[0], columns[-1] - columns[0] + 1, rows[-1] - rows[0] + 1]
+        places = find_objects(shown)
+        for number, lengths in run_lengths(shown).items():
+            one, (rows, columns) = instances[number], places[number - 1]
             count += 1
             annotation = {
                 "id": count,
                 "image_id": place,
                 "category_id": one["class_id"],
                 "instance_id": number,
-                "segmentation": {"size": [height, width], "counts": run_lengths(mask)},
-                "area": int(mask.sum()),
-                "bbox": [int(side) for side in box],
+                "segmentation": {"size": [height, width], "counts": lengths},
+                "area": sum(lengths[1::2]),
+                "bbox": [columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start],
                 "iscrowd": 0,
             }
             if one.get("score") is not None:
@@ -86,9 +87,19 @@ def _blocks(
     yield b'], "images": ' + json.dumps(images, ensure_ascii=False).encode() + b"}\n"
 
 
-def run_lengths(mask: np.ndarray) -> list[int]:
-    """COCO's uncompressed run lengths of a mask [H, W] bool: column by column, the first run is of zeros."""
-    flat = mask.ravel(order="F")
-    ends = np.flatnonzero(np.diff(flat)) + 1
-    runs = np.diff([0, *ends.tolist(), flat.size]).tolist()
-    return [0, *runs] if flat[0] else runs
+def run_lengths(shown: np.ndarray) -> dict[int, list[int]]:
+    """COCO's uncompressed run lengths of each number above 0 in [H, W] i32: column by column, the first run is of
+    what comes before it. All are found in one pass, however many there are.
+    """
+    flat = shown.ravel(order="F")
+    begins = np.concatenate([[0], np.flatnonzero(np.diff(flat)) + 1])
+    ends = np.append(begins[1:], flat.size)
+    order = np.argsort(flat[begins], kind="stable")
+    numbers, firsts = np.unique(flat[begins][order], return_index=True)
+    found = dict[int, list[int]]()
+    for number, runs in zip(numbers.tolist(), np.split(order, firsts[1:]), strict=True):
+        edges = np.stack([begins[runs], ends[runs]], axis=1).ravel()
+        lengths = np.diff(edges, prepend=0, append=flat.size).tolist()
+        if number > 0:
+            found[number] = lengths if lengths[-1] else lengths[:-1]
+    return found

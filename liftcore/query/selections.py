@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Self
@@ -27,6 +28,7 @@ MOST_HISTORY = 100  # steps that are kept of a selection
 SEEN_BEFORE = 0.75  # of a ray's light: where so much is lost, it meets a surface
 RAYS = 1 << 15  # that are looked along at once
 NEAR = 0.01  # in front of a camera, scene units
+ROUNDING = 1e-6  # pixels beyond a stroke's edge that count as on it
 BESIDE = 0.25  # of a selection's box, on each side: where splats that it may grow by are looked for,
 MOST_SIZES = 0.99  # and as far as all but a hundredth of the scene's splats reach
 
@@ -197,16 +199,50 @@ def area_mask(area: PixelBox | Stroke, size: tuple[int, int], radius: float) -> 
         mask = np.zeros((height, width), np.bool_)
         mask[max(0, area.y0) : max(0, area.y1), max(0, area.x0) : max(0, area.x1)] = True
         return mask
-    mask, reach = np.zeros((height, width), np.bool_), int(np.ceil(radius))
-    for ends in pairwise(np.array(area.pixels)):
-        (left, top), (right, bottom) = np.min(ends, axis=0) - reach, np.max(ends, axis=0) + reach + 1
-        rows, columns = slice(max(0, top), max(0, bottom)), slice(max(0, left), max(0, right))
-        y, x = np.ogrid[:height, :width]
-        dx, dy = x[:, columns] - ends[0][0], y[rows] - ends[0][1]
-        way = (ends[1] - ends[0]).astype(np.float64)
-        share = np.clip((dx * way[0] + dy * way[1]) / max(way @ way, 1.0), 0, 1)
-        mask[rows, columns] |= np.hypot(dx - share * way[0], dy - share * way[1]) <= radius
-    return mask
+    # Along each row: the pieces of the stroke that begin at a pixel, less those that ended before it. Discs around
+    # its corners and rectangles between them are convex, so a row crosses each of them once.
+    changes = np.zeros((height, width + 1), np.int16)
+    corners = np.array(area.pixels, np.float64)
+    pieces = [_disc_runs(corner, radius, height) for corner in corners]
+    pieces += [_rectangle_runs(ends, radius, height) for ends in pairwise(corners)]
+    for rows, low, high in pieces:
+        first, end = np.clip(np.ceil(low - ROUNDING), 0, width), np.clip(np.floor(high + ROUNDING) + 1, 0, width)
+        changes[rows, first.astype(np.int64)] += 1
+        changes[rows, np.maximum(first, end).astype(np.int64)] -= 1
+    return np.cumsum(changes[:, :-1], axis=1, dtype=np.int16) > 0
+
+
+def _rows_between(low: float, high: float, height: int) -> np.ndarray:
+    """[n] i64, the rows of an image that lie between two places."""
+    return np.arange(max(0, math.ceil(low - ROUNDING)), min(height, math.floor(high + ROUNDING) + 1))
+
+
+def _disc_runs(centre: np.ndarray, radius: float, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows [n] i64 of an image that a disc crosses, and from where to where it does, [n] f64 each."""
+    x, y = centre.tolist()
+    rows = _rows_between(y - radius, y + radius, height)
+    half = np.sqrt(np.maximum(radius**2 - (rows - y) ** 2, 0))
+    return rows, x - half, x + half
+
+
+def _rectangle_runs(
+    ends: tuple[np.ndarray, np.ndarray], radius: float, height: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The same of all that lies across a line, as far as a radius to both sides of it."""
+    begin, end = ends
+    across = (end - begin)[::-1] * (-radius, radius) / max(np.hypot(*(end - begin)), 1.0)
+    corners = [begin + across, end + across, end - across, begin - across]
+    rows = _rows_between(min(y for _, y in corners), max(y for _, y in corners), height)
+    low, high = np.full(len(rows), np.inf), np.full(len(rows), -np.inf)
+    for (x, y), (to_x, to_y) in zip(corners, [*corners[1:], corners[0]], strict=True):
+        meets = (rows >= min(y, to_y) - ROUNDING) & (rows <= max(y, to_y) + ROUNDING)
+        if y == to_y:
+            crossing = np.array([[x], [to_x]])
+        else:
+            crossing = np.clip(x + (rows - y) * ((to_x - x) / (to_y - y)), min(x, to_x), max(x, to_x))[None]
+        low = np.where(meets, np.minimum(low, crossing.min(axis=0)), low)
+        high = np.where(meets, np.maximum(high, crossing.max(axis=0)), high)
+    return rows, low, high
 
 
 def splats_under(scene: OpenedLift, camera: Camera, mask: np.ndarray, *, through: bool = False) -> np.ndarray:

@@ -44,7 +44,6 @@ from service.store.lifts import LiftRecord
 
 # What routes ask of the query process: requests with the files of a lift and an encoder, and answers with a tag
 
-MASKED_VIEWS = 200  # of an export: more take minutes of the process that answers everybody
 EXPORT_BYTES = 16  # of a splat's labels
 ROW_BYTES, SCORE_BYTES = 32, 4  # of a splat in the .splat format, and in an array
 NUMBER_BYTES = 24  # of a number in JSON, at most
@@ -214,7 +213,8 @@ def with_encoder(
     if chosen is None:
         spec = encoder_spec(deps.settings, lift.metadata["text_space"], asked.encoder)
         file = encoder_file(spec)
-        names |= {} if file is None else {str(file): "the encoder's file"}
+        if file is not None:
+            names |= {str(file): "the encoder's file", f"text table {file.name}": "the text table"}
     elif asked.table is not None and asked.encoder is not None:
         raise InvalidRequest("table", expected="table or encoder", got="both", hint="leave one of them out")
     else:
@@ -411,9 +411,6 @@ def export(asked: AskedToExport, deps: Deps, ask: Ask) -> Response:
     `truth.safetensors` (masks for a trade-off).
     """
     lift = find_lift(asked.lift, deps)
-    if asked.view is None and lift.view_count > MASKED_VIEWS:
-        expected, got = f"a view, of a lift with more than {MASKED_VIEWS}", f"none, and {lift.view_count} views"
-        raise InvalidRequest("view", expected=expected, got=got)
     wanted: dict[str, Any] = scene_request("export", lift, deps) | NO_ENCODER | {"words": None}
     title = [asked.of]
     if asked.of == "questions":

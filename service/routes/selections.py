@@ -13,7 +13,7 @@ from fastapi.responses import JSONResponse
 from liftcore.errors import NotFound
 from service import models
 from service.content import kept
-from service.errors import InvalidRequest
+from service.errors import Changed, Conflict, InvalidRequest
 from service.requests import JsonRoute
 from service.routes.lifts import ObjectId
 from service.routes.queries import NO_ENCODER, Ask, bits_of, query_request, scene_request
@@ -66,14 +66,16 @@ def edit_selection(
 ) -> Response:
     """Add, take away, grow, shrink or set: a step of its history, which PATCH goes back."""
     found = deps.store.lifts.get(deps.owner, lift)
-    before = deps.store.selections.get(deps.owner, found.id, selection)
-    versions = _versions(match)
-    versions = frozenset({before.version}) if versions is None else versions
+    before = deps.store.selections.get(deps.owner, found.id, selection, _versions(match))
     splats = _edited(asked, found, deps, ask, deps.store.selections.bits(before))
-    # What was worked on is the version that was read: another that came meanwhile is not overwritten.
-    return _answer(
-        deps.store.selections.extend(deps.owner, found.id, selection, splats, versions & {before.version}), deps
-    )
+    try:  # what was worked on is the version that was read: another that came meanwhile is not overwritten
+        made = deps.store.selections.extend(deps.owner, found.id, selection, splats, frozenset({before.version}))
+    except Changed as error:
+        if _versions(match) is not None:
+            raise
+        hint = "send the edit again"
+        raise Conflict("selection", expected=error.expected, got="one that another edit changed", hint=hint) from None
+    return _answer(made, deps)
 
 
 @router.patch(ONE, response_model=models.Selection)

@@ -20,6 +20,8 @@ from service.store.owners import SEEN, Owner, require_quota
 
 MOST = 200  # selections of a lift
 HISTORY = 100  # steps that a selection can go back
+MOST_BYTES, BYTES_A_SPLAT = 64 << 20, 64  # of all steps of a lift's selections, compressed: so much, and a splat more
+NO_USE = "delete one that is of no use any more"
 MOST_THINGS = 10_000  # of a lift, that have a name or are hidden
 
 SHOWN = (
@@ -78,8 +80,7 @@ class SelectionStore:
         with _lift_there(lift), self._database.write(counted=True) as connection:
             number = connection.execute("SELECT count(*) FROM selections WHERE lift = ?", (lift,)).fetchone()[0]
             if number >= MOST:
-                hint = "delete one that is of no use any more"
-                raise OverLimit("selection", expected=f"at most {MOST} of a lift", got="more", hint=hint)
+                raise OverLimit("selection", expected=f"at most {MOST} of a lift", got="more", hint=NO_USE)
             row = {"id": selection, "lift": lift, "name": name, "version": 1, "step": 0}
             insert(connection, "selections", row | {"created": now, "changed": now})
             self._keep(connection, owner, selection, 0, splats)
@@ -96,7 +97,7 @@ class SelectionStore:
             OverQuota, NoSpace: there is no room for it.
         """
         with self._database.write(counted=True) as connection:
-            found = self._expect(connection, owner, lift, selection, versions)
+            found = _expected(connection, owner, lift, selection, versions)
             step = found.step + 1
             terms = (selection, found.step, step - HISTORY)
             connection.execute(
@@ -117,7 +118,7 @@ class SelectionStore:
             InvalidRequest: there is no such step.
         """
         with self._database.write(counted=True) as connection:
-            found = self._expect(connection, owner, lift, selection, versions)
+            found = _expected(connection, owner, lift, selection, versions)
             step = changes.get("step", found.step)
             if not found.first <= step <= found.last:
                 expected = f"a step from {found.first} to {found.last}"
@@ -134,19 +135,24 @@ class SelectionStore:
             Changed: it has another version than these.
         """
         with self._database.write(counted=True) as connection:
-            self._expect(connection, owner, lift, selection, versions)
+            _expected(connection, owner, lift, selection, versions)
             connection.execute("DELETE FROM selections WHERE id = ?", (selection,))
 
-    def get(self, owner: Owner, lift: str, selection: str) -> SelectionRecord:
-        """The selection of that id; NotFound where the lift has none."""
+    def get(self, owner: Owner, lift: str, selection: str, versions: frozenset[int] | None = None) -> SelectionRecord:
+        """The selection of that id.
+
+        Raises:
+            NotFound: the lift has none.
+            Changed: it has another version than these.
+        """
         with self._database.read() as connection:
-            return _found(connection, owner, lift, selection)
+            return _expected(connection, owner, lift, selection, versions)
 
     def all(self, owner: Owner, lift: str) -> list[SelectionRecord]:
         """Those of a lift, newest first."""
         with self._database.read() as connection:
             rows = connection.execute(
-                f"{VISIBLE} ORDER BY selections.created DESC, selections.id", _terms(owner, lift)
+                f"{VISIBLE} ORDER BY selections.created DESC, selections.id", owner.terms(lift=lift)
             )
             return [_record(row) for row in rows]
 
@@ -173,7 +179,7 @@ class SelectionStore:
         """Of the lift's objects that somebody named or hid: their names, and whether they are hidden."""
         asked = f"SELECT thing, name, hidden FROM things JOIN jobs ON jobs.id = lift WHERE lift = :lift AND {SEEN}"
         with self._database.read() as connection:
-            rows = connection.execute(asked, _terms(owner, lift)).fetchall()
+            rows = connection.execute(asked, owner.terms(lift=lift)).fetchall()
         return {row["thing"]: (row["name"], bool(row["hidden"])) for row in rows}
 
     def change_thing(self, lift: str, thing: int, changes: dict[str, Any]) -> None:
@@ -194,20 +200,19 @@ class SelectionStore:
                     f"UPDATE things SET {column} = ? WHERE lift = ? AND thing = ?", (changes[column], lift, thing)
                 )
 
-    def _expect(
-        self, connection: sqlite3.Connection, owner: Owner, lift: str, selection: str, versions: frozenset[int] | None
-    ) -> SelectionRecord:
-        found = _found(connection, owner, lift, selection)
-        if versions is not None and found.version not in versions:
-            raise Changed("selection", expected="the version that was seen", got="a newer one", hint="GET it again")
-        return found
-
     def _keep(
         self, connection: sqlite3.Connection, owner: Owner, selection: str, number: int, splats: SplatSet
     ) -> None:
         packed = zlib.compress(splats.bits)
         edit, box = json.dumps(splats.edit), None if splats.box is None else json.dumps(splats.box)
         coming = len(packed) + len(edit)
+        taken = "SELECT total(length(splats) + length(edit)) FROM selection_steps JOIN selections ON id = selection"
+        lift = "(SELECT lift FROM selections WHERE id = ?)"
+        (held,) = connection.execute(f"{taken} WHERE lift = {lift}", (selection,)).fetchone()
+        most = MOST_BYTES + BYTES_A_SPLAT * 8 * len(splats.bits)
+        if held + coming > most:
+            expected = f"at most {most} bytes of all selections of a lift"
+            raise OverLimit("selection", expected=expected, got="more", hint=NO_USE)
         self._files.require_room(coming)
         require_quota(connection, owner, coming)
         row = {"selection": selection, "number": number, "edit": edit, "count": splats.count}
@@ -233,16 +238,18 @@ def _lift_there(lift: str) -> Iterator[None]:
         raise NotFound("lift", expected="the id of a lift", got=lift, hint="it was deleted meanwhile") from None
 
 
-def _found(connection: sqlite3.Connection, owner: Owner, lift: str, selection: str) -> SelectionRecord:
-    terms = _terms(owner, lift) | {"selection": selection}
+def _expected(
+    connection: sqlite3.Connection, owner: Owner, lift: str, selection: str, versions: frozenset[int] | None
+) -> SelectionRecord:
+    """The selection of that id; NotFound where there is none, Changed where it has another version than these."""
+    terms = owner.terms(lift=lift, selection=selection)
     row = connection.execute(f"{VISIBLE} AND selections.id = :selection", terms).fetchone()
     if row is None:
         raise _none(selection)
-    return _record(row)
-
-
-def _terms(owner: Owner, lift: str) -> dict[str, Any]:
-    return owner.terms(lift=lift)
+    found = _record(row)
+    if versions is not None and found.version not in versions:
+        raise Changed("selection", expected="the version that was seen", got="a newer one", hint="GET it again")
+    return found
 
 
 def _record(row: sqlite3.Row) -> SelectionRecord:

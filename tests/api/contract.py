@@ -1,6 +1,6 @@
 """The service against its own OpenAPI document: schemathesis calls every operation over real sockets.
 
-    python -m tests.api.contract [--examples N]
+    python -m tests.api.contract [--examples N] [--phases PHASE ...] [--keys without|with]
 
 What would take seconds a call has a stand-in: the check of an upload takes any bytes, and a lift is done at once. So
 uploads and lifts succeed here, and what is made can be looked at, asked and deleted. Queries run in the real worker,
@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -51,7 +51,7 @@ from urllib.parse import urlencode
 def filter_query(context, query):
     return len(urlencode(query or {}, doseq=True, errors="replace")) < 60_000
 """
-SECONDS = 1500
+SECONDS = 1500.0  # that schemathesis may take; a busy machine needs more
 PATIENCE_SECONDS = 300.0  # for what takes some seconds; the machine may be busy
 
 
@@ -90,7 +90,13 @@ def _warm_up(address: str, secret: str | None) -> None:
 
 
 def conformance(
-    address: str, secret: str | None, *, examples: int, phases: tuple[str, ...] = PHASES, without: str | None = None
+    address: str,
+    secret: str | None,
+    *,
+    examples: int,
+    phases: Sequence[str] = PHASES,
+    without: str | None = None,
+    seconds: float = SECONDS,
 ) -> str:
     """What schemathesis found wrong, as it tells it; empty when nothing is. The same seed makes the same calls.
 
@@ -100,6 +106,7 @@ def conformance(
         examples: of each operation and phase.
         phases: of schemathesis; those of `coverage` are as many as the schema has corners.
         without: a pattern of paths that are left out.
+        seconds: that it may take.
     """
     command = [
         str(Path(sys.executable).with_name("schemathesis")), "run", f"{address}/openapi.json", "--no-color",
@@ -114,7 +121,7 @@ def conformance(
         Path(folder, "hooks.py").write_text(HOOKS)
         hooked = os.environ | {"SCHEMATHESIS_HOOKS": "hooks", "PYTHONPATH": folder}
         found = subprocess.run(
-            command, cwd=folder, env=hooked, capture_output=True, text=True, timeout=SECONDS, check=False
+            command, cwd=folder, env=hooked, capture_output=True, text=True, timeout=seconds, check=False
         )
     return "" if found.returncode == 0 else f"{found.stdout}\n{found.stderr}"
 
@@ -123,15 +130,23 @@ def main() -> int:
     """The long form, without keys and with them; 1 when something does not conform."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--examples", type=int, default=30, help="of each operation and phase")
-    given = parser.parse_args()
+    parser.add_argument("--phases", nargs="+", choices=PHASES, default=PHASES, help="of schemathesis")
+    parser.add_argument("--keys", nargs="+", choices=("without", "with"), default=("without", "with"))
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="that either may take")
+    options = parser.parse_args()
     wrong = False
-    for keys in (False, True):
-        with tempfile.TemporaryDirectory() as folder, served(Path(folder) / "data", keys=keys) as (address, secret):
+    for keys in options.keys:
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            served(Path(folder) / "data", keys=keys == "with") as (address, secret),
+        ):
             begun = time.monotonic()
-            found = conformance(address, secret, examples=given.examples)
-        wrong = wrong or bool(found)
-        told = found or "everything conforms"
-        print(f"--- {'with' if keys else 'without'} keys, {time.monotonic() - begun:.0f} s ---\n{told}", flush=True)
+            failures = conformance(
+                address, secret, examples=options.examples, phases=options.phases, seconds=options.seconds
+            )
+        wrong = wrong or bool(failures)
+        head = f"--- {keys} keys, {time.monotonic() - begun:.0f} s ---"
+        print(head, failures or "everything conforms", sep="\n", flush=True)
     return int(wrong)
 
 

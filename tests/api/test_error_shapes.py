@@ -126,6 +126,18 @@ def test_odd_requests_are_refused_as_problems_or_taken(
                 assert more["content"].endswith(b"{}") and by_default, (path, more)
 
 
+def test_body_that_is_no_object_is_named_so(client: TestClient, lift: dict[str, Any]) -> None:
+    selection = client.post(f"/lifts/{lift['id']}/selections", json={"name": "mine"}).json()["links"]["self"]
+    for path, operations in client.get("/openapi.json").json()["paths"].items():
+        asked = re.sub(r"/lifts/{lift}/selections/{selection}", selection, path).replace("{lift}", lift["id"])
+        for method, operation in operations.items():
+            if "application/json" in operation.get("requestBody", {}).get("content", {}):
+                for body in (3, [], "text", None):
+                    problem = assert_problem(client.request(method, address(asked), json=body))
+                    assert (problem["status"], problem["argument"]) == (422, "body"), (method, path, body, problem)
+    assert client.delete(selection).status_code == 204
+
+
 def test_long_bodies_are_413_where_bodies_are_read(client: TestClient, routes: dict[str, set[str]]) -> None:
     for path, taken in routes.items():
         if "POST" in taken and "{" not in path and path != "/lifts":  # which takes a file

@@ -425,6 +425,9 @@ def test_texts_are_asked_as_words_and_others_are_refused_with_those_that_can_be(
     words = client.get("/query/words", params=asked | {"text": "no"}).json()
     assert (words["any_text"], words["words"]) == (False, [{"word": "novel", "typed": "novel"}])
     assert "nearest" not in assert_problem(client.get("/query/words", params=asked | {"lift": "0" * 32}))
+    for vocabulary in ({}, {"table": own_table}, {"encoder": "default"}):  # no name of a file of the server
+        refused = assert_problem(client.get("/query", params={"lift": lift["id"], "text": "boaat"} | vocabulary))
+        assert refused["nearest"] and ".safetensors" not in refused["detail"]
 
 
 def test_words_that_come_with_an_order_are_those_of_the_lift(

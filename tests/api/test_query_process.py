@@ -306,6 +306,19 @@ def test_large_answer_is_a_file_and_the_same_bytes(
         assert reply_to([request], kept) == Frame({}) and (tmp_path / "draft").read_bytes() == content
 
 
+@pytest.mark.parametrize(
+    ("bound", "argument", "of"), [("WORD_COSINES", "words", "words"), ("MASK_PIXELS", "view", "questions")]
+)
+def test_what_would_take_minutes_is_refused_before_it_begins(
+    request_of: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch, bound: str, argument: str, of: str
+) -> None:
+    monkeypatch.setattr(answers, bound, 60)
+    export = {"of": of, "of_view": None, "words": None, "parts": []}
+    asked = request_of("export", text=["apple"]) | export
+    (fault,) = reply_to([asked], Answers(scenes=1, cache_bytes=0)).header.values()
+    assert (fault["kind"], fault["argument"]) == ("invalid-query", argument) and "at most" in fault["expected"]
+
+
 def test_questions_asked_together_take_one_pass_within_cache_and_memory(
     request_of: Callable[..., dict[str, Any]], passes: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:

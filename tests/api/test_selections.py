@@ -27,6 +27,7 @@ from service.store.store import Store
 
 from .conftest import parts_of
 from .guarded import Guarded, guarded
+from .test_problems import assert_problem
 from .test_queries import array
 from .tiny_scene import SPLATS_A_CLUSTER, WORDS
 
@@ -111,6 +112,25 @@ def test_edit_of_an_older_version_is_refused(client: TestClient, route: str) -> 
     assert client.delete(own, headers={"If-Match": "*"}).status_code == 204
 
 
+@pytest.mark.parametrize(("match", "status"), [({}, 409), ({"If-Match": "*"}, 409), ({"If-Match": '"1"'}, 412)])
+def test_edit_that_another_one_overtakes_is_refused(
+    client: TestClient, route: str, monkeypatch: pytest.MonkeyPatch, match: dict[str, str], status: int
+) -> None:
+    selection, queries = begun(client, route, **LAMP), parts_of(client).queries
+    edits, call = selection["links"]["edits"], queries.call
+
+    def overtaken(*wanted: Any) -> Any:
+        monkeypatch.undo()
+        assert client.post(edits, json={"how": "set"}).status_code == 200
+        return call(*wanted)
+
+    monkeypatch.setattr(queries, "call", overtaken)
+    late = assert_problem(client.post(edits, json={"how": "grow"}, headers=match))
+    assert (late["status"], late["argument"]) == (status, "selection")
+    assert client.get(selection["links"]["self"]).json()["count"] == 0
+    assert client.post(edits, json={"how": "grow"}).status_code == 200
+
+
 @pytest.mark.parametrize(
     ("body", "argument"),
     [
@@ -153,6 +173,19 @@ def test_selections_and_their_history_are_bounded(
     monkeypatch.setattr(module, "MOST", 1)
     refused = client.post(route, json={"name": "more"})
     assert (refused.status_code, refused.json()["type"]) == (422, "/problems/over-limit")
+
+
+def test_selections_of_a_lift_take_no_more_bytes_than_its_splats_allow(
+    client: TestClient, lift: dict[str, Any], route: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "MOST_BYTES", 0)
+    monkeypatch.setattr(module, "BYTES_A_SPLAT", 2)
+    edits = begun(client, route)["links"]["edits"]
+    while (reply := client.post(edits, json={"how": "set"})).status_code == 200:
+        assert reply.json()["step"] < 2 * lift["count"]
+    assert assert_problem(reply)["type"] == "/problems/over-limit"
+    assert client.delete(client.get(route).json()["selections"][0]["links"]["self"]).status_code == 204
+    assert client.post(route, json={"name": "more"}).status_code == 201
 
 
 def test_things_take_names_and_are_hidden(client: TestClient, lift: dict[str, Any], route: str) -> None:

@@ -62,8 +62,9 @@ def test_masks_in_views_are_those_of_the_instances(scene: Scene, tmp_path: Path)
 
 
 def test_run_lengths_are_columns_and_begin_with_zeros() -> None:
-    assert run_lengths(np.array([[1, 0], [1, 0], [0, 1]], bool)) == [0, 2, 3, 1]
-    assert run_lengths(np.array([[0, 1], [1, 1]], bool)) == [1, 3] and run_lengths(np.zeros((2, 2), bool)) == [4]
+    assert run_lengths(np.array([[1, 0], [1, 0], [0, 1]])) == {1: [0, 2, 3, 1]}
+    assert run_lengths(np.array([[0, 7], [2, 7]])) == {2: [1, 1, 2], 7: [2, 2]}
+    assert run_lengths(np.zeros((2, 2))) == {}
 
 
 def test_objects_are_lines_of_json(scene: Scene, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ import torch
 from liftcore.errors import InvalidQuery, NotFound, SplatliftError
 from liftcore.query.question import Query
 from liftcore.query.scene import Scene
+from liftcore.query.selections import area_mask
+from liftcore.query.terms import Stroke
 from liftcore.raster.reference import ReferenceRaster
 from liftcore.scene.cameras import Camera
 from liftcore.scene.touching import touching_pairs
@@ -49,6 +52,23 @@ def test_edits_are_undone_and_redone_one_by_one(scene: Scene) -> None:
     selection.undo().edit("add", cluster(2)).redo()  # what was undone is forgotten
     assert rows_of(selection.splats) == rows_of(cluster(0) | cluster(2))
     assert not selection.undo().undo().undo().splats.any() and selection.history == ()
+
+
+@pytest.mark.parametrize("radius", [0.5, 1.0, 2.0, 5.3, 40.0])
+def test_stroke_marks_the_pixels_within_its_radius(radius: float) -> None:
+    random = np.random.default_rng(int(radius * 10))
+    for _ in range(30):
+        width, height = random.integers(1, 50, 2).tolist()
+        corners = random.integers(-30, 70, (random.integers(2, 5), 2)).tolist()
+        x, y = np.meshgrid(np.arange(width), np.arange(height))
+        far = np.full((height, width), np.inf)
+        for (ax, ay), (bx, by) in pairwise(corners):
+            way = np.array([bx - ax, by - ay], np.float64)
+            share = np.clip(((x - ax) * way[0] + (y - ay) * way[1]) / max(way @ way, 1.0), 0, 1)
+            far = np.minimum(far, np.hypot(x - ax - share * way[0], y - ay - share * way[1]))
+        marked = area_mask(Stroke("view", tuple(map(tuple, corners))), (width, height), radius)
+        off_the_edge = np.abs(far - radius) > 1e-5
+        assert (marked == (far <= radius))[off_the_edge].all() and marked[far == radius].all()
 
 
 @pytest.mark.parametrize("area", ["camera:box:12,2,19,20", "camera:stroke:14,4,17,22"])
