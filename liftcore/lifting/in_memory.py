@@ -32,6 +32,7 @@ from liftcore.solve.directions import region_totals
 from liftcore.solve.least_squares import AllRays, reference, refine
 from liftcore.solve.loss import huber_factors
 from liftcore.solve.mask_edges import weaken_edges
+from liftcore.solve.membership import Memberships, RegionGroups, memberships
 from liftcore.solve.objects import NodeVectors, RegionObjects, region_objects
 from liftcore.solve.reweight import Agreement, agreement_factors, reweighted, whole_regions
 from liftcore.solve.smooth import smooth
@@ -53,6 +54,7 @@ class SceneWeights:
     views: LiftViews
     geometry: Geometry  # its W as it is solved
     sums: np.ndarray | None = None  # [P] f64, of the rows of W as it was weighed; None: W is that
+    threads: int | None = None  # None: the cores that this process may use
     consensus: Tensor | None = None  # [nnz] f32, until W is reweighted
     agreement: Agreement | None = None
 
@@ -65,6 +67,12 @@ class SceneWeights:
     def on_processor(self) -> RegionWeights:
         """W on the CPU, copied once."""
         return self.weights.cpu()
+
+    @cached_property
+    def members(self) -> Memberships:
+        """The memberships of W, which objects and consensus ask alike."""
+        groups = RegionGroups.of(self.weights.offsets.numpy(), self.geometry.levels)
+        return memberships(self.on_processor, groups, self.threads)
 
     def row_sums(self) -> np.ndarray:
         """[P] f64, of W as it was weighed."""
@@ -116,11 +124,12 @@ class InMemory(Steps[SceneWeights]):
             checkpoint=self.checkpoint.of(self.splats, plan.device.facts()) if self.checkpoint else None,
             first=first, on_first=look,
         )  # fmt: skip
-        W = SceneWeights(raster, plan.device, plan.features_room, views, geometry)
+        W = SceneWeights(raster, plan.device, plan.features_room, views, geometry, threads=self.threads)
         return W, WeighedViews(plans[-1], geometry.levels, W.weights.region.shape[0], geometry.blind)
 
     def find_objects(self, W: SceneWeights) -> RegionObjects:
-        return region_objects(W.on_processor, W.geometry.levels, W.geometry.evidence().numpy(), self.threads)
+        evidence = W.geometry.evidence().numpy()
+        return region_objects(W.on_processor, W.geometry.levels, evidence, self.threads, members=W.members)
 
     def node_vectors(self, W: SceneWeights, objects: RegionObjects) -> NodeVectors:
         codebook = W.geometry.codebook
@@ -128,7 +137,8 @@ class InMemory(Steps[SceneWeights]):
         return NodeVectors.of(codebook, totals, objects)
 
     def compare_masks(self, W: SceneWeights) -> SceneWeights:
-        shares = mask_consensus(W.on_processor, W.geometry.levels, self.threads, means=self.splats.means)
+        means, levels = self.splats.means, W.geometry.levels
+        shares = mask_consensus(W.on_processor, levels, self.threads, means=means, members=W.members)
         return replace(W, consensus=torch.from_numpy(shares))
 
     def reweight(self, W: SceneWeights) -> tuple[SceneWeights, float | None]:

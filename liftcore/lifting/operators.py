@@ -171,7 +171,7 @@ def region_weights(
     count = inputs.splats.count
     with shown_progress(progress) as reporter:
         geometry = weigh_views(raster, count, inputs.views, inputs.settings, reporter, by_rows=True, threads=threads)
-        W = SceneWeights(raster, device, None, inputs.views, geometry)
+        W = SceneWeights(raster, device, None, inputs.views, geometry, threads=threads)
         if reweight:
             steps = InMemory(inputs.splats, inputs.settings, Timings(reporter), threads)
             W, _ = reweigh(steps, W, bool((geometry.levels >= 0).any()), inputs.settings, steps.timings)

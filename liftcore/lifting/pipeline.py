@@ -22,6 +22,7 @@ from liftcore.lifting.planning.plan import Plan, plan_lift
 from liftcore.lifting.warm_up import warm_up_lift
 from liftcore.query.result import LiftResult
 from liftcore.runtime.device import choose_device, within_memory
+from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, Timings, shown_progress
 from liftcore.runtime.torch_modes import usual_modes
 from liftcore.scene.cameras import Camera, Cameras
@@ -92,7 +93,8 @@ def lift(
         timings = Timings(reporter)
         if engine is None:
             steps = InMemory(inputs.splats, inputs.settings, timings, threads, checkpoint)
-            result = run(steps, inputs, timings, tell_plan)
+            with one_thread():
+                result = run(steps, inputs, timings, tell_plan)
         else:
             folder = checkpoint.folder if checkpoint else None
             with steps_in_blocks(engine, inputs, timings, folder, threads=threads) as steps:

@@ -54,7 +54,7 @@ OBSERVES = 0.3  # of a region, that a level of a view must see to say anything o
 PRIOR = 2.0  # views' worth of the scene's mean: one view alone may be the one that is wrong
 MOST_SPLATS = 1 << 13
 MOST_WITNESSES = 64
-BLOCK_ENTRIES = 1 << 22
+BLOCK_ENTRIES = 1 << 23  # a pass over all rows each
 PIECES = 16  # of the rows, for threads
 STEPS = 1 << 30  # of a share
 ONE_VIEW = 1 << 40  # that says something; MOST_WITNESSES shares are less
@@ -129,7 +129,7 @@ def mean_share(told: int, asked: int) -> float:
 
 def with_mean(sums: np.ndarray, views: np.ndarray, usual: float, threads: int | None = None) -> np.ndarray:
     """Sums of q become c_jm, in place: [nnz] f32, as `RegionShares` has both."""
-    step = BLOCK_ENTRIES >> 2
+    step = BLOCK_ENTRIES >> 3
     blocks = [(first, min(first + step, sums.size)) for first in range(0, sums.size, step)]
     run_each(lambda first, last: finish(first, last, sums, views, usual), blocks, threads)
     return sums
@@ -178,15 +178,15 @@ def region_shares(
     arrays = rows, indptr, region, base, sizes
     run_each(lambda *ends: count_splats(*[*ends, *arrays]), pieces, threads)
     consensus, witnesses = np.ones(region.size, np.float32), np.zeros(region.size, np.uint8)
-    told, here, whole = 0, indptr[rows], sizes.sum(axis=0, dtype=np.int64)
+    told, here, stops, whole = 0, indptr[rows], indptr[rows + 1], sizes.sum(axis=0, dtype=np.int64)
     for first, last in _edges(whole, BLOCK_ENTRIES):
         begins = np.concatenate([[0], np.cumsum(whole[first:last])])
         at = begins[:-1] + np.cumsum(sizes[:, first:last], axis=0, dtype=np.int64) - sizes[:, first:last]
         splats, there = np.empty(begins[-1], np.int32), here.copy()
         sums, views = np.zeros(begins[-1], np.float32), np.zeros(begins[-1], np.uint8)
-        order = [base + first, base + last, rows, here, there, indptr, region, own, at, splats]
+        order = [base + first, base + last, here, there, stops, region, own, at, splats]
         run_each(lambda *ends, order=order: by_region(*ends, *order), pieces, threads)
-        parts = [(part, *ends) for part, ends in enumerate(_edges(whole[first:last], max(BLOCK_ENTRIES // 64, 1)))]
+        parts = [(part, *ends) for part, ends in enumerate(_edges(whole[first:last], max(BLOCK_ENTRIES // 128, 1)))]
         shares = np.zeros(len(parts), np.int64)
         block = [base + first, begins, splats, tuples.starts, tuples.tuples, tuples.parents, tuples.members, totals]
         block += [groups.view, groups.group, groups.levels, sums, views, shares]
@@ -266,14 +266,14 @@ def slot(table, parents, members, parent, member):
 
 
 @kernel
-def by_region(piece, begin, end, first, last, rows, here, there, indptr, region, own, at, splats):
+def by_region(piece, begin, end, first, last, here, there, stops, region, own, at, splats):
     """The splats of the regions ``first..last`` by region, each in the order of rows; below zero: it belongs not.
 
-    Entries of these regions begin ``here`` [rows] i64, and those of later ones ``there``.
+    Entries of these regions begin ``here`` [rows] i64, those of later ones ``there``; rows end at ``stops``.
     """
     at = at[piece].copy()
     for j in range(begin, end):
-        k, stop = here[j], indptr[rows[j] + 1]
+        k, stop = here[j], stops[j]
         while k < stop and region[k] < last:
             m = region[k] - first
             splats[at[m]] = j if own[k] else ~j

@@ -252,20 +252,14 @@ def node_shares(
     W: RegionWeights, labels: np.ndarray, number: int, others: np.ndarray, threads: int | None = None
 ) -> Iterator[PieceSums]:
     """The weight of some regions [n] i64 in each label at every piece of a block: [1, (number + 1) n], -1 first."""
-    place, shape = node_numbers(others, int(W.offsets[-1])), (number + 1, others.size)
+    place, indptr = node_numbers(others, int(W.offsets[-1])), W.indptr.numpy()
+    arrays = indptr, W.region.numpy(), W.weight.numpy(), place, others.size
 
     def summed(first: int, last: int) -> PieceSums:
-        lengths, whole = W.indptr[first : last + 1].diff().numpy(), csr_array(shape, dtype=np.float64)
-        for a, b in row_blocks(lengths, last - first, BLOCK_ENTRIES):
-            own = slice(int(W.indptr[first + a]), int(W.indptr[first + b]))
-            columns = place[W.region[own].numpy()]
-            kept = columns >= 0
-            rows = np.repeat(labels[first + a : first + b] + 1, lengths[a:b])[kept]
-            whole = whole + csr_array((W.weight[own].numpy()[kept].astype(np.float64), (rows, columns[kept])), shape)
-        table = whole.tocoo()
-        places = table.row.astype(np.int64) * others.size + table.col
-        order = np.argsort(places)
-        return PieceSums(places[order], table.data[None, order])
+        order = np.argsort(labels[first:last], kind="stable")
+        ends = np.cumsum(np.bincount(labels[first:last] + 1, minlength=number + 1))
+        places, sums = sum_by_label(order + first, ends, *arrays)
+        return PieceSums(places, sums[None])
 
     return in_order(summed, pieces(W.indptr.shape[0] - 1), threads)
 
@@ -569,3 +563,36 @@ def show(first, last, labels, indptr, region, weight, view, views, shown):
         if labels[j] >= 0:
             for k in range(indptr[j], indptr[j + 1]):
                 shown[labels[j] * views + view[region[k]]] += weight[k]
+
+
+@kernel
+def sum_by_label(rows, ends, indptr, region, weight, place, size):
+    """The weight of the regions with a place at the rows of each label: (label size + place, weight), ascending.
+
+    Args:
+        rows: [n] i64, those of the first label before those of the second. ends: [labels] i64, of each label.
+        place: [M] i32 below size; -1 for none.
+    """
+    most = 0
+    for row in rows:
+        most += indptr[row + 1] - indptr[row]
+    places, values, count = np.empty(most, np.int64), np.empty(most), 0
+    sums, is_met, met = np.zeros(size), np.zeros(size, np.bool_), np.empty(size, np.int32)
+    begin = 0
+    for label in range(ends.size):
+        found = 0
+        for row in rows[begin : ends[label]]:
+            for k in range(indptr[row], indptr[row + 1]):
+                at = place[region[k]]
+                if at >= 0:
+                    if not is_met[at]:
+                        is_met[at] = True
+                        met[found] = at
+                        found += 1
+                    sums[at] += weight[k]
+        for at in np.sort(met[:found]):
+            places[count], values[count] = label * size + at, sums[at]
+            count += 1
+            sums[at], is_met[at] = 0.0, False
+        begin = ends[label]
+    return places[:count].copy(), values[:count].copy()
