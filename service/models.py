@@ -683,6 +683,22 @@ class AskedForNodes(BaseModel):
     cursor: int = Field(0, ge=0, le=10**9, description="the `next` of the page before")
 
 
+NUMBER = r"[+-]?(\d{1,20}(\.\d{0,20})?|\.\d{1,20})([eE][+-]?\d{1,3})?"
+UP = rf"^(cameras|{NUMBER},{NUMBER},{NUMBER})$"
+
+
+class AskedForTree(AskedForNodes):
+    """Which nodes to list, and whether to say how objects lie to each other."""
+
+    relations: bool = Field(False, description="how the objects lie to each other, with numbers")
+    up: str | None = Field(
+        None,
+        pattern=UP,
+        description="with relations: the direction against gravity in the frame of the splats, x,y,z, or cameras, "
+        "where photos were taken upright; left out, nothing is on, under or beside another",
+    )
+
+
 class AskedForSceneObjects(AskedForNodes):
     """Which objects to list, and what names them."""
 
@@ -691,7 +707,10 @@ class AskedForSceneObjects(AskedForNodes):
 
 
 class LiftTree(SceneTree, OfLift):
-    """Some of the nodes of a lift's tree: objects first, those with the most evidence first."""
+    """Some of the nodes of a lift's tree: objects first, those with the most evidence first.
+
+    Of the relations those whose `node` is on the page.
+    """
 
     encoder: str | None = Field(description="what named them, without its file; null for nothing")
     next: int | None = Field(description="the cursor of the page after this one; null at the end")

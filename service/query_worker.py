@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from cachetools import LRUCache
@@ -61,6 +61,7 @@ ANSWER_BYTES = 6  # of a splat: its score, whether it was seen, whether it was s
 ENTRY_BYTES = 2 << 10  # of what is kept, beside its tensors and its question
 WORD_COSINES = 1 << 31  # of splats and the words that may name them: about a minute and a half of a core
 MASK_PIXELS = 1 << 26  # of the views of an export: a minute, as of the largest picture
+RELATION_BYTES = 512  # of two objects: a pydantic model with its dictionary
 NUMBER_BYTES = 32  # of a number of a question: a Python float and the place in its tuple
 
 
@@ -319,15 +320,20 @@ class Answers:
     def _tree(self, request: dict[str, Any]) -> Frame:
         def make() -> SceneTree:
             words, encoder = ([], None) if request["encoder"] is None else self._words(request)
-            return self._scene(request).tree(words, encoder=encoder)
+            return self._scene(request).tree(
+                words, encoder=encoder, relations=request["relations"], up=_direction(request["up"])
+            )
 
-        key = ("tree", request["lift"], request["encoder"], json.dumps(request["encoder_version"]))
-        found = self._kept(key, make)
+        decides = (request[name] for name in ("lift", "encoder", "encoder_version", "relations", "up"))
+        found = self._kept(("tree", json.dumps([*decides])), make)
         assert isinstance(found, SceneTree)
         first, last = request["first"], request["first"] + request["count"]
-        after = last if last < found.count else None
-        told = {"explanation": found.explanation, "count": found.count, "next": after}
-        return _json(request, told, "nodes", (one.model_dump(mode="json") for one in found.nodes[first:last]))
+        nodes = found.nodes[first:last]
+        listed = {one.id for one in nodes}
+        relations = tuple(one for one in found.relations if one.node in listed)
+        page = found.model_copy(update={"nodes": nodes, "relations": relations})
+        told = page.model_dump(mode="json", exclude={"nodes"}) | {"next": last if last < found.count else None}
+        return _json(request, told, "nodes", (one.model_dump(mode="json") for one in page.nodes))
 
     def _regions(self, request: dict[str, Any]) -> Frame:
         found = self._scene(request).regions(request["view"], request["x"], request["y"])
@@ -388,6 +394,13 @@ def _selected(scene: Scene, name: str, bits: str) -> Any:
     """A selection of these splats, without the history of one of the same name."""
     scene.selections.pop(name, None)
     return scene.select(name).edit(Edit(how="set", bits=bits))
+
+
+def _direction(up: str | None) -> tuple[float, float, float] | Literal["cameras"] | None:
+    if up is None or up == "cameras":
+        return up
+    x, y, z = map(float, up.split(","))
+    return x, y, z
 
 
 def _given(thing: dict[str, Any] | None) -> dict[str, Any]:
@@ -456,7 +469,7 @@ def bytes_of(made: Kept) -> int:
     if isinstance(made, Catalogue):
         return ENTRY_BYTES * (1 + len(made.objects)) + made.features.nbytes
     if isinstance(made, SceneTree):
-        return ENTRY_BYTES * (1 + len(made.nodes))
+        return ENTRY_BYTES * (1 + len(made.nodes)) + RELATION_BYTES * len(made.relations)
     return ENTRY_BYTES + made.attention.nbytes + made.row_sums.nbytes + made.mask.nbytes
 
 

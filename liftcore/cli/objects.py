@@ -30,7 +30,10 @@ def add_arguments(parser: Parser) -> None:
     lying = "with --tree: how objects lie to each other"
     parser.add_argument("--relations", action="store_true", help=lying)
     against = "against gravity, in the frame of the splats: which object is on, under or beside another"
-    parser.add_argument("--up", type=float, nargs=3, metavar=("X", "Y", "Z"), help=f"with --relations: {against}")
+    lies = parser.add_mutually_exclusive_group()
+    lies.add_argument("--up", type=float, nargs=3, metavar=("X", "Y", "Z"), help=f"with --relations: {against}")
+    held = "the same, of cameras whose photos were taken upright"
+    lies.add_argument("--up-of-cameras", dest="up", action="store_const", const="cameras", help=held)
     parser.add_argument("--features", action="store_true", help="with --json: each one's mean feature, too")
     parser.add_argument("--csv", type=Path, metavar="CSV", help="write the list as a table")
     parser.add_argument("--splats", type=Path, metavar="FOLDER", help="write one PLY an object, object-ID.ply")
@@ -81,7 +84,7 @@ def _tree(options: argparse.Namespace, scene: Scene) -> int:
     if options.csv or options.features:
         named = "--csv" if options.csv else "--features"
         raise InvalidQuery(named, expected="the list of objects", got="--tree", hint="--json has the tree")
-    up = None if options.up is None else tuple(options.up)
+    up = tuple(options.up) if isinstance(options.up, list) else options.up
     answer = scene.tree(words, encoder=encoder, relations=options.relations or up is not None, up=up)
     files, exports = dict[str, Any](), dict[str, Any]()
     for one in answer.nodes if options.splats else ():

@@ -15,7 +15,7 @@ import io
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from liftcore.query.objects import largest_box
 from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.question import ListedObjects, Point, SceneNode, SceneObject, SceneTree
 from liftcore.query.relations import relations as related
+from liftcore.query.relations import upright
 from liftcore.query.scores import cosines, norms_of
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.origin import MAP_REACH
@@ -79,7 +80,8 @@ def catalogue(scene: OpenedLift, words: Sequence[str] = (), vectors: Any = None)
     number = len(scene.object_views)
     features = object_features(scene)
     facts = _described(scene, scene.object, np.arange(number), scene.object_views, _named(features, words, vectors))
-    told = f"{len(facts)} objects, which masks of three or more views keep together" if facts else NONE_FOUND
+    count = "1 object" if len(facts) == 1 else f"{len(facts)} objects"
+    told = f"{count}, which masks of three or more views keep together" if facts else NONE_FOUND
     return Catalogue(tuple(SceneObject(**one) for one in facts), told, features[[one["id"] for one in facts]])
 
 
@@ -89,7 +91,7 @@ def tree(
     vectors: Any = None,
     *,
     relations: bool = False,
-    up: Point | None = None,
+    up: Point | Literal["cameras"] | None = None,
 ) -> SceneTree:
     """The objects of a lift with their parts and groups, named by the nearest of some words.
 
@@ -97,7 +99,7 @@ def tree(
         scene, words, vectors: as of `catalogue`. relations, up: as of `Scene.tree`.
 
     Raises:
-        InvalidQuery, InvalidLift: as `catalogue`; or up has no direction.
+        InvalidQuery, InvalidLift: as `catalogue`; or up has no direction, or the cameras have none in common.
     """
     if scene.object is None or scene.object_views is None:
         return SceneTree(explanation=NOT_LOOKED_FOR, count=0, nodes=())
@@ -119,13 +121,22 @@ def tree(
         parent = int(parents[node]) if parents[node] >= 0 else None
         confidence = float(scene.node_confidence[node])
         nodes.append(SceneNode(**one | more, parent=parent, confidence=confidence))
-    counts = {kind: sum(one.kind == kind for one in nodes) for kind in ("object", "part", "group")}
-    told = f"{counts['object']} objects with {counts['part']} parts, in {counts['group']} groups"
-    answer = SceneTree(explanation=told if nodes else NONE_FOUND, count=len(nodes), nodes=tuple(nodes))
+    explanation = _counts(nodes) if nodes else NONE_FOUND
+    answer = SceneTree(explanation=explanation, count=len(nodes), nodes=tuple(nodes))
     if not relations:
         return answer
+    if up == "cameras":
+        up = upright(scene.cameras.values())
     members = [np.flatnonzero(scene.members(node)) for node in range(objects)]
     return answer.model_copy(update={"up": up, "relations": related(scene.splats, members, scene.evidence, up)})
+
+
+def _counts(nodes: Sequence[SceneNode]) -> str:
+    """How many objects, parts and groups there are, such as ``1 object with 2 parts, in 1 group``."""
+    counts = {kind: sum(one.kind == kind for one in nodes) for kind in ("object", "part", "group")}
+    objects, parts, groups = (f"{count} {kind}{'s' * (count != 1)}" for kind, count in counts.items())
+    parts = f" with {parts if counts['part'] else 'no parts'}"
+    return objects + parts + (f", in {groups}" if counts["group"] else "")
 
 
 def _described(

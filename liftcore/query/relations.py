@@ -14,12 +14,12 @@ Of thing a and thing b, with heights along ``up`` and the ground at right angles
 ``gap`` is between the nearest centres; of on and under between heights, of beside on the ground. ``overlap`` is the
 share of a's splats in b's box, of its footprint above b, or of heights.
 
-Which way is up no splat says: it is given, or on, under and beside are not told.
+Which way is up no splat says: it is given, or that of the cameras (`upright`); or on, under and beside are not told.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING
@@ -32,6 +32,7 @@ from liftcore.query.question import Point, Relation
 from liftcore.scene.touching import touch_pairwise
 
 if TYPE_CHECKING:
+    from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
 
 NEAR = 0.15  # of its own height: what stands on something sinks in, or floats, by less
@@ -42,6 +43,8 @@ MOST_THINGS = 64
 MOST_SPLATS = 1 << 16  # of a thing that are looked at, evenly chosen
 CELLS = 16  # of a footprint's side
 PAIRS = 256  # of nearest splats, of which one must touch
+LEVELLED = 0.002  # of each camera's weight, that its right axis does not take from up: of cameras that all look alike
+LEAST_UPRIGHT = 0.5  # mean cosine of the cameras' own up with that of all: less, and photos lie on their sides
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,28 @@ def relations(
         if len(things[a].rows) and len(things[b].rows):
             found += _of_pair(splats, a, b, things[a], things[b], known=up is not None)
     return tuple(found)
+
+
+def upright(cameras: Iterable[Camera]) -> Point:
+    """Which way is up where photos were taken upright, unit, in the frame of the splats.
+
+    Cameras look down or up at things and are seldom rolled: it is the mean of their own up without what lies along
+    their right axes.
+
+    Raises:
+        InvalidQuery: the cameras have no up in common.
+    """
+    poses = np.stack([camera.viewmat[:3, :3] for camera in cameras])
+    right, own = poses[:, 0], -poses[:, 1]
+    axis = np.linalg.solve(right.T @ right + LEVELLED * len(poses) * np.eye(3), own.sum(axis=0))
+    axis /= max(float(np.linalg.norm(axis)), 1e-30)
+    common = float((own @ axis).mean())
+    if common < LEAST_UPRIGHT:
+        expected, hint = "cameras that are upright", "give x,y,z, the direction against gravity"
+        got = f"a mean cosine of {common:.2f} to one direction"
+        raise InvalidQuery("up", expected=expected, got=got, hint=hint)
+    x, y, z = axis.tolist()
+    return x, y, z
 
 
 def _turn(up: Point | None) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from liftcore.errors import InvalidLift
 from liftcore.query.opened import OpenedLift
@@ -219,15 +219,15 @@ class Scene(OpenedLift):
         *,
         encoder: TextEncoder | str | Path | None = None,
         relations: bool = False,
-        up: tuple[float, float, float] | None = None,
+        up: tuple[float, float, float] | Literal["cameras"] | None = None,
     ) -> SceneTree:
         """The objects of `catalogue` with their parts and groups of them: a node's parts are nodes, too.
 
         Args:
             words, vectors, encoder: as in `catalogue`.
             relations: whether to say how the objects lie to each other (`liftcore.query.relations`).
-            up: the direction against gravity in the frame of the splats; None: not known, and no object is on
-                another.
+            up: the direction against gravity in the frame of the splats, or ``cameras``, where photos were taken
+                upright; None: not known, and no object is on another.
         """
         from liftcore.query.catalogue import tree
 

@@ -228,9 +228,12 @@ def scene_objects(
 
 
 @router.get("/lifts/{lift}/tree", response_model=models.LiftTree, tags=["lifts"])
-def scene_tree(lift: str, deps: Deps, ask: Ask, asked: Annotated[models.AskedForNodes, Query()]) -> Response:
-    """The same things with their parts and groups of them, objects first; a node's splats are an object's."""
-    return _nodes("tree", lift, deps, ask, asked)
+def scene_tree(lift: str, deps: Deps, ask: Ask, asked: Annotated[models.AskedForTree, Query()]) -> Response:
+    """The same things with their parts and groups of them, objects first; a node's splats are an object's.
+
+    With `relations`, how the objects lie to each other.
+    """
+    return _nodes("tree", lift, deps, ask, asked, relations=asked.relations or asked.up is not None, up=asked.up)
 
 
 def _nodes(operation: str, lift: str, deps: Deps, ask: Ask, asked: models.AskedForNodes, **more: Any) -> Response:

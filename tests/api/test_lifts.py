@@ -260,6 +260,34 @@ def test_views_have_their_poses_in_pages(client: TestClient, lift: dict[str, Any
         np.testing.assert_allclose(-pose[:3, :3].T @ pose[:3, 3], (VIEWS[view["name"]], 0, 0), atol=1e-6)
 
 
+def test_relations_of_objects_have_their_numbers_and_come_once(
+    client: TestClient, lift: dict[str, Any], scene: TinyScene, tmp_path: Path
+) -> None:
+    (tmp_path / "lift").write_bytes(client.get(lift["links"]["features"]).content)
+    tensors = load((tmp_path / "lift").read_bytes())
+    cluster = np.arange(SPLATS_A_CLUSTER)
+    tensors["object"][:] = tensors["node"][:] = 2
+    tensors["object"][cluster] = tensors["node"][cluster] = splat_rows()[cluster, 0] > -1.2  # its halves
+    with safe_open(tmp_path / "lift", framework="np") as opened:
+        route = client.post("/lifts", content=save(tensors, opened.metadata())).json()["links"]["tree"]
+    plain = client.get(route).json()
+    assert (plain["relations"], plain["up"]) == ([], None)
+    unknown = client.get(route, params={"relations": True}).json()
+    assert unknown["nodes"] == plain["nodes"] and unknown["up"] is None
+    assert {one["relation"] for one in unknown["relations"]} <= {"touching", "inside"}
+    whole = client.get(route, params={"relations": True, "up": "0,-1,0"}).json()
+    (beside,) = [one for one in whole["relations"] if one["relation"] == "beside"]
+    assert {beside["node"], beside["other"]} == {0, 1} and 0 <= beside["gap"] < 0.2 and beside["overlap"] > 0.5
+    pages = [client.get(route, params={"up": "0,-2,0", "limit": 1, "cursor": at}).json() for at in range(3)]
+    assert [one for page in pages for one in page["relations"]] == whole["relations"]
+    cameras = client.get(route, params={"up": "cameras"}).json()
+    np.testing.assert_allclose(cameras["up"], (0, 1, 0), atol=1e-6)
+    assert cameras["relations"] == whole["relations"]
+    for wrong in ("0,-1", "0,-1,0,0", "nan,0,1", "0,0,0", "1e999,0,0", "up", ""):
+        problem = assert_problem(client.get(route, params={"up": wrong}))
+        assert (problem["status"], problem["argument"]) == (422, "up")
+
+
 def test_objects_are_there_without_words_and_a_table_names_them(
     client: TestClient, lift: dict[str, Any], scene: TinyScene
 ) -> None:

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.relations import relations
+from liftcore.query.relations import relations, upright
+from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
 
 STEP = 0.1
@@ -66,6 +67,33 @@ def test_without_up_nothing_is_on_another() -> None:
     told = found(np.eye(3), None)
     assert {relation for _, relation, _ in told} == {"touching", "inside"}
     assert ("table", "touching", "bowl") in told and ("table", "touching", "lamp") not in told
+
+
+def circling(turn: np.ndarray, *, roll: float = 0.0, over: float = np.pi) -> list[Camera]:
+    """Cameras that look down at a table from a part of a circle around it, each rolled by so many times its angle."""
+    cameras = []
+    for angle in np.linspace(0, over, 9):
+        forward = np.array([np.cos(angle), np.sin(angle), -0.8]) / np.hypot(1, 0.8)
+        right = np.cross(forward, (0, 0, 1))
+        right /= np.linalg.norm(right)
+        down = np.cross(forward, right)
+        lean = roll * angle
+        sides = np.cos(lean) * right + np.sin(lean) * down, np.cos(lean) * down - np.sin(lean) * right
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = np.stack([*sides, forward]) @ turn.T
+        cameras.append(Camera.pinhole("", 64, 48, 50.0, 50.0, 32.0, 24.0, viewmat))
+    return cameras
+
+
+@pytest.mark.parametrize("over", [2 * np.pi, np.pi / 2, 0.6])
+def test_up_is_that_of_cameras_that_look_down(over: float) -> None:
+    for turn in (np.eye(3), LEFT):
+        assert np.array(upright(circling(turn, over=over))) @ turn[:, 2] > np.cos(np.deg2rad(5))
+
+
+def test_cameras_that_are_rolled_have_no_up() -> None:
+    with pytest.raises(InvalidQuery, match="up: expected cameras that are upright"):
+        upright(circling(np.eye(3), roll=2.0, over=2 * np.pi))
 
 
 def test_an_up_without_a_direction_is_refused() -> None:
