@@ -107,10 +107,12 @@ def measure_view(sample: SampledRays, features: Tensor, codebook: Tensor) -> Vie
     measures, by_ray = np.zeros((readout.rays.size, 3)), np.argsort(readout.rays, kind="stable")
     for first, last in _ray_chunks(starts, _CHUNK_VALUES // features.shape[1]):
         chosen = by_ray[slice(*np.searchsorted(readout.rays, [first, last], sorter=by_ray))]
-        X = features[splats[starts[first] : starts[last]]].float().div_(scale).numpy()  # [entries, F]
-        B = readout.rows(chosen).observed(codebook).div_(scale).numpy()  # [rows, F]
+        X = features[splats[starts[first] : starts[last]]].float()  # [entries, F]
+        B = readout.rows(chosen).observed(codebook)  # [rows, F]
+        if scale != 1.0:
+            X, B = X.div_(scale), B.div_(scale)
         own_starts, own_weights = starts[first : last + 1] - starts[first], weights[starts[first] : starts[last]]
-        measures[chosen] = measure_rows(readout.rays[chosen] - first, own_starts, own_weights, X, B)
+        measures[chosen] = measure_rows(readout.rays[chosen] - first, own_starts, own_weights, X.numpy(), B.numpy())
     measures[:, :2] *= scale**2
     measures[row_sums[readout.rays] == 0, 2] = np.nan
     return ViewMeasures(row_sums, measures[:, 0], measures[:, 1], measures[:, 2])
@@ -131,23 +133,26 @@ def measure_rows(rays, starts, weights, X, B):
     """Residual, surrogate and beta of every row, [rows, 3] f64.
 
     Args:
-        rays: [rows] i64, the ray of a row. starts: [n + 1] i64, each ray's entries.
+        rays: [rows] i64 ascending, the ray of a row. starts: [n + 1] i64, each ray's entries.
         weights: [entries] f64. X: [entries, F] f32, the entries' splats. B: [rows, F] f32.
     """
     measures = np.zeros((rays.shape[0], 3))
     channels = B.shape[1]
     rendered = np.empty(channels, np.float32)
     for row in range(rays.shape[0]):
-        rendered[:] = 0
+        begin, end = starts[rays[row]], starts[rays[row] + 1]
+        if row == 0 or rays[row] != rays[row - 1]:
+            rendered[:] = 0
+            for entry in range(begin, end):
+                small_weight = np.float32(weights[entry])
+                for c in range(channels):
+                    rendered[c] += small_weight * X[entry, c]
         observed = B[row]
         surrogate = distance = total = 0.0
-        for entry in range(starts[rays[row]], starts[rays[row] + 1]):
-            weight = weights[entry]
-            small_weight = np.float32(weight)
-            lifted = X[entry]
+        for entry in range(begin, end):
+            weight, lifted = weights[entry], X[entry]
             square = np.float32(0.0)
             for c in range(channels):
-                rendered[c] += small_weight * lifted[c]
                 difference = lifted[c] - observed[c]
                 square += difference * difference
             surrogate += weight * square

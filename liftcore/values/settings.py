@@ -247,7 +247,7 @@ class LiftSettings(Shown):
     )
     aggregation_channels: int = Field(50, ge=1, le=1_024, description="principal components that HDBSCAN sees")
     certificate_rays: int = Field(
-        10_000,
+        4_000,
         ge=0,
         le=10_000_000,
         description="rays sampled for the certificate, a million at most",
