@@ -15,6 +15,7 @@ from typing import Any
 import anyio
 from fastapi import FastAPI
 from starlette.datastructures import MutableHeaders
+from starlette.middleware.cors import CORSMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from liftcore import __version__
@@ -38,6 +39,9 @@ PLACES = 4  # of requests that are begun at the same time
 TURN_SECONDS = 0.05  # many times what the event loop needs for a request
 PROBES = frozenset({"/healthz", "/readyz"})
 PATH_CHARACTERS = 200  # of a path in the log
+# That pages of other sites may send beside what every page may, and read beside what every page reads
+CORS_HEADERS = ("Authorization", "Content-Type", "If-None-Match", "If-Range", "Range", "Last-Event-ID")
+CORS_EXPOSED = ("ETag", "Content-Range", "Content-Disposition", "Retry-After", "WWW-Authenticate", "X-Request-ID")
 # For browsers: nothing here is guessed at, framed or allowed to load anything; pages bring a policy of their own.
 SAFE_HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -93,7 +97,9 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
         responses=problems.RESPONSES,
         openapi_url=None,  # `service.routes.operations` tells it, and of keys, beside the event loop
         redirect_slashes=False,
+        generate_unique_id_function=lambda route: route.name,  # by which clients call their functions
     )
+    app.state.readers = settings.cors_origins
     app.state.stopping, app.state.metrics, app.state.documents = stopping, metrics, operations.Documents(app)
     app.add_middleware(AnswerHead)
     app.add_middleware(Gate, keys=store.keys, settings=settings, stopping=lambda: stopping.begun)
@@ -143,12 +149,18 @@ def job_limits(settings: ServiceSettings) -> JobLimits:
 class RecordedApp(FastAPI):
     """Records its requests outside of all else, so that answers to unforeseen errors are recorded too.
 
-    ``state.metrics`` must be there before the first request.
+    ``state.metrics`` and ``state.readers``, origins of other sites, must be there before the first request.
     """
 
     def build_middleware_stack(self) -> ASGIApp:
-        """The usual layers within the recorder."""
-        return Recorder(super().build_middleware_stack(), self.state.metrics)
+        """The usual layers within the recorder; refusals too are read by pages that may read."""
+        stack: ASGIApp = super().build_middleware_stack()
+        if readers := self.state.readers:
+            stack = CORSMiddleware(
+                stack, readers, ("GET", "HEAD", "POST"), CORS_HEADERS,
+                allow_credentials=False, expose_headers=CORS_EXPOSED,
+            )  # fmt: skip
+        return Recorder(stack, self.state.metrics)
 
 
 class Recorder:

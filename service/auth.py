@@ -31,6 +31,7 @@ from service.errors import (
     require_share,
 )
 from service.problems import CLOSE
+from service.requests import is_json
 from service.settings import ServiceSettings
 from service.store.keys import KeyRecord, KeyStore
 from service.store.owners import NOBODY, SERVICE, Owner, Scope
@@ -39,7 +40,8 @@ CALLER = "caller"  # of the scope's state
 LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
 BEARER = re.compile(r"bearer +([A-Za-z0-9._~+/-]+=*)", re.ASCII | re.IGNORECASE)  # RFC 6750, 2.1
 LOOKUPS = 4  # threads that look keys up, so that slow routes cannot keep anyone waiting at the gate
-CHECKED = re.compile("PUT /assets/.*|POST /lifts|PATCH /assets/.*|POST (/lift/plan)")  # by a process each
+# Requests that a process each checks
+CHECKED = re.compile("(PUT|PATCH) /assets/.*|POST /assets|POST /lifts|POST (?P<plan>/lift/plan)")
 # Open to everybody: what says nothing of anyone's work. The page asks for a key itself; the API is described to those
 # who have none yet, and browsers send none with a link.
 OPEN = frozenset(
@@ -83,7 +85,7 @@ class Gate:
         self._app = app
         self._keys = keys.under(settings.keys)
         self._settings = settings
-        self._hosts = Hosts(settings.host, settings.allowed_hosts)
+        self._hosts = Hosts(settings.host, settings.allowed_hosts, settings.cors_origins)
         self._stopping = stopping
         self._uploads: Counter[str] = Counter()  # by key, those that are on their way, and plans
         self._lookups = anyio.CapacityLimiter(LOOKUPS)
@@ -99,8 +101,9 @@ class Gate:
             return
         method, headers = scope["method"], Headers(scope=scope)
         require_one_length(headers)
-        self._hosts.check(method, headers)
-        caller = await self._caller(needed(method, scope["path"]), headers)
+        wanted = needed(method, scope["path"])
+        self._hosts.check(method, headers, only_reads=wanted is Scope.READ)
+        caller = await self._caller(wanted, headers)
         if caller.key is not None and caller.owner.sees_all:
             told = {"key": caller.key, "method": method, "path": scope["path"]}
             log.info("an admin key is used", extra={"fields": told})
@@ -110,11 +113,11 @@ class Gate:
             raise busy
         scope.setdefault("state", {})[CALLER] = caller
         checked = CHECKED.fullmatch(f"{method} {scope['path']}")
-        if checked is None:
+        if checked is None or (scope["path"] == "/lifts" and is_json(headers)):  # an order
             await self._app(scope, receive, send)
             return
         own, most = caller.owner.key, caller.max_uploads
-        require_share("plan" if checked[1] else "upload", self._uploads[own], most)
+        require_share("plan" if checked["plan"] else "upload", self._uploads[own], most)
         self._uploads[own] += 1
         try:
             await self._app(scope, receive, send)
@@ -198,15 +201,21 @@ class Hosts:
         bound: the address that the service listens on. When that is all of them, every address in digits is this
             service: rebinding needs a name.
         allowed: more names, for those who come through a proxy or by a name of this machine.
+        readers: origins of other sites whose pages may read, `*` for all.
     """
 
-    def __init__(self, bound: str, allowed: Iterable[str]) -> None:
+    def __init__(self, bound: str, allowed: Iterable[str], readers: Iterable[str] = ()) -> None:
+        self._readers = frozenset(readers)
         self._allowed = frozenset(name.lower() for name in allowed)
         self._names = LOOPBACK | {bound.lower()} | self._allowed
         self._all_addresses = _is_address(bound) and ipaddress.ip_address(bound).is_unspecified
 
-    def check(self, method: str, headers: Headers) -> None:
-        """See that a request means this service, and that no foreign page sends it.
+    def check(self, method: str, headers: Headers, *, only_reads: bool = False) -> None:
+        """See that a request means this service, and that no foreign page sends it that may not.
+
+        Args:
+            method, headers: of the request.
+            only_reads: whether it changes nothing, though its method may: a question with a body.
 
         Raises:
             Misdirected: the Host is another.
@@ -220,8 +229,13 @@ class Hosts:
                 hint="the operator may add names with SPLATLIFT_ALLOWED_HOSTS",
             )  # fmt: skip
         origins = headers.getlist("origin")
-        if method not in SAFE and any(not self._same_site(origin, hosts[0]) for origin in origins):
+        if method in SAFE or (only_reads and all(self._may_read(origin) for origin in origins)):
+            return
+        if any(not self._same_site(origin, hosts[0]) for origin in origins):
             raise ForeignOrigin("Origin", expected="this service's own page", got=", ".join(origins)[:200])
+
+    def _may_read(self, origin: str) -> bool:
+        return "*" in self._readers or origin.lower() in self._readers
 
     def _same_site(self, origin: str, host: str) -> bool:
         try:

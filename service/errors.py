@@ -3,8 +3,8 @@
 SplatliftError
 └── ServiceError
     ├── Unauthorized, MissingScope, ForeignOrigin, Misdirected      who may ask
-    ├── InvalidRequest, UnreadableBody, DigestMismatch, UnsupportedEncoding, TooLarge,
-    │   RangeNotSatisfiable, KeyReused
+    ├── InvalidRequest, UnreadableBody, DigestMismatch, UnsupportedEncoding,
+    │   UnsupportedMedia, TooLarge, RangeNotSatisfiable, KeyReused
     ├── InUse, Conflict, Changed                                             what the state of things does not allow
     ├── OverQuota, OverLimit, NoSpace                               what there is no room for
     ├── RetryLater: TooMany, Busy (NotReady)                        what may go well in a while
@@ -70,7 +70,7 @@ class InvalidRequest(ServiceError):
 
 
 class UnreadableBody(ServiceError):
-    """A body that no reader of JSON gets to the end of."""
+    """A body that cannot be parsed as JSON."""
 
     kind, status, title = "malformed-request", 400, "The request is malformed"
 
@@ -85,6 +85,12 @@ class UnsupportedEncoding(ServiceError):
     """A body that is compressed."""
 
     kind, status, title = "unsupported-encoding", 415, "The content encoding is not supported"
+
+
+class UnsupportedMedia(ServiceError):
+    """A body of a media type that the route does not take."""
+
+    kind, status, title = "unsupported-media-type", 415, "The media type is not supported"
 
 
 class TooLarge(ServiceError):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -15,6 +16,7 @@ from pydantic import (
     ConfigDict,
     Field,
     GetJsonSchemaHandler,
+    computed_field,
 )
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError
@@ -163,6 +165,17 @@ class Problem(BaseModel):
     request_id: Annotated[str | None, Field(description="as in X-Request-ID; the log has it too")] = None
 
 
+def iso_of(name: str, *, optional: bool = False) -> Any:
+    """A field for the moment of the field of that name, which is in seconds since 1970: ISO 8601, in UTC."""
+
+    def moment(self: BaseModel) -> datetime | None:
+        seconds = getattr(self, name)
+        return None if seconds is None else datetime.fromtimestamp(seconds, UTC)
+
+    kind: Any = datetime | None if optional else datetime
+    return computed_field(return_type=kind, description=f"{name} as ISO 8601, in UTC")(property(moment))
+
+
 class Asset(BaseModel):
     """An uploaded file."""
 
@@ -172,6 +185,7 @@ class Asset(BaseModel):
     counts: dict[str, Any] = Field(description="what is in it: splats, views, channels and so on")
     warnings: list[str]
     created: float = Field(description="seconds since 1970")
+    created_at = iso_of("created")
     links: dict[str, str]
 
 
@@ -274,9 +288,12 @@ class Job(BaseModel):
     plan: Plan | None = Field(description="of a lift, from before its first view is walked; the latest attempt's")
     progress: Progress | None
     problem: Problem | None
-    created: float
+    created: float = Field(description="seconds since 1970, as started and ended are")
     started: float | None
     ended: float | None
+    created_at = iso_of("created")
+    started_at = iso_of("started", optional=True)
+    ended_at = iso_of("ended", optional=True)
     request_id: str | None = Field(description="the X-Request-ID of the request that made it")
     links: dict[str, str]
 
@@ -301,6 +318,7 @@ class LogLine(BaseModel):
 
     line: str
     time: float = Field(description="seconds since 1970")
+    time_at = iso_of("time")
 
 
 class LiftResult(BaseModel):
@@ -331,7 +349,8 @@ class LiftResult(BaseModel):
     )
     certificate: dict[str, Any]
     timings: dict[str, float] = Field(description="seconds a stage")
-    created: float
+    created: float = Field(description="seconds since 1970")
+    created_at = iso_of("created")
     links: dict[str, str]
 
 
@@ -403,6 +422,7 @@ class Tradeoff(BaseModel):
     budget_s: float
     seconds: float = Field(description="that it took")
     created: float = Field(description="seconds since 1970")
+    created_at = iso_of("created")
     links: dict[str, str]
 
 
@@ -644,8 +664,10 @@ class ListedSelection(OfLift):
     first: int = Field(description="the steps that it can go to, by PATCH")
     last: int
     version: int = Field(description="its ETag, for If-Match")
-    created: float = Field(description="seconds since 1970")
+    created: float = Field(description="seconds since 1970, as changed is")
     changed: float
+    created_at = iso_of("created")
+    changed_at = iso_of("changed")
     links: dict[str, str]
 
 
@@ -657,7 +679,7 @@ class SelectionStep(BaseModel):
     count: int = Field(description="splats after it")
 
 
-class Selection(ListedSelection):
+class SelectionDetail(ListedSelection):
     """A selection with its history."""
 
     history: list[SelectionStep] = Field(description="also the steps that were undone")

@@ -185,7 +185,7 @@ def _methods_of(request: Request) -> list[str]:
     return [*taken, "HEAD"] if "GET" in taken else taken
 
 
-def refusal(request: Request, error: RequestValidationError) -> errors.InvalidRequest:
+def refusal(request: Request, error: RequestValidationError) -> errors.ServiceError:
     """The first thing that is wrong with the form of a request: where, what was expected, what came."""
     first = error.errors()[0]
     place, kind, told = [str(part) for part in first["loc"]], first["type"], first.get("ctx", {})
@@ -214,15 +214,15 @@ def _expected(told: dict[str, Any]) -> str:
     return told.get("ctx", {}).get("expected") or words[:1].lower() + words[1:]
 
 
-def _no_json(body: str, place: int, why: str) -> errors.InvalidRequest:
+def _no_json(body: str, place: int, why: str) -> errors.UnreadableBody:
     shown = repr(body[place : place + SHOWN_OF_JSON]) if place < len(body) else "its end"
     got = f"{shown} at character {place + 1} ({why[:1].lower()}{why[1:]})"
-    return errors.InvalidRequest("body", expected="JSON", got=got, hint="in the body of the request")
+    return errors.UnreadableBody("body", expected="JSON", got=got, hint="in the body of the request")
 
 
-def _unread(media: str | None) -> errors.InvalidRequest:
+def _unread(media: str | None) -> errors.UnsupportedMedia:
     """A body that is not read, as nothing says that it is JSON: curl says that all it sends is a form."""
-    return errors.InvalidRequest(
+    return errors.UnsupportedMedia(
         "Content-Type", expected="application/json", got="nothing" if media is None else _short(media),
         hint="send the header Content-Type: application/json with the body",
     )  # fmt: skip

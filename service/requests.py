@@ -15,10 +15,20 @@ from fastapi import APIRouter, Body, Depends, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import APIRoute
 from pydantic import BaseModel, TypeAdapter, ValidationError
+from starlette.datastructures import Headers
+from starlette.routing import Match
+from starlette.types import Scope
 
 from service import models
 from service.content import TAGGED
-from service.errors import InvalidRequest, ServiceError, TooLarge, UnreadableBody, UnsupportedEncoding
+from service.errors import (
+    InvalidRequest,
+    ServiceError,
+    TooLarge,
+    UnreadableBody,
+    UnsupportedEncoding,
+    UnsupportedMedia,
+)
 from service.problems import CLOSE, refusal
 
 NAME_CHARACTERS = 80  # of a name or a value that came, told back
@@ -26,6 +36,7 @@ M = TypeVar("M", bound=BaseModel)
 F = TypeVar("F", bound=Callable[..., Any])
 BODY = "in the body of the request"
 JSON = re.compile(r"\s*application/([^;\s]+\+)?json\s*(;|$)", re.IGNORECASE)  # what the framework takes for it
+PARTS = re.compile(r"\s*multipart/", re.IGNORECASE)  # as forms send files
 LET_GO = 16  # times the limit of a body: an upload sent to the wrong route ends there
 
 
@@ -36,7 +47,8 @@ async def _known_only(request: Request) -> None:
     if not given:
         return
     route: APIRoute = request.scope["route"]
-    described = {parameter["name"]: parameter for parameter in (route.openapi_extra or {}).get("parameters", ())}
+    more = (route.openapi_extra or {}).get("parameters", ())
+    described = {parameter["name"]: parameter for parameter in more if parameter["in"] == "query"}
     known = [*_names(route), *described]
     lists = {name for name, parameter in described.items() if parameter["schema"].get("type") == "array"}
     for name in given:
@@ -84,6 +96,35 @@ class JsonRoute(APIRoute):
         return with_body
 
 
+class OrderRoute(JsonRoute):
+    """A route for bodies of JSON alone, beside one of the same path for files: it comes before that."""
+
+    def matches(self, scope: Scope) -> tuple[Match, Scope]:
+        """The framework's, of requests whose Content-Type is JSON."""
+        return super().matches(scope) if is_json(Headers(scope=scope)) else (Match.NONE, {})
+
+
+def is_json(headers: Headers) -> bool:
+    """Whether a body is said to be JSON."""
+    return JSON.match(headers.get("content-type", "")) is not None
+
+
+def require_file(headers: Headers) -> None:
+    """See that a body is a file as it is: neither compressed nor a part of a form.
+
+    Raises:
+        UnsupportedEncoding: its Content-Encoding says that it is compressed.
+        UnsupportedMedia: its Content-Type says that it is a form.
+    """
+    require_plain(headers.getlist("content-encoding"))
+    media = headers.get("content-type", "")
+    if PARTS.match(media):
+        raise UnsupportedMedia(
+            "Content-Type", expected="the file itself as the body", got=repr(media[:NAME_CHARACTERS]),
+            hint="send it with curl -T FILE or --data-binary @FILE, as application/octet-stream",
+        )  # fmt: skip
+
+
 class _BoundedRequest(Request):
     """A request with its body read within the limit, and as a model where it is JSON."""
 
@@ -94,8 +135,8 @@ class _BoundedRequest(Request):
             UnsupportedEncoding: it is compressed.
             TooLarge: it is too long. A client that is still sending when its connection closes never reads the
                 answer: what is a few times too long is read to its end and let go.
-            InvalidRequest: it holds too many values, is no JSON, or not what the route takes.
-            UnreadableBody: it cannot be parsed.
+            InvalidRequest: it holds too many values, or is not what the route takes.
+            UnreadableBody: it cannot be parsed as JSON.
         """
         require_plain(self.headers.getlist("content-encoding"))
         deps, content, received = self.app.state.deps, bytearray(), 0
@@ -109,7 +150,7 @@ class _BoundedRequest(Request):
         if received > limit:
             raise _too_large(limit)
         self._begin, self._value = bytes(content[:NAME_CHARACTERS]), None
-        if content and JSON.match(self.headers.get("content-type", "")):  # else the framework refuses it unread
+        if content and is_json(self.headers):  # else the framework refuses it unread
             self._value = await anyio.to_thread.run_sync(_validated, self, model, content, limiter=deps.parsing)
             if isinstance(self._value, ServiceError):
                 raise self._value
@@ -216,7 +257,8 @@ def both(router: APIRouter, path: str, parameters: Parameters[Any], **route: Any
         answers = {"responses": route["responses"] | TAGGED} if "responses" in route else {}
         get = router.get(path, openapi_extra=parameters.described(), **route | answers)
         get(_reading(endpoint, Annotated[parameters.model, Depends(parameters)]))
-        router.post(path, **route)(_reading(endpoint, Annotated[parameters.model, Body()]))
+        post = router.post(path, name=f"{endpoint.__name__}_by_body", **route)
+        post(_reading(endpoint, Annotated[parameters.model, Body()]))
         return endpoint
 
     return register

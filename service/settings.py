@@ -5,11 +5,12 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, ValidationError, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict, SettingsError
 
 from liftcore.errors import InvalidInput
@@ -18,6 +19,7 @@ from service.errors import InvalidRequest, Misconfigured
 
 MiB = 1 << 20
 GiB = 1 << 30
+ORIGIN = re.compile(r"https?://[a-z0-9.-]+(:\d{1,5})?|https?://\[[0-9a-f:.]+\](:\d{1,5})?")  # RFC 6454, 6.2
 
 
 # Of releases before; a proxy bounds slow clients now.
@@ -49,6 +51,11 @@ class ServiceSettings(BaseSettings):
         None,
         description="required: requests need a key even before one was made, and the service may bind to any "
         "address; none: all on this machine are admins, on loopback only; not set = required once a key was made",
+    )
+    cors_origins: Annotated[tuple[str, ...], NoDecode] = Field(
+        (),
+        description="origins of other sites whose pages may read here (CORS), such as https://lab.example, with "
+        "commas between; * = all of them, where SPLATLIFT_KEYS is required; not set = none",
     )
     key_bytes: int = Field(
         100 * GiB, ge=0, description="bytes of assets and results that a key may store; more get 403"
@@ -142,10 +149,23 @@ class ServiceSettings(BaseSettings):
         256 * MiB, ge=0, description="answers and views that the query process keeps for what is asked next"
     )
 
-    @field_validator("allowed_hosts", mode="before")
+    @field_validator("allowed_hosts", "cors_origins", mode="before")
     @classmethod
     def _names(cls, given: Any) -> Any:
         return [name.strip() for name in given.split(",") if name.strip()] if isinstance(given, str) else given
+
+    @field_validator("cors_origins")
+    @classmethod
+    def _origins(cls, origins: tuple[str, ...], known: ValidationInfo) -> tuple[str, ...]:
+        """See that origins are as browsers send them, and that not every page reads what needs no key."""
+        for origin in origins:
+            if origin == "*" and known.data.get("keys") != "required":
+                expected = "origins by their names, or SPLATLIFT_KEYS=required"
+                raise Misconfigured("cors_origins", expected=expected, got="*")
+            if origin != "*" and not ORIGIN.fullmatch(origin):
+                expected = "origins such as https://lab.example or http://localhost:3000, with commas between"
+                raise Misconfigured("cors_origins", expected=expected, got=repr(origin)[:120])
+        return origins
 
     def max_upload_bytes(self, kind: str) -> int:
         """The size limit of an asset kind, or of a ``lift``."""

@@ -15,7 +15,7 @@ from service.child import error_of
 from service.content import FILE, Cursor, Limit, file_answer, listed
 from service.errand import run_errand
 from service.errors import Crashed
-from service.requests import JsonRoute, require_plain
+from service.requests import JsonRoute, require_file
 from service.state import AppState, Deps
 from service.store.assets import SHOWN_CHARACTERS, AssetRecord
 from service.store.files import require_whole
@@ -29,13 +29,15 @@ MAX_DIGITS = 20  # of a Content-Length: h11 takes no more
 router = APIRouter(prefix="/assets", tags=["assets"], route_class=JsonRoute)
 # By the name of the other routes' part: to OpenAPI, two templates that match the same paths are one path twice.
 AssetKind = Annotated[models.AssetKind, Path(alias="asset", description="what it is")]
+KindParameter = Annotated[models.AssetKind, Query(description="what it is")]
 AssetId = Annotated[str, Path(description="sha256: and the digest of the bytes, in hex")]
 Sha256 = Annotated[
     str | None,
     Query(pattern="^[0-9a-fA-F]{64}$", description="of the content; checked if given"),
 ]
 NamesCursor = Annotated[int, Query(ge=0, le=10**9, description="the `next` of the page before")]
-RAW_BODY = {
+KNOWN_ALREADY: dict[int | str, dict[str, Any]] = {200: {"model": models.Asset, "description": "It was here already"}}
+RAW_BODY: dict[str, Any] = {
     "requestBody": {
         "required": True,
         "description": "the file itself",
@@ -44,26 +46,28 @@ RAW_BODY = {
 }
 
 
-@router.put(
-    "/{asset}",
-    response_model=models.Asset,
-    status_code=201,
-    responses={200: {"model": models.Asset, "description": "It was here already"}},
-    openapi_extra=RAW_BODY,
-)
-async def upload(kind: AssetKind, request: Request, deps: Deps, sha256: Sha256 = None) -> Response:
-    """Upload splats (any format but checkpoints), cameras (JSON, or a zip of a COLMAP model or of several files), a
+@router.put("/{asset}", response_model=models.Asset, status_code=201, responses=KNOWN_ALREADY, openapi_extra=RAW_BODY)
+async def put_asset(kind: AssetKind, request: Request, deps: Deps, sha256: Sha256 = None) -> Response:
+    """Upload a file. It is checked whole.
+
+    It is splats (any format but checkpoints), cameras (JSON, or a zip of a COLMAP model or of several files), a
     feature pack, masks, a text table, or photos (a zip of JPEG and PNG files that are named like the views).
     """
     asset, new = await taken(AssetIntake, kind, request, deps, sha256)
     return _reply(asset, 201 if new else 200)
 
 
+@router.post("", response_model=models.Asset, status_code=201, responses=KNOWN_ALREADY, openapi_extra=RAW_BODY)
+async def create_asset(kind: KindParameter, request: Request, deps: Deps, sha256: Sha256 = None) -> Response:
+    """Upload a file, as PUT does."""
+    return await put_asset(kind, request, deps, sha256)
+
+
 async def taken(
     into: Callable[..., Intake[Taken]], kind: models.UploadKind, request: Request, deps: AppState, sha256: str | None
 ) -> tuple[Taken, bool]:
     """Take the body of an upload in, check it whole and keep it; whether its owner did not have it before."""
-    require_plain(request.headers.getlist("content-encoding"))
+    require_file(request.headers)
     limit = deps.settings.max_upload_bytes(kind)
     require_size(kind, _announced(request), limit)  # before a byte of it is asked for with 100 Continue
     intake = into(deps.store, deps.owner, kind, limit)
@@ -113,7 +117,7 @@ def get_asset(asset: AssetId, deps: Deps) -> Response:
 
 
 @router.get("/{asset}/names", response_model=models.Names)
-def get_names(asset: AssetId, deps: Deps, limit: Limit = models.PAGE, cursor: NamesCursor = 0) -> models.Names:
+def get_asset_names(asset: AssetId, deps: Deps, limit: Limit = models.PAGE, cursor: NamesCursor = 0) -> models.Names:
     """The names of views, or the words, that an asset holds, in pages: of long ones a page may have fewer."""
     names = deps.store.assets.names(deps.owner, asset, cursor, limit + 1)
     most = max(1, sum(total <= models.PAGE_CHARACTERS for total in accumulate(map(len, names[:limit]))))
@@ -121,19 +125,14 @@ def get_names(asset: AssetId, deps: Deps, limit: Limit = models.PAGE, cursor: Na
 
 
 @router.get("/{asset}/content", response_class=Response, responses=FILE)
-def get_content(asset: AssetId, request: Request, deps: Deps) -> Response:
+def get_asset_content(asset: AssetId, request: Request, deps: Deps) -> Response:
     """The bytes of an asset, or a range of them."""
     found = deps.store.assets.get(deps.owner, asset)
     digest = found.id.removeprefix("sha256:")
     return file_answer(request, found.path, found.bytes, digest, found.file_name)
 
 
-@router.patch(
-    "/{asset}",
-    response_model=models.Asset,
-    status_code=201,
-    responses={200: {"model": models.Asset, "description": "It was here already"}},
-)
+@router.patch("/{asset}", response_model=models.Asset, status_code=201, responses=KNOWN_ALREADY)
 async def change_pack(asset: AssetId, change: models.PackChange, deps: Deps) -> Response:
     """Name the encoder or the text space of a feature pack: the same features under these names, as another asset."""
     made, new = await anyio.to_thread.run_sync(_retagged, asset, change, deps, limiter=deps.checks)

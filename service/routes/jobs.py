@@ -22,7 +22,7 @@ from service.errand import run_errand
 from service.errors import InvalidRequest, OverLimit
 from service.observe import current_id
 from service.problems import problem_of
-from service.requests import JsonRoute
+from service.requests import JsonRoute, OrderRoute
 from service.state import AppState, Deps
 from service.store.assets import ALL, AssetRecord, kernel_of
 from service.store.jobs import Event, EventKind, JobOrder, JobRecord, fingerprint, labels_of
@@ -70,21 +70,27 @@ REPEATED: dict[int | str, dict[str, Any]] = {
 @router.post(
     "/lift", response_model=models.Job, status_code=202, responses=REPEATED, tags=["jobs"],
 )  # fmt: skip
-async def submit(order: models.LiftRequest, deps: Deps, key: Key = None) -> Response:
+async def order_lift(order: models.LiftRequest, deps: Deps, key: Key = None) -> Response:
     """Lift features onto splats. The job is on the disk before this answers."""
     return await anyio.to_thread.run_sync(_lift, order, deps, key, limiter=deps.ordering)
 
 
+# The document tells of it beside the upload of a lift file, in `service.routes.lifts`: to OpenAPI they are one.
+router.add_api_route(
+    "/lifts", order_lift, methods=["POST"], route_class_override=OrderRoute, include_in_schema=False, status_code=202
+)
+
+
 @router.post("/lift/plan", response_model=models.Plan, tags=["jobs"])
-async def plan(order: models.LiftRequest, deps: Deps) -> models.Plan:
+async def plan_lift(order: models.LiftRequest, deps: Deps) -> models.Plan:
     """What a lift would do and need, without doing it: the views that it takes, and the memory."""
     return await anyio.to_thread.run_sync(_planned, order, deps, limiter=deps.planning)
 
 
 @router.post(
-    "/tradeoff", name="submit", response_model=models.Job, status_code=202, responses=REPEATED, tags=["trade-offs"],
+    "/tradeoff", response_model=models.Job, status_code=202, responses=REPEATED, tags=["trade-offs"],
 )  # fmt: skip
-async def submit_tradeoff(order: models.TradeoffRequest, deps: Deps, key: Key = None) -> Response:
+async def order_tradeoff(order: models.TradeoffRequest, deps: Deps, key: Key = None) -> Response:
     """Compare the dial and the presets on a scene within a budget. The job is on the disk before this answers."""
     return await anyio.to_thread.run_sync(_compare, order, deps, key, limiter=deps.ordering)
 

@@ -15,6 +15,7 @@ from service import models
 from service.content import FILE, TAGGED, Cursor, Limit, file_answer, kept, listed, unchanged
 from service.requests import JsonRoute
 from service.routes.assets import RAW_BODY, Sha256, taken
+from service.routes.jobs import Key
 from service.routes.queries import (
     NO_ENCODER,
     NPY,
@@ -56,6 +57,15 @@ Layer = Annotated[
     Query(description="principal components of features, clusters, or one of the others through a colour map"),
 ]
 
+FILE_OR_ORDER: dict[str, Any] = {
+    "required": True,
+    "description": "an order as JSON, or a lift file itself",
+    "content": {
+        "application/json": {"schema": {"$ref": "#/components/schemas/LiftRequest"}},
+        **RAW_BODY["requestBody"]["content"],
+    },
+}
+
 router = APIRouter(route_class=JsonRoute)
 
 
@@ -69,15 +79,27 @@ def list_lifts(deps: Deps, limit: Limit = models.PAGE, cursor: Cursor = None) ->
     "/lifts",
     response_model=models.LiftResult,
     status_code=201,
-    responses={200: {"model": models.LiftResult, "description": "It was here already"}},
-    openapi_extra=RAW_BODY,
+    responses={
+        200: {
+            "model": models.LiftResult | models.Job,
+            "description": "The file was here already; or the job that the same Idempotency-Key made before",
+        },
+        202: {"model": models.Job, "description": "The job of an order"},
+    },
+    openapi_extra={"requestBody": FILE_OR_ORDER},
     tags=["lifts"],
 )
-async def upload_lift(request: Request, deps: Deps, sha256: Sha256 = None, cameras: LiftCameras = None) -> Response:
-    """Bring a lift file of the command line, which is checked whole.
+async def create_lift(
+    request: Request, deps: Deps, sha256: Sha256 = None, cameras: LiftCameras = None, key: Key = None
+) -> Response:
+    """Order a lift with a body of JSON, as POST /lift does; or bring a lift file of the command line.
 
-    Its splats and its file of cameras must be assets (404 names the missing one), its feature packs only for examples
-    by region. ``cameras`` names other cameras with the same poses, such as a zip of the folder that was lifted with.
+    The Content-Type tells which of the two it is: application/json is an order, any other a file. ``Idempotency-Key``
+    is of orders; ``sha256`` and ``cameras`` are of files.
+
+    A file is checked whole. Its splats and its file of cameras must be assets (404 names the missing one), its
+    feature packs only for examples by region. ``cameras`` names other cameras with the same poses, such as a zip of
+    the folder that was lifted with.
     """
     lift, new = await taken(partial(LiftIntake, cameras=cameras), LIFT, request, deps, sha256)
     location = {"Location": f"/lifts/{lift.id}"}
@@ -109,7 +131,7 @@ def get_lift(lift: str, deps: Deps) -> models.LiftResult:
 
 
 @router.get("/lifts/{lift}/features", response_class=Response, responses=FILE, tags=["lifts"])
-def get_features(lift: str, request: Request, deps: Deps) -> Response:
+def get_lift_features(lift: str, request: Request, deps: Deps) -> Response:
     """The lift file (safetensors), or a range of it."""
     found = deps.store.lifts.get(deps.owner, lift)
     return file_answer(request, found.path, found.bytes, found.sha256, f"lift-{found.id}.safetensors")
@@ -122,7 +144,7 @@ def get_tradeoff(tradeoff: str, deps: Deps) -> models.Tradeoff:
 
 
 @router.get("/tradeoffs/{tradeoff}/chart", response_class=Response, responses=PNG | TAGGED, tags=["trade-offs"])
-def get_chart(tradeoff: str, request: Request, deps: Deps) -> Response:
+def get_tradeoff_chart(tradeoff: str, request: Request, deps: Deps) -> Response:
     """Accuracy over time, and how near the dial stays to the exact lift, as a picture."""
     found = deps.store.tradeoffs.get(deps.owner, tradeoff)
     etag = f'"{found.sha256}"'
@@ -130,7 +152,7 @@ def get_chart(tradeoff: str, request: Request, deps: Deps) -> Response:
 
 
 @router.get("/tradeoffs/{tradeoff}/table", response_class=Response, responses=MARKDOWN, tags=["trade-offs"])
-def get_table(tradeoff: str, deps: Deps) -> Response:
+def get_tradeoff_table(tradeoff: str, deps: Deps) -> Response:
     """The runs as a table, with what it says and how it was made."""
     return Response(deps.store.tradeoffs.get(deps.owner, tradeoff).page, headers={"Content-Type": MARKDOWN_TYPE})
 
@@ -139,7 +161,7 @@ def get_table(tradeoff: str, deps: Deps) -> Response:
 
 
 @router.get("/lifts/{lift}/splats", responses=PLY | TAGGED, response_class=Response, tags=["lifts"])
-def splats(lift: str, request: Request, deps: Deps, ask: Ask) -> Response:
+def get_lift_splats(lift: str, request: Request, deps: Deps, ask: Ask) -> Response:
     """The scene for a web viewer: `.splat`, 32 bytes a splat, rows as in the lift.
 
     2DGS discs are thin Gaussians there, and DBS kernels the Gaussians of nearest size.
@@ -149,14 +171,14 @@ def splats(lift: str, request: Request, deps: Deps, ask: Ask) -> Response:
 
 
 @router.get("/lifts/{lift}/colours", responses=NPY | TAGGED, response_class=Response, tags=["lifts"])
-def colours(lift: str, request: Request, deps: Deps, ask: Ask, what: Layer = "pca") -> Response:
+def get_lift_colours(lift: str, request: Request, deps: Deps, ask: Ask, what: Layer = "pca") -> Response:
     """A colour for every splat: .npy, uint8 [P, 3], sRGB. Splats without a feature are grey."""
     found = deps.store.lifts.get(deps.owner, lift)
     return tagged_answer(request, deps, scene_request("layer", found, deps) | {"what": what}, found, ask)
 
 
 @router.get("/lifts/{lift}/photo", responses=PHOTO | TAGGED, response_class=Response, tags=["lifts"])
-def photo(lift: str, view: View, request: Request, deps: Deps, ask: Ask) -> Response:
+def get_photo(lift: str, view: View, request: Request, deps: Deps, ask: Ask) -> Response:
     """The photo of a view, as it was uploaded.
 
     Where its camera is of the stored pixels, an EXIF orientation becomes 1, so that no browser turns the photo.
@@ -186,7 +208,7 @@ def _with_photo(deps: AppState, lift: LiftRecord, views: list[str]) -> set[str]:
 
 
 @router.get("/lifts/{lift}/views", response_model=models.Views, tags=["lifts"])
-def views(lift: str, deps: Deps, ask: Ask, limit: Limit = models.PAGE, cursor: ViewsCursor = 0) -> models.Views:
+def list_views(lift: str, deps: Deps, ask: Ask, limit: Limit = models.PAGE, cursor: ViewsCursor = 0) -> models.Views:
     """The cameras of the scene with their poses, in pages; also those that were not lifted."""
     found = deps.store.lifts.get(deps.owner, lift)
     answer = ask(scene_request("views", found, deps) | {"first": cursor, "count": limit}).header
@@ -199,7 +221,7 @@ def views(lift: str, deps: Deps, ask: Ask, limit: Limit = models.PAGE, cursor: V
 
 
 @router.get("/lifts/{lift}/regions", response_model=models.CoveringRegions, tags=["lifts"])
-def regions(lift: str, view: View, x: Pixel, y: Pixel, deps: Deps, ask: Ask) -> models.CoveringRegions:
+def list_regions(lift: str, view: View, x: Pixel, y: Pixel, deps: Deps, ask: Ask) -> models.CoveringRegions:
     """The regions of the lift's feature packs that cover a pixel of a view's photo: each is an example to ask by."""
     found = deps.store.lifts.get(deps.owner, lift)
     wanted = with_packs(scene_request("regions", found, deps), found, deps, "lift") | {"view": view, "x": x, "y": y}
@@ -207,7 +229,7 @@ def regions(lift: str, view: View, x: Pixel, y: Pixel, deps: Deps, ask: Ask) -> 
 
 
 @router.get("/lifts/{lift}/regions/mask", responses=PNG | TAGGED, response_class=Response, tags=["lifts"])
-def region_mask(
+def get_region_mask(
     lift: str, view: View, level: Level, region: Level, request: Request, deps: Deps, ask: Ask
 ) -> Response:
     """The pixels of a view's photo that one region covers: a PNG, white where it is."""
@@ -218,9 +240,7 @@ def region_mask(
 
 
 @router.get("/lifts/{lift}/objects", response_model=models.SceneObjects, tags=["lifts"])
-def scene_objects(
-    lift: str, deps: Deps, ask: Ask, asked: Annotated[models.AskedForSceneObjects, Query()]
-) -> Response:
+def list_objects(lift: str, deps: Deps, ask: Ask, asked: Annotated[models.AskedForSceneObjects, Query()]) -> Response:
     """The things in the scene, found by masks alone when it was lifted; a vocabulary names them."""
     things = list(deps.store.selections.things(deps.owner, deps.store.lifts.get(deps.owner, lift).id).items())
     more = {"means": asked.features, "things": things, "splat": asked.splat}
@@ -228,7 +248,7 @@ def scene_objects(
 
 
 @router.get("/lifts/{lift}/tree", response_model=models.LiftTree, tags=["lifts"])
-def scene_tree(lift: str, deps: Deps, ask: Ask, asked: Annotated[models.AskedForTree, Query()]) -> Response:
+def get_tree(lift: str, deps: Deps, ask: Ask, asked: Annotated[models.AskedForTree, Query()]) -> Response:
     """The same things with their parts and groups of them, objects first; a node's splats are an object's.
 
     With `relations`, how the objects lie to each other.
@@ -247,7 +267,7 @@ def _nodes(operation: str, lift: str, deps: Deps, ask: Ask, asked: models.AskedF
 
 
 @router.get("/lifts/{lift}/objects/{thing}/splats", responses=PLY | TAGGED, response_class=Response, tags=["lifts"])
-def object_splats(lift: str, thing: ObjectId, request: Request, deps: Deps, ask: Ask) -> Response:
+def get_object_splats(lift: str, thing: ObjectId, request: Request, deps: Deps, ask: Ask) -> Response:
     """The splats of one object and no others: a PLY of the dialect that was lifted."""
     found = deps.store.lifts.get(deps.owner, lift)
     wanted = scene_request("splats", found, deps) | {"what": f"object-{thing}", "object": thing}

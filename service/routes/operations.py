@@ -90,6 +90,16 @@ def page() -> HTMLResponse:
     return HTMLResponse((WEB / "page.html").read_text(encoding="utf-8"), headers=PAGE_HEADERS)
 
 
+def with_summaries(document: dict[str, Any]) -> dict[str, Any]:
+    """An OpenAPI document whose operations have the first sentence of their description as their summary."""
+    for operations in document["paths"].values():
+        for operation in operations.values():
+            summary, *rest = re.split(r"\.\s+", operation["description"].rstrip("."), maxsplit=1)
+            operation["summary"] = " ".join(summary.split())
+            operation["description"] = f"{rest[0]}." if rest else f"{operation['summary']}."
+    return document
+
+
 class Documents:
     """The routes as OpenAPI has them, without keys and with them: made once, as that takes half a second."""
 
@@ -102,7 +112,7 @@ class Documents:
         """The one of the two, as JSON."""
         with self._turn:
             if not self._made:
-                found = self._app.openapi()
+                found = with_summaries(self._app.openapi())
                 self._made = tuple(bytes(JSONResponse(made).body) for made in (found, with_keys(found)))
         return self._made[keys]
 

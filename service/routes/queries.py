@@ -264,7 +264,7 @@ def query(asked: Question, deps: Deps, ask: Ask) -> dict[str, Any]:
 
 
 @router.get("/query/words", response_model=WordsAnswer)
-def askable(asked: Annotated[AskedForWords, Parameter()], deps: Deps, ask: Ask) -> WordsAnswer:
+def query_words(asked: Annotated[AskedForWords, Parameter()], deps: Deps, ask: Ask) -> WordsAnswer:
     """What can be asked: words that a text which is being typed may become, and words for what is here."""
     lift = find_lift(asked.lift, deps)
     wanted = with_encoder(scene_request("askable", lift, deps), asked, lift, deps)
@@ -272,32 +272,32 @@ def askable(asked: Annotated[AskedForWords, Parameter()], deps: Deps, ask: Ask) 
 
 
 @both(router, "/query/objects", ASKED, response_model=ObjectsAnswer)
-def objects(asked: Question, deps: Deps, ask: Ask) -> dict[str, Any]:
+def query_objects(asked: Question, deps: Deps, ask: Ask) -> dict[str, Any]:
     """The things that were found, splats that touch one another: where each lies, and how large it is."""
     lift = find_lift(asked.lift, deps)
     return {"lift": lift.id, **ask(query_request("objects", asked, lift, deps)).header}
 
 
 @both(router, "/query/scores", ASKED, responses=NPY, response_class=Response)
-def scores(asked: Question, request: Request, deps: Deps, ask: Ask) -> Response:
+def query_scores(asked: Question, request: Request, deps: Deps, ask: Ask) -> Response:
     """The score of every splat: .npy, float32 [P]."""
     return _entity("scores", asked, request, deps, ask)
 
 
 @both(router, "/query/selection", ASKED, responses=NPY, response_class=Response)
-def selection(asked: Question, request: Request, deps: Deps, ask: Ask) -> Response:
+def query_selection(asked: Question, request: Request, deps: Deps, ask: Ask) -> Response:
     """Which splats were selected: .npy, bool [P]. By `auto` they are not just those at or above the threshold."""
     return _entity("selection", asked, request, deps, ask)
 
 
 @both(router, "/query/mask", IN_VIEW, responses=PNG, response_class=Response)
-def mask(asked: Question, request: Request, deps: Deps, ask: Ask) -> Response:
+def query_mask(asked: Question, request: Request, deps: Deps, ask: Ask) -> Response:
     """Where it is in a view, or from a camera of your own in a body: a PNG, white where it is."""
     return _entity("mask", asked, request, deps, ask, seen_from(asked))
 
 
 @both(router, "/query/attention", IN_VIEW, responses=PNG, response_class=Response)
-def attention(asked: Question, request: Request, deps: Deps, ask: Ask) -> Response:
+def query_attention(asked: Question, request: Request, deps: Deps, ask: Ask) -> Response:
     """How well each pixel of a view, or of a camera of your own in a body, answers to it: a PNG."""
     return _entity("attention", asked, request, deps, ask, seen_from(asked))
 
@@ -307,7 +307,7 @@ SplatsOf = Annotated[Literal["object", "scores"], Parameter(description=SPLATS_O
 
 
 @both(router, "/query/splats", ASKED, responses=PLY, response_class=Response)
-def splats(asked: Question, request: Request, deps: Deps, ask: Ask, what: SplatsOf = "object") -> Response:
+def query_splats(asked: Question, request: Request, deps: Deps, ask: Ask, what: SplatsOf = "object") -> Response:
     """What was found, or the scene in the colours of its scores, as splats: a PLY of the dialect that was lifted."""
     return _entity("splats", asked, request, deps, ask, {"what": what})
 
@@ -383,21 +383,21 @@ def segment(asked: AskedToSegment, deps: Deps, ask: Ask) -> Response:
 
 
 @router.post("/query/segment/labels", responses=NPY, response_class=Response)
-def labels(asked: AskedToSegment, deps: Deps, ask: Ask) -> Response:
+def segment_labels(asked: AskedToSegment, deps: Deps, ask: Ask) -> Response:
     """The value of every splat's word, 0 for none: .npy, int32 [P]."""
     lift = find_lift(asked.lift, deps)
     return made(deps, _word_request("word_labels", asked, lift, deps), lift, ask, {})
 
 
 @router.post("/query/segment/map", responses=PNG, response_class=Response)
-def word_map(asked: AskedToSegment, deps: Deps, ask: Ask) -> Response:
+def segment_map(asked: AskedToSegment, deps: Deps, ask: Ask) -> Response:
     """The values of a view's pixels in colours, with a palette: a PNG whose text `legend` has the words by value."""
     lift = find_lift(asked.lift, deps)
     return made(deps, _word_request("word_map", asked, lift, deps) | seen_from(asked), lift, ask, {})
 
 
 @router.post("/query/segment/picture", responses=PNG, response_class=Response)
-def picture(asked: AskedToSegment, deps: Deps, ask: Ask) -> Response:
+def segment_picture(asked: AskedToSegment, deps: Deps, ask: Ask) -> Response:
     """A view tinted with the colours of its words, beside a drawn legend: a PNG."""
     lift = find_lift(asked.lift, deps)
     return made(deps, _word_request("word_picture", asked, lift, deps) | seen_from(asked), lift, ask, {})
@@ -441,7 +441,7 @@ def _by_name(questions: list[models.NamedQuestion]) -> dict[str, models.NamedQue
 
 
 @router.post("/query/what", response_model=WhatAnswer)
-def what(asked: AskedWhat, deps: Deps, ask: Ask) -> WhatAnswer:
+def name_example(asked: AskedWhat, deps: Deps, ask: Ask) -> WhatAnswer:
     """What is this? The words that a pixel, a splat, a region or a vector is most like."""
     lift = find_lift(asked.lift, deps)
     wanted = _word_request("what", asked, lift, deps) | {"example": asked.example, "top": asked.top}

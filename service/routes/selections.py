@@ -39,7 +39,7 @@ def list_selections(lift: str, deps: Deps) -> models.Selections:
     return models.Selections(selections=[_listed(one) for one in selections])
 
 
-@router.post("/lifts/{lift}/selections", response_model=models.Selection, status_code=201)
+@router.post("/lifts/{lift}/selections", response_model=models.SelectionDetail, status_code=201)
 def create_selection(lift: str, asked: models.NewSelection, deps: Deps, ask: Ask) -> Response:
     """Begin a selection, with the splats of an edit or with none. Questions name it as `sets=selection:ID`."""
     found = deps.store.lifts.get(deps.owner, lift)
@@ -48,7 +48,7 @@ def create_selection(lift: str, asked: models.NewSelection, deps: Deps, ask: Ask
     return _answer(made, deps, 201, {"Location": f"/lifts/{found.id}/selections/{made.id}"})
 
 
-@router.get(ONE, response_model=models.Selection)
+@router.get(ONE, response_model=models.SelectionDetail)
 def get_selection(
     lift: str,
     selection: SelectionId,
@@ -60,7 +60,7 @@ def get_selection(
     return _answer(deps.store.selections.get(deps.owner, found.id, selection), deps, bits=bits)
 
 
-@router.post(ONE + "/edits", response_model=models.Selection)
+@router.post(ONE + "/edits", response_model=models.SelectionDetail)
 def edit_selection(
     lift: str, selection: SelectionId, asked: models.AskedEdit, deps: Deps, ask: Ask, match: IfMatch = None
 ) -> Response:
@@ -78,7 +78,7 @@ def edit_selection(
     return _answer(made, deps)
 
 
-@router.patch(ONE, response_model=models.Selection)
+@router.patch(ONE, response_model=models.SelectionDetail)
 def change_selection(
     lift: str, selection: SelectionId, change: models.SelectionChange, deps: Deps, match: IfMatch = None
 ) -> Response:
@@ -144,7 +144,7 @@ def _answer(
 ) -> Response:
     more: dict[str, Any] = {"history": deps.store.selections.history(found)}
     more["bits"] = base64.b64encode(deps.store.selections.bits(found)).decode() if bits else None
-    made = models.Selection(**_listed(found).model_dump(), **more)
+    made = models.SelectionDetail(**_listed(found).model_dump(), **more)
     content = made.model_dump(mode="json")
     return JSONResponse(content, status, headers=kept(f'"{found.version}"') | (headers or {}))
 

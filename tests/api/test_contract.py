@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -49,6 +50,17 @@ def test_document_has_every_setting_of_a_lift_with_its_meaning(client: TestClien
     fields = schemas["LiftRequest"]["properties"]["settings"]["properties"]
     assert fields.keys() == LiftSettings.model_fields.keys()
     assert fields["smoothness"]["description"]
+
+
+def test_operations_have_names_of_functions_and_a_sentence(client: TestClient) -> None:
+    paths = client.get("/openapi.json").json()["paths"]
+    operations = [operation for methods in paths.values() for operation in methods.values()]
+    names = [operation["operationId"] for operation in operations]
+    assert len(set(names)) == len(names) and all(re.fullmatch(r"[a-z]+(_[a-z]+)*", name) for name in names)
+    for operation in operations:
+        assert " " in operation["summary"] and "\n" not in operation["summary"], operation["operationId"]
+    bodies = paths["/lifts"]["post"]["requestBody"]["content"]
+    assert bodies.keys() == {"application/json", "application/octet-stream"}
 
 
 def test_answers_are_as_the_document_says_and_what_is_deleted_is_gone(copied: Path, table: Path) -> None:

@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -81,6 +82,22 @@ def test_same_key_is_the_same_job_or_refused_with_another_order(quick: Quick) ->
         for key in ("", "x" * 256):
             reply = client.post("/lift", json=body, headers={"Idempotency-Key": key})
             assert assert_problem(reply)["status"] == 422
+
+
+def test_lifts_are_ordered_by_json_and_times_are_in_seconds_and_iso(quick: Quick) -> None:
+    with quick("answer") as (client, body):
+        first = client.post("/lift", json=body, headers={"Idempotency-Key": "one"})
+        again = client.post("/lifts", json=body, headers={"Idempotency-Key": "one"})
+        other = client.post("/lifts", content=json.dumps(body), headers={"Content-Type": "Application/json"})
+        assert [reply.status_code for reply in (first, again, other)] == [202, 200, 202]
+        assert first.json()["id"] == again.json()["id"] != other.json()["id"]
+        assert other.headers["location"] == f"/jobs/{other.json()['id']}"
+        assert client.post("/lifts?sha256=" + "0" * 64, json=body).status_code == 422  # of files
+        job = ended(client, other.headers["location"])
+        for name in ("created", "started", "ended"):
+            assert datetime.fromisoformat(job[f"{name}_at"]).timestamp() == pytest.approx(job[name], abs=1e-5)
+        queued = client.post("/lift", json=body).json()
+        assert queued["ended"] is None and queued["ended_at"] is None
 
 
 def test_full_line_is_503_with_retry_after_and_a_known_key_still_finds_its_job(quick: Quick) -> None:

@@ -25,7 +25,7 @@ from liftcore.errors import SplatliftError
 from service.auth import CALLER, OPEN, Gate, Hosts, host_name, is_loopback, needed
 from service.commands.serve import require_keys
 from service.content import EventStreams, is_last
-from service.errors import Busy, ForeignOrigin, Misdirected, TooMany
+from service.errors import Busy, ForeignOrigin, Misconfigured, Misdirected, TooMany
 from service.models import JobState
 from service.settings import ServiceSettings
 from service.store.jobs import Event
@@ -45,8 +45,9 @@ PAGE |= {f"/web/example/{name}" for name in ("point_cloud.spz", "cameras.json", 
 OPEN_ROUTES = {*PAGE, "/healthz", "/readyz", "/version", *DOCS}
 # Routes that name nothing of anybody: they show one's own things, or make new ones.
 NAMELESS = {("GET", "/metrics"), ("GET", "/assets"), ("PUT", "/assets/{asset}"), ("GET", "/jobs"), ("GET", "/lifts")}
-NAMELESS |= {("POST", "/lifts")}
+NAMELESS |= {("POST", "/lifts"), ("POST", "/assets")}
 ASKING = {"text": "apple", "view": "v"}
+TIMES = {"created": 0, "created_at": ""}
 
 
 @pytest.fixture
@@ -181,7 +182,7 @@ def test_same_bytes_are_of_each_who_uploaded_them(tmp_path: Path, house: Guarded
     assert house.ask("bob", "GET", f"/assets/{asset}").status_code == 404  # a digest is no proof
     second = house.ask("bob", "PUT", "/assets/cameras", content=content)
     assert second.status_code == 201  # new to him: that she has it, he does not learn
-    assert {**first.json(), "created": 0} == {**second.json(), "created": 0}
+    assert first.json() | TIMES == second.json() | TIMES
     assert house.ask("bob", "PUT", "/assets/cameras", content=content).status_code == 200
     assert house.ask("bob", "DELETE", f"/assets/{asset}").status_code == 204
     assert house.ask("bob", "GET", f"/assets/{asset}/content").status_code == 404
@@ -448,6 +449,45 @@ def test_gate_answers_with_problems(house: Guarded) -> None:
     assert "access-control-allow-origin" not in reply.headers
     own = house.ask("alice", "POST", f"/jobs/{house.queued}/cancel", headers={"Origin": "http://127.0.0.1"})
     assert own.status_code == 200
+
+
+LAB = "https://lab.example"
+PREFLIGHT = {"Origin": LAB, "Access-Control-Request-Method": "GET", "Access-Control-Request-Headers": "authorization"}
+
+
+def test_no_page_of_another_site_reads_unless_it_is_named(house: Guarded) -> None:
+    assert house.ask(None, "OPTIONS", "/jobs", headers=PREFLIGHT).status_code >= 400
+    reply = house.ask("alice", "GET", "/jobs", headers={"Origin": LAB})
+    assert not [name for name in reply.headers if name.startswith("access-control")]
+
+
+def test_pages_of_named_origins_read_with_a_key_and_change_nothing(tmp_path: Path) -> None:
+    with guarded(tmp_path / "data", cors_origins=f"http://localhost:3000, {LAB}") as house:
+        preflight = house.ask(None, "OPTIONS", "/jobs", headers=PREFLIGHT)
+        assert preflight.status_code == 200 and preflight.headers["access-control-allow-origin"] == LAB
+        assert "authorization" in preflight.headers["access-control-allow-headers"].lower()
+        for name, status in (("alice", 200), (None, 401)):  # refusals are read, too
+            reply = house.ask(name, "GET", "/jobs", headers={"Origin": LAB})
+            assert (reply.status_code, reply.headers["access-control-allow-origin"]) == (status, LAB)
+            assert "access-control-allow-credentials" not in reply.headers
+            assert "X-Request-ID" in reply.headers["access-control-expose-headers"]
+        asked = {"json": {"text": ["apple"], "lift": NOBODY}, "headers": {"Origin": LAB}}
+        assert house.ask("alice", "POST", "/query", **asked).status_code == 404  # a question reads
+        refused = house.ask("alice", "POST", f"/jobs/{house.queued}/cancel", headers={"Origin": LAB})
+        assert assert_problem(refused)["type"] == "/problems/foreign-origin"
+        other = house.ask("alice", "GET", "/jobs", headers={"Origin": "https://evil.example"})
+        assert "access-control-allow-origin" not in other.headers
+        asked["headers"] = {"Origin": "https://evil.example"}
+        assert assert_problem(house.ask("alice", "POST", "/query", **asked))["type"] == "/problems/foreign-origin"
+
+
+@pytest.mark.parametrize("origins", ["*", "lab.example", "https://lab.example/", "null", "https://*.example"])
+def test_origins_that_no_browser_sends_are_refused_and_all_only_where_keys_are_required(
+    origins: str, tmp_path: Path
+) -> None:
+    with pytest.raises(Misconfigured, match="cors_origins"):
+        ServiceSettings.model_validate({"data": tmp_path, "cors_origins": origins})
+    assert ServiceSettings.model_validate({"cors_origins": "*", "keys": "required"}).cors_origins == ("*",)
 
 
 def gate_of(store: Store, app: Any, **settings: int) -> Gate:

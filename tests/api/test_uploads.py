@@ -42,6 +42,18 @@ def test_same_bytes_are_the_same_asset_however_they_come(
     assert uploaded.splats == f"sha256:{digest}"
 
 
+def test_asset_is_posted_with_its_kind_and_no_form_is_taken(client: TestClient, uploaded: Uploaded) -> None:
+    content = client.get(f"/assets/{uploaded.cameras}/content").content
+    again = client.post("/assets", params={"kind": "cameras"}, content=content)
+    assert (again.status_code, again.json()["id"]) == (200, uploaded.cameras)
+    assert client.post("/assets", content=content).status_code == 422
+    assert client.post("/assets", params={"kind": "camera"}, content=content).status_code == 422
+    for method, path in (("PUT", "/assets/cameras"), ("POST", "/assets?kind=cameras"), ("POST", "/lifts")):
+        told = assert_problem(client.request(method, path, files={"file": content}))
+        assert (told["status"], told["argument"]) == (415, "Content-Type"), path
+        assert "curl -T" in told["hint"]
+
+
 def test_packs_are_named_anew_as_assets_of_their_own(client: TestClient, uploaded: Uploaded) -> None:
     at = f"/assets/{uploaded.features}"
     before = client.get(at).json()["counts"]
