@@ -26,7 +26,7 @@ from torch.nn.functional import normalize
 
 import liftcore as lc
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.text import open_encoder
+from liftcore.text import TextEncoder, open_encoder
 from liftcore.values.views import ViewFeatures
 from tests.benchmarks.base import command_line, read_pack, tell
 from tests.benchmarks.tabletop import Truth, counted, tabletop
@@ -84,10 +84,11 @@ def in_cone(regions: lc.Regions, share: float) -> lc.Regions:
 
 
 def still_life_scene(
-    kind: str, seed: int, pieces: Sequence[Piece] | None = None
+    kind: str, seed: int, pieces: Sequence[Piece] | None = None, encoder: TextEncoder | None = None
 ) -> tuple[Truth, dict[str, ViewFeatures]]:
-    """The still life, or other pieces in its place, with mistakes, and its truth."""
-    made, encoder, (mistakes, cone) = still_life(seed, pieces=pieces), open_encoder("minilm"), MISTAKES[kind]
+    """The still life, or other pieces in its place, with mistakes, and its truth; minilm if no encoder is named."""
+    encoder = encoder or open_encoder("minilm")
+    made, (mistakes, cone) = still_life(seed, pieces=pieces), MISTAKES[kind]
     raster = CpuRaster(made.splats)
     views: dict[str, ViewFeatures] = {
         view: in_cone(seen, cone) for view, seen in observe(made, raster, encoder, mistakes, seed).items()

@@ -1,77 +1,244 @@
-"""What the smoothness of features gains and costs: lifts of each pack with several lambdas.
+"""What the smoothness of features gains and costs: all tables of it in docs/results.md.
 
-    python -m tests.benchmarks.smoothness SCENE [--every N] [--packs NAME ...] [--lambdas L ...]
-        [--colours KIND] [--json]
+    python -m tests.benchmarks.smoothness DATA [--tables NAME ...] [--only TEXT] [--into FILE] [--json]
 
-``chosen`` is the lambda that ``auto`` took. One colour, or a random one a splat, says
-nothing of the scene.
+``DATA`` holds ``tabletop`` and ``plush``. A cell is splat accuracy / argmax mIoU / the worst class's IoU
+(`tests.benchmarks.tabletop`); columns are lambdas, and ``chosen`` is the one of ``auto``. ``--into`` keeps a row a
+line as soon as it is measured, and a row that is there is not measured again: stop whenever you like, and go on.
 
-With truth in the layout of ``tabletop``: splat accuracy, argmax mIoU and the worst class of each pack
-(`tests.benchmarks.tabletop`). With ``grids_test.safetensors`` instead: fidelity, the mean cosine about the maps' mean
-of rendered features with the maps of views that were not lifted.
+``strengths``   packs of tabletop with 4 to 52 views, and mistakes of seeds of their own; in their own colours, and
+                with one colour for all splats
+``generated``   the tests' still life and small things, with four kinds of mistakes, also in random colours. Words are
+                random unit vectors of 128 channels
+``edges``       the column ``4, no edges`` of both: what places and colours do alone, without the edges of masks
+``factors``     reweighting's parts, alone and together, each without smoothness, with 4 and with the chosen one
+``fidelity``    ``plush``: the mean cosine about the maps' mean of rendered features with the maps of other views
+
+A scene is lifted once, and the step is taken by each lambda on the scores of the classes, which are sums of channels:
+the step is linear, but for values that leave the range of a channel.
 """
 
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+import json
+import zlib
+from argparse import Namespace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
+import numpy as np
 import torch
+from torch import Tensor
 from torch.nn.functional import cosine_similarity
 
 import liftcore as lc
+from liftcore.lifting import in_memory
 from liftcore.scene.cameras import Camera
 from liftcore.scene.harmonics import SH_C0
-from liftcore.values.views import FeatureGrid
-from tests.benchmarks.base import command_line, read_pack, read_scene, tell
-from tests.benchmarks.tabletop import tabletop
+from liftcore.scene.neighbours import SplatGraph
+from liftcore.solve.codebook import Codebook
+from liftcore.solve.mask_edges import weaken_edges
+from liftcore.solve.smooth import smooth
+from liftcore.solve.smooth_by_halves import STRENGTHS, SmoothnessChoice, choose_smoothness
+from liftcore.values.region_weights import RegionWeights
+from liftcore.values.views import FeatureGrid, ViewFeatures
+from tests.benchmarks.base import command_line, read_pack, read_scene, table_of, tell
+from tests.benchmarks.consensus import still_life_scene, with_mistakes
+from tests.benchmarks.tabletop import Figures, Truth, tabletop
+from tests.still_life.objects import small_things
 
-LAMBDAS = ("0", "0.3", "1", "4", "auto")
-COLOURS = ("true", "one", "random")
+TABLES = ("strengths", "generated", "factors", "fidelity")
+COLOURS = ("own", "one", "random")
+STRONG = 4.0
+GENERATED = {"still life": None, "small things": small_things()}
+LAMBDAS = ("0", "0.3", "1", "4", "auto")  # of fidelity
 TEST_MAPS = "grids_test"
 FULL = 0.5  # of a ray that the scene takes, for its cell to be judged
 CHANNELS = 64  # rendered at a time
+FACTORS: dict[str, dict[str, Any]] = {
+    "row-sum": {"robust_steps": 0},
+    "robust step": {"preset": "row-sum", "robust_steps": 1},
+    "and reliability": {"consensus": False},
+    "and consensus (`default`)": {},
+}
 
-Judge = Callable[[lc.LiftResult], dict[str, float]]
+HIDDEN = ("table", "name")  # columns of the file alone
+Row = dict[str, Any]
 
 
-def rows(folder: Path, pack: str, every: int, lambdas: list[str], colours: str) -> Iterator[dict[str, Any]]:
-    """A lift of the preset ``default`` with each lambda; seconds are those of the step and of all other steps."""
-    splats, cameras = read_scene(folder)
-    splats, views = coloured(splats, colours), read_pack(folder, pack, every)
-    judge = truth_judge(folder) if (folder / "truth.json").is_file() else fidelity_judge(folder, splats, cameras)
-    for smoothness in lambdas:
-        strength = smoothness if smoothness == "auto" else float(smoothness)
-        result = lc.lift(splats, cameras, views, certificate_rays=0, smoothness=strength, progress=False).cpu()
-        timings = result.metadata.timings
-        step = timings.get("smooth", 0.0) + timings.get("halves", 0.0)
-        facts = result.diagnostics.get("smoothing", {"smoothness": 0.0})
-        head = {"pack": pack, "views": len(views), "smoothness": smoothness, "chosen": facts["smoothness"]}
-        yield head | judge(result) | {"step s": step, "lift s": sum(timings.values()) - step}
+class RandomWords:
+    """A unit vector for each word, which its letters draw; all share a little, as those of text encoders do."""
+
+    name, channels = "random words", 128
+
+    def encode(self, texts: Sequence[str]) -> np.ndarray:
+        """[n, 128] f32."""
+        drawn = [np.random.default_rng(zlib.crc32(text.encode())).standard_normal(self.channels) for text in texts]
+        common = np.random.default_rng(0).standard_normal(self.channels)
+        vectors = np.array([one / np.linalg.norm(one) for one in drawn]) + 0.3 * common / np.linalg.norm(common)
+        return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class StepInputs:
+    """What the step has of a lift."""
+
+    truth: Truth
+    W: RegionWeights
+    levels: np.ndarray  # [M] i8
+    codebook: Codebook
+    evidence: Tensor  # [P] f32
+    confidence: Tensor | None  # [P] f32
+    seen: Tensor  # [P] bool
+    scores: Tensor  # [P, K] f32, of X with the classes
+    params: lc.CompositingParams
+
+    @classmethod
+    def of(cls, truth: Truth, views: Mapping[str, ViewFeatures], **settings: Any) -> "StepInputs":
+        """Lift, and hold what the step is called with."""
+        parts = dict[str, Any]()
+
+        def weaken(graph: SplatGraph, W: RegionWeights, levels: np.ndarray, *_: Any) -> tuple[SplatGraph, float]:
+            parts.update(W=W, levels=levels)
+            return graph, 0.0
+
+        def choose(_: RegionWeights, codebook: Codebook, *__: Any, **___: Any) -> SmoothnessChoice:
+            parts.update(codebook=codebook)
+            return SmoothnessChoice(0.0, {})
+
+        def hold(X: Tensor, *arguments: Any, **_: Any) -> tuple[Tensor, dict[str, Any]]:
+            evidence, confidence, seen = arguments[1:4]
+            scores = torch.cat([rows.float() @ truth.classes.T for rows in X.split(1 << 14)])
+            parts.update(evidence=evidence, confidence=confidence, seen=seen, scores=scores)
+            return X, {"smoothness": 0.0}
+
+        with mock.patch.multiple(in_memory, weaken_edges=weaken, choose_smoothness=choose, smooth=hold):
+            lifted = truth.lift(views, smoothness="auto", progress=False, **settings)
+        return cls(truth, params=lifted.settings.render_params, **parts)
+
+    def graph(self, colours: str) -> SplatGraph:
+        """Places and colours of the splats."""
+        return SplatGraph.of(coloured(self.truth.raster.splats, colours))
+
+    def choose(self, graph: SplatGraph) -> float:
+        """What ``auto`` takes."""
+        return choose_smoothness(self.W, self.codebook, graph, self.confidence).smoothness
+
+    def judge(self, steps: Mapping[str, tuple[SplatGraph, float]]) -> dict[str, str]:
+        """Figures after each step, a graph with a lambda."""
+        tables = [
+            smooth(self.scores.clone(), graph, self.evidence, self.confidence, self.seen, strength)[0]
+            for graph, strength in steps.values()
+        ]
+        figures = self.truth.judge_each(tables, self.params)
+        return {name: cell(one) for name, one in zip(steps, figures, strict=True)}
+
+
+def cell(figures: Figures) -> str:
+    """Accuracy / mIoU / worst class."""
+    return " / ".join(f"{value:.3f}".removeprefix("0") for value in vars(figures).values())
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene with features, and the rows that it gives."""
+
+    table: str
+    name: str
+    open: Callable[[], tuple[Truth, Mapping[str, ViewFeatures]]]
+    colours: Sequence[str] = ("own",)
+
+    def row_names(self) -> list[tuple[str, str]]:
+        """Name and kind (colours, or a factor) of each row."""
+        return [(self.name, kind) for kind in (FACTORS if self.table == "factors" else self.colours)]
+
+    def measure(self, missing: Sequence[str]) -> Iterator[Row]:
+        """The rows of these kinds."""
+        truth, views = self.open()
+        inputs = None if self.table == "factors" else StepInputs.of(truth, views)
+        for kind in missing:
+            head = {"table": self.table, "features": f"{self.name}, {len(views)} views", "name": self.name}
+            if inputs:
+                yield {**head, "kind": kind, **strengths(inputs, kind)}
+            else:
+                yield {**head, "kind": kind, **with_factor(StepInputs.of(truth, views, **FACTORS[kind]))}
+
+
+def strengths(inputs: StepInputs, colours: str) -> dict[str, Any]:
+    """Figures by lambda, without the edges of masks, and the lambda that was chosen."""
+    plain = inputs.graph(colours)
+    graph, parted = weaken_edges(plain, inputs.W, inputs.levels)
+    steps = {f"{strength:g}": (graph, strength) for strength in (0.0, *STRENGTHS)}
+    steps |= {"4, no edges": (plain, STRONG)} if parted else {}
+    return {"chosen": inputs.choose(graph), **inputs.judge(steps)}
+
+
+def with_factor(inputs: StepInputs) -> dict[str, Any]:
+    """Figures without smoothness, with 4 and with the chosen lambda."""
+    graph, _ = weaken_edges(inputs.graph("own"), inputs.W, inputs.levels)
+    chosen = inputs.choose(graph)
+    steps = {"0": (graph, 0.0), "4": (graph, STRONG), "auto": (graph, chosen)}
+    return {"chosen": chosen, **inputs.judge(steps)}
+
+
+def cases(data: Path, tables: Sequence[str]) -> Iterator[Case]:
+    """All scenes of the tables, which open when they are measured."""
+    folder = data / "tabletop"
+    scenes = list[Truth]()
+
+    def truth() -> Truth:
+        scenes.append(scenes[0] if scenes else tabletop(folder))
+        return scenes[0]
+
+    def pack(name: str, every: int) -> Callable[[], tuple[Truth, Mapping[str, ViewFeatures]]]:
+        return lambda: (truth(), read_pack(folder, name, every))
+
+    def mistaken(kind: str, seed: int) -> tuple[Truth, Mapping[str, ViewFeatures]]:
+        return truth(), with_mistakes(folder, kind, seed)
+
+    for name, file, every, colours in (
+        ("grids", "grids", 1, COLOURS[:2]), ("grids", "grids", 3, COLOURS[:1]), ("grids", "grids", 5, COLOURS[:1]),
+        *(("hard", "features_hard", every, COLOURS[: 2 if every < 5 else 1]) for every in (13, 7, 4, 2, 1)),
+        *(("noisy", "features", every, COLOURS[: 2 if every in (1, 4) else 1]) for every in (13, 7, 4, 1)),
+    ):  # fmt: skip
+        if "strengths" in tables:
+            yield Case("strengths", f"{name}, every {every}", pack(file, every), colours)
+    for kind, seed in product(("hard", "usual"), (7, 8)):
+        if "strengths" in tables:
+            yield Case("strengths", f"{kind} {seed}", partial(mistaken, kind, seed))
+    for scene, (kind, seed) in product(GENERATED, (("usual", 7), ("hard", 7), ("exact", 7), ("cone", 8))):
+        if "generated" in tables:
+            yield Case("generated", f"{scene}, {kind} {seed}", partial(generated, scene, kind, seed), COLOURS)
+    for name, file, every in (
+        ("hard", "features_hard", 1), ("hard", "features_hard", 4), ("noisy", "features", 1),
+        ("noisy", "features", 4), ("grids", "grids", 1),
+    ):  # fmt: skip
+        if "factors" in tables:
+            yield Case("factors", f"{name}, every {every}", pack(file, every))
+    for scene in GENERATED if "factors" in tables else ():
+        yield Case("factors", f"{scene}, hard 7", partial(generated, scene, "hard", 7))
+
+
+def generated(scene: str, kind: str, seed: int) -> tuple[Truth, Mapping[str, ViewFeatures]]:
+    """A scene of the tests with mistakes."""
+    return still_life_scene(kind, seed, GENERATED[scene], RandomWords())
 
 
 def coloured(splats: lc.Splats, kind: str) -> lc.Splats:
     """The splats with their own colours, one colour, or a random colour each."""
-    if kind == "true":
+    if kind == "own":
         return splats
     shape, generator = (splats.count, 1, 3), torch.Generator().manual_seed(1)
     colours = torch.zeros(shape) if kind == "one" else (torch.rand(shape, generator=generator) - 0.5) / SH_C0
     return replace(splats, sh=colours)
 
 
-def truth_judge(folder: Path) -> Judge:
-    """Figures of a lift against the classes of splats and pixels."""
-    truth = tabletop(folder)
-
-    def judge(lifted: lc.LiftResult) -> dict[str, float]:
-        found = truth.judge(lifted)
-        return {"accuracy": found.accuracy, "mIoU": found.miou, "worst class": found.worst}
-
-    return judge
-
-
-def fidelity_judge(folder: Path, splats: lc.Splats, cameras: lc.Cameras) -> Judge:
-    """Fidelity of a lift to maps of other views."""
+def fidelity_rows(folder: Path, missing: Sequence[tuple[str, str]]) -> Iterator[Row]:
+    """A row for each stride and lambda: fidelity of a lift to maps of other views."""
+    splats, cameras = read_scene(folder)
     maps = {name: grid for name, grid in read_pack(folder, TEST_MAPS).items() if isinstance(grid, FeatureGrid)}
     mean = torch.stack([one.grid.float().mean(dim=(0, 1)) for one in maps.values()]).mean(dim=0)
 
@@ -85,10 +252,14 @@ def fidelity_judge(folder: Path, splats: lc.Splats, cameras: lc.Cameras) -> Judg
         shown = shown / filled.clamp_min(FULL)[:, :, None]
         return cosine_similarity(shown - mean, grid - mean, dim=2)[filled >= FULL]
 
-    def judge(lifted: lc.LiftResult) -> dict[str, float]:
-        return {"fidelity": float(torch.cat([cosines(lifted, name) for name in maps]).mean())}
-
-    return judge
+    for name, smoothness in missing:
+        views = read_pack(folder, "grids", int(name.rsplit(" ", 1)[1]))
+        strength = smoothness if smoothness == "auto" else float(smoothness)
+        result = lc.lift(splats, cameras, views, certificate_rays=0, smoothness=strength, progress=False).cpu()
+        fidelity = float(torch.cat([cosines(result, view) for view in maps]).mean())
+        chosen = result.diagnostics.get("smoothing", {}).get("smoothness", 0.0)
+        head = {"table": "fidelity", "features": f"{name}, {len(views)} views", "name": name, "kind": smoothness}
+        yield {**head, "chosen": chosen, "fidelity": fidelity}
 
 
 def at_cells(camera: Camera, width: int, height: int) -> Camera:
@@ -99,21 +270,58 @@ def at_cells(camera: Camera, width: int, height: int) -> Camera:
     return lc.Camera(camera.viewmat, K, width, height, name=camera.name)
 
 
+class Rows:
+    """Rows that were measured, a line of JSON each, in a file where one is named."""
+
+    def __init__(self, file: Path | None) -> None:
+        self.file = file
+        lines = file.read_text().splitlines() if file and file.is_file() else []
+        self.rows: list[Row] = [json.loads(line) for line in lines]
+
+    def __contains__(self, key: tuple[str, str, str]) -> bool:
+        return any((row["table"], row["name"], row["kind"]) == key for row in self.rows)
+
+    def add(self, row: Row) -> None:
+        """Hold a row, and write it."""
+        self.rows.append(row)
+        if self.file:
+            with self.file.open("a") as lines:
+                lines.write(json.dumps(row) + "\n")
+
+
+def measure(options: Namespace, rows: Rows) -> None:
+    """Measure what is not there."""
+    for case in cases(options.data, options.tables):
+        missing = [kind for name, kind in case.row_names() if (case.table, name, kind) not in rows]
+        if missing and options.only in case.name:
+            for row in case.measure(missing):
+                rows.add(row)
+    if "fidelity" in options.tables:
+        wanted = product(("dense, every 1", "dense, every 4"), LAMBDAS)
+        missing = [one for one in wanted if ("fidelity", *one) not in rows and options.only in one[0]]
+        for row in fidelity_rows(options.data / "plush", missing) if missing else ():
+            rows.add(row)
+
+
 def main() -> None:
-    """Print the table, or one JSON object."""
+    """Print the tables, or one JSON object."""
     parser = command_line(
         "tests.benchmarks.smoothness",
         __doc__,
-        ("folder", {"type": Path}),
-        ("--every", {"type": int, "default": 1, "metavar": "N", "help": "take every n-th view"}),
-        ("--packs", {"nargs": "+", "default": ["grids"], "metavar": "NAME"}),
-        ("--lambdas", {"nargs": "+", "default": list(LAMBDAS), "metavar": "L"}),
-        ("--colours", {"default": "true", "choices": COLOURS}),
+        ("data", {"type": Path}),
+        ("--tables", {"nargs": "+", "default": TABLES, "choices": TABLES}),
+        ("--only", {"default": "", "metavar": "TEXT", "help": "scenes whose name has it, as 'hard, every 4'"}),
+        ("--into", {"type": Path, "metavar": "FILE", "help": "rows that are measured; those in it are not again"}),
     )
     options = parser.parse_args()
-    given = options.every, options.lambdas, options.colours
-    table = [row for pack in options.packs for row in rows(options.folder, pack, *given)]
-    tell(table, as_json=options.json)
+    rows = Rows(options.into)
+    measure(options, rows)
+    shown = [[row for row in rows.rows if row["table"] == table] for table in options.tables]
+    columns = [list(dict.fromkeys(key for row in part for key in row if key not in HIDDEN)) for part in shown]
+    if not options.json:
+        for part, names in list(zip(shown, columns, strict=True))[:-1]:
+            print(table_of(part, names) + "\n")
+    tell(rows.rows if options.json else shown[-1], as_json=options.json, columns=columns[-1])
 
 
 if __name__ == "__main__":

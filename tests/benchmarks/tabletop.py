@@ -9,7 +9,7 @@ argmax over the class scores, rendered in the held-out views with the opacity ga
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -75,8 +75,19 @@ class Truth:
 
     def judge_scores(self, scores: Tensor, params: lc.CompositingParams, raster: Raster | None = None) -> Figures:
         """The figures of scores [P, K], rendered with these parameters."""
+        return self.judge_each([scores], params, raster)[0]
+
+    def judge_each(
+        self, tables: Sequence[Tensor], params: lc.CompositingParams, raster: Raster | None = None
+    ) -> list[Figures]:
+        """The figures of several tables of scores [P, K], rendered at once."""
+        images = self.rendered(torch.cat(list(tables), dim=1), params, raster)
+        parts = zip(*(image.split(len(self.classes), dim=2) for image in images), strict=True)
+        return [self._figures(scores, part) for scores, part in zip(tables, parts, strict=True)]
+
+    def _figures(self, scores: Tensor, images: Sequence[Tensor]) -> Figures:
         accuracy = float((scores.argmax(dim=1) == self.objects)[self.counted].float().mean())
-        best = torch.stack([image.argmax(dim=2) for image in self.rendered(scores, params, raster)])
+        best = torch.stack([image.argmax(dim=2) for image in images])
         shown = torch.stack(list(self.held_out.values()))
         best[shown < 0] = NO_LABEL  # rays that meet nothing show no class
         ious = class_ious(best, shown, len(self.classes))
