@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
+from safetensors import safe_open
+from safetensors.numpy import save
 
 from service.store.keys import Quota
 from service.store.owners import Scope
@@ -171,6 +175,54 @@ def test_click_takes_the_thing_and_another_its_patch(page: Browser) -> None:
     page.until("splatlift.viewer.settled")
     page.press("#scene", *splat_at(page, LAMP))
     page.until(f"{EXAMPLES}.length === 1 && !{SETS}.length")
+
+
+@pytest.fixture
+def parted(served: Served, tmp_path: Path) -> Iterator[str]:
+    """A lift whose lamp has two parts, nodes 3 and 4: its splats of even and of odd rows."""
+    (tmp_path / "lift").write_bytes(httpx.get(f"{served.address}/lifts/{served.lift}/features").content)
+    with safe_open(tmp_path / "lift", framework="np") as opened:
+        metadata = opened.metadata()
+        tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+    lamp, rows = int(tensors["object"][LAMP]), np.flatnonzero(tensors["object"] == tensors["object"][LAMP])
+    tensors["node"][rows] = 3 + rows % 2
+    tensors["node_parents"] = np.array([-1, -1, -1, lamp, lamp], np.int32)
+    for name in ("node_views", "node_confidence", "node_features"):
+        tensors[name] = tensors[name][[0, 1, 2, lamp, lamp]]
+    lifted = httpx.post(f"{served.address}/lifts", content=save(tensors, metadata)).raise_for_status().json()["id"]
+    yield lifted
+    httpx.delete(f"{served.address}/jobs/{lifted}?with_lift=true").raise_for_status()
+
+
+def test_things_unfold_into_parts_by_keyboard_and_by_clicks(page: Browser, served: Served, parted: str) -> None:
+    page.open(f"{served.address}/?lift={parted}")
+    page.until(f"{READY} && splatlift.things.nodes.size === 5")
+    unfold = "document.querySelector('#catalogue-list [aria-expanded]')"
+    assert page.value(f"{unfold}.getAttribute('aria-label')") == "2 parts of lamp"
+    page.value(f"{unfold}.focus()")
+    page.key("Enter")
+    page.until("document.querySelectorAll('#catalogue-list .parts li').length === 2")
+    assert page.value(f"document.activeElement === {unfold} && {unfold}.getAttribute('aria-expanded')") == "true"
+    page.press("#catalogue-list .parts .thing")
+    page.until(f"{SETS}.join() === 'object:3' && {FOUND}")
+    assert page.value("splatlift.ask.now.count") == 10 and text_of(page, "#chips .chip").startswith("lamp: ")
+    page.press("#clear")
+    page.press("#reset-view")
+    page.until("splatlift.viewer.settled")
+    whole, part = f"object:{page.value('splatlift.things.nodes.get(3).parent')}", "object:4"
+    at = splat_at(page, LAMP)
+    for taken in (whole, part):
+        page.press("#scene", *at)
+        page.until(f"{SETS}.join() === '{taken}' && {FOUND}")
+    page.press("#scene", *at, alt=True)
+    page.until(f"{EXAMPLES}.join() === 'splat:{LAMP}'")
+    page.press("#clear")
+    page.press(MODE_VIEW)
+    page.until("document.querySelector('#render').naturalWidth === 32")
+    page.press("#render", 27.5 / 32, 12.5 / 24)
+    page.until(f"{SETS}.join() === '{whole}' && {FOUND}")
+    page.press("#render", 27.5 / 32, 12.5 / 24)
+    page.until(f"['object:3', 'object:4'].includes({SETS}.join()) && {FOUND}")
 
 
 def test_thing_takes_a_name_and_is_hidden_for_good(page: Browser, served: Served) -> None:
@@ -437,7 +489,7 @@ def test_photo_view_shows_the_mask_and_takes_examples(page: Browser) -> None:
     ask(page, "lamp")
     page.until("!document.querySelector('#mask').hidden")
     assert min(page.value(CLEAR)) > 16
-    page.press("#render", 7.5 / 32, 12.5 / 24)
+    page.press("#render", 7.5 / 32, 12.5 / 24, alt=True)
     page.until(f"{EXAMPLES}.length === 1")
     assert page.value(EXAMPLES) == ["left:7,12"]
     page.until("document.querySelectorAll('#picture .mark').length === 1")

@@ -20,9 +20,10 @@ const SHIFTED = 5; // pixels that the pointer may move in a click
 const IN_VIEWS = ["rgb", "pca", "cluster", "confidence", "depth"]; // that the service draws of a view
 
 export class Look {
-  // changed: when colours or the link must follow; fly: with a view; pick: with an example's notation.
-  constructor({ changed, fly, pick, fallback }) {
-    Object.assign(this, { changed, fly, pick, views: [], view: null, colours: new Map(), layer: null, turn: 0, mode: fallback ? "view" : "scene" });
+  // changed: when colours or the link must follow; fly: with a view; pick: with an example's notation;
+  // hit: with that of a click, which may mean a thing.
+  constructor({ changed, fly, pick, hit, fallback }) {
+    Object.assign(this, { changed, fly, pick, hit, views: [], view: null, colours: new Map(), layer: null, turn: 0, mode: fallback ? "view" : "scene" });
     this.fallback = fallback;
     for (const input of document.querySelectorAll("input[name=layer]")) input.addEventListener("change", () => this.choose(input.value));
     for (const input of document.querySelectorAll("input[name=mode]")) input.addEventListener("change", () => this.switch(input.value));
@@ -241,7 +242,7 @@ export class Look {
     if (!pixel || !event.detail) return;
     if (box) this.pick(`${this.view.name}:box:${box}`, event.shiftKey);
     else if (this.masks?.picking) this.masks.at(this.view.name, ...pixel, event.shiftKey);
-    else this.pick(`${this.view.name}:${pixel}`, event.shiftKey);
+    else this.hit(`${this.view.name}:${pixel}`, event.shiftKey, event.altKey);
   }
 }
 

@@ -30,7 +30,7 @@ let turn = 0; // of opening lifts: what an older one loads is late and is droppe
 let busy = true; // until it is known what to open
 
 const ask = new Ask({ changed, fly: box => viewer?.toBox(box) });
-const look = new Look({ changed: () => { repaint(); link(); }, fly: view => viewer?.to(view), pick: (term, less) => pointed(term, less), fallback: !webgl() });
+const look = new Look({ changed: () => { repaint(); link(); }, fly: view => viewer?.to(view), pick: (term, less) => pointed(term, less), hit: (term, shift, alt) => hit(term, null, shift, alt), fallback: !webgl() });
 const names = new Names({ changed, centres: (values, most) => viewer?.mesh ? viewer.centres(values, most) : [], alone: () => ask.reset(true), more: term => { tab("ask"); ask.example(term, false); } });
 const masks = new Masks({ pick: (term, less) => { tab("ask"); ask.example(term, less); }, swap: (old, term) => ask.swap(old, term) });
 const take = new Take({ ask, look, names, shot });
@@ -387,17 +387,19 @@ function pointing(canvas, built) {
     }
     last = event.timeStamp;
     const { shiftKey, altKey } = event;
-    waiting = setTimeout(() => hit(at3d(event), shiftKey, altKey), TWICE);
+    waiting = setTimeout(() => hit3d(at3d(event), shiftKey, altKey), TWICE);
   });
   canvas.addEventListener("keydown", event => keyed(event, built));
 }
 
-// A click takes the thing there, a second one or Alt a patch of it; Shift several things, or less of a patch.
-async function hit(found, shift, alt = false) {
-  if (!found) return tell("There is no splat there.");
+const hit3d = (found, shift, alt) => (found ? hit(`splat:${found.splat}`, found.at, shift, alt) : tell("There is no splat there."));
+
+// A click takes the thing there, another one its part, down to the smallest; one more or Alt what is like the place.
+// Shift takes several things, or less of what is like a place.
+async function hit(term, point, shift, alt = false) {
   const patch = alt || !at("panel-name").hidden || (shift && ask.now && !ask.now.sets.length);
-  if (!patch && await things.at(found.splat, shift)) return undefined;
-  return pointed(`splat:${found.splat}`, shift && !ask.now?.sets.length, found.at);
+  if (!patch && await things.at(term, shift)) return undefined;
+  return pointed(term, shift && !ask.now?.sets.length, point);
 }
 
 // Somebody points at a thing: more of it, or with the panel of names what it is.
@@ -411,7 +413,7 @@ function keyed(event, built) {
   if (turns[event.key]) built.turn(...turns[event.key]);
   else if (event.key === "+" || event.key === "=") built.zoom(0.85);
   else if (event.key === "-") built.zoom(1 / 0.85);
-  else if (event.key === "Enter") hit(built.pick(at("scene").clientWidth / 2, at("scene").clientHeight / 2), event.shiftKey);
+  else if (event.key === "Enter") hit3d(built.pick(at("scene").clientWidth / 2, at("scene").clientHeight / 2), event.shiftKey);
   else return;
   event.preventDefault();
 }

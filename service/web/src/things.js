@@ -1,27 +1,35 @@
-// The things in the scene, which the lift found by masks alone: a list before anything is asked, and what a click takes.
+// The things in the scene, which the lift found by masks alone, and their parts: a list before anything is asked, and
+// what a click takes.
 import { at, el, plural, tell } from "./dom.js";
+import { search } from "./question.js";
 import { json, patch, words } from "./service.js";
 
 const MOST = 100; // things in the list
+const NODES = 1000; // of the tree, things among them
 const WHOLE = 0.5; // of the scene's splats: what has more is no thing, but what things stand on
 
 export class Things {
   // hold: with the terms that are taken; held: those; fly: with a box to look at, and the view that shows most of it;
   // naming: names by terms.
   constructor({ hold, held, fly, naming }) {
-    Object.assign(this, { hold, held, fly, naming, found: [] });
+    Object.assign(this, { hold, held, fly, naming, found: [], nodes: new Map(), open: new Set() });
     at("catalogue-hidden").addEventListener("click", () => { this.all = !this.all; this.show(); });
   }
 
   async of(lift) {
-    Object.assign(this, { lift, found: [], all: false });
+    Object.assign(this, { lift, found: [], nodes: new Map(), open: new Set(), all: false });
     this.show();
     if (!lift?.links.objects) return; // of a lift from before there were any
     try {
       const route = `/lifts/${lift.id}/objects?limit=${MOST}`;
-      const named = `${route}&encoder=${encodeURIComponent(lift.text_space)}`; // refused where that space has no table of words
-      const { objects } = lift.text_space === "none" ? await json(route) : await json(named).catch(() => json(route));
+      const space = `&encoder=${encodeURIComponent(lift.text_space)}`;
+      let named = lift.text_space === "none" ? "" : space;
+      const { objects } = await json(route + named).catch(() => { named = ""; return json(route); }); // that space has no table of words
       if (lift === this.lift) this.have(objects);
+      this.show();
+      const { nodes } = objects.length && lift.links.tree ? await json(`${lift.links.tree}?limit=${NODES}${named}`) : { nodes: [] };
+      if (lift === this.lift) this.nodes = new Map(nodes.map(node => [node.id, node]));
+      if (lift === this.lift) this.have(this.found);
     } catch { /* asked in words all the same */ }
     this.show();
   }
@@ -37,7 +45,21 @@ export class Things {
       seen.set(thing.name, number);
       thing.title = !thing.name ? `Thing ${thing.id + 1}` : times.get(thing.name) > 1 ? `${thing.name} ${number}` : thing.name;
       this.naming.set(term(thing), thing.title);
+      this.entitle(thing);
     }
+  }
+
+  // Parts are numbered within their whole, which their names say where a part is met alone.
+  entitle(whole) {
+    this.parts(whole).forEach((part, place) => {
+      part.title = `${part.name ? `${part.name}, part` : "Part"} ${place + 1}`;
+      this.naming.set(term(part), `${this.naming.get(term(whole))}: ${part.title.toLowerCase()}`);
+      this.entitle(part);
+    });
+  }
+
+  parts({ id }) {
+    return (this.nodes.get(id)?.parts ?? []).map(part => this.nodes.get(part)).filter(Boolean);
   }
 
   background(thing) {
@@ -51,30 +73,62 @@ export class Things {
     at("catalogue").hidden = !this.found.length;
     at("catalogue-hidden").hidden = !hidden;
     at("catalogue-hidden").textContent = this.all ? "Leave out what is hidden" : `Show ${plural(hidden, "hidden thing")}`;
-    at("catalogue-list").replaceChildren(...shown.map(thing => el("li", { className: thing.hidden ? "hidden-thing" : "" },
-      el("button", { type: "button", className: "thing", "aria-pressed": String(held.includes(term(thing))), on: { click: event => this.press(thing, event.shiftKey) } },
-        el("span", {}, thing.title, el("small", {}, plural(thing.splats, "splat")))),
+    const focus = document.activeElement?.dataset.unfolds; // which is made anew
+    at("catalogue-list").replaceChildren(...shown.map(thing => el("li", { className: thing.hidden ? "hidden-thing" : "" }, ...this.line(thing, held),
       el("button", { type: "button", className: "plain", title: "Give it a name", "aria-label": `Name ${thing.title}`, on: { click: event => this.write(thing, event.target.closest("li")) } }, "\u270e"),
-      el("button", { type: "button", className: "plain", "aria-label": `${thing.hidden ? "Show" : "Hide"} ${thing.title}`, on: { click: () => this.change(thing, { hidden: !thing.hidden }) } }, thing.hidden ? "Show" : "Hide"))));
+      el("button", { type: "button", className: "plain", "aria-label": `${thing.hidden ? "Show" : "Hide"} ${thing.title}`, on: { click: () => this.change(thing, { hidden: !thing.hidden }) } }, thing.hidden ? "Show" : "Hide"),
+      ...this.below(thing, held))));
+    if (focus) at("catalogue-list").querySelector(`[data-unfolds="${focus}"]`)?.focus();
+  }
+
+  // What takes a thing or a part, after what unfolds its parts where it has any.
+  line(node, held) {
+    const parts = this.parts(node);
+    const opened = this.open.has(node.id);
+    const unfolds = el("button", { type: "button", className: "plain unfold", "aria-expanded": String(opened), "aria-controls": `parts-${node.id}`,
+      "aria-label": `${plural(parts.length, "part")} of ${this.naming.get(term(node))}`, data: { unfolds: node.id }, on: { click: () => this.unfold(node) } }, opened ? "\u25be" : "\u25b8");
+    return [...(parts.length ? [unfolds] : []),
+      el("button", { type: "button", className: "thing", "aria-pressed": String(held.includes(term(node))), on: { click: event => this.press(node, event.shiftKey) } },
+        el("span", {}, node.title, el("small", {}, plural(node.splats, "splat"), parts.length ? `, ${plural(parts.length, "part")}` : "")))];
+  }
+
+  below(node, held) {
+    const parts = this.parts(node);
+    if (!parts.length) return [];
+    const items = this.open.has(node.id) ? parts.map(part => el("li", {}, ...this.line(part, held), ...this.below(part, held))) : [];
+    return [el("ol", { id: `parts-${node.id}`, className: "parts", "aria-label": `Parts of ${this.naming.get(term(node))}`, hidden: !items.length }, ...items)];
+  }
+
+  unfold({ id }) {
+    if (!this.open.delete(id)) this.open.add(id);
+    this.show();
   }
 
   // One alone, or beside those that are taken.
   press(thing, more) {
-    const held = more ? this.held().filter(one => one.startsWith("object:")) : [];
-    const own = term(thing);
-    this.hold(held.includes(own) ? held.filter(one => one !== own) : [...held, own]);
+    this.take(term(thing), more);
     if (!more) this.fly(thing.box, thing.views[0]);
   }
 
-  // The thing of a splat that was clicked; false where there is none, or it is taken already: then its patch is meant.
-  async at(splat, more) {
+  take(own, more) {
+    const held = more ? this.held().filter(one => one.startsWith("object:")) : [];
+    this.hold(held.includes(own) ? held.filter(one => one !== own) : [...held, own]);
+  }
+
+  // What a click on an example may mean: the thing there, with another click its part, and so on to the smallest; false
+  // where there is none, or that is taken already: then what is like the place is meant.
+  async at(example, more) {
     if (!this.found.length) return false;
     try {
-      const { objects: [found] } = await json(`/lifts/${this.lift.id}/objects?splat=${splat}`);
-      if (!found || this.background(found)) return false;
+      const { candidates } = await json(`/query?${search({ lift: this.lift.id, like: example, top: 0 })}`);
+      const nested = candidates.filter(one => one.kind !== "group" && !this.background(one)).reverse(); // the largest first
+      if (!nested.length) return false;
       const held = this.held();
-      if (!more && held.length === 1 && held[0] === term(found)) return false;
-      this.press(this.found.find(({ id }) => id === found.id) || { ...found, title: `Thing ${found.id + 1}` }, more);
+      const taken = more || held.length !== 1 ? -1 : nested.findIndex(one => one.set === held[0]);
+      if (taken === nested.length - 1) return false;
+      const chosen = nested[taken + 1];
+      for (const { id } of nested.slice(0, taken + 1)) this.open.add(id);
+      this.take(chosen.set, more);
       return true;
     } catch (problem) {
       tell(words(problem), true);
