@@ -61,8 +61,6 @@ PAGE = 1000  # records of a list, names or views in one answer
 BODY_BRACKETS = 10_000
 BODY_COMMAS = 140_000
 
-# Zips
-
 
 def _once(texts: list[str]) -> list[str]:
     return list(dict.fromkeys(texts))

@@ -496,7 +496,7 @@ def move(
 ) -> None:
     """Within a write transaction: bring a job to a state, and note it."""
     changed = connection.execute(
-        "UPDATE jobs SET state = :state, problem = :problem, leased_until = NULL,"
+        "UPDATE jobs SET state = :state, problem = :problem,"
         " ended = CASE WHEN :ended THEN :now ELSE NULL END,"
         " progress = CASE WHEN :state = 'queued' THEN NULL ELSE progress END"
         " WHERE id = :job RETURNING *",

@@ -172,8 +172,7 @@ class LiftStore:
             row = connection.execute(
                 "INSERT INTO jobs (id, owner, state, attempt, splats, cameras, settings, created, started, ended)"
                 " VALUES (:id, :owner, 'succeeded', 1, :splats, :cameras, :settings, :time, :time, :time)"
-                " ON CONFLICT (id) DO UPDATE SET state = 'succeeded', ended = :time, problem = NULL,"
-                " leased_until = NULL RETURNING *",
+                " ON CONFLICT (id) DO UPDATE SET state = 'succeeded', ended = :time, problem = NULL RETURNING *",
                 {
                     "id": job,
                     "owner": owner.key,

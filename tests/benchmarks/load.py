@@ -67,14 +67,14 @@ def measure(seconds: float, rounds: int, splats: int) -> dict[str, Any]:
             other = _upload(client, folder / "other", OTHER)
             client.get("/query", lift=job["id"], text=next(words))
             alone = _questions(url, job["id"], words, rounds)
-            quiet = probe(url, _after(seconds / 4))
+            quiet = probe(url, after(seconds / 4))
             stop = threading.Event()
             lifts = threading.Thread(target=_keep_lifting, args=(url, other, stop))
             lifts.start()
             while not any(job["state"] == "running" and job["plan"] for job in client.get("/jobs")["jobs"]):
                 time.sleep(0.05)
-            with _slow_clients(url, f"/assets/{large['splats']}/content") as told:
-                slow = probe(url, _after(seconds))
+            with slow_clients(url, f"/assets/{large['splats']}/content") as told:
+                slow = probe(url, after(seconds))
             beside = _questions(url, job["id"], words, rounds)
             ran = lifts.is_alive()
             stop.set()
@@ -172,13 +172,13 @@ def probe(url: str, over: Callable[[], bool]) -> dict[str, Any]:
     return {"probes": len(times[""]), "wrong": wrong, **shown}
 
 
-def _after(seconds: float) -> Callable[[], bool]:
+def after(seconds: float) -> Callable[[], bool]:
     end = time.monotonic() + seconds
     return lambda: time.monotonic() >= end
 
 
 @contextlib.contextmanager
-def _slow_clients(url: str, path: str, sockets: int = 200, readers: int = 20) -> Iterator[dict[str, Any]]:
+def slow_clients(url: str, path: str, sockets: int = 200, readers: int = 20) -> Iterator[dict[str, Any]]:
     """Run them in a process of their own; what they tell at their end is in the dict then."""
     command = [sys.executable, "-m", "tests.benchmarks.load", "--slow", str(urlsplit(url).port), path]
     command += [str(sockets), str(readers)]
