@@ -42,7 +42,7 @@ from liftcore.query.question import (
     TopSplat,
 )
 from liftcore.query.scores import LEAST_LIKENESS, LOWEST_COSINE, combine, cosines, cosines_about
-from liftcore.query.selection import LEAST_FIRST, SAME_WORD, Rivals, contest, nearer_than_rivals, whole_things
+from liftcore.query.selection import LEAST_FIRST, SAME_WORD, Rivals, contest, nearer_than_rivals, with_things
 from liftcore.query.selections import set_members
 from liftcore.query.terms import Vector
 from liftcore.query.threshold import find_threshold, nothing_alike
@@ -354,12 +354,9 @@ def _selected(
     found = found.model_copy(update={"clear": found.clear and standing.first >= LEAST_FIRST})
     if rivals[-1].allowed == 0:
         selected = nearer_than_rivals(scene, selected, rivals[-1])
-    whole = whole_things(scene, selected, weights, rivals[0])
-    if whole:
-        selected = selected | (scene.seen & np.isin(np.asarray(scene.object), whole))
-        things = "a thing" if len(whole) == 1 else f"{len(whole)} things"
-        told = f"{found.explanation.removesuffix('.')}; of {things} mostly above it all is taken."
-        found = found.model_copy(update={"explanation": told})
+    selected, told = with_things(scene, selected, weights, rivals[0])
+    if told:
+        found = found.model_copy(update={"explanation": f"{found.explanation.removesuffix('.')}; {told}."})
     return found, selected
 
 

@@ -10,9 +10,16 @@ held to other words. Two kinds of them compete:
 - **The other words of a pack** or of a short table are all that its author distinguishes: where one of them is
   nearer, a splat is not selected.
 
-A thing of the region graph (`liftcore.solve.objects`) that is mostly selected may be taken whole: its other splats
-got wrong masks. It may hold two things, though. So the rest of it must be nearer to the part that is selected than to
-any other thing, in features; and where less than `MOST` is selected, no other thing's best word may be nearer to it.
+Then the things of the region graph (`liftcore.solve.objects`) are asked, which know of each splat what masks keep it
+with:
+
+- A thing that is mostly selected may be **taken whole**: its other splats got wrong masks. It may hold two things,
+  though. So the rest of it must be nearer to the part that is selected than to any other thing, in features; else
+  only those splats of the rest are taken that are, one by one. Where less than `MOST` is selected, the whole rest is
+  taken or none, and no other thing's best word may be nearer to it.
+- Of a thing of which less than `SOME` is selected **none is taken** where that part, too, is nearer to the best word of
+  the thing than to the query's: masks say that it is of the thing, and hardly that it is what was asked for. What
+  shines through a thing, or was merged with it, has its own word as the nearest and stays.
 """
 
 from __future__ import annotations
@@ -130,37 +137,83 @@ def nearer_than_rivals(scene: OpenedLift, selected: np.ndarray, rivals: Rivals) 
     return kept
 
 
-def whole_things(scene: OpenedLift, selected: np.ndarray, weights: np.ndarray, rivals: Rivals) -> list[int]:
-    """The things of the region graph that a selection [P] bool covers mostly and that it may take whole.
+def with_things(
+    scene: OpenedLift, selected: np.ndarray, weights: np.ndarray, rivals: Rivals
+) -> tuple[np.ndarray, str]:
+    """A selection [P] bool after what the things of the region graph say of it, and a clause on that; "" for nothing.
 
     Args:
         scene: an opened lift. weights: [P] f32, how much each splat counts.
     """
     if scene.object is None or scene.object_views is None or len(scene.object) != len(selected):
-        return []
+        return selected, ""
     number, own = len(scene.object_views), np.where(scene.seen, scene.object, -1)
     of_thing = own >= 0
     whole = np.bincount(own[of_thing], weights[of_thing], number)
     inside = np.bincount(own[of_thing & selected], weights[of_thing & selected], number)
     shares = inside / np.where(whole > 0, whole, 1.0)
-    open_ones = np.flatnonzero((shares >= SOME) & (inside < whole))
-    if not open_ones.size:
-        return []
+    if not (inside > 0).any():
+        return selected, ""
     means = scene.thing_means
     known = np.linalg.norm(means, axis=1) > 0
     near = known & (rivals.ahead_of_means(scene, means) <= rivals.allowed)
     others = means[known & ~near]  # what has no part in the answer
     words = rivals.vectors[np.unique((others @ rivals.vectors.T).argmax(axis=1))] if len(rivals.vectors) else others
-    taken = []
-    for thing in open_ones[near[open_ones]].tolist():
+    changed, grown, told = selected.copy(), 0, []
+    for thing in np.flatnonzero(near & (shares >= SOME) & (inside < whole)).tolist():
         mine = own == thing
         part, rest = (scene.mean_of(np.flatnonzero(mine & side)) for side in (selected, ~selected))
+        more = np.flatnonzero(mine & ~selected)
         if len(others) and _about(scene, others, rest).max() >= _about(scene, part[None], rest)[0]:
+            more = _nearest_to(scene, more, means[known], int(known[:thing].sum())) if shares[thing] >= MOST else more[:0]
+        elif shares[thing] < MOST and (words @ rest).max(initial=-1.0) > (rivals.directions @ rest).max():
             continue
-        if shares[thing] < MOST and (words @ rest).max(initial=-1.0) > (rivals.directions @ rest).max():
-            continue
-        taken.append(thing)
-    return taken
+        changed[more] = True
+        grown += bool(more.size)
+    left = _other_things(scene, own, selected, known & (inside > 0) & (shares < SOME), rivals)
+    if left and weights[selected & np.isin(own, left)].sum() < weights[selected].sum() / 2:
+        changed &= ~np.isin(own, left)
+        told = [f"{_things(len(left))} to which another word is nearer none is"]
+    if grown:
+        told = [f"{_things(grown)} mostly above it more is taken", *told]
+    return changed, ", ".join(f"of {clause}" for clause in told)
+
+
+def _things(count: int) -> str:
+    return "a thing" if count == 1 else f"{count} things"
+
+
+def _other_things(
+    scene: OpenedLift, own: np.ndarray, selected: np.ndarray, among: np.ndarray, rivals: Rivals
+) -> list[int]:
+    """The things to whose selected splats the word of the thing itself is nearer than the query's.
+
+    Args:
+        own: [P] i32, the thing of each splat, -1 for none. selected: [P] bool. among: [N] bool, the things looked at.
+    """
+    found = []
+    for thing in np.flatnonzero(among).tolist() if len(rivals.vectors) else ():
+        mean, part = scene.thing_means[thing], scene.mean_of(np.flatnonzero((own == thing) & selected))
+        word = rivals.vectors[(rivals.vectors @ mean).argmax()]
+        if word @ part > (rivals.directions @ part).max() and word @ mean > (rivals.directions @ mean).max():
+            found.append(thing)
+    return found
+
+
+def _nearest_to(scene: OpenedLift, rows: np.ndarray, means: np.ndarray, thing: int) -> np.ndarray:
+    """Those of some splats [n] that are nearer to one of the things than to any other, about the scene's mean.
+
+    Args:
+        means: [N, F] f32, unit, of things. thing: its row.
+    """
+    offsets = means - scene.rough_mean
+    offsets /= np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), np.float32(1e-12))
+    shift, kept = offsets @ scene.rough_mean, []
+    for first in range(0, len(rows), _AT_ONCE):
+        some = rows[first : first + _AT_ONCE]
+        along = products(scene.features[some], scene.norms[some], offsets, offsets[:0])[0] - shift
+        kept.append(some[along.argmax(axis=1) == thing])
+    return np.concatenate([rows[:0], *kept])
 
 
 def _about(scene: OpenedLift, means: np.ndarray, mean: np.ndarray) -> np.ndarray:

@@ -131,3 +131,32 @@ def test_thing_that_is_mostly_selected_is_taken_whole_unless_it_holds_two(scene:
     assert np.flatnonzero(whole.selected).tolist() == list(range(300))
     mixed = ask(lifted(scene, rows, object=two, object_views=views), "cat", table)
     assert not mixed.selected[300:].any()
+
+
+def test_of_a_thing_with_another_nearer_word_nothing_is_selected(scene: Scene, table: TableEncoder) -> None:
+    views, things = torch.zeros((3, 5), dtype=torch.int32), np.repeat([0, 1, 2], [300, 200, 200]).astype(np.int32)
+    words = ["cat"] * 300 + ["boat"] * 200 + ["pizza"] * 200
+    rows = pictures(table, words, 0.1)
+    rows[:40] = 0.52 * rows[:40] + 0.48 * pictures(table, ["boat"] * 40, 0.1)  # of the cat, and somewhat like a boat
+    merged = pictures(table, ["boat"] * 40 + words[40:], 0.1)  # boats that masks keep with the cat
+    found = [
+        ask(lifted(scene, some, **fields), "boat", table)
+        for some in (rows, merged)
+        for fields in ({}, {"object": torch.from_numpy(things), "object_views": views})
+    ]
+    assert found[0].selected[:40].mean() > 0.5 and not found[1].selected[:300].any()
+    assert "another word is nearer" in found[1].threshold.explanation
+    assert found[2].selected[:40].mean() > 0.5 and (found[3].selected >= found[2].selected)[:40].all()
+    assert all(one.selected[300:500].mean() > 0.9 for one in found)
+
+
+def test_of_a_thing_that_holds_two_what_is_nearest_to_it_is_taken(scene: Scene, table: TableEncoder) -> None:
+    words = ["cat"] * 300 + ["boat"] * 200 + ["pizza"] * 200
+    rows = pictures(table, words, 0.1)
+    rows[250:300] = 0.55 * rows[250:300] + 0.45 * pictures(table, ["zebra"] * 50, 0.1)
+    things = np.repeat([0, 1, 2], [360, 140, 200]).astype(np.int32)  # sixty splats of the boat are in the cat's
+    views = torch.zeros((3, 5), dtype=torch.int32)
+    cut = ask(lifted(scene, rows), "cat", table)
+    found = ask(lifted(scene, rows, object=torch.from_numpy(things), object_views=views), "cat", table)
+    assert cut.selected[250:300].mean() < 0.5 < found.selected[250:300].mean()
+    assert not found.selected[300:].any()
