@@ -194,8 +194,9 @@ def _other_things(
     found = []
     for thing in np.flatnonzero(among).tolist() if len(rivals.vectors) else ():
         mean, part = scene.thing_means[thing], scene.mean_of(np.flatnonzero((own == thing) & selected))
-        word = rivals.vectors[(rivals.vectors @ mean).argmax()]
-        if word @ part > (rivals.directions @ part).max() and word @ mean > (rivals.directions @ mean).max():
+        word = rivals.vectors[(rivals.vectors @ (mean - scene.rough_mean)).argmax()]  # words near to all are none
+        nearer = (word - rivals.directions) @ np.stack([mean, part, mean - scene.rough_mean, part - scene.rough_mean]).T
+        if (nearer > 0).all():
             found.append(thing)
     return found
 

@@ -134,16 +134,13 @@ def test_thing_that_is_mostly_selected_is_taken_whole_unless_it_holds_two(scene:
 
 
 def test_of_a_thing_with_another_nearer_word_nothing_is_selected(scene: Scene, table: TableEncoder) -> None:
-    views, things = torch.zeros((3, 5), dtype=torch.int32), np.repeat([0, 1, 2], [300, 200, 200]).astype(np.int32)
-    words = ["cat"] * 300 + ["boat"] * 200 + ["pizza"] * 200
-    rows = pictures(table, words, 0.1)
-    rows[:40] = 0.52 * rows[:40] + 0.48 * pictures(table, ["boat"] * 40, 0.1)  # of the cat, and somewhat like a boat
-    merged = pictures(table, ["boat"] * 40 + words[40:], 0.1)  # boats that masks keep with the cat
-    found = [
-        ask(lifted(scene, some, **fields), "boat", table)
-        for some in (rows, merged)
-        for fields in ({}, {"object": torch.from_numpy(things), "object_views": views})
-    ]
+    words = ["sheep"] * 300 + ["cow"] * 200 + ["curtain"] * 1200
+    things = torch.from_numpy(np.repeat([0, 1, 2], [300, 200, 1200]).astype(np.int32))
+    rows, views = pictures(table, words, 0.1), torch.zeros((3, 5), dtype=torch.int32)
+    rows[:40] = 0.5 * rows[:40] + 0.5 * pictures(table, ["cow"] * 40, 0.1)  # of the sheep, and somewhat like a cow
+    merged = pictures(table, ["cow"] * 40 + words[40:], 0.1)  # of a cow that masks keep with the sheep
+    ways: tuple[dict[str, Any], ...] = {}, {"object": things, "object_views": views}
+    found = [ask(lifted(scene, some, **fields), "cow", table) for some in (rows, merged) for fields in ways]
     assert found[0].selected[:40].mean() > 0.5 and not found[1].selected[:300].any()
     assert "another word is nearer" in found[1].threshold.explanation
     assert found[2].selected[:40].mean() > 0.5 and (found[3].selected >= found[2].selected)[:40].all()
