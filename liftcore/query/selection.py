@@ -17,8 +17,8 @@ with:
   though. So the rest of it must be nearer to the part that is selected than to any other thing, in features; else
   only those splats of the rest are taken that are, one by one. Where less than `MOST` is selected, the whole rest is
   taken or none, and no other thing's best word may be nearer to it.
-- Of a thing of which less than `SOME` is selected **none is taken** where that part, too, is nearer to the best word of
-  the thing than to the query's: masks say that it is of the thing, and hardly that it is what was asked for. What
+- Of a thing of which less than `SOME` is selected **none is taken** where that part, too, is nearer to the best word
+  of the thing than to the query's: masks say that it is of the thing, and hardly that it is what was asked for. What
   shines through a thing, or was merged with it, has its own word as the nearest and stays.
 """
 
@@ -165,22 +165,25 @@ def with_things(
         part, rest = (scene.mean_of(np.flatnonzero(mine & side)) for side in (selected, ~selected))
         more = np.flatnonzero(mine & ~selected)
         if len(others) and _about(scene, others, rest).max() >= _about(scene, part[None], rest)[0]:
-            more = _nearest_to(scene, more, means[known], int(known[:thing].sum())) if shares[thing] >= MOST else more[:0]
+            if shares[thing] < MOST:
+                continue
+            more = _nearest_to(scene, more, means[known], int(known[:thing].sum()))
         elif shares[thing] < MOST and (words @ rest).max(initial=-1.0) > (rivals.directions @ rest).max():
             continue
         changed[more] = True
         grown += bool(more.size)
-    left = _other_things(scene, own, selected, known & (inside > 0) & (shares < SOME), rivals)
-    if left and weights[selected & np.isin(own, left)].sum() < weights[selected].sum() / 2:
-        changed &= ~np.isin(own, left)
-        told = [f"{_things(len(left))} to which another word is nearer none is"]
     if grown:
-        told = [f"{_things(grown)} mostly above it more is taken", *told]
-    return changed, ", ".join(f"of {clause}" for clause in told)
+        added = int(changed.sum() - selected.sum())
+        told = [f"{_counted(added, 'more splat')} of {_counted(grown, 'thing')} mostly above it count too"]
+    left = selected & np.isin(own, _other_things(scene, own, selected, known & (inside > 0) & (shares < SOME), rivals))
+    if left.any() and weights[left].sum() < weights[selected].sum() / 2:
+        changed &= ~left
+        told += [f"{_counted(int(left.sum()), 'splat')} of things to which another word is nearer do not"]
+    return changed, ", ".join(told)
 
 
-def _things(count: int) -> str:
-    return "a thing" if count == 1 else f"{count} things"
+def _counted(count: int, what: str) -> str:
+    return f"{count:,} {what}{'' if count == 1 else 's'}"
 
 
 def _other_things(
@@ -195,8 +198,8 @@ def _other_things(
     for thing in np.flatnonzero(among).tolist() if len(rivals.vectors) else ():
         mean, part = scene.thing_means[thing], scene.mean_of(np.flatnonzero((own == thing) & selected))
         word = rivals.vectors[(rivals.vectors @ (mean - scene.rough_mean)).argmax()]  # words near to all are none
-        nearer = (word - rivals.directions) @ np.stack([mean, part, mean - scene.rough_mean, part - scene.rough_mean]).T
-        if (nearer > 0).all():
+        pair = np.stack([mean, part])
+        if ((word - rivals.directions) @ np.concatenate([pair, pair - scene.rough_mean]).T > 0).all():
             found.append(thing)
     return found
 
