@@ -175,7 +175,8 @@ def with_things(
     if grown:
         added = int(changed.sum() - selected.sum())
         told = [f"{_counted(added, 'more splat')} of {_counted(grown, 'thing')} mostly above it count too"]
-    left = selected & np.isin(own, _other_things(scene, own, selected, known & (inside > 0) & (shares < SOME), rivals))
+    some = known & (inside > 0) & (shares < SOME)
+    left = selected & np.isin(own, _other_things(scene, own, selected, some, rivals))
     if left.any() and weights[left].sum() < weights[selected].sum() / 2:
         changed &= ~left
         told += [f"{_counted(int(left.sum()), 'splat')} of things to which another word is nearer do not"]
