@@ -51,6 +51,8 @@ OPEN = frozenset(
         "/openapi.json", "/docs", "/docs/swagger-ui-bundle.js", "/docs/swagger-ui.css",
     }
 )  # fmt: skip
+# Where the scope `shared` reads and asks: the store shows such a key the lifts that it was given, and no others.
+SHARED = re.compile(r"/key|/lifts(/[^/]+(/(?!shares(/|$)).*)?)?|/query(/.*)?|/render")
 SAFE = frozenset({"GET", "HEAD"})
 WORKLESS = frozenset({"GET", "HEAD", "OPTIONS"})  # methods that start nothing: a stop refuses the others
 SCHEMES = {
@@ -72,6 +74,7 @@ class Caller:
     owner: Owner
     max_uploads: int | None = None
     key: str | None = None  # its id, for the log
+    record: KeyRecord | None = None
 
 
 EVERYBODY = Caller(SERVICE)  # while there are no keys
@@ -103,7 +106,7 @@ class Gate:
         require_one_length(headers)
         wanted = needed(method, scope["path"])
         self._hosts.check(method, headers, only_reads=wanted is Scope.READ)
-        caller = await self._caller(wanted, headers)
+        caller = await self._caller(wanted, scope["path"], headers)
         if caller.key is not None and caller.owner.sees_all:
             told = {"key": caller.key, "method": method, "path": scope["path"]}
             log.info("an admin key is used", extra={"fields": told})
@@ -126,7 +129,7 @@ class Gate:
             if not self._uploads[own]:
                 del self._uploads[own]
 
-    async def _caller(self, wanted: Scope | None, headers: Headers) -> Caller:
+    async def _caller(self, wanted: Scope | None, path: str, headers: Headers) -> Caller:
         if wanted is None:
             return STRANGER
         required, key = await anyio.to_thread.run_sync(self._keys.admit, bearer(headers), limiter=self._lookups)
@@ -141,7 +144,7 @@ class Gate:
                 hint="the operator makes keys with splatlift keys create",
                 headers={"WWW-Authenticate": f'Bearer realm="splatlift"{code}'},
             )  # fmt: skip
-        if not allows(key.scopes, wanted):
+        if not allows(key.scopes, wanted, path):
             told = f'Bearer realm="splatlift", error="insufficient_scope", scope="{wanted}"'
             raise MissingScope(
                 "Authorization", expected=f"a key with the scope {wanted}",
@@ -157,7 +160,8 @@ class Gate:
             max_bytes=settings.key_bytes if quota.max_bytes is None else quota.max_bytes,
             max_queued=settings.key_queued if quota.max_queued is None else quota.max_queued,
         )
-        return Caller(owner, settings.key_uploads if quota.max_uploads is None else quota.max_uploads, key.id)
+        most = settings.key_uploads if quota.max_uploads is None else quota.max_uploads
+        return Caller(owner, most, key.id, key)
 
 
 def needed(method: str, path: str) -> Scope | None:
@@ -172,8 +176,10 @@ def needed(method: str, path: str) -> Scope | None:
     return Scope.READ if method in SAFE or asks else Scope.WRITE
 
 
-def allows(scopes: frozenset[Scope], wanted: Scope) -> bool:
-    """Whether a key of these scopes may do what needs that one."""
+def allows(scopes: frozenset[Scope], wanted: Scope, path: str) -> bool:
+    """Whether a key of these scopes may do what needs that one at that path."""
+    if Scope.SHARED in scopes and wanted is Scope.READ and SHARED.fullmatch(path):
+        return True
     return wanted in scopes or Scope.ADMIN in scopes
 
 

@@ -690,6 +690,50 @@ class Selections(BaseModel):
     selections: list[ListedSelection]
 
 
+class OwnKey(BaseModel):
+    """What a key may do."""
+
+    name: str | None = Field(description="whose it is, or what for; null where no key is needed")
+    scopes: list[str]
+    lifts: list[JobId] = Field(description="of the scope `shared`: those that it was given")
+    expires: float | None = Field(description="seconds since 1970; null for never")
+    expires_at = iso_of("expires", optional=True)
+
+
+class AskedShare(Body):
+    """A key to make for somebody."""
+
+    model_config = BUILT
+    name: SelectionName = Field(description="for whom it is")
+    expires_s: Annotated[float, Field(ge=60, le=31_622_400), NoBoolean] = Field(
+        2_592_000, description="seconds until it ends; 30 days if left out, a year at most"
+    )
+
+
+class Share(BaseModel):
+    """A key that looks at one lift and asks it. It ends with the key that made it."""
+
+    id: str
+    name: str
+    created: float = Field(description="seconds since 1970, as expires is")
+    expires: float | None = Field(description="null for never")
+    created_at = iso_of("created")
+    expires_at = iso_of("expires", optional=True)
+    links: dict[str, str]
+
+
+class NewShare(Share):
+    """A share with its secret."""
+
+    key: str = Field(description="the secret, which nobody can ask for again; links.page carries it")
+
+
+class Shares(BaseModel):
+    """The valid shares of a lift, newest first."""
+
+    shares: list[Share]
+
+
 class AskedForNodes(BaseModel):
     """Which nodes of a lift's tree to list, and what names them."""
 

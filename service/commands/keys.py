@@ -21,7 +21,7 @@ from service.errors import InvalidRequest
 from service.settings import read_settings
 from service.store.database import DATABASE, Database
 from service.store.keys import KeyRecord, KeyStore, Quota
-from service.store.owners import parse_scopes
+from service.store.owners import Scope, parse_scopes
 
 MAX_NAME = 100
 QUOTAS = {
@@ -37,7 +37,8 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=Parser)
     create = actions.add_parser("create", parents=[shared], help="make a key and show it, once")
     create.add_argument("--name", required=True, metavar="NAME", help="whose it is, or what for")
-    create.add_argument("--scopes", required=True, metavar="SCOPES", help="read,write,metrics,admin: what it may do")
+    create.add_argument("--scopes", metavar="SCOPES", help="read,write,metrics,admin: what it may do")
+    create.add_argument("--lifts", metavar="IDS", help="in place of scopes: lifts that it may look at and ask, alone")
     create.add_argument("--expires", metavar="WHEN", help="after 30d, 12h or 90m, or at a date (UTC); else never")
     for name, limit in QUOTAS.items():
         option = f"--{name.replace('_', '-')}"
@@ -89,7 +90,9 @@ def _create(keys: KeyStore, given: argparse.Namespace) -> None:
         raise InvalidRequest("name", expected=f"1 to {MAX_NAME} printable characters", got=repr(given.name)[:120])
     quota = Quota(given.max_bytes, given.max_queued, given.max_uploads)
     expires = None if given.expires is None else _moment(given.expires)
-    key, secret = keys.create(name, parse_scopes(given.scopes.split(",")), quota, expires=expires)
+    lifts = [lift.strip() for lift in (given.lifts or "").split(",") if lift.strip()]
+    scopes = parse_scopes((given.scopes or (Scope.SHARED if lifts else "")).split(","))
+    key, secret = keys.create(name, scopes, quota, expires=expires, lifts=lifts)
     _show(key, secret, given)
 
 

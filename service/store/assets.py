@@ -16,7 +16,7 @@ from service.errors import InUse
 from service.models import AssetKind, UploadKind
 from service.store.database import Database, Page, insert, page_of, record_of
 from service.store.files import DataDirectory, is_whole
-from service.store.owners import SEEN, Owner, require_quota
+from service.store.owners import SEEN, SHOWN_ASSETS, Owner, require_quota
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ VISIBLE = (
     "SELECT assets.*, created FROM (SELECT asset, min(created) AS created"
     f" FROM asset_owners WHERE {SEEN} GROUP BY asset) JOIN assets ON asset = id"
 )
-ONE = VISIBLE.replace("GROUP", "AND asset = :asset GROUP")
+ONE = VISIBLE.replace(f"{SEEN} GROUP", f"{SHOWN_ASSETS} AND asset = :asset GROUP")
 
 
 SHOWN_CHARACTERS = 256 << 10  # of counts; of more the names, or words, are told apart, in pages

@@ -20,13 +20,15 @@ from liftcore.files import whole_file
 from service.errors import InvalidRequest, Misconfigured, StaleDatabase
 from service.store.files import remove, sync_directory
 
-VERSION = 14  # SQLite's user_version
-OF_0_4 = 13  # that of release 0.4, which takes databases of any version before to it, and lacks SELECTIONS
+VERSION = 15  # SQLite's user_version
+OF_0_4 = 13  # that of release 0.4, which takes databases of any version before to it
 MIGRATING_RELEASE = "0.4.0"
-TABLES_OF_0_4, SELECTIONS = (
-    Path(__file__).with_name(f"{name}.sql").read_text(encoding="utf-8") for name in ("schema_of_0_4", "selections")
+TABLES_OF_0_4, SELECTIONS, SHARES = (
+    Path(__file__).with_name(f"{name}.sql").read_text(encoding="utf-8")
+    for name in ("schema_of_0_4", "selections", "shares")
 )
-SCHEMA = TABLES_OF_0_4 + SELECTIONS
+# By the version of a database, what it lacks; a new one has version 0.
+STEPS = {0: TABLES_OF_0_4 + SELECTIONS + SHARES, OF_0_4: SELECTIONS + SHARES, 14: SHARES}
 DATABASE = "service.sqlite"  # in the data directory, beside two files that know an empty or older one from it:
 GENERATION = "generation"  # the number that the newest counted transaction had
 KEYS_REQUIRED = "keys.required"  # there when a key was ever made
@@ -91,15 +93,14 @@ class Database:
             version = connection.execute("PRAGMA user_version").fetchone()[0]
             if version == 0 and least is not None:
                 raise StaleDatabase(self._path.parent, "an empty one")
-            if version not in (0, OF_0_4, VERSION):
+            if version != VERSION and version not in STEPS:
                 hint = "use the release that wrote it, or another data directory"
                 if version < VERSION:
                     hint = f"start a service of release {MIGRATING_RELEASE} over it once, which migrates it"
                 expected = f"a database of schema version {VERSION}"
                 raise Misconfigured("data", expected=expected, got=f"{version}", hint=hint)
             if version != VERSION:
-                statements = SCHEMA if version == 0 else SELECTIONS
-                for statement in statements.split(";\n"):  # `executescript` would commit before it begins
+                for statement in STEPS[version].split(";\n"):  # `executescript` would commit before it begins
                     connection.execute(statement)
                 connection.execute(f"PRAGMA user_version = {VERSION}")
             self._require_generation(least)

@@ -25,7 +25,15 @@ from service.models import ENDED, AssetKind, JobKind, JobState
 from service.store.assets import own
 from service.store.database import Database, Page, insert, page_of, parsed, record_of
 from service.store.files import DataDirectory
-from service.store.owners import ENDED_KEYS, QUEUE_RETRY_SECONDS, SEEN, Owner, require_quota, require_turn
+from service.store.owners import (
+    ENDED_KEYS,
+    QUEUE_RETRY_SECONDS,
+    SEEN,
+    SHOWN_JOBS,
+    Owner,
+    require_quota,
+    require_turn,
+)
 
 LOG_LINES = 200  # a job; older ones go
 LINE_CHARACTERS = 500
@@ -401,7 +409,8 @@ class JobStore:
 
 def find(connection: sqlite3.Connection, job: str, owner: Owner) -> sqlite3.Row | None:
     """The row of a job that an owner sees."""
-    return connection.execute(f"SELECT * FROM jobs WHERE id = :job AND {SEEN}", owner.terms(job=job)).fetchone()
+    asked = f"SELECT * FROM jobs WHERE id = :job AND {SHOWN_JOBS}"
+    return connection.execute(asked, owner.terms(job=job)).fetchone()
 
 
 def row_of(connection: sqlite3.Connection, job: str, owner: Owner) -> sqlite3.Row:

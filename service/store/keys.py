@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import json
 import secrets
 import sqlite3
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Self
@@ -43,6 +45,11 @@ class KeyRecord:
     created: float  # seconds since 1970
     revoked: float | None = None
     expires: float | None = None
+    lifts: tuple[str, ...] = ()  # of the scope `shared`: what it was given
+
+
+# With what each is given
+KEYS = "SELECT keys.*, (SELECT json_group_array(lift) FROM key_lifts WHERE key = keys.id) AS lifts FROM keys"
 
 
 class KeyStore:
@@ -66,15 +73,36 @@ class KeyStore:
         return ruled
 
     def create(
-        self, name: str, scopes: frozenset[Scope], quota: Quota, *, expires: float | None = None
+        self,
+        name: str,
+        scopes: frozenset[Scope],
+        quota: Quota,
+        *,
+        expires: float | None = None,
+        lifts: Sequence[str] = (),
+        maker: str | None = None,
     ) -> tuple[KeyRecord, str]:
         """Make a key, which is valid until it is revoked or expires (seconds since 1970).
 
+        Args:
+            name: for people.
+            scopes, quota: what it may do, and fill.
+            expires: when it ends; None = never.
+            lifts: what it is given, with the scope `shared`, which it then has alone.
+            maker: the id of a key, with whose end it ends.
+
         Returns:
             The key, and its secret, which nobody can ask for again.
+
+        Raises:
+            InvalidRequest: it is given lifts without that scope, or has that scope with another, or without lifts.
+            NotFound: there is no such lift.
         """
-        secret = _new_secret()
-        key = KeyRecord(secrets.token_hex(6), name, scopes, quota, time.time(), expires=expires)
+        if (Scope.SHARED in scopes or lifts) and not (scopes == {Scope.SHARED} and lifts):
+            got = f"{', '.join(sorted(scopes))} and {len(lifts)} lifts"
+            raise InvalidRequest("scopes", expected="shared alone, with the lifts that the key is given", got=got)
+        secret, given = _new_secret(), tuple(sorted(set(lifts)))
+        key = KeyRecord(secrets.token_hex(6), name, scopes, quota, time.time(), expires=expires, lifts=given)
         row = {
             "id": key.id,
             "name": name,
@@ -85,10 +113,15 @@ class KeyStore:
             "max_uploads": quota.max_uploads,
             "created": key.created,
             "expires": expires,
+            "maker": maker,
         }
         remember_keys(self._data)  # first: a key whose database is lost must not leave the door open
         with self._database.write(counted=True) as connection:
             insert(connection, "keys", row)
+            for lift in key.lifts:
+                if connection.execute("SELECT 1 FROM lifts WHERE id = ?", (lift,)).fetchone() is None:
+                    raise NotFound("lift", expected="the id of a lift", got=lift[:80], hint="GET /lifts lists them")
+                connection.execute("INSERT INTO key_lifts VALUES (?, ?)", (key.id, lift))
         return key, secret
 
     def rotate(self, named: str, *, grace: float = 0.0) -> tuple[KeyRecord, str]:
@@ -116,10 +149,11 @@ class KeyStore:
             if len(found) > 1:
                 ids = ", ".join(row["id"] for row in found)
                 raise InvalidRequest("key", expected="a name that one key has", got=named, hint=f"name one of {ids}")
-            row = connection.execute(
-                "UPDATE keys SET old_digest = digest, old_until = ?, digest = ? WHERE id = ? RETURNING *",
+            connection.execute(
+                "UPDATE keys SET old_digest = digest, old_until = ?, digest = ? WHERE id = ?",
                 (now + grace, digest_of(secret), found[0]["id"]),
-            ).fetchone()
+            )
+            row = connection.execute(f"{KEYS} WHERE id = ?", (found[0]["id"],)).fetchone()
         return _record(row), secret
 
     def revoke(self, key: str) -> KeyRecord:
@@ -135,13 +169,38 @@ class KeyStore:
             if row is None:
                 raise NotFound("key", expected="the id of a key", got=key, hint="keys list shows them")
             stop_waiting(connection)
+            row = connection.execute(f"{KEYS} WHERE id = ?", (key,)).fetchone()
         return _record(row)
 
     def all(self) -> list[KeyRecord]:
         """Every key, oldest first, with those that were revoked."""
         with self._database.read() as connection:
-            rows = connection.execute("SELECT * FROM keys ORDER BY created, id").fetchall()
+            rows = connection.execute(f"{KEYS} ORDER BY created, id").fetchall()
         return [_record(row) for row in rows]
+
+    def of_lift(self, lift: str) -> list[KeyRecord]:
+        """The keys that a lift was given to and that are valid, newest first."""
+        given, terms = "SELECT key FROM key_lifts WHERE lift = :lift", {"lift": lift, "now": time.time()}
+        asked = f"{KEYS} WHERE id IN ({given}) AND id NOT IN ({ENDED_KEYS}) ORDER BY created DESC, id"
+        with self._database.read() as connection:
+            rows = connection.execute(asked, terms).fetchall()
+        return [_record(row) for row in rows]
+
+    def take_away(self, key: str, lift: str) -> None:
+        """Take a lift away from a key that it was given to; a key that then has none is revoked.
+
+        Raises:
+            NotFound: it was not given to that key.
+        """
+        with self._database.write(counted=True) as connection:
+            if not connection.execute("DELETE FROM key_lifts WHERE key = ? AND lift = ?", (key, lift)).rowcount:
+                hint = "GET /lifts/{lift}/shares lists them"
+                raise NotFound("share", expected="the id of a share of the lift", got=key, hint=hint)
+            connection.execute(
+                "UPDATE keys SET revoked = coalesce(revoked, ?) WHERE id = ?"
+                " AND id NOT IN (SELECT key FROM key_lifts)",
+                (time.time(), key),
+            )
 
     def required(self) -> bool:
         """Whether requests need a key: from the first one that was ever made, revoked, lost or not."""
@@ -154,7 +213,7 @@ class KeyStore:
             if secret is None:
                 return self._required(connection), None
             row = connection.execute(
-                "SELECT * FROM keys WHERE (digest = :digest OR (old_digest = :digest AND old_until > :now))"
+                f"{KEYS} WHERE (digest = :digest OR (old_digest = :digest AND old_until > :now))"
                 f" AND id NOT IN ({ENDED_KEYS})",
                 {"digest": digest_of(secret), "now": time.time()},
             ).fetchone()
@@ -210,4 +269,5 @@ def _record(row: sqlite3.Row) -> KeyRecord:
         created=row["created"],
         revoked=row["revoked"],
         expires=row["expires"],
+        lifts=tuple(json.loads(row["lifts"])),
     )

@@ -20,7 +20,7 @@ from service.store.assets import own
 from service.store.database import Database, Page, insert, page_of, parsed, record_of
 from service.store.files import DataDirectory
 from service.store.jobs import JobOrder, succeed, told
-from service.store.owners import SEEN, Owner, require_quota
+from service.store.owners import SEEN, SHOWN_JOBS, Owner, require_quota
 
 BY_HAND = "set by hand"  # of the rendering that a lift's plan tells: the setting was not auto
 
@@ -87,7 +87,9 @@ FEATURES = "(SELECT json_group_array(asset) FROM (SELECT asset FROM job_features
 NAMES_OF_VIEWS = ("views_without_camera", "views_without_splats")  # in a certificate
 SHOWN_BYTES = 64 << 10  # of metadata; of more the names of views are told apart, in pages
 LONG = ("views", "words")  # what metadata leave out then
-VISIBLE = f"SELECT lifts.*, splats, cameras, {FEATURES} AS features FROM lifts JOIN jobs USING (id) WHERE {SEEN}"
+VISIBLE = (
+    f"SELECT lifts.*, splats, cameras, {FEATURES} AS features FROM lifts JOIN jobs USING (id) WHERE {SHOWN_JOBS}"
+)
 VISIBLE_TRADEOFFS = (
     "SELECT tradeoffs.*, splats, cameras, json_extract(parameters, '$.labels') AS labels,"
     f" {FEATURES} AS features FROM tradeoffs JOIN jobs USING (id) WHERE {SEEN}"

@@ -12,8 +12,19 @@ from service.errors import InvalidRequest, OverQuota, TooMany
 
 # For WHERE clauses over a table with a column `owner`; its names are bound by `Owner.terms`.
 SEEN = "(:sees_all OR owner = :owner)"
+# The same to look only, over jobs and over owners of assets: also what a key was given (`service.auth` is its gate).
+GIVEN = "SELECT lift FROM key_lifts WHERE key = :owner"
+GIVEN_ASSETS = (
+    f"SELECT splats FROM jobs WHERE id IN ({GIVEN}) UNION SELECT cameras FROM jobs WHERE id IN ({GIVEN})"
+    f" UNION SELECT asset FROM job_features WHERE job IN ({GIVEN})"
+    f" UNION SELECT photos FROM lifts WHERE id IN ({GIVEN})"
+    f" UNION SELECT json_extract(parameters, '$.table') FROM jobs WHERE id IN ({GIVEN})"
+)
+SHOWN_JOBS = f"(:sees_all OR owner = :owner OR jobs.id IN ({GIVEN}))"
+SHOWN_ASSETS = f"(:sees_all OR owner = :owner OR asset IN ({GIVEN_ASSETS}))"
 # Keys that nobody comes in with any more; `:now` in seconds since 1970. A NULL is no end.
-ENDED_KEYS = "SELECT id FROM keys WHERE revoked IS NOT NULL OR expires <= :now"
+_ENDED = "SELECT id FROM keys WHERE revoked IS NOT NULL OR expires <= :now"
+ENDED_KEYS = f"{_ENDED} OR maker IN ({_ENDED})"
 QUEUE_RETRY_SECONDS = 30  # a lift takes seconds to minutes, and one must end before the line is shorter
 
 
@@ -22,6 +33,7 @@ class Scope(StrEnum):
 
     READ = "read"  # look: assets, jobs, results, queries, pictures
     WRITE = "write"  # upload, order, cancel, delete
+    SHARED = "shared"  # look at and ask the lifts that the key was given
     METRICS = "metrics"  # /metrics, which tells of everybody's work together, and nothing else
     ADMIN = "admin"  # all of these, on everybody's things
 

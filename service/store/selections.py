@@ -16,7 +16,7 @@ from liftcore.errors import NotFound
 from service.errors import Changed, InvalidRequest, OverLimit
 from service.store.database import Database, insert, parsed, record_of
 from service.store.files import DataDirectory
-from service.store.owners import SEEN, Owner, require_quota
+from service.store.owners import SHOWN_JOBS, Owner, require_quota
 
 MOST = 200  # selections of a lift
 HISTORY = 100  # steps that a selection can go back
@@ -30,7 +30,8 @@ SHOWN = (
 )
 VISIBLE = (
     f"SELECT {SHOWN} FROM selections JOIN jobs ON jobs.id = lift"
-    f" JOIN selection_steps AS steps ON selection = selections.id AND number = step WHERE lift = :lift AND {SEEN}"
+    " JOIN selection_steps AS steps ON selection = selections.id AND number = step"
+    f" WHERE lift = :lift AND {SHOWN_JOBS}"
 )
 
 
@@ -177,7 +178,9 @@ class SelectionStore:
 
     def things(self, owner: Owner, lift: str) -> dict[int, tuple[str | None, bool]]:
         """Of the lift's objects that somebody named or hid: their names, and whether they are hidden."""
-        asked = f"SELECT thing, name, hidden FROM things JOIN jobs ON jobs.id = lift WHERE lift = :lift AND {SEEN}"
+        asked = (
+            f"SELECT thing, name, hidden FROM things JOIN jobs ON jobs.id = lift WHERE lift = :lift AND {SHOWN_JOBS}"
+        )
         with self._database.read() as connection:
             rows = connection.execute(asked, owner.terms(lift=lift)).fetchall()
         return {row["thing"]: (row["name"], bool(row["hidden"])) for row in rows}

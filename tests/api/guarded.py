@@ -134,6 +134,12 @@ def every_route(app: FastAPI) -> list[tuple[str, str]]:
 
 def address(path: str, job: str, asset: str) -> str:
     """A route's path with the ids in their places."""
-    for name, value in {"kind": "cameras", "asset": asset, "thing": "0", "selection": "0" * 16}.items():
+    for name, value in {
+        "kind": "cameras",
+        "asset": asset,
+        "thing": "0",
+        "selection": "0" * 16,
+        "share": "0" * 12,
+    }.items():
         path = path.replace(f"{{{name}}}", value)
     return re.sub(r"\{(job|lift|tradeoff)\}", job, path)

@@ -26,8 +26,9 @@ from service.auth import CALLER, OPEN, Gate, Hosts, host_name, is_loopback, need
 from service.commands.serve import require_keys
 from service.content import EventStreams, is_last
 from service.errors import Busy, ForeignOrigin, Misconfigured, Misdirected, TooMany
-from service.models import JobState
+from service.models import AssetKind, JobState
 from service.settings import ServiceSettings
+from service.store.assets import CheckedUpload
 from service.store.jobs import Event
 from service.store.keys import Quota
 from service.store.owners import SERVICE, Owner, Scope
@@ -45,7 +46,7 @@ PAGE |= {f"/web/example/{name}" for name in ("point_cloud.spz", "cameras.json", 
 OPEN_ROUTES = {*PAGE, "/healthz", "/readyz", "/version", *DOCS}
 # Routes that name nothing of anybody: they show one's own things, or make new ones.
 NAMELESS = {("GET", "/metrics"), ("GET", "/assets"), ("PUT", "/assets/{asset}"), ("GET", "/jobs"), ("GET", "/lifts")}
-NAMELESS |= {("POST", "/lifts"), ("POST", "/assets")}
+NAMELESS |= {("POST", "/lifts"), ("POST", "/assets"), ("GET", "/key")}
 ASKING = {"text": "apple", "view": "v"}
 TIMES = {"created": 0, "created_at": ""}
 
@@ -80,7 +81,7 @@ def test_every_route_wants_its_scope(house: Guarded) -> None:
     for method, path in closed_routes(house):
         wanted = needed(method, path)
         assert wanted is not None
-        others = " ".join(scope for scope in Scope if scope not in (wanted, Scope.ADMIN))
+        others = " ".join(scope for scope in Scope if scope not in (wanted, Scope.ADMIN, Scope.SHARED))
         secret = make_key(house.store, others)[1]
         reply = house.client.request(
             method, address(path, house.done, house.order.splats), headers=bearer(secret), content=b"{"
@@ -103,7 +104,7 @@ def test_scopes_are_as_documented() -> None:
 
 def naming(method: str, path: str, job: str, asset: str, house: Guarded) -> list[dict[str, Any]]:
     """Requests to a route that name a job, a lift or an asset, once for each place that takes a name."""
-    if method == "PATCH" or "/selections" in path:
+    if method == "PATCH" or "/selections" in path or "/shares" in path:
         name = {"encoder" if path.startswith("/assets") else "name": "a name"}
         return [{"json": {"how": "grow"} if path.endswith("/edits") else name}]
     of_views = {"/photo": {}, "/regions": {"x": 1, "y": 1}, "/regions/mask": {"level": 0, "region": 0}}
@@ -189,6 +190,111 @@ def test_same_bytes_are_of_each_who_uploaded_them(tmp_path: Path, house: Guarded
     assert house.ask("alice", "GET", f"/assets/{asset}/content").content == content
     assert house.ask("alice", "DELETE", f"/assets/{asset}").status_code == 204
     assert not list((tmp_path / "data" / "blobs").rglob("*.json"))
+
+
+# What is given
+
+
+def shared_key(house: Guarded, **more: Any) -> dict[str, str]:
+    """The header of a key that was given Alice's first lift."""
+    return bearer(house.store.keys.create("guest", frozenset({Scope.SHARED}), Quota(), lifts=[house.done], **more)[1])
+
+
+def test_key_to_a_lift_reads_and_asks_that_one_and_is_let_in_nowhere_else(house: Guarded) -> None:
+    finish(house.store, b"another lift")  # of Alice, by the job that was in line
+    other, asset, guest = house.queued, house.order.splats, shared_key(house)
+    read = refused = 0
+    for method, path in closed_routes(house):
+        lifts = path.startswith(("/lifts", "/query", "/render")) and not path.endswith(("/shares", "/shares/{share}"))
+        may = needed(method, path) is Scope.READ and (lifts or path == "/key")
+        nameless = (method, path) in NAMELESS
+        for lift in (house.done, other):
+            for how in [{}] if nameless else naming(method, path, lift, asset, house):
+                at = address(path, lift, asset)
+                reply = house.client.request(method, at, headers=guest, **how)
+                if not may:
+                    assert assert_problem(reply)["type"] == "/problems/missing-scope", f"{method} {path}"
+                    refused += 1
+                elif nameless:
+                    assert reply.status_code == 200, path
+                elif lift == other:
+                    assert assert_problem(reply)["type"] == "/problems/not-found", f"{method} {path}"
+                else:
+                    mine = house.ask("alice", method, at, **how)
+                    assert reply.status_code == mine.status_code, f"{method} {path}"
+                    read += 1
+    assert read >= 20 and refused >= 20
+    assert [one["id"] for one in house.client.get("/lifts", headers=guest).json()["lifts"]] == [house.done]
+    assert house.client.get(f"/lifts/{house.done}/features", headers=guest).content == b"a lift"
+    assert house.client.get("/key", headers=guest).json()["lifts"] == [house.done]
+
+
+def test_key_to_a_lift_asks_with_no_other_asset_of_its_owner(house: Guarded, tmp_path: Path) -> None:
+    alice = Owner(house.ids["alice"], sees_all=False)
+    with house.store.files.draft(".safetensors") as draft:
+        draft.write_bytes(b"a table")
+        upload = CheckedUpload(draft, AssetKind.TABLE, "f" * 64, ".safetensors", {"words": ["apple"]}, [])
+        table = house.store.assets.add(alice, upload)[0].id
+    guest, texts = shared_key(house), set()
+    for one in (table, NO_ASSET):
+        asked = {"text": "apple", "lift": house.done, "table": one}
+        reply = house.client.get("/query", params=asked, headers=guest)
+        assert assert_problem(reply)["type"] == "/problems/not-found"
+        texts.add(reply.text.replace(one, "ID").partition('"request_id"')[0])
+    assert len(texts) == 1
+
+
+def test_owner_gives_a_lift_to_a_key_and_takes_it_away(house: Guarded) -> None:
+    at = f"/lifts/{house.done}/shares"
+    made = house.ask("alice", "POST", at, json={"name": "Bob from the lab", "expires_s": 3600})
+    assert made.status_code == 201 and made.headers["cache-control"] == "no-store"
+    share = made.json()
+    assert share["links"]["page"] == f"/?lift={house.done}#key={share['key']}"
+    assert share["expires"] == pytest.approx(time.time() + 3600, abs=60) and share["expires_at"].endswith("Z")
+    guest = bearer(share["key"])
+    assert house.client.get("/key", headers=guest).json()["name"] == "Bob from the lab"
+    assert house.client.get(f"/lifts/{house.done}", headers=guest).status_code == 200
+    (listed,) = house.ask("alice", "GET", at).json()["shares"]
+    assert listed["id"] == share["id"] and share["key"] not in str(listed)
+    assert [house.ask(name, "GET", at).status_code for name in ("bob", "boss")] == [404, 200]
+    assert house.ask("bob", "DELETE", share["links"]["self"]).status_code == 404
+    assert house.ask("alice", "DELETE", share["links"]["self"]).status_code == 204
+    assert house.client.get(f"/lifts/{house.done}", headers=guest).status_code == 401
+    assert house.ask("alice", "DELETE", share["links"]["self"]).status_code == 404
+    for wrong in ({}, {"name": ""}, {"name": "x", "expires_s": 1}, {"name": "x", "scopes": ["admin"]}):
+        assert assert_problem(house.ask("alice", "POST", at, json=wrong))["status"] == 422
+
+
+@pytest.mark.parametrize("end", ["expired", "revoked", "maker revoked", "lift deleted"])
+def test_shared_key_ends(end: str, house: Guarded) -> None:
+    guest, key = shared_key(house, maker=house.ids["alice"]), house.store.keys.of_lift(house.done)[0].id
+    assert house.client.get("/lifts", headers=guest).status_code == 200
+    match end:
+        case "expired":
+            with house.store.database.write() as connection:
+                connection.execute("UPDATE keys SET expires = ? WHERE id = ?", (time.time(), key))
+        case "revoked":
+            house.store.keys.revoke(key)
+        case "maker revoked":
+            house.store.keys.revoke(house.ids["alice"])
+        case _:
+            assert house.ask("alice", "DELETE", f"/lifts/{house.done}").status_code == 204
+            assert house.client.get("/lifts", headers=guest).json()["lifts"] == []
+            assert house.client.get(f"/lifts/{house.done}", headers=guest).status_code == 404
+            return
+    assert house.client.get("/lifts", headers=guest).status_code == 401
+
+
+def test_lifts_are_given_by_the_command_line_with_no_other_scope(
+    house: Guarded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    create = ["keys", "create", "--name", "guest", "--data", str(tmp_path / "data")]
+    assert main([*create, "--lifts", house.done]) == 0
+    guest = bearer(capsys.readouterr().out.strip())
+    assert house.client.get(f"/lifts/{house.done}", headers=guest).status_code == 200
+    for wrong in (["--lifts", NOBODY], ["--lifts", house.done, "--scopes", "read"], ["--scopes", "shared"], []):
+        assert main([*create, *wrong]) == 2, wrong
+        assert "splatlift: " in capsys.readouterr().err
 
 
 # Making and revoking
