@@ -20,8 +20,13 @@ from liftcore.errors import SplatliftError
 from service.child import error_of, is_stopped
 from service.errors import Busy, ClientLeft, Crashed, TimedOut, require_share
 
-# Without these each array of a query is mapped anew and its pages are faulted in one by one: a fifth of its time.
-MEMORY = {"MALLOC_MMAP_THRESHOLD_": str(64 << 20), "MALLOC_TRIM_THRESHOLD_": str(256 << 20)}
+# Without the first two each array of a query is mapped anew and its pages are faulted in one by one: a fifth of its
+# time. A query is a row of small operations, each of which would wait for a team of threads of its library to meet,
+# late beside a lift: more than half of its time. The kernels bring threads of their own.
+ENVIRONMENT = {
+    "MALLOC_MMAP_THRESHOLD_": str(64 << 20), "MALLOC_TRIM_THRESHOLD_": str(256 << 20),
+    "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
+}  # fmt: skip
 STDERR = 2  # where what libraries of the worker print goes
 PIPE_BYTES = 256 << 10  # of an answer; the HTTP process holds it in memory while a client reads it: more is a file
 AHEAD_BYTES = 1 << 20  # of requests that are sent along with the one before them
@@ -301,7 +306,7 @@ class QueryClient:
         with ours, theirs:
             self._process = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=STDERR, pass_fds=[theirs.fileno()], start_new_session=True,
-                env=MEMORY | os.environ,
+                env=ENVIRONMENT | os.environ,
             )  # fmt: skip
             self._worker = Connection(ours.detach())
         if self._stopped:  # whoever stopped us may have looked before there was a process

@@ -24,7 +24,6 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Literal
 
-import torch
 from cachetools import LRUCache
 
 from liftcore import (
@@ -441,15 +440,6 @@ def write_draft(blocks: Iterable[bytes], draft: Path) -> None:
         raise NoSpace("splats", expected=expected, got="a full disk", hint=hint) from None
 
 
-def use_one_library_thread() -> None:
-    """Let the libraries compute in the calling thread.
-
-    A query is a row of small operations, each of which would wait for a team of threads to meet; beside a lift that
-    keeps the cores busy they meet late. The kernels bring threads of their own.
-    """
-    torch.set_num_threads(1)
-
-
 def _key(request: dict[str, Any]) -> str:
     """What an answer is kept by: a digest, as a question may be as long as a body."""
     names = ("lift", "encoder", "encoder_version", "query" if "query" in request else "words")
@@ -518,7 +508,6 @@ def main() -> None:
     """Answer until the server is gone."""
     end_with_parent(sys.stdin.fileno())
     server = Connection(int(sys.argv[1]))
-    use_one_library_thread()
     answers = Answers(scenes=int(sys.argv[2]), cache_bytes=int(sys.argv[3]))
     threading.Thread(target=_warm_up, args=(answers, sys.argv[4]), daemon=True).start()
     with contextlib.suppress(EOFError, ConnectionError):

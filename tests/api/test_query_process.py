@@ -7,6 +7,7 @@ import os
 import signal
 import socket
 import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -26,6 +27,7 @@ from liftcore.query.terms import Vector
 from service import query_client as client
 from service import query_worker as answers
 from service.auth import EVERYBODY
+from service.child import children_of
 from service.errors import Busy, ClientLeft, TimedOut, TooMany
 from service.models import Question
 from service.query_client import Frame, QueryClient, QueryLimits, Waiter
@@ -304,6 +306,17 @@ def test_large_answer_is_a_file_and_the_same_bytes(
     monkeypatch.setattr(answers, "PIPE_BYTES", 10)
     for request, content in zip(requests, small, strict=True):
         assert reply_to([request], kept) == Frame({}) and (tmp_path / "draft").read_bytes() == content
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc tells the environment of a process")
+def test_libraries_of_the_query_process_compute_in_one_thread(client: TestClient) -> None:
+    assert parts_of(client).queries.alive()
+    processes = [Path("/proc", str(child)) for child in children_of(os.getpid())]
+    workers = [process for process in processes if b"query_worker" in (process / "cmdline").read_bytes()]
+    assert workers
+    for worker in workers:
+        environment = (worker / "environ").read_bytes().split(b"\0")
+        assert {b"OMP_NUM_THREADS=1", b"OPENBLAS_NUM_THREADS=1"} <= set(environment)
 
 
 @pytest.mark.parametrize(

@@ -150,6 +150,7 @@ def bounds(client: httpx.Client) -> dict[str, int]:
             "/query", content=large, headers={"Content-Type": "application/json"}
         ).status_code,
         "100 KB of headers": client.get("/healthz", headers={"X-Long": "x" * 100_000}).status_code,
+        "2 MiB by POST /assets": client.post("/assets?kind=table", content=bytes(2 << 20)).status_code,
         "no such lift": client.get(f"/lifts/{'0' * 32}").status_code,
     }
 
