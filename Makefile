@@ -14,7 +14,7 @@ CUDA_TORCH_PIP ?=
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 export PIP_ROOT_USER_ACTION = ignore
 
-.PHONY: demo test check kernels soak contract load gpu lint format serve web bench sbom setup clean
+.PHONY: demo test check kernels soak contract load gpu wheel lint format serve web bench docs sbom setup clean
 
 demo: $(READY)  ## the whole job through the real service; SCENE=DIR takes a scene of your own, ASK=TEXT a question
 	$(BIN)/splatlift demo --out "$(OUT)" $(if $(SCENE),--scene "$(SCENE)") $(if $(ASK),--ask "$(ASK)")
@@ -59,6 +59,17 @@ gpu:  ## all that a card is for: CUDA's torch, conformance, speed, accuracy, gsp
 	tests/unit/solve/test_closed_form.py || held=$$?; \
 	env -u TRITON_INTERPRET $(BIN)/python -m tests.benchmarks.gpu --shared $(SHARED) && exit $$held
 
+# torch first, from where the lock's is; all else as pip chooses, as for somebody who installs the wheel.
+wheel:  ## the core's wheel, installed into an empty environment and used there without any extra
+	rm -rf build dist
+	$(PYTHON) -m venv build/core
+	build/core/bin/python -m pip wheel --quiet --no-deps --wheel-dir dist .
+	build/core/bin/python -m pip install --quiet --no-compile $(TORCH_PIP) $$(sed -nE 's/^(torch==[^ ]*).*/\1/p' requirements.lock)
+	build/core/bin/python -m pip install --quiet --no-compile dist/*.whl
+	build/core/bin/python -m pip check
+	build/core/bin/python -I tests/core_alone.py
+	@du -sh build/core | cut -f1 | sed 's/$$/ in the environment/'
+
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -79,6 +90,13 @@ web: $(READY)  ## the page, from service/web/src into service/web/built
 	$(BIN)/python -m liftcore.query.question > service/web/src/question.json
 	cd service/web && npm ci --silent && node build.mjs
 	cp service/web/node_modules/axe-core/axe.min.js tests/browser/axe.min.js
+
+# The site's tools are no part of the lock: they have an environment of their own, and read docstrings from .venv.
+docs: $(READY)  ## the docs site in build/site; a broken link or reference fails
+	[ -x .venv/docs/bin/python ] || $(PYTHON) -m venv .venv/docs
+	.venv/docs/bin/python -m pip install --quiet --no-compile -r docs/requirements.txt
+	PYTHONPATH=.:$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))') \
+	.venv/docs/bin/python -m sphinx -W --keep-going -q -b html docs build/site
 
 sbom: $(READY)  ## what is installed, as CycloneDX: sbom.json, by a tool in an environment of its own
 	$(PYTHON) -m venv .venv/sbom && .venv/sbom/bin/python -m pip install --quiet cyclonedx-bom==7.5.0

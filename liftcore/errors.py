@@ -1,4 +1,4 @@
-"""Public: errors, of what can be wrong with what a user gives us.
+"""Public: errors, of what can be wrong with what a user gives us::
 
     SplatliftError                 every error that is the user's to mend
     ├── InvalidInput               a file or value is malformed      -> exit 2, HTTP 422

@@ -1,8 +1,8 @@
 """The machine that a figure was taken on; the most memory that this process took."""
 
-import os
 import platform
 import resource
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from liftcore.runtime.cores import cores
 from liftcore.runtime.device import processor
 
 
@@ -24,7 +25,7 @@ def hardware() -> dict[str, Any]:
 
     return {
         "cpu": f"{processor()} ({get_host_cpu_name()})",
-        "cores": len(os.sched_getaffinity(0)),
+        "cores": cores(),
         "python": platform.python_version(),
         "torch": torch.__version__,
         "numba": numba.__version__,
@@ -47,4 +48,5 @@ def peak_memory() -> int:
         lines = [line for line in status.read_text(encoding="ascii").splitlines() if line.startswith("VmHWM:")]
         if lines:
             return int(lines[0].split()[1]) * 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    unit = 1 if sys.platform == "darwin" else 1024  # macOS counts bytes
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit

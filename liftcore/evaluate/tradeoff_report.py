@@ -1,17 +1,17 @@
 """A comparison of speeds, and what it leaves behind: ``tradeoff.png``, ``.md`` and ``.json`` in a folder."""
 
+from __future__ import annotations
+
 import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-
-from liftcore.errors import InvalidInput, InvalidSettings
+from liftcore.errors import InvalidInput, InvalidSettings, Unavailable
 from liftcore.evaluate.hardware import machine_line
 from liftcore.evaluate.ranking import NAMES
 from liftcore.evaluate.tradeoff import SceneFiles, compare
@@ -19,6 +19,10 @@ from liftcore.io.files import whole_file
 from liftcore.io.json_file import finite
 from liftcore.runtime.progress import Progress, shown_progress
 from liftcore.scene.kernel import Kernel
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 HEADS = ("run", "views", "wall s", "CPU s", "faster by CPU", "peak MiB", "cosine", "5 %", "lost", "centred",
          "mask IoU", "phrase IoU", "95 %")  # fmt: skip
@@ -76,16 +80,26 @@ def compare_speeds(
     Raises:
         InvalidSettings: ``speed`` among the settings. InvalidInput: the scene lacks what is needed; or whatever a
             lift refuses.
-        Unavailable: a run did not end within a day.
+        Unavailable: matplotlib is not installed, which draws the chart; a run did not end within a day.
     """
     if not isinstance(files, SceneFiles):
         raise InvalidInput("files", expected="SceneFiles", got=repr(files)[:80])
     if not isinstance(settings, Mapping) or "speed" in settings:
         got = "speed" if isinstance(settings, Mapping) else repr(settings)[:80]
         raise InvalidSettings("settings", expected="settings that are the same in all runs", got=got)
+    _check_chart()
     with shown_progress(progress) as reporter:
         facts = compare(files, budget, settings, threads, reporter, kernel)
     return SpeedComparison(finite({"title": TITLE, "scene": scene, "command": command} | facts))
+
+
+def _check_chart() -> None:
+    try:
+        import_module("matplotlib")
+    except ImportError as error:
+        hint = "pip install 'splatlift[evaluate]'"
+        expected = "the package matplotlib"
+        raise Unavailable("chart of a trade-off", expected=expected, got=str(error), hint=hint) from None
 
 
 def save(document: Mapping[str, Any], out: Path) -> list[Path]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -46,6 +45,7 @@ from liftcore.query.selection import LEAST_FIRST, SAME_WORD, Rivals, contest, ne
 from liftcore.query.selections import set_members
 from liftcore.query.terms import Vector
 from liftcore.query.threshold import find_threshold, nothing_alike
+from liftcore.runtime.cores import cores
 from liftcore.text import TextEncoder, check_texts
 from liftcore.text.wording import Wording, base_of, plain
 
@@ -209,7 +209,7 @@ def answers(scene: OpenedLift, questions: Sequence[Question]) -> list[Answer]:
     similarities = _similarities(scene, questions)
     if len(questions) == 1:
         return [_answer(scene, questions[0], similarities[0])]
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         return list(pool.map(lambda asked, similar: _answer(scene, asked, similar), questions, similarities))
 
 

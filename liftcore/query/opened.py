@@ -446,6 +446,8 @@ class OpenedLift:
         from liftcore.values.lift_file import found_input
 
         path, moved = Path(remembered.path), self._moved.get(role) is not None
+        if role == "splats" and moved and not remembered.sha256 and path.exists():
+            return path  # of values in memory, so nothing says more than how many they are
         found = found_input(role, remembered, self.metadata, None if moved else self.path)
         if found is not None:
             return found

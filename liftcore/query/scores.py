@@ -7,13 +7,13 @@ which takes ten times as long. Rows go in fixed shares over threads, and the bit
 and on no other direction.
 """
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from liftcore.errors import InvalidQuery
+from liftcore.runtime.cores import cores
 from liftcore.runtime.jit import vectorised
 
 DEFAULT_NEGATIVES = ("object", "things", "stuff", "texture")  # LangSplat's canonical phrases
@@ -225,7 +225,7 @@ def _bits(features: np.ndarray) -> tuple[np.ndarray, bool, np.float32]:
 
 def _over_rows(count: int, work: Callable[[int, int], None]) -> None:
     starts = range(0, count, SHARE_ROWS)
-    threads = min(len(starts), len(os.sched_getaffinity(0)))
+    threads = min(len(starts), cores())
     if threads <= 1:
         work(0, count)
         return

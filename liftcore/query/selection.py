@@ -24,7 +24,6 @@ with:
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -33,6 +32,7 @@ import numpy as np
 
 from liftcore.query.presence import References, nearer_counts, products
 from liftcore.query.threshold import LEAST_SHARE
+from liftcore.runtime.cores import cores
 
 if TYPE_CHECKING:
     from liftcore.query.opened import OpenedLift
@@ -132,7 +132,7 @@ def nearer_than_rivals(scene: OpenedLift, selected: np.ndarray, rivals: Rivals) 
         own, others = products(scene.features[some], scene.norms[some], rivals.directions, rivals.vectors)
         kept[some] = others.max(axis=1) <= own.max(axis=1)
 
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         list(pool.map(compare, range(0, len(rows), _AT_ONCE)))
     return kept
 

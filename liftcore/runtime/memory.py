@@ -42,7 +42,8 @@ def zeros(shape: tuple[int, ...], dtype: torch.dtype, *, name: str, in_file: boo
     check_disk(size, name)
     handle, path = tempfile.mkstemp(prefix="splatlift-")
     try:
-        os.posix_fallocate(handle, 0, size)
+        if hasattr(os, "posix_fallocate"):  # not macOS, where a disk that fills meanwhile ends the process
+            os.posix_fallocate(handle, 0, size)
         return torch.from_file(path, shared=True, size=prod(shape), dtype=dtype).view(shape)
     except OSError as error:
         raise _no_disk(size, name, error.strerror or str(error)) from None

@@ -77,7 +77,15 @@ class Plugin:
             yield
         except SplatliftError:
             raise
-        except Exception as error:  # of code that is not ours
+        except Exception as error:
+            if isinstance(error, ModuleNotFoundError) and self.entry.module.startswith("service."):
+                raise Unavailable(
+                    repr(self.entry.name),
+                    expected=f"the package {error.name}",
+                    got="none",
+                    hint="pip install 'splatlift[service]'",
+                ) from error
+            # of code that is not ours
             got = f"{type(error).__name__}: {error}"[:160]
             hint = f"see whether {self.entry.value} imports and runs alone, or remove the package"
             raise Unavailable(f"plugin {self.value}", expected="one that works", got=got, hint=hint) from error
@@ -92,7 +100,7 @@ def load_plugin(group: Group, name: str) -> Any:
     plugin = find_plugin(group, name)
     if plugin is None:
         expected = f"a package with an entry point of that name in {group}"
-        hint = "splatlift's package 'service' has it: pip install splatlift, or make setup in a checkout"
+        hint = "splatlift's package 'service' has it: pip install 'splatlift[service]', or make setup in a checkout"
         own = group in ("splatlift.commands", "splatlift.viewers")
         raise Unavailable(repr(name), expected=expected, got="none installed", hint=hint if own else "")
     return plugin.load()

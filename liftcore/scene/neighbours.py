@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Self, TypeVar
 
 import numpy as np
 
+from liftcore.runtime.cores import cores
 from liftcore.scene.harmonics import SH_C0
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def map_nearest(
         near = np.asarray(tree.query(places[own], most)[1], np.int32).reshape(len(own), most)
         return work(own, near)
 
-    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
+    with ThreadPoolExecutor(threads or cores()) as pool:
         return list(pool.map(work_piece, range(0, len(means), _PIECE)))
 
 

@@ -9,7 +9,6 @@ faint splats keep their digits. float32 adds LONG terms one by one; longer bags,
 are sums of the sums of such parts: added one by one, ten million equal terms would be wrong in their first digit.
 """
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -18,6 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
+from liftcore.runtime.cores import cores
 from liftcore.runtime.device import CPU, Device, give_back_memory, out_of_memory
 from liftcore.runtime.memory import zeros
 from liftcore.runtime.one_thread import one_thread
@@ -130,8 +130,8 @@ def solve_rows(
         if device.kind == "cpu":
             run_each(solve_block, blocks, threads)
         else:
-            cores, late = threads or len(os.sched_getaffinity(0)), list[tuple[int, int]]()
-            run_each(partial(_unless_full, solve_block, late), blocks, min(cores, BESIDE))
+            workers, late = threads or cores(), list[tuple[int, int]]()
+            run_each(partial(_unless_full, solve_block, late), blocks, min(workers, BESIDE))
             for block in late:
                 _halved_to_fit(solve_block, *block)
         progress("solve", number + 1, len(slices), "slices")

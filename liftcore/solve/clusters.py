@@ -4,7 +4,6 @@ A splat's **direction** is its unit feature less the scene's mean of these, made
 lie in a narrow cone, and the angle at the cone's axis tells objects apart where the angle at the origin does not.
 """
 
-import os
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from liftcore.runtime.cores import cores
 from liftcore.scene.splats import Splats
 from liftcore.scene.touching import touching
 from liftcore.values.settings import LiftSettings
@@ -187,7 +187,7 @@ def assign(
         inside = known[block] & (distances <= reaches[nearest])
         labels[block][inside] = nearest[inside]
 
-    with one_blas_thread(), ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
+    with one_blas_thread(), ThreadPoolExecutor(threads or cores()) as pool:
         list(pool.map(assign_block, range(0, features.shape[0], BLOCK)))
     return labels
 

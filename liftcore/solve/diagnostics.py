@@ -15,7 +15,6 @@ The paper defines beta at the optimum x^; here it is measured at the answer x', 
 """
 
 import math
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
@@ -25,6 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from liftcore.runtime.cores import cores
 from liftcore.runtime.jit import vectorised
 from liftcore.runtime.one_thread import one_thread
 from liftcore.scene.cameras import Camera
@@ -84,7 +84,7 @@ def measure_samples(
     samples: Sequence[SampledRays], features: Tensor, codebooks: Sequence[Tensor], threads: int | None = None
 ) -> ViewMeasures:
     """The measures of all views' sampled rays, one view after the other: features [P, C], codebooks [M, C]."""
-    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
+    with ThreadPoolExecutor(threads or cores()) as pool:
         return joined(list(pool.map(lambda sample, book: measure_view(sample, features, book), samples, codebooks)))
 
 

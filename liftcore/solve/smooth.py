@@ -23,7 +23,6 @@ its neighbours by ``a_jk sqrt(w_k)``, and those behind it the mean of these, rin
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -35,6 +34,7 @@ import torch
 from torch import Tensor
 
 from liftcore.raster.cpu.simd import LANES, in_all_lanes, keep_lanes, lanes_at, plus, plus_product, times
+from liftcore.runtime.cores import cores
 from liftcore.runtime.device import CPU, Device
 from liftcore.runtime.jit import kernel
 from liftcore.runtime.one_thread import one_thread
@@ -129,7 +129,7 @@ def smooth(
     for rows, _ in rings:
         has_feature[rows] = True
     steps, residual, moved, whole = list[Step](), 0.0, 0.0, 0.0
-    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
+    with ThreadPoolExecutor(threads or cores()) as pool:
         if smoothness and has_evidence.any():
             signs = _random_signs(X.shape[1])
             probes = _probe(X, graph.order, has_evidence, signs, pool)

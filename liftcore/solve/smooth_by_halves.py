@@ -28,7 +28,6 @@ it: what a lambda does to a splat, its neighbourhood decides.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -38,6 +37,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from liftcore.runtime.cores import cores
 from liftcore.runtime.device import CPU
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, silent
@@ -120,7 +120,7 @@ def choose_smoothness(
     smoothed = [half.features for half in halves]
     tries = {0.0: compare(smoothed)}
     supports = [smoothing_weights(torch.from_numpy(half.sums), confidence) for half in halves]
-    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
+    with ThreadPoolExecutor(threads or cores()) as pool:
         for number, strength in enumerate(STRENGTHS):
             best = max(bits for bits, _ in tries.values())
             smoothed = [

@@ -6,7 +6,6 @@ and the sums of pieces are added up in their order. Whoever works on a block of 
 can hand on the sums of its pieces, and all of them together give the bits of a scene that lies in one place.
 """
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -17,6 +16,8 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+
+from liftcore.runtime.cores import cores
 
 PIECE = 1 << 15  # splats
 AHEAD = 2  # results a thread, that wait for those before them
@@ -69,7 +70,7 @@ def added(parts: Iterable[PieceSums], shape: tuple[int, int]) -> np.ndarray:
 
 def in_order(work: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], threads: int | None) -> Iterator[Any]:
     """The results of work for each tuple of arguments, in their order, by so many threads; few wait at a time."""
-    count = threads or len(os.sched_getaffinity(0))
+    count = threads or cores()
     waiting, left = deque[Future[Any]](), iter(arguments)
     with ThreadPoolExecutor(count) as pool:
         for own in left:

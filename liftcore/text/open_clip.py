@@ -93,9 +93,9 @@ def library() -> Any:
         import_torchvision()
         import open_clip
     except ImportError as error:
-        raise Unavailable(
-            "encoder open_clip", expected="the package open_clip_torch", got=str(error), hint="pip install it"
-        ) from None
+        hint = "pip install 'splatlift[encoders]'"
+        expected = "the package open_clip_torch"
+        raise Unavailable("encoder open_clip", expected=expected, got=str(error), hint=hint) from None
     return open_clip
 
 

@@ -1,7 +1,6 @@
 """Region weights ``W = A^T S``: what each region of each view weighs at each splat, before any feature."""
 
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
@@ -19,6 +18,7 @@ from torch import Tensor
 
 from liftcore.errors import InvalidInput, Unavailable
 from liftcore.io.safetensors_file import map_tensors, write_tensors
+from liftcore.runtime.cores import cores
 from liftcore.runtime.device import out_of_memory
 from liftcore.runtime.memory import zeros
 from liftcore.runtime.one_line import one_line
@@ -305,7 +305,7 @@ def run_each(work: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], thr
 
     What several of them write must not overlap. The first error of any is raised.
     """
-    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
+    with ThreadPoolExecutor(threads or cores()) as pool:
         list(pool.map(lambda own: work(*own), arguments))
 
 

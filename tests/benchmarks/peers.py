@@ -14,7 +14,6 @@ LONG is not asked for more. Cosine: of a splat's feature with ours, the mean by 
 """
 
 import math
-import os
 import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -35,6 +34,7 @@ from liftcore.raster import open_raster
 from liftcore.raster.cpu.composite import Frame
 from liftcore.raster.cpu.project import CUTOFF, KY, MX, MY, OPACITY, ROOT_X, SLOPE
 from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.runtime.cores import cores
 from liftcore.runtime.device import CPU, Device
 from liftcore.runtime.one_thread import one_thread
 from liftcore.scene.compositing import ALPHA_FLOOR, TILE, Weighting
@@ -44,7 +44,7 @@ from tests.benchmarks.base import command_line, tell
 from tests.benchmarks.scenes import Room
 
 LONG = 60.0  # seconds
-THREADS = len(os.sched_getaffinity(0))
+THREADS = cores()
 
 
 TINY = Room(500, 1, (64, 48), 4)  # to load kernels and start threads

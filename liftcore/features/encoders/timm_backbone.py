@@ -223,9 +223,8 @@ def _library() -> Any:
         import_torchvision()
         import timm
     except ImportError as error:
-        raise Unavailable(
-            "encoder timm", expected="the package timm", got=str(error), hint="pip install it"
-        ) from None
+        hint = "pip install 'splatlift[encoders]'"
+        raise Unavailable("encoder timm", expected="the package timm", got=str(error), hint=hint) from None
     return timm
 
 

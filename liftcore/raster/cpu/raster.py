@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import math
-import os
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -53,6 +52,7 @@ from liftcore.raster.cpu.project import (
 )
 from liftcore.raster.cpu.tiles import Bands, depth_order
 from liftcore.raster.cpu.weights import entries_of, merged, reading_of, weigh_tiles
+from liftcore.runtime.cores import cores
 from liftcore.runtime.device import give_back_memory
 from liftcore.scene.compositing import TILE, CompositingParams, Weighting, every_pixel
 from liftcore.values.region_weights import RegionWeights, one_view
@@ -88,7 +88,7 @@ class CpuRaster:
         self.splats = splats
         self._scene = activated(splats, 1.0)
         self._scale = 1.0  # of the scene's opacity logits
-        self._allocate(threads or len(os.sched_getaffinity(0)))
+        self._allocate(threads or cores())
 
     def _allocate(self, threads: int) -> None:
         """Threads and buffers of its own."""

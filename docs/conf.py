@@ -1,0 +1,46 @@
+"""The docs site (`make docs`): the Markdown pages here, and a reference from docstrings of the public modules."""
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import liftcore
+
+ROOT = Path(__file__).parents[1]
+
+project = "splatlift"
+author = "The splatlift authors"
+release = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+exclude_patterns = ["requirements.txt"]
+html_theme = "furo"
+html_title = f"splatlift {release}"
+html_extra_path = ["quickstart.ipynb"]
+default_role = "code"  # docstrings name code in single backticks
+myst_heading_anchors = 4
+autodoc_typehints = "signature"
+autodoc_member_order = "groupwise"
+autodoc_default_options = {"members": True, "ignore-module-all": False}
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+suppress_warnings = ["ref.python"]  # a value that several public modules offer has one text
+
+
+NAMES = "(all names of liftcore)"  # in reference.md: autodoc does not see what is loaded at first use
+
+
+def list_names() -> str:
+    """Directives for each public name of `liftcore`."""
+    kinds = {name: "class" if isinstance(getattr(liftcore, name), type) else "function" for name in liftcore.__all__}
+    return "\n".join(f".. auto{kind}:: liftcore.{name}\n" for name, kind in kinds.items())
+
+
+def prepare_page(app: Any, page: str, source: list[str]) -> None:
+    """Fill in the names, and name files of the checkout that are no pages without a link: there is none here."""
+    text = source[0].replace(NAMES, list_names()) if page == "reference" else source[0]
+    source[0] = re.sub(r"\[([^\]]*)\]\(\.\./[^)]*\)", r"\1", text)
+
+
+def setup(app: Any) -> None:
+    app.connect("source-read", prepare_page)
