@@ -318,10 +318,7 @@ class Answers:
 
     def _tree(self, request: dict[str, Any]) -> Frame:
         def make() -> SceneTree:
-            words, encoder = ([], None) if request["encoder"] is None else self._words(request)
-            return self._scene(request).tree(
-                words, encoder=encoder, relations=request["relations"], up=_direction(request["up"])
-            )
+            return self._named_tree(request, relations=request["relations"], up=_direction(request["up"]))
 
         decides = (request[name] for name in ("lift", "encoder", "encoder_version", "relations", "up"))
         found = self._kept(("tree", json.dumps([*decides])), make)
@@ -371,17 +368,29 @@ class Answers:
         elif request["of"] == "words":
             source = self._named(request)
         else:
-            found = self._named_objects(request)
-            given = {thing: {"name": name} for thing, (name, _) in request["things"] if name is not None}
-            things = [one.model_copy(update=given.get(one.id)) for one in found.objects]
-            source = replace(found, objects=tuple(things))
+            source = self._named_things(request)
         blocks = scene.blocks_of(source, "bundle", view=request["of_view"])
         write_draft(blocks, Path(request["draft"]))
         return Frame({})
 
+    def _named_things(self, request: dict[str, Any]) -> Catalogue | SceneTree:
+        """The objects of a lift by the names that they were given, with their parts where it has any."""
+        given = {thing: {"name": name} for thing, (name, _) in request["things"] if name is not None}
+        if self._scene(request).node is None:
+            found = self._named_objects(request)
+            return replace(found, objects=tuple(one.model_copy(update=given.get(one.id)) for one in found.objects))
+        tree = self._named_tree(request)
+        return tree.model_copy(
+            update={"nodes": tuple(one.model_copy(update=given.get(one.id)) for one in tree.nodes)}
+        )
+
     def _count_objects(self, request: dict[str, Any]) -> Frame:
         views = self._scene(request).object_views
         return Frame({"count": 0 if views is None else len(views)})
+
+    def _named_tree(self, request: dict[str, Any], **lying: Any) -> SceneTree:
+        words, encoder = ([], None) if request["encoder"] is None else self._words(request)
+        return self._scene(request).tree(words, encoder=encoder, **lying)
 
     def _named_objects(self, request: dict[str, Any]) -> Catalogue:
         """The objects of a lift; all words of the table that the request names, if it does, name them."""

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.objects import named_catalogue
+from liftcore.cli.objects import named_tree
 from liftcore.cli.options import Parser, add_encoder, add_lift, opened_lift, text_encoder, whole
 from liftcore.cli.query import made_from
 from liftcore.cli.reply import reply, write_files
@@ -16,6 +16,7 @@ from liftcore.errors import InvalidInput
 
 if TYPE_CHECKING:
     from liftcore import Answer, Catalogue, Scene, Segmentation
+    from liftcore.models import SceneTree
 
 WHAT = {".json": "masks", ".jsonl": "lines"}  # by the suffix; all others are splats with labels
 
@@ -67,7 +68,9 @@ def run(options: argparse.Namespace) -> int:
     document: dict[str, Any] = {"files": files, "splats": splats, "what": what}
     if source is not None and not isinstance(source, int) and what != "object":
         labels = scene.labels(source)
-        document |= {name: len(labels.document[name]) for name in ("classes", "instances")}
+        document |= {
+            name: len(labels.document[name]) for name in ("classes", "instances", "nodes") if name in labels.document
+        }
     if suffix != ".ply" and what not in WHAT.values() and scene.splats.kernel != "3dgs":
         document["warnings"] = [
             f"{scene.splats.kernel} splats are written as the nearest Gaussians, all that the format has"
@@ -76,7 +79,7 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _source(options: argparse.Namespace, scene: Scene) -> Answer | Segmentation | Catalogue | int | None:
+def _source(options: argparse.Namespace, scene: Scene) -> Answer | Segmentation | Catalogue | SceneTree | int | None:
     if options.object is not None:
         return int(options.object)
     if options.text:
@@ -84,9 +87,7 @@ def _source(options: argparse.Namespace, scene: Scene) -> Answer | Segmentation 
     if options.words is not None or options.all_words:
         encoder = text_encoder(options, scene)
         return scene.segment(read_words(options.words, scene, encoder), encoder=encoder, progress=True)
-    if scene.object is None:
-        return None
-    return named_catalogue(options, scene)[1]
+    return None if scene.object is None else named_tree(options, scene)
 
 
 def _query(texts: list[str]) -> Any:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from liftcore import Catalogue, Scene, TextEncoder
+    from liftcore.models import SceneTree
 
 
 def add_arguments(parser: Parser) -> None:
@@ -76,6 +77,12 @@ def named_catalogue(options: argparse.Namespace, scene: Scene) -> tuple[TextEnco
     """The objects of a lift, named by ``--vocabulary`` or the words of the encoder, and that encoder."""
     encoder, words = _vocabulary(options, scene)
     return encoder, scene.catalogue(words, encoder=encoder)
+
+
+def named_tree(options: argparse.Namespace, scene: Scene) -> Catalogue | SceneTree:
+    """The same with their parts and groups, of a lift that has them."""
+    encoder, words = _vocabulary(options, scene)
+    return (scene.catalogue if scene.node is None else scene.tree)(words, encoder=encoder)
 
 
 def _tree(options: argparse.Namespace, scene: Scene) -> int:

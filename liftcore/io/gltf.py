@@ -79,7 +79,7 @@ def read_gltf(path: Path, *, colour: bool = True) -> Fields:
 
 
 def read_gltf_document(path: Path) -> dict[str, Any]:
-    """What the property tables of a file say of its feature ids: ``instances`` and ``classes``; empty without any.
+    """What the property tables of a file say of its feature ids: ``instances``, ``classes``, ``nodes``; may be empty.
 
     Raises:
         InvalidSplats: the file is malformed.
@@ -227,7 +227,8 @@ class _Asset:
         rows: list[dict[str, Any]] = [{} for _ in range(count)]
         for key in own:
             member = self._at_key(self._at_key(members, "properties"), key)
-            if not member.get("array") and member.get("type") in ("STRING", *TABLE_WIDTHS):
+            listed = member.get("array") and member.get("type") == "SCALAR" and "count" not in member
+            if listed or (not member.get("array") and member.get("type") in ("STRING", *TABLE_WIDTHS)):
                 column = self._table_column(self._at_key(own, key), member, count)
                 for row, value in zip(rows, column, strict=True):
                     row[str(key)[:64]] = value
@@ -236,15 +237,27 @@ class _Asset:
     def _table_column(self, own: dict[str, Any], member: dict[str, Any], count: int) -> list[Any]:
         values = self._view(own.get("values"))
         if member["type"] == "STRING":
-            code = TABLE_TYPES.get(str(own.get("stringOffsetType", "UINT32")), "<u4")
-            ends = self._typed(self._view(own.get("stringOffsets")), code, count + 1).astype(np.int64)
-            if (np.diff(ends) < 0).any():
-                raise self._broken("texts one after the other", "offsets that go back")
             text = values.tobytes()
-            return [text[low:high].decode("utf-8", "replace") for low, high in pairwise(ends.tolist())]
+            ends = self._ends(own, "string", count)
+            return [text[low:high].decode("utf-8", "replace") for low, high in pairwise(ends)]
         width, code = TABLE_WIDTHS[member["type"]], TABLE_TYPES.get(str(member.get("componentType")), "<f4")
+        if member.get("array"):
+            ends = self._ends(own, "array", count)
+            if not 0 <= ends[-1] <= MAX_TABLE_CELLS:
+                raise self._broken(f"at most {MAX_TABLE_CELLS} values of a property", str(ends[-1]))
+            numbers = self._typed(values, code, ends[-1])
+            return [numbers[low:high].tolist() for low, high in pairwise(ends)]
         numbers = self._typed(values, code, count * width).reshape(count, width)
         rows: list[Any] = (numbers[:, 0] if width == 1 else numbers).tolist()
+        return rows
+
+    def _ends(self, own: dict[str, Any], kind: str, count: int) -> list[int]:
+        """Where each row of a property of texts or arrays begins, and the end of the last."""
+        code = TABLE_TYPES.get(str(own.get(f"{kind}OffsetType", "UINT32")), "<u4")
+        ends = self._typed(self._view(own.get(f"{kind}Offsets")), code, count + 1).astype(np.int64)
+        if (np.diff(ends, prepend=0) < 0).any():
+            raise self._broken("rows one after the other", "offsets that go back")
+        rows: list[int] = ends.tolist()
         return rows
 
     def _typed(self, values: np.ndarray, code: str, count: int) -> np.ndarray:
@@ -287,7 +300,7 @@ class _Asset:
         )
         for one in [*of_attributes, *({"attribute": place} for place in sorted(plain) if place not in named)]:
             label, place = f"{one.get('label')}_id", one["attribute"]
-            usual = IDS[place] if 0 <= place < len(IDS) and IDS[place] not in found else f"feature_id_{place}"
+            usual = IDS[place] if 0 <= place < 2 and IDS[place] not in found else f"feature_id_{place}"
             found[label if label in IDS else usual] = one
         return found
 

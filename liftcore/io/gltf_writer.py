@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -47,7 +48,10 @@ MEMBERS = {  # of the rows of property tables: type, component type
     "box_low": ("VEC3", "FLOAT64"), "box_high": ("VEC3", "FLOAT64"),
     "oriented_box_centre": ("VEC3", "FLOAT64"), "oriented_box_axes": ("MAT3", "FLOAT64"),
     "oriented_box_half_sizes": ("VEC3", "FLOAT64"), "question": ("STRING", ""), "provenance": ("STRING", ""),
+    "kind": ("STRING", ""), "parent": ("SCALAR", "UINT32"), "depth": ("SCALAR", "UINT32"),
+    "path": ("SCALAR", "UINT32"), "parts": ("SCALAR", "UINT32"),
 }  # fmt: skip
+ARRAYS = ("path", "parts")  # members with any number of values in a row
 
 
 def gltf_blocks(splats: Splats, document: Mapping[str, Any] | None = None) -> Iterator[bytes]:
@@ -192,7 +196,7 @@ def _feature_set(columns: Mapping[str, np.ndarray], name: str, sets: Sequence[st
 def _add_tables(
     binary: _Binary, columns: Mapping[str, np.ndarray], document: Mapping[str, Any], sets: Sequence[str]
 ) -> dict[str, Any]:
-    """The property tables of instances and classes: a row an id, the first of which is that of none."""
+    """The property tables of instances, classes and nodes: a row an id, the first of which is that of none."""
     tables, classes = [], {}
     for name, kind in zip(IDS, KINDS, strict=True):
         if name not in sets:
@@ -208,7 +212,9 @@ def _add_tables(
         properties = {key: _add_property(binary, key, rows) for key in members}
         tables.append({"name": kind, "class": label, "count": len(rows), "properties": properties})
         described = {
-            key: {"type": kind} | ({"componentType": component} if component else {})
+            key: {"type": kind}
+            | ({"componentType": component} if component else {})
+            | ({"array": True} if key in ARRAYS else {})
             for key, (kind, component) in members.items()
         }
         classes[label] = {"name": label, "properties": described}
@@ -234,6 +240,11 @@ def _add_property(binary: _Binary, key: str, rows: Sequence[Mapping[str, Any]]) 
         texts = [str(row.get(key, "")).encode() for row in rows]
         offsets = np.cumsum([0, *map(len, texts)]).astype("<u4")
         return {"values": binary.view(b"".join(texts) or b"\0"), "stringOffsets": binary.view(offsets.tobytes())}
+    if key in ARRAYS:
+        arrays = [row.get(key, ()) for row in rows]
+        offsets = np.cumsum([0, *map(len, arrays)]).astype("<u4")
+        numbers = np.array([*chain(*arrays)], TABLE_TYPES[component])
+        return {"values": binary.view(numbers.tobytes() or bytes(4)), "arrayOffsets": binary.view(offsets.tobytes())}
     values = np.zeros((len(rows), TABLE_WIDTHS[kind]), TABLE_TYPES[component])
     for place, row in enumerate(rows):
         values[place] = row.get(key, 0)

@@ -1,9 +1,10 @@
 """What every splat is, as files keep it: a number or two a splat, and a document of what these mean.
 
-The columns of a splat are ``class_id`` and ``instance_id``, from 1 with 0 for none, ``score`` and ``confidence``; a
-file may have others. They are `Splats.extras` of splats that are read or written. The document has ``classes`` and
-``instances``, each a list of objects whose ``class_id`` or ``instance_id`` is that of the columns, with their names,
-scores, colours, boxes and questions (docs/formats.md).
+The columns of a splat are ``class_id``, ``instance_id`` and ``node_id``, from 1 with 0 for none, ``score`` and
+``confidence``; a file may have others. They are `Splats.extras` of splats that are read or written. The document has
+``classes``, ``instances`` and ``nodes``, each a list of objects whose ``class_id``, ``instance_id`` or ``node_id`` is
+that of the columns, with their names, scores, colours, boxes and questions (docs/formats.md). A splat's node is the
+smallest; it is of all others of that node's ``path``, too.
 """
 
 from __future__ import annotations
@@ -25,10 +26,10 @@ if TYPE_CHECKING:
 
 FORMAT = "splatlift-labels/1"
 COLUMN = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]{0,63}")  # a name that readers of PLY take
-IDS = ("instance_id", "class_id")  # columns of whole numbers, 0 for none
+IDS = ("instance_id", "class_id", "node_id")  # columns of whole numbers, 0 for none
 MAX_COLUMNS = 256  # of a file that is not a PLY
 MAX_DOCUMENT_BYTES = 64 << 20
-KINDS = ("instances", "classes")  # of the document, by the columns above
+KINDS = ("instances", "classes", "nodes")  # of the document, by the columns above
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,9 @@ class Labels:
         """The labels of the rows that a mask [P] chooses, with what the document says of those alone."""
         columns = {name: values[rows] for name, values in self.columns.items()}
         left = {name: set(np.unique(columns[name]).tolist()) for name in IDS if name in columns}
+        if "node_id" in left:  # a node is left with any of its parts
+            paths = (one["path"] for one in self.document["nodes"] if one["node_id"] in left["node_id"])
+            left["node_id"] = {number for path in paths for number in path}
         document = self.document | {"splats": int(np.count_nonzero(rows))}
         for name, kind in zip(IDS, KINDS, strict=True):
             if name in left:
@@ -84,14 +88,15 @@ def document_bytes(labels: Labels) -> bytes:
 
 
 def document_lines(labels: Labels) -> bytes:
-    """The instances as JSON Lines: an object a line, with all that the document says of it."""
+    """The instances, or the nodes where there are any, as JSON Lines: a line each, with all that is said of it."""
     whole = {name: labels.document[name] for name in ("format", "made_by", "frame") if name in labels.document}
-    rows = (json.dumps(one | whole, ensure_ascii=False) for one in labels.document.get("instances", []))
+    listed = labels.document.get("nodes") or labels.document.get("instances", [])
+    rows = (json.dumps(one | whole, ensure_ascii=False) for one in listed)
     return "".join(f"{row}\n" for row in rows).encode()
 
 
 def rows_by_id(document: dict[str, Any], kind: str) -> list[dict[str, Any]]:
-    """The rows of ``classes`` or ``instances`` where their numbers are their places; an empty one where is none."""
+    """The rows of one of KINDS where their numbers are their places; an empty one where is none."""
     name = IDS[KINDS.index(kind)]
     rows = {one[name]: one for one in document.get(kind, [])}
     return [rows.get(place, {}) for place in range(max(rows, default=0) + 1)]

@@ -25,7 +25,8 @@ def masks_json(
     """The masks of all instances in views, in blocks, a view at a time.
 
     A pixel is of the instance with the most weight on its ray, in the photo's own pixels. Masks are uncompressed run
-    lengths, column by column. ``image_id`` counts from 1, ``category_id`` is the class, 0 without a name.
+    lengths, column by column. ``image_id`` counts from 1, ``category_id`` is the class, 0 without a name. Parts,
+    which labels of a tree have, have masks too: a pixel is of the smallest node with the most weight, and its path.
 
     Args:
         views: their names; None: those that were lifted. on_view: is given each with the instances [H, W] i32 of its
@@ -39,52 +40,76 @@ def masks_json(
     if not instances:
         raise InvalidQuery("source", expected="labels with instances", got="none", hint="export other words")
     kinds = {one["class_id"]: one["name"] for one in labels.document["classes"]}
-    if any(one["class_id"] not in kinds for one in instances.values()):
+    parts = {one["node_id"]: one for one in labels.document.get("nodes", []) if one["kind"] == "part"}
+    class_of = {name: number for number, name in kinds.items()}
+    for number, one in parts.items():
+        class_id = class_of.setdefault(one["name"], len(class_of) + 1) if one["name"] else 0
+        parts[number] = one | {"class_id": class_id}
+    kinds |= {number: name for name, number in class_of.items()}
+    if any(one["class_id"] not in kinds for one in (*instances.values(), *parts.values())):
         kinds[0] = "object"
     head = {
         "info": {"description": "instances of a lift in its views", "contributor": labels.document["made_by"]},
         "categories": [{"id": number, "name": name} for number, name in sorted(kinds.items())],
     }
     chosen = scene.metadata.views if views is None else views
-    return _blocks(scene, labels.columns["instance_id"], instances, head, chosen, on_view)
+    return _blocks(scene, labels, instances, parts, head, chosen, on_view)
 
 
 def _blocks(
     scene: OpenedLift,
-    numbers: np.ndarray,
+    labels: Labels,
     instances: dict[int, dict[str, Any]],
+    parts: dict[int, dict[str, Any]],
     head: dict[str, Any],
     views: Sequence[str],
     on_view: Callable[[str, np.ndarray], None] | None,
 ) -> Iterator[bytes]:
-    from scipy.ndimage import find_objects
-
     images, count = [], 0
+    depths = _part_tables(labels, parts)
     yield json.dumps(head, ensure_ascii=False)[:-1].encode() + b', "annotations": ['
     for place, view in enumerate(views, 1):
-        shown = value_map(scene, numbers, view)
+        shown = value_map(scene, labels.columns["instance_id"], view)
         if on_view is not None:
             on_view(view, shown)
         height, width = shown.shape
         images.append({"id": place, "file_name": view, "width": width, "height": height})
-        places = find_objects(shown)
-        for number, lengths in run_lengths(shown).items():
-            one, (rows, columns) = instances[number], places[number - 1]
+        smallest = value_map(scene, labels.columns["node_id"], view) if parts else shown
+        maps = [(shown, instances), *((table[smallest], parts) for table in depths)]
+        for one in (one for numbers, rows in maps for one in _annotations(numbers, rows)):
             count += 1
-            annotation = {
-                "id": count,
-                "image_id": place,
-                "category_id": one["class_id"],
-                "instance_id": number,
-                "segmentation": {"size": [height, width], "counts": lengths},
-                "area": sum(lengths[1::2]),
-                "bbox": [columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start],
-                "iscrowd": 0,
-            }
-            if one.get("score") is not None:
-                annotation["score"] = one["score"]
-            yield (", " if count > 1 else "").encode() + json.dumps(annotation).encode()
+            yield (", " if count > 1 else "").encode() + json.dumps({"id": count, "image_id": place} | one).encode()
     yield b'], "images": ' + json.dumps(images, ensure_ascii=False).encode() + b"}\n"
+
+
+def _part_tables(labels: Labels, parts: dict[int, dict[str, Any]]) -> list[np.ndarray]:
+    """For each depth of parts, the part there that each node is of, by their numbers, [nodes + 1] i32; 0 for none."""
+    paths = {one["node_id"]: one["path"] for one in labels.document.get("nodes", [])}
+    tables = []
+    for depth in sorted({one["depth"] for one in parts.values()}):
+        table = np.zeros(max(paths) + 1, np.int32)
+        for node, path in paths.items():
+            table[node] = path[depth] if len(path) > depth and path[depth] in parts else 0
+        tables.append(table)
+    return tables
+
+
+def _annotations(shown: np.ndarray, rows: dict[int, dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """The mask of each number above 0 in [H, W] i32, with what its row says of it."""
+    from scipy.ndimage import find_objects
+
+    places = find_objects(shown)
+    for number, lengths in run_lengths(shown).items():
+        one, (down, across) = rows[number], places[number - 1]
+        yield {
+            "category_id": one["class_id"],
+            **{key: one[key] for key in ("instance_id", "node_id", "parent", "path") if key in one},
+            "segmentation": {"size": [*shown.shape], "counts": lengths},
+            "area": sum(lengths[1::2]),
+            "bbox": [across.start, down.start, across.stop - across.start, down.stop - down.start],
+            "iscrowd": 0,
+            **({"score": one["score"]} if one.get("score") is not None else {}),
+        }
 
 
 def run_lengths(shown: np.ndarray) -> dict[int, list[int]]:

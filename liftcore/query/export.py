@@ -17,7 +17,7 @@ from liftcore.query.catalogue import Catalogue, one_object_splats, table_csv
 from liftcore.query.colours import NOT_SEEN_COLOUR, cluster_colours, heat_colours
 from liftcore.query.objects import MOST_SPLATS, objects
 from liftcore.query.opened import OpenedLift, as_numpy
-from liftcore.query.question import Answer
+from liftcore.query.question import Answer, SceneTree
 
 if TYPE_CHECKING:  # these load torch
     from PIL.Image import Image
@@ -33,6 +33,7 @@ FILES = {  # of what a file is made -> the files that there are of it
     "segmentation": ("coloured", "labels", "picture", "splat_labels", *OF_LABELS),
     "object": ("object",),
     "catalogue": ("csv", *OF_LABELS),
+    "scenetree": OF_LABELS,
     "scene": ("rgb", "depth", "pca", "cluster", "confidence", "splats"),
 }
 
@@ -44,7 +45,7 @@ BY_SUFFIX = {  # what a name asks for of many things
 
 def blocks_of(
     scene: OpenedLift,
-    source: Answer | Mapping[str, Answer] | Segmentation | Catalogue | int | None,
+    source: Answer | Mapping[str, Answer] | Segmentation | Catalogue | SceneTree | int | None,
     what: str = "",
     *,
     view: str | Camera | None = None,
@@ -58,13 +59,17 @@ def blocks_of(
     """
     kind = "object" if isinstance(source, int) else "scene" if source is None else type(source).__name__.lower()
     kind = "answers" if isinstance(source, Mapping) else kind
-    usual = BY_SUFFIX.get(suffix) if kind in ("segmentation", "catalogue", "answers") or suffix == ".zip" else None
+    usual = (
+        BY_SUFFIX.get(suffix)
+        if kind in ("segmentation", "catalogue", "scenetree", "answers") or suffix == ".zip"
+        else None
+    )
     what = what or usual or FILES[kind][0]
     if what not in FILES[kind]:
         raise InvalidQuery("what", expected=f"one of {', '.join(FILES[kind])}", got=repr(what))
     if isinstance(source, int):
         return one_object_splats(scene, source, suffix or ".ply")
-    if isinstance(source, Mapping) or (source is not None and what in OF_LABELS):
+    if isinstance(source, Mapping | SceneTree) or (source is not None and what in OF_LABELS):
         return _of_labels(scene, source, what, suffix, view)
     if source is None:
         return _of_scene(scene, what, view, suffix)
@@ -125,7 +130,7 @@ def _of_words(scene: OpenedLift, found: Segmentation, what: str, view: str | Cam
 
 def _of_labels(
     scene: OpenedLift,
-    source: Answer | Mapping[str, Answer] | Segmentation | Catalogue,
+    source: Answer | Mapping[str, Answer] | Segmentation | Catalogue | SceneTree,
     what: str,
     suffix: str,
     view: str | Camera | None,

@@ -19,7 +19,7 @@ from liftcore.query.catalogue import Catalogue
 from liftcore.query.colours import cluster_colours
 from liftcore.query.objects import LEAST_EVIDENCE, objects, trimmed_box
 from liftcore.query.opened import OpenedLift, as_numpy
-from liftcore.query.question import Answer
+from liftcore.query.question import Answer, SceneNode, SceneObject, SceneTree
 from liftcore.runtime.version import __version__
 from liftcore.scene.touching import touching
 
@@ -32,16 +32,18 @@ FRAMES = {
 }
 
 
-def labels(scene: OpenedLift, source: Segmentation | Answer | Mapping[str, Answer] | Catalogue) -> Labels:
-    """The labels of a segmentation, of answers, or of the objects of a lift.
+def labels(scene: OpenedLift, source: Segmentation | Answer | Mapping[str, Answer] | Catalogue | SceneTree) -> Labels:
+    """The labels of a segmentation, of answers, or of the objects of a lift, with their parts where it is its tree.
 
     Of a segmentation ``class_id`` is the value of a splat's word (`Segmentation.values`), ``instance_id`` counts
     groups of splats of one word that touch (`liftcore.scene.touching`), with the most evidence first; groups with
     less than a twentieth of the evidence of their word's largest have a class alone. Of an answer every selected
     splat has class 1, and the instances are its objects. Of several answers, by names, each is a class; a splat that
     several select is of the one whose threshold it passes by most. Of a catalogue the instances are its objects, and
-    the classes their names; without names there are none. 0 is none of both. ``score`` is the cosine to the word, or
-    the answer's score. ``confidence`` is the lift's, where it was reweighted; other lifts have none.
+    the classes their names; without names there are none. Of a tree they are those of its objects, and ``node_id`` is
+    the smallest node of a splat, an object, a part or a group: its id and one more. 0 is none of all. ``score`` is
+    the cosine to the word, or the answer's score. ``confidence`` is the lift's, where it was reweighted; other lifts
+    have none.
 
     Raises:
         InvalidQuery: nothing was found, or more splats than objects are made of.
@@ -52,7 +54,8 @@ def labels(scene: OpenedLift, source: Segmentation | Answer | Mapping[str, Answe
         if isinstance(source, Answer | Mapping):
             made = _of_answers(scene, {_name(source): source} if isinstance(source, Answer) else source)
         else:
-            made = _of_catalogue(scene, source) if isinstance(source, Catalogue) else _of_words(scene, source)
+            of_objects = isinstance(source, Catalogue | SceneTree)
+            made = _of_objects(scene, source) if of_objects else _of_words(scene, source)
         scene.labelled = parts, made
     columns: Labels = scene.labelled[1]
     return columns
@@ -122,26 +125,52 @@ def _of_answers(scene: OpenedLift, answers: Mapping[str, Answer]) -> Labels:
     return _labels(scene, chosen, instances, scores, classes, told)
 
 
-def _of_catalogue(scene: OpenedLift, catalogue: Catalogue) -> Labels:
-    if not catalogue.objects or scene.object is None or scene.object_views is None:
-        raise InvalidQuery("source", expected="a lift with objects", got=catalogue.explanation, hint="export words")
-    names = list(dict.fromkeys(one.name for one in catalogue.objects if one.name is not None))
-    colours = cluster_colours(len(scene.object_views)).tolist()
+def _of_objects(scene: OpenedLift, source: Catalogue | SceneTree) -> Labels:
+    objects: Sequence[SceneObject]
+    if isinstance(source, SceneTree):
+        objects = [one for one in source.nodes if one.kind == "object"]
+    else:
+        objects = source.objects
+    if not objects or scene.object is None or scene.object_views is None:
+        raise InvalidQuery("source", expected="a lift with objects", got=source.explanation, hint="export words")
+    names = list(dict.fromkeys(one.name for one in objects if one.name is not None))
+    class_of = {name: value for value, name in enumerate(names, 1)}
+    colours = cluster_colours(len(scene.object_views if scene.node_parents is None else scene.node_parents)).tolist()
     numbers, told = np.zeros(len(scene.object_views) + 1, np.int32), []  # the last is of -1
     scores = np.zeros(len(scene.object_views) + 1, np.float32)
-    for one in catalogue.objects:
-        numbers[one.id] = 0 if one.name is None else names.index(one.name) + 1
+    for one in objects:
+        numbers[one.id] = class_of.get(one.name or "", 0)
         scores[one.id] = one.score or 0.0
         entry: dict[str, Any] = {"instance_id": one.id + 1, "class_id": int(numbers[one.id]), "name": one.name}
-        entry |= {"colour": colours[one.id], "score": one.score, "share": one.share, "views": list(one.views)}
-        facts = _facts(scene, np.flatnonzero(scene.object == one.id), None)
-        told.append(entry | facts | {"box": {"low": one.box[0], "high": one.box[1]}})
+        told.append(entry | _described(scene, one, colours[one.id]))
     values = numbers[scene.object]
     classes = [
         {"class_id": value, "name": name, "splats": int((values == value).sum())}
         for value, name in enumerate(names, 1)
     ]
-    return _labels(scene, values, scene.object + 1, scores[scene.object] if names else None, classes, told)
+    made = _labels(scene, values, scene.object + 1, scores[scene.object] if names else None, classes, told)
+    if scene.node is None or not isinstance(source, SceneTree):
+        return made
+    listed = [_path(one) | _described(scene, one, colours[one.id]) for one in source.nodes]
+    for entry, node in zip(
+        made.document["instances"], (one for one in source.nodes if one.kind == "object"), strict=True
+    ):
+        entry.update(_path(node))
+    columns = made.columns | {"node_id": scene.node + 1}
+    return Labels(columns, made.document | {"columns": list(columns), "nodes": listed})
+
+
+def _path(one: SceneNode) -> dict[str, Any]:
+    """Where a node is in the tree, by the numbers of the column ``node_id``."""
+    path = [node + 1 for node in one.path]
+    facts = {"node_id": one.id + 1, "kind": one.kind, "name": one.name, "parent": path[-2] if len(path) > 1 else 0}
+    return facts | {"depth": len(path) - 1, "path": path, "parts": [node + 1 for node in one.parts]}
+
+
+def _described(scene: OpenedLift, one: SceneObject, colour: list[int]) -> dict[str, Any]:
+    facts = _facts(scene, np.flatnonzero(scene.members(one.id)), None)
+    entry = {"colour": colour, "score": one.score, "share": one.share, "views": list(one.views)} | facts
+    return entry | {"box": {"low": one.box[0], "high": one.box[1]}}
 
 
 def _labels(

@@ -36,7 +36,7 @@ if TYPE_CHECKING:  # these load torch
     from liftcore.text import TextEncoder
 
 Source: TypeAlias = (  # of a file
-    "Query | str | Answer | Mapping[str, Answer] | Segmentation | Catalogue | np.ndarray | int | None"
+    "Query | str | Answer | Mapping[str, Answer] | Segmentation | Catalogue | SceneTree | np.ndarray | int | None"
 )
 
 
@@ -332,7 +332,7 @@ class Scene(OpenedLift):
 
         return layer_colours(self, what)
 
-    def labels(self, source: Answer | Mapping[str, Answer] | Segmentation | Catalogue) -> Labels:
+    def labels(self, source: Answer | Mapping[str, Answer] | Segmentation | Catalogue | SceneTree) -> Labels:
         """Numbers a splat and what they mean, as files of labels have them (`liftcore.query.labels.labels`)."""
         from liftcore.query.labels import labels
 
@@ -372,14 +372,14 @@ class Scene(OpenedLift):
         """Make a file, in blocks.
 
         Args:
-            source: a question or its answer, answers by names, a segmentation, a catalogue, the id of an object of
-                it, or an array; None: the scene.
+            source: a question or its answer, answers by names, a segmentation, a catalogue or a tree, the id of an
+                object or another node, or an array; None: the scene.
             what: of an answer object, coloured, scores, selection, mask, attention or overlay; of a segmentation
-                coloured, labels, picture or splat_labels; of a catalogue csv; of all three labelled (splats with
-                labels), names (what these mean), lines (an object a line, JSON), masks (COCO's JSON, in the views) or
-                bundle (all of it in a ZIP); of the scene what `render` draws, or splats; of an array npy, or mask of
-                booleans [H, W]. Empty: the first of these; of a segmentation or a catalogue as a .glb labelled, .json
-                masks, .jsonl lines; as a .zip the bundle.
+                coloured, labels, picture or splat_labels; of a catalogue csv; of all these and of a tree labelled
+                (splats with labels), names (what these mean), lines (an object a line, JSON), masks (COCO's JSON, in
+                the views) or bundle (all of it in a ZIP); of the scene what `render` draws, or splats; of an array
+                npy, or mask of booleans [H, W]. Empty: the first of these; of a segmentation or a catalogue as a .glb
+                labelled, .json masks, .jsonl lines; as a .zip the bundle.
             view: of pictures, as in `look`. suffix: of its name, where there are several formats.
             seen: the answer as the view shows it, where that is known. photo: of the view, for an overlay.
 

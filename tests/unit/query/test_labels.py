@@ -17,6 +17,8 @@ from liftcore.query.question import Query
 from liftcore.query.scene import Scene
 from liftcore.query.terms import Region, Vector
 from tests.api.tiny_scene import CHANNELS, SPLATS_A_CLUSTER, VIEWS, WORDS, text_table
+from tests.unit.query.test_catalogue import with_parts
+from tests.unit.scene.test_usd import needs_usd
 
 EYE = np.eye(3, CHANNELS, dtype=np.float32)
 CLUSTER = np.repeat(np.arange(3), SPLATS_A_CLUSTER)
@@ -59,6 +61,60 @@ def test_masks_in_views_are_those_of_the_instances(scene: Scene, tmp_path: Path)
         assert sum(one["segmentation"]["counts"][1::2]) == one["area"] > 0
         centre = one["bbox"][0] + one["bbox"][2] / 2
         assert WORDS.index(names[one["category_id"]]) == int(3 * centre / view["width"])
+
+
+@pytest.fixture
+def parted(scene: Scene, tmp_path: Path) -> Scene:
+    """The scene with its first object in two parts, nodes 3 and 4."""
+    with_parts(scene).save(tmp_path / "parts.lift.safetensors")
+    return Scene(tmp_path / "parts.lift.safetensors", scene.splats, scene.cameras)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".glb", ".spz", pytest.param(".usdc", marks=needs_usd)])
+def test_files_of_a_tree_come_back_with_paths_and_the_smallest_nodes(
+    parted: Scene, tmp_path: Path, suffix: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "words.safetensors").write_bytes(text_table())
+    named = ["--table", str(tmp_path / "words.safetensors")]
+    assert main(["export", str(parted.path), "-o", str(tmp_path / f"x{suffix}"), *named, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["nodes"] == 5
+    found = read_labels(tmp_path / f"x{suffix}")
+    assert parted.node is not None and parted.object is not None
+    np.testing.assert_array_equal(found.columns["node_id"], parted.node + 1)
+    np.testing.assert_array_equal(found.columns["instance_id"], parted.object + 1)
+    nodes = {one["node_id"]: one for one in found.document["nodes"]}
+    tree = parted.tree(WORDS, EYE).nodes
+    assert set(nodes) == {one.id + 1 for one in tree}
+    for one in tree:
+        told = nodes[one.id + 1]
+        assert (told["kind"], told["name"], told["splats"]) == (one.kind, one.name, one.splats)
+        assert list(told["path"]) == [node + 1 for node in one.path] and told["depth"] == len(one.path) - 1
+        assert list(told["parts"]) == [node + 1 for node in one.parts]
+        assert told["parent"] == (0 if one.parent is None else one.parent + 1)
+    for one in found.document["instances"]:
+        assert list(one["path"]) == [one["instance_id"]]
+
+
+def test_lines_and_masks_of_a_tree_have_its_parts(parted: Scene, tmp_path: Path) -> None:
+    tree = parted.tree()
+    parted.export(tmp_path / "o.jsonl", tree)
+    lines = [json.loads(line) for line in (tmp_path / "o.jsonl").read_text(encoding="utf-8").splitlines()]
+    assert [one["path"] for one in lines] == [[1], [2], [3], [1, 4], [1, 5]]
+    parted.export(tmp_path / "m.json", tree)
+    document = json.loads((tmp_path / "m.json").read_text(encoding="utf-8"))
+    assert document["categories"] == [{"id": 0, "name": "object"}]
+    views = {one["image_id"] for one in document["annotations"]}
+    assert len(views) == len(parted.metadata.views)
+    for view in views:
+        areas = {tuple(one["path"]): one["area"] for one in document["annotations"] if one["image_id"] == view}
+        assert set(areas) == {(1,), (2,), (3,), (1, 4), (1, 5)}
+        assert areas[1, 4] + areas[1, 5] == pytest.approx(areas[1,], abs=0.1 * areas[1,])
+
+
+def test_rows_of_labels_keep_the_nodes_that_hold_theirs(parted: Scene) -> None:
+    found = parted.labels(parted.tree())
+    some = found.chosen(found.columns["node_id"] == 4)
+    assert [one["node_id"] for one in some.document["nodes"]] == [1, 4]
 
 
 def test_run_lengths_are_columns_and_begin_with_zeros() -> None:
