@@ -18,8 +18,8 @@ FOUND = (
 TROUBLE = "!document.querySelector('#toast').hidden && document.querySelector('#toast').classList.contains('bad')"
 AMBER, SKY = "255,176,0", "56,182,255"  # colours of the first and the second question
 # Columns of the picture, in hundredths of its width, of pixels whose hue is near to a colour's.
-COLUMNS = """((wanted, near) => {
-  const from = splatlift.viewer.canvas;
+COLUMNS = """((wanted, near, canvas) => {
+  const from = document.querySelector(canvas);
   const flat = Object.assign(document.createElement('canvas'), { width: from.width, height: from.height });
   const context = flat.getContext('2d');
   context.drawImage(from, 0, 0);
@@ -42,10 +42,10 @@ def text_of(browser: Browser, selector: str) -> str:
     return browser.value(f"document.querySelector({json.dumps(selector)}).textContent")
 
 
-def columns(browser: Browser, colour: str | None = None, near: float = 0.35) -> list[int]:
+def columns(browser: Browser, colour: str | None = None, near: float = 0.35, *, canvas: str = "#scene") -> list[int]:
     """Where the 3D picture shows a colour; without one, where it shows anything."""
-    browser.until("splatlift.viewer.settled")
-    return browser.value(f"{COLUMNS}({f'[{colour}]' if colour else 'null'}, {near})")
+    browser.until("splatlift.viewer.settled && (!splatlift.beside.link || splatlift.beside.left?.settled)")
+    return browser.value(f"{COLUMNS}({f'[{colour}]' if colour else 'null'}, {near}, '{canvas}')")
 
 
 def splat_at(browser: Browser, row: int) -> tuple[float, float]:

@@ -137,15 +137,11 @@ export class Ask {
 
   // From a link.
   restore(parameters) {
-    const given = name => parameters.getAll(name);
-    const terms = given("text").slice(0, MOST).map(text => ({ text: [text] }));
-    at("words").value = given("text").join(", ");
-    at("but").value = given("negatives").join(", ");
-    if (given("like").length) terms.push({ like: given("like") });
-    if (given("sets").length) terms.push({ sets: given("sets") });
-    if (!terms.length) return undefined;
-    if (given("unlike").length) terms.at(-1).unlike = given("unlike");
-    this.questions = terms.map((one, place) => fresh({ ...read(parameters, place), ...one }, place));
+    at("words").value = parameters.getAll("text").join(", ");
+    at("but").value = parameters.getAll("negatives").join(", ");
+    const questions = linkedQuestions(parameters);
+    if (!questions.length) return undefined;
+    this.questions = questions;
     at("heat").checked = this.heat = parameters.get("layer") === "attention" || parameters.has("heat");
     return this.ask();
   }
@@ -158,8 +154,7 @@ export class Ask {
 
   // What the service is asked by a question.
   body(question) {
-    const cut = question.threshold !== "auto" && !question.answer?.present; // which holds all the same
-    return { lift: this.lift.id, ...asked({ ...question, negatives: question.sets.length ? [] : this.negatives, ...(cut && { absent: "keep" }) }) };
+    return request(this.lift, question, this.negatives);
   }
 
   // The same in an address.
@@ -189,19 +184,10 @@ export class Ask {
 
   async answer(question, mine) {
     try {
-      const automatic = { ...question, threshold: "auto" };
-      const [answer, scores, selected] = await Promise.all([
-        json(`/query?${this.parameters(question, { top: 1 })}`),
-        question.sets.length ? bytes(`/query/selection?${this.parameters(question)}`).then(content => Float32Array.from(npy(content)))
-          : bytes(`/query/scores?${this.parameters(automatic)}`).then(npy),
-        question.threshold === "auto" && !question.sets.length ? bytes(`/query/selection?${this.parameters(question)}`).then(npy) : null,
-      ]);
+      const got = await answered(this.lift, question, this.negatives);
       if (mine !== this.turn) return;
-      const { min = 0, max = 0 } = answer.statistics;
-      const cut = answer.threshold.value ?? Infinity;
-      const shown = selected ? passing(scores, selected, cut) : scores;
-      Object.assign(question, { answer, scores, shown, low: min, high: max, cut, count: answer.count, bins: histogram(scores, min, max) });
-      if (question.threshold === "auto") question.auto = answer.threshold.value;
+      Object.assign(question, got);
+      if (question.threshold === "auto") question.auto = got.answer.threshold.value;
       else if (question.auto === undefined) question.auto = await this.automaticCut(question);
     } catch (problem) {
       if (mine !== this.turn) return;
@@ -286,13 +272,11 @@ export class Ask {
 
   // What the viewer paints: the questions that have an answer, each with its cut.
   painted() {
-    return this.questions.filter(question => question.answer && lit(question))
-      .map(question => ({ question, scores: question.shown, cut: question.cut, high: question.high, rgb: rgb(question.colour) }));
+    return painted(this.questions);
   }
 
   heated() {
-    const question = this.now;
-    return this.heat && question?.answer ? { scores: question.scores, low: question.low, high: question.high } : null;
+    return this.heat ? heated(this.now) : null;
   }
 
   boxes() {
@@ -417,6 +401,41 @@ export class Ask {
     at("apart").textContent = now.nothings && !things.length ? now.nothings : "";
   }
 }
+
+// Questions of a link.
+export function linkedQuestions(parameters) {
+  const given = name => parameters.getAll(name);
+  const terms = given("text").slice(0, MOST).map(text => ({ text: [text] }));
+  if (given("like").length) terms.push({ like: given("like") });
+  if (given("sets").length) terms.push({ sets: given("sets") });
+  if (given("unlike").length && terms.length) terms.at(-1).unlike = given("unlike");
+  return terms.map((one, place) => fresh({ ...read(parameters, place), ...one }, place));
+}
+
+// What the service is asked by a question of a lift.
+function request(lift, question, negatives) {
+  const cut = question.threshold !== "auto" && !question.answer?.present; // which holds all the same
+  return { lift: lift.id, ...asked({ ...question, negatives: question.sets.length ? [] : negatives, ...(cut && { absent: "keep" }) }) };
+}
+
+// The answer to a question, its scores, what of them is shown, and where they are cut.
+export async function answered(lift, question, negatives) {
+  const path = (route, how, more = {}) => `${route}?${search({ ...request(lift, { ...question, ...how }, negatives), ...more })}`;
+  const [answer, scores, selected] = await Promise.all([
+    json(path("/query", {}, { top: 1 })),
+    question.sets.length ? bytes(path("/query/selection")).then(content => Float32Array.from(npy(content)))
+      : bytes(path("/query/scores", { threshold: "auto" })).then(npy),
+    question.threshold === "auto" && !question.sets.length ? bytes(path("/query/selection")).then(npy) : null,
+  ]);
+  const { min = 0, max = 0 } = answer.statistics;
+  const cut = answer.threshold.value ?? Infinity;
+  return { answer, scores, shown: selected ? passing(scores, selected, cut) : scores, low: min, high: max, cut, count: answer.count, bins: histogram(scores, min, max) };
+}
+
+// What the painter takes of questions that have an answer, and of one whose scores are shown as heat.
+export const painted = questions => questions.filter(question => question.answer && lit(question))
+  .map(question => ({ question, scores: question.shown, cut: question.cut, high: question.high, rgb: rgb(question.colour) }));
+export const heated = question => (question?.answer ? { scores: question.scores, low: question.low, high: question.high } : null);
 
 const fresh = (terms, place) => ({ ...blank(), things: [], ...terms, colour: COLOURS[place % COLOURS.length] });
 const split = text => text.split(",").map(word => word.trim()).filter(Boolean);

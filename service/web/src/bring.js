@@ -1,9 +1,10 @@
 // The panel of bringing: files by drag and drop, the settings of a lift from the schema, jobs as they run, and what
 // is here already.
+import { Chart } from "./chart.js";
 import { ago, at, count, el, plural, size, tell, twice } from "./dom.js";
 import { camerasOf, dropped, gathered, kindOf, named, remember } from "./files.js";
 import { space } from "./lifts.js";
-import { bytes, events, json, patch, picture, post, remove, upload, words } from "./service.js";
+import { bytes, events, json, patch, post, remove, upload, words } from "./service.js";
 
 const PAGE = 20; // of each list
 const LOOK = 15_000; // ms between looks for jobs of others, while the panel is open
@@ -31,7 +32,8 @@ export class Bring {
   // open: the id of the lift that is shown, or null; raised: to bring the panel to the front.
   // preview: with a file of splats and what cameras there are, to be seen before they are lifted.
   constructor({ opened, gone, open, raised, preview }) {
-    Object.assign(this, { opened, gone, open, raised, preview, cameras: [], files: [], followed: new Map(), charts: new Map(), jobs: [] });
+    Object.assign(this, { opened, gone, open, raised, preview, cameras: [], files: [], followed: new Map(), jobs: [] });
+    this.chart = new Chart({ opened, ordered: (job, name) => this.begin(job, { name }) });
     const stop = event => { if ([...event.dataTransfer.types].includes("Files")) event.preventDefault(); };
     addEventListener("dragover", event => { stop(event); document.body.classList.add("dragging"); });
     addEventListener("dragleave", event => { if (!event.relatedTarget) document.body.classList.remove("dragging"); });
@@ -50,7 +52,22 @@ export class Bring {
     at("speed").replaceChildren(...Object.entries(SPEEDS).map(([name, why], place) => choice("speed", name, name, why, place === 0)));
     at("more-settings").addEventListener("toggle", () => { if (at("more-settings").open) this.schema(); });
     setInterval(() => { if (!document.hidden && !at("panel-bring").hidden) this.refresh(); }, LOOK);
+    const before = begun();
     this.show();
+    this.resume(before);
+  }
+
+  // What was dropped before the page was loaded again: what is here already stays, and the rest is named, as a browser
+  // hands its files to one page alone.
+  async resume(files) {
+    const before = await Promise.all(files.map(async ({ name, bytes: length, kind, id }) => {
+      const one = { name, bytes: length, kind, sent: 0, asset: id ? await json(`/assets/${id}`).catch(() => null) : null, problem: null };
+      return one.asset ? one : { ...one, problem: { title: "Not here yet", detail: "this page was loaded again while it went up; drop it once more" }, left: true };
+    }));
+    if (this.files.length || !before.length) return;
+    this.files = before;
+    this.show();
+    if (before.some(({ left }) => left)) this.raised();
   }
 
   // Files after an order, or splats with others of theirs, are of another scene: a new order.
@@ -66,6 +83,7 @@ export class Bring {
     for (const { file, kind, needs, why } of all) {
       const one = { name: file.name, bytes: file.size, kind, needs, file, sent: 0, asset: null, problem: null };
       if (!kind) one.problem = { title: "Not sent", detail: why ?? (/\.bin$/i.test(file.name) ? "drop the folder of the COLMAP model, or a zip of it" : `it is none of ${Object.values(WANTED).join("; ")}; photos; or a lift file`) };
+      this.files = this.files.filter(known => !(known.left && known.name === file.name && known.bytes === file.size));
       if (kind && kind !== "features") this.files = this.files.filter(known => known.kind !== kind || !known.asset);
       this.files.push(one);
       if (kind === "lift") this.sendLift(one);
@@ -117,9 +135,7 @@ export class Bring {
         tellState("Checking it\u2026");
       }
       const job = await post("/lift", { splats: assets.splats.id, cameras: assets.cameras.id, features: [assets.features.id], settings: {} });
-      this.jobs = [job, ...this.jobs.filter(known => known.id !== job.id)];
-      this.showJobs();
-      await this.follow(job, { ordered: true, name: "Example: things on a table", step: ({ stage, done, total }) => tellState(`${STAGES[stage] || stage}\u2026`, total ? done / total : undefined) });
+      await this.begin(job, { name: "Example: things on a table", step: ({ stage, done, total }) => tellState(`${STAGES[stage] || stage}\u2026`, total ? done / total : undefined) });
     } catch (problem) {
       state.textContent = words(problem);
     } finally {
@@ -177,6 +193,7 @@ export class Bring {
   }
 
   show() {
+    keep(this.ordered ? [] : this.files.filter(one => OF_SCENE.includes(one.kind) && (one.asset || one.left || !one.problem)));
     at("sent").replaceChildren(...this.files.map(one => this.line(one)));
     const has = kind => this.files.some(one => one.kind === kind && one.asset);
     const missing = Object.keys(KINDS).filter(kind => !has(kind));
@@ -289,14 +306,19 @@ export class Bring {
       at("order-problem").hidden = true;
       this.ordered = path === "/lift";
       remember(job.id, this.sceneName() ?? this.ids("splats").map(named).at(-1));
-      this.jobs = [job, ...this.jobs.filter(known => known.id !== job.id)];
-      this.showJobs();
-      this.follow(job, { ordered: true, photos: this.ids("photos").at(-1), name: this.sceneName() });
+      this.begin(job, { photos: this.ids("photos").at(-1), name: this.sceneName() });
       at("jobs").scrollIntoView({ block: "nearest" });
     } catch (problem) {
       at("order-problem").textContent = words(problem);
       at("order-problem").hidden = false;
     }
+  }
+
+  // A job that was ordered here.
+  begin(job, more) {
+    this.jobs = [job, ...this.jobs.filter(known => known.id !== job.id)];
+    this.showJobs();
+    return this.follow(job, { ordered: true, ...more });
   }
 
   // Live progress, until the job has ended. What was ordered here is opened when it is done.
@@ -376,13 +398,13 @@ export class Bring {
     if (ENDED.includes(job.state) && job.ended) parts.push(el("span", { className: "state" }, `${job.started ? `took ${(job.ended - job.started).toFixed(1)} s, ` : ""}${ago(job.ended)}`));
     const actions = el("span", { className: "actions" });
     if (job.state === "succeeded" && job.kind === "lift") actions.append(el("button", { type: "button", on: { click: () => this.opened(job.id) } }, "Open"));
-    if (job.state === "succeeded" && job.kind === "tradeoff") actions.append(el("button", { type: "button", "aria-expanded": String(this.charts.has(job.id)), on: { click: () => this.chart(job) } }, this.charts.has(job.id) ? "Hide chart" : "Show chart"));
+    if (job.state === "succeeded" && job.kind === "tradeoff") actions.append(el("button", { type: "button", on: { click: () => this.chart.show(job.id).catch(problem => tell(words(problem), true)) } }, "Show chart"));
     if (["queued", "running"].includes(job.state)) actions.append(el("button", { type: "button", on: { click: () => this.cancel(job) } }, "Cancel"));
     if (ENDED.includes(job.state)) {
       const going = job.state !== "succeeded" ? "" : job.kind === "lift" ? "?with_lift=true" : "?with_tradeoff=true";
       actions.append(twice("Delete", () => remove(`/jobs/${job.id}${going}`).then(() => { this.jobs = this.jobs.filter(known => known !== job); this.showJobs(); this.gone(); })));
     }
-    return el("li", { className: "job", data: { state: job.state } }, ...parts, actions, this.charts.get(job.id));
+    return el("li", { className: "job", data: { state: job.state } }, ...parts, actions);
   }
 
   async cancel(job) {
@@ -393,18 +415,15 @@ export class Bring {
       tell(words(problem), true);
     }
   }
+}
 
-  async chart(job) {
-    try {
-      if (this.charts.delete(job.id)) return this.showJobs(true);
-      const [image, { choice }] = await Promise.all([picture(`/tradeoffs/${job.id}/chart`), json(`/tradeoffs/${job.id}`)]);
-      image.alt = "Seconds against accuracy of each run";
-      this.charts.set(job.id, el("figure", { className: "chart" }, image, el("figcaption", {}, choice.why || "")));
-      this.showJobs(true);
-    } catch (problem) {
-      tell(words(problem), true);
-    }
-  }
+// The files of an order that is being put together, for this tab alone.
+const BEGUN = "splatlift-order";
+const begun = () => { try { return JSON.parse(sessionStorage.getItem(BEGUN)) ?? []; } catch { return []; } };
+function keep(files) {
+  try {
+    sessionStorage.setItem(BEGUN, JSON.stringify(files.map(({ name, bytes: length, kind, asset }) => ({ name, bytes: length, kind, id: asset?.id ?? null }))));
+  } catch { /* a browser that keeps nothing */ }
 }
 
 const lines = ({ summary, warnings }) => [...warnings.map(warning => el("li", { className: "warning" }, warning)), ...summary.map(line => el("li", {}, line))];

@@ -9,9 +9,9 @@ const SPACES = { none: "no words", prompts: "own words", "": "words of no known 
 export const space = ({ text_space: name }) => SPACES[name] || "asked in words";
 
 export class Lifts {
-  // opened: with the lift to show; changed: after one was named or deleted.
-  constructor({ opened, changed }) {
-    Object.assign(this, { opened, changed });
+  // opened: with the lift to show; beside: with one to see beside what is open; changed: after one was named or deleted.
+  constructor({ opened, beside, changed }) {
+    Object.assign(this, { opened, beside, changed });
   }
 
   show(lifts, open) {
@@ -25,6 +25,7 @@ export class Lifts {
       el("span", { className: "state" }, `${count(lift.count)} splats \u00b7 ${lift.view_count} views \u00b7 ${space(lift)} \u00b7 ${ago(lift.created)}`),
       el("span", { className: "actions" },
         lift.id === open ? el("span", { className: "quiet" }, "Open") : el("button", { type: "button", on: { click: () => this.opened(lift.id) } }, "Open"),
+        open && lift.id !== open ? el("button", { type: "button", className: "only-3d", "aria-label": `Compare with the lift of ${ago(lift.created)}`, on: { click: () => this.beside(lift.id) } }, "Compare") : null,
         twice("Delete", () => remove(`/jobs/${lift.id}?with_lift=true`).then(() => this.changed()))))));
   }
 

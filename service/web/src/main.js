@@ -1,5 +1,6 @@
 // The page: a lift on the stage, what is asked of it, and a link that opens the same again.
 import { Ask, label, naming } from "./ask.js";
+import { Beside } from "./beside.js";
 import { Bring } from "./bring.js";
 import { at, count, el, fill, size, tell } from "./dom.js";
 import { Hand } from "./hand.js";
@@ -35,7 +36,8 @@ const names = new Names({ changed, centres: (values, most) => viewer?.mesh ? vie
 const masks = new Masks({ pick: (term, less) => { tab("ask"); ask.example(term, less); }, swap: (old, term) => ask.swap(old, term) });
 const take = new Take({ ask, look, names, shot });
 const bring = new Bring({ opened: id => open(id, true), gone: () => refreshLifts(), open: () => lift?.id ?? null, raised: () => tab("bring"), preview });
-const lifts = new Lifts({ opened: id => open(id, true), changed: () => refreshLifts() });
+const beside = new Beside({ viewer: () => viewer, made: plain, now: () => String(linked()), changed: () => { beside.follow(ask.questions, lift); link(); } });
+const lifts = new Lifts({ opened: id => open(id, true), changed: () => refreshLifts(), beside: async id => { if (!beside.link) beside.hold(linked()); await open(id, true); } });
 const hand = new Hand({ ask, label, look, naming, viewer: () => (viewer?.mesh ? viewer : null) });
 const things = new Things({ naming, held: () => ask.now?.sets || [], hold: sets => ask.hold(sets), fly: (box, view) => (look.mode === "view" ? look.go(view) : viewer?.toBox(box, look.views.find(({ name }) => name === view))) });
 
@@ -58,6 +60,7 @@ function changed() {
   repaint();
   if (!sliding) link();
   take.show();
+  beside.follow(ask.questions, lift);
   const question = ask.now?.answer ? `${ask.parameters(ask.now)}` : names.shown ? JSON.stringify([names.asked, ...names.only]) : "";
   clearTimeout(changed.soon);
   if (question !== drawn) changed.soon = setTimeout(() => { drawn = question; look.draw(); }, 150); // the slider moves often
@@ -124,6 +127,16 @@ function slid() {
 // browser's history; a camera that moves is none.
 function link() {
   if (!lift || busy || going) return;
+  const parameters = linked();
+  const fixed = ["view", "what", "show", "hide", "camera", "heat"];
+  const now = String([...parameters].filter(([name]) => !fixed.includes(name)));
+  const waits = ask.questions.some(question => !question.answer && !question.problem);
+  if (entry !== null && entry !== now && waits) return; // it is an entry once it is answered
+  history[entry !== null && entry !== now ? "pushState" : "replaceState"](null, "", `?${parameters}`);
+  entry = now;
+}
+
+function linked() {
   const parameters = new URLSearchParams({ lift: lift.id });
   if (look.view) parameters.set("view", look.view.name);
   ask.link(parameters);
@@ -133,12 +146,8 @@ function link() {
   if (look.mode !== "scene" && !look.fallback) parameters.set("show", look.mode);
   if (at("hide").checked) parameters.set("hide", "1");
   if (viewer?.mesh) parameters.set("camera", viewer.place3d.map(value => Number(value.toPrecision(5))).join(","));
-  const fixed = ["view", "what", "show", "hide", "camera", "heat"];
-  const now = String([...parameters].filter(([name]) => !fixed.includes(name)));
-  const waits = ask.questions.some(question => !question.answer && !question.problem);
-  if (entry !== null && entry !== now && waits) return; // it is an entry once it is answered
-  history[entry !== null && entry !== now ? "pushState" : "replaceState"](null, "", `?${parameters}`);
-  entry = now;
+  if (beside.link) parameters.set("beside", beside.link);
+  return parameters;
 }
 
 // Back and forth: what was asked then is asked again.
@@ -164,6 +173,7 @@ async function restored(parameters) {
   const answered = ask.restore(parameters);
   await hand.restore(parameters);
   await answered;
+  if (!look.fallback) beside.restore(parameters);
   if (parameters.has("named")) { tab("name"); names.restore(parameters); }
 }
 
@@ -202,6 +212,7 @@ async function refreshLifts() {
   lifts.show(known, lift?.id);
   if (gone && !next) { // it was deleted
     lift = null;
+    beside.end();
     viewer?.clear();
     of(null);
     tell("The scene that was open was deleted.");
@@ -215,12 +226,13 @@ async function refreshLifts() {
 async function open(id, fresh = false) {
   const mine = ++turn;
   busy = true;
-  const parameters = !fresh && [null, id].includes(started.get("lift")) ? started : new URLSearchParams();
+  let parameters = !fresh && [null, id].includes(started.get("lift")) ? started : new URLSearchParams();
   trouble(null);
   try {
     loading("Opening the lift");
     const found = await json(`/lifts/${id}`);
     if (mine !== turn) return;
+    if (fresh && lift) parameters = beside.carried(found) ?? parameters;
     lift = found;
     at("empty").hidden = true;
     document.body.classList.remove("no-lifts");
@@ -296,6 +308,7 @@ async function appear(mine) {
 }
 
 function stand(parameters) {
+  viewer.lead();
   viewer.origin = lift.origin;
   viewer.settle(look.views);
   if (look.view) viewer.to(look.view, true);
@@ -311,9 +324,8 @@ function stand(parameters) {
 function made() {
   try {
     const canvas = at("scene");
-    const built = new Viewer(canvas, placed);
+    const built = plain(canvas, placed);
     built.moved = link;
-    built.background(ground());
     pointing(canvas, built);
     return built;
   } catch (problem) {
@@ -321,6 +333,12 @@ function made() {
     console.warn(problem);
     return null;
   }
+}
+
+function plain(canvas, seen = () => {}) {
+  const built = new Viewer(canvas, seen);
+  built.background(ground());
+  return built;
 }
 
 const ground = () => getComputedStyle(document.documentElement).getPropertyValue("--ground").trim();
@@ -488,10 +506,10 @@ onHeard(answers => {
 at("open-example").addEventListener("click", () => bring.example());
 onRefused(() => { at("door-wrong").hidden = !keyOf(); if (!at("door").open) at("door").showModal(); });
 at("forget").hidden = !keyOf();
-dark.addEventListener("change", () => { viewer?.background(ground()); repaint(); ask.bars(); });
+dark.addEventListener("change", () => { viewer?.background(ground()); beside.left?.background(ground()); repaint(); ask.bars(); });
 
 // For tests, and for the curious in the console.
-Object.assign(globalThis, { splatlift: { ask, look, bring, take, things, names, masks, hand, get viewer() { return viewer; }, get lift() { return lift; }, label, COLOURS } });
+Object.assign(globalThis, { splatlift: { ask, look, bring, take, things, names, masks, hand, beside, get viewer() { return viewer; }, get lift() { return lift; }, label, COLOURS } });
 
 async function begin() {
   if (look.fallback) fallBack();

@@ -70,10 +70,7 @@ export class Names {
     at("named").textContent = "Naming every splat\u2026";
     at("stage").classList.add("asking");
     try {
-      const { lift } = this;
-      const body = { lift: lift.id, ...asked };
-      const found = await post("/query/segment", body);
-      const values = npy(await bytes("/query/segment/labels", { body }));
+      const [found, values] = await namedSplats(this.lift, asked);
       if (mine !== this.turn) return;
       Object.assign(this, { asked, found, values, none: found.none });
       this.only = new Set(found.found.filter(({ word }) => only.includes(word)).map(({ value }) => value));
@@ -123,10 +120,7 @@ export class Names {
 
   paint() {
     if (!this.found) return;
-    const palette = [REST, ...this.found.found.map(({ value, colour }) => (this.is(value) ? colour : REST))];
-    const colours = new Uint8Array(3 * this.values.length);
-    this.values.forEach((value, row) => colours.set(palette[value], 3 * row));
-    this.layer = { colours, cover: COVER };
+    this.layer = inColours(this.found, this.values, value => this.is(value));
   }
 
   painted() {
@@ -185,7 +179,7 @@ export class Names {
     if (own) at("own-words").value = named.join(", ");
     at("vocabulary").value = this.chosen = own ? OWN : table ?? "";
     at("own-words-label").hidden = !own;
-    this.name(own ? { words: named } : table ? { table } : {}, parameters.getAll("only"));
+    this.name(linkedWords(parameters), parameters.getAll("only"));
   }
 
   link(parameters) {
@@ -206,6 +200,27 @@ export class Names {
     at("what-of").textContent = spot.words.length ? `Most like \u201c${spot.words[0].word}\u201d` : "Looking\u2026";
     at("what-words").replaceChildren(...spot.words.map(({ word, score }) => el("li", {}, el("span", {}, word), el("span", { className: "score" }, score.toFixed(3)))));
   }
+}
+
+// The words of a link, as the service is asked for them.
+export function linkedWords(parameters) {
+  const words = parameters.getAll("named");
+  return words[0] !== "*" ? { words } : parameters.has("table") ? { table: parameters.get("table") } : {};
+}
+
+// Which words are here, and the number of each splat's.
+export async function namedSplats(lift, asked) {
+  const body = { lift: lift.id, ...asked };
+  const found = await post("/query/segment", body);
+  return [found, npy(await bytes("/query/segment/labels", { body }))];
+}
+
+// The layer of such splats; words that are not looked at have the colour of none.
+export function inColours(found, values, looked) {
+  const palette = [REST, ...found.found.map(({ value, colour }) => (looked(value) ? colour : REST))];
+  const colours = new Uint8Array(3 * values.length);
+  values.forEach((value, row) => colours.set(palette[value], 3 * row));
+  return { colours, cover: COVER };
 }
 
 const line = (named, names) => el("li", {}, el("button", { type: "button", className: "thing", style: { "--mine": hex(named.colour) }, "aria-pressed": String(names.only.has(named.value)), on: { click: () => names.press(named.value) } },

@@ -34,7 +34,7 @@ export class Viewer {
     this.controls.dampingFactor = 0.12;
     this.controls.zoomToCursor = true;
     this.controls.addEventListener("change", () => this.draw());
-    this.controls.addEventListener("start", () => { this.flight = null; });
+    this.controls.addEventListener("start", () => { this.flight = null; this.lead(); });
     this.moved = () => {};
     this.controls.addEventListener("end", () => this.moved());
     this.boxes = new THREE.Group();
@@ -61,6 +61,34 @@ export class Viewer {
     this.draw();
   }
 
+  // One camera for two viewers: the one that was moved last leads.
+  pair(partner) {
+    this.partner = partner;
+    partner.partner = this;
+    this.lead();
+    this.draw();
+  }
+
+  lead() {
+    if (!this.partner) return;
+    this.leads = true;
+    this.partner.leads = false;
+  }
+
+  // Another viewer's camera, in this one's frame.
+  follow({ camera, controls, lens, origin }) {
+    const shift = new THREE.Vector3(...origin.map((value, axis) => value - this.origin[axis]));
+    const [position, target] = [camera.position.clone().add(shift), controls.target.clone().add(shift)];
+    if (position.equals(this.camera.position) && target.equals(this.controls.target) && lens === this.lens && camera.up.equals(this.camera.up)) return;
+    this.flight = null;
+    this.camera.up.copy(camera.up);
+    this.camera.position.copy(position);
+    this.controls.target.copy(target);
+    this.lens = lens;
+    this.frame();
+    this.draw();
+  }
+
   background(colour) {
     this.renderer.setClearColor(new THREE.Color(colour), 1);
     this.draw();
@@ -72,6 +100,7 @@ export class Viewer {
       this.asked = 0;
       this.fly(now);
       this.controls.update();
+      if (this.leads) this.partner.follow(this);
       this.renderer.render(this.scene, this.camera);
       this.frames += 1;
       this.seen(point => this.place(point));
@@ -275,6 +304,7 @@ export class Viewer {
   }
 
   go(position, target, quick = still()) {
+    this.lead();
     if (quick) {
       this.flight = null;
       this.camera.position.copy(position);
@@ -303,6 +333,7 @@ export class Viewer {
 
   // By keyboard: turn by angles in radians, zoom by a factor.
   turn(around, over) {
+    this.lead();
     const offset = this.camera.position.clone().sub(this.controls.target);
     const turned = new THREE.Quaternion().setFromUnitVectors(this.camera.up, new THREE.Vector3(0, 1, 0));
     const place = new THREE.Spherical().setFromVector3(offset.applyQuaternion(turned));
@@ -316,6 +347,7 @@ export class Viewer {
   }
 
   zoom(factor) {
+    this.lead();
     this.camera.position.sub(this.controls.target).multiplyScalar(factor).add(this.controls.target);
     this.moved();
     this.draw();

@@ -1,0 +1,97 @@
+"""Two sides with one camera: words, cuts and lifts beside each other; and the chart of a comparison of settings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import httpx
+import pytest
+
+from tests.api.following import ended
+
+from .browser import Browser
+from .conftest import Served
+from .looking import AMBER, READY, ask, columns, text_of
+
+pytestmark = pytest.mark.slow
+COMPARE = "#panel-ask [data-compare]"
+BOTH = "splatlift.beside.scene && splatlift.beside.left.settled && splatlift.viewer.settled"
+PLACES = "[splatlift.viewer, splatlift.beside.left].map(side => side.place3d)"
+SHARED = f"{BOTH} && (([one, other]) => one.every((value, axis) => Math.abs(value - other[axis]) < 1e-6))({PLACES})"
+
+
+@pytest.fixture
+def page(browser: Browser, served: Served) -> Iterator[Browser]:
+    browser.window(1200, 700)
+    browser.open(served.address)
+    browser.until(READY)
+    yield browser
+    browser.open("about:blank#")
+
+
+@pytest.fixture
+def other_lift(served: Served) -> Iterator[str]:
+    with httpx.Client(base_url=served.address, timeout=60) as client:
+        known = client.get(f"/lifts/{served.lift}").json()
+        order = {name: known[name] for name in ("splats", "cameras", "features")} | {"settings": {"preset": "mean"}}
+        job = ended(client, client.post("/lift", json=order).headers["location"])["id"]
+        yield job
+        assert client.delete(f"/jobs/{job}?with_lift=true").status_code == 204
+
+
+def test_two_words_are_seen_beside_each_other_with_one_camera(page: Browser) -> None:
+    ask(page, "lamp")
+    page.press(COMPARE)
+    page.until(SHARED)
+    ask(page, "apple")
+    assert "lamp" in text_of(page, "#beside-said") and "apple" in text_of(page, "#right-said")
+    right, left = (columns(page, AMBER, canvas=canvas) for canvas in ("#scene", "#beside"))
+    assert max(right) < 50 < min(left)  # the apple is left of the lamp
+    before = page.value(PLACES)
+    for side in ("#scene", "#beside"):  # either turns both
+        page.drag(side, (0.5, 0.5), (0.7, 0.5))
+        page.until(SHARED)
+        assert page.value(PLACES) != before
+        before = page.value(PLACES)
+    page.window(390, 844)
+    page.until(SHARED)
+    assert page.value("document.documentElement.scrollWidth") == 390
+    over, below = (
+        page.value(f"document.querySelector('{side}').getBoundingClientRect().y") for side in ("#beside", "#scene")
+    )
+    assert over < below
+    assert page.violations() == {}
+    page.press("#end-compare")
+    assert page.value("document.querySelector('#beside').checkVisibility()") is False
+
+
+def test_link_opens_both_sides_and_back_leaves_one(page: Browser) -> None:
+    ask(page, "lamp")
+    page.press(COMPARE)
+    page.until(BOTH)
+    page.value("document.querySelector('#cut').value = document.querySelector('#cut').max")
+    for event in ("input", "change"):
+        page.value(f"document.querySelector('#cut').dispatchEvent(new Event('{event}'))")
+    page.until(f"location.search.includes('threshold') && {BOTH}")
+    sides = "['#beside-said', '#right-said'].map(side => document.querySelector(side).textContent)"
+    left, right = page.value(sides)
+    assert left != right and "lamp" in left and "lamp" in right
+    address = page.value("location.href")
+    page.open("about:blank#")
+    page.open(address)
+    page.until(f"{READY} && {BOTH} && splatlift.ask.now.answer")
+    assert page.value(sides) == [left, right]
+    page.press("#end-compare")
+    page.until("!location.search.includes('beside')")
+    page.value("history.back()")
+    page.until(BOTH)
+
+
+def test_other_lift_is_asked_the_same_beside_what_is_open(page: Browser, served: Served, other_lift: str) -> None:
+    ask(page, "lamp")
+    page.press("#tab-bring")
+    page.until("document.querySelector('#lifts [aria-label^=Compare]')")
+    page.press("#lifts [aria-label^=Compare]")
+    page.until(f"splatlift.lift?.id === '{other_lift}' && {SHARED} && splatlift.ask.now?.answer")
+    assert page.value("splatlift.beside.scene.id") == served.lift and page.value("splatlift.ask.now.text") == ["lamp"]
+    assert min(columns(page, AMBER)) > 50 and min(columns(page, AMBER, canvas="#beside")) > 50
