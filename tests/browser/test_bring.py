@@ -38,7 +38,7 @@ HELD_ANSWERS = """(() => {
     return answer;
   };
 })()"""
-CHART = "document.querySelector('.chart img')?.naturalWidth > 100"
+POINT = "document.querySelector('#chart .point')"
 
 
 @pytest.fixture
@@ -85,7 +85,20 @@ def test_dropped_files_are_planned_compared_and_cancelled(empty: Browser, files:
     empty.until("splatlift.bring.followed.size === 0")  # the list is as it stays
     assert empty.value("fetch('jobs').then(reply => reply.json()).then(({jobs}) => jobs.length)") == 2
     empty.press("#jobs .job:last-child .actions button")
-    empty.until(CHART)
+    empty.until(f"document.querySelector('#chart').open && {POINT}")
+    assert empty.violations() == {}
+    runs = empty.value("splatlift.bring.chart.shown.map(run => run.name)")
+    labels = empty.value(
+        "[...document.querySelectorAll('#chart .point')].map(point => point.getAttribute('aria-label'))"
+    )
+    assert len(labels) == len(runs) and all(label.startswith(name) for name, label in zip(runs, labels, strict=True))
+    empty.value(f"{POINT}.dispatchEvent(new Event('click'))")  # its lift, which is made anew
+    empty.until(READY, LONG)
+    name_of = "({preset, speed}) => [preset, speed].join()"
+    assert (
+        empty.value(f"[splatlift.bring.chart.shown[0], splatlift.lift].map(one => one.settings).map({name_of})")
+        == [empty.value(f"({name_of})(splatlift.lift.settings)")] * 2
+    )
 
 
 def test_lift_file_asks_for_what_it_was_made_of_and_opens(
@@ -118,7 +131,7 @@ def test_lift_file_looks_again_for_what_came_while_it_looked(
     empty.until(READY)
 
 
-def test_dropped_folder_brings_its_cameras(empty: Browser, tmp_path: Path) -> None:
+def test_dropped_folder_brings_its_cameras(empty: Browser, files: dict[str, Path], tmp_path: Path) -> None:
     model = tmp_path / "model"
     with zipfile.ZipFile(io.BytesIO(colmap_zip())) as archive:
         archive.extractall(model)
@@ -128,6 +141,35 @@ def test_dropped_folder_brings_its_cameras(empty: Browser, tmp_path: Path) -> No
     empty.until("document.querySelectorAll('.file.done').length === 2")
     names = empty.value("[...document.querySelectorAll('.file.done .name')].map(name => name.textContent)")
     assert sorted(names) == ["model.zip", "point_cloud.ply"] and "3 views" in text_of(empty, "#sent")
+    empty.until("splatlift.viewer?.draft")
+    drawn = empty.value("[...splatlift.viewer.cones.geometry.attributes.position.array]")
+    empty.drop([files["cameras"]])  # the same cameras
+    empty.until("splatlift.viewer.cones.geometry.attributes.position.count === 3 * 16")
+    empty.until("splatlift.bring.cameras[0].name !== 'left.png'")
+    same = empty.value("[...splatlift.viewer.cones.geometry.attributes.position.array]")
+    assert len(drawn) == 3 * 16 * 3 and drawn == pytest.approx(same, abs=1e-5)
+
+
+def test_zip_of_streamed_splats_is_taken_as_splats(empty: Browser, tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "scene.zip", "w") as archive:
+        for name in ("lod-meta.json", "0_0/meta.json", "0_0/means_l.webp", "0_0/means_u.webp"):
+            archive.writestr(name, "{}")
+    empty.drop([tmp_path / "scene.zip"])
+    empty.until("document.querySelector('.file .kind')?.textContent === 'splats'")
+
+
+def test_files_are_still_there_after_the_page_is_loaded_again(empty: Browser, files: dict[str, Path]) -> None:
+    empty.drop([files["splats"], files["cameras"]])
+    empty.until("document.querySelectorAll('.file.done').length === 2")
+    empty.value("XMLHttpRequest.prototype.send = () => {}")  # what is sent from here on never arrives
+    empty.drop([files["features"]])
+    empty.until("document.querySelectorAll('#sent .file').length === 3")
+    empty.value("location.reload()")
+    empty.until("document.querySelector('.file.bad .state')?.textContent.includes('drop it once more')")
+    assert "features.safetensors" in text_of(empty, ".file.bad .name")
+    empty.drop([files["features"]])
+    empty.until("!document.querySelector('#lift-it').disabled")
+    assert empty.value("document.querySelectorAll('#sent .file').length") == 3
 
 
 def test_lift_file_waits_for_other_cameras_after_wrong_ones(

@@ -1,5 +1,6 @@
 // What a file is, by its name and what is in it: nothing is sent before that is known.
-import { Zip, ZipPassThrough } from "fflate";
+import { unzip, Zip, ZipPassThrough } from "fflate";
+import { colmapViews } from "./colmap.js";
 import table from "./kinds.json"; // of liftcore.io.kinds: suffixes that are sent, and what others are
 
 const HEADER = 32 << 20; // bytes of a safetensors header that are read here
@@ -7,6 +8,8 @@ const TAIL = 1 << 20; // of a zip: its list of names lies at its end
 const DEPTH = 5; // folders down
 const CAMERAS = new RegExp(table.cameras);
 const PACK = /\.safetensors$/i;
+const SOG = /(^|[^\w-])(lod-meta\.json|means_[lu]\.webp)/; // of an unbundled or a streamed one
+const READABLE = 512e6; // bytes of a zip whose cameras are read here
 const PHOTO = /\.(jpe?g|png)$/i;
 const suffix = name => /\.[^.]*$/.exec(name.toLowerCase())?.[0] ?? "";
 const isSplats = name => table.kinds[suffix(name)] === "splats";
@@ -25,6 +28,7 @@ async function zipKind(file) {
   const names = new TextDecoder("latin1").decode(await file.slice(-TAIL).arrayBuffer());
   const has = suffixes => new RegExp(`[^\\x00-\\x1f](${suffixes.map(one => `\\${one}`).join("|")})`, "i").test(names);
   if (/(cameras|images)\.(bin|txt)|transforms[^/]*\.json|cameras\.json/.test(names)) return "cameras";
+  if (SOG.test(names)) return "splats";
   if (has(Object.keys(table.kinds).filter(one => table.kinds[one] === "splats"))) return "splats";
   return has(table.images) ? "photos" : "cameras";
 }
@@ -43,14 +47,17 @@ async function safetensors(file) {
   }
 }
 
-// What was dropped: files, and of folders the cameras as one zip, the newest splats and the packs; or all files where there
-// are no cameras. Photos of a folder stay: they may be gigabytes.
+// What was dropped: files, and of folders the cameras as one zip, the newest splats and the packs; a SOG's folder as one
+// zip; or all files where there are no cameras. Photos of a folder stay: they may be gigabytes.
 export async function dropped({ items, files }) {
   const entries = [...items].map(item => item.webkitGetAsEntry?.()).filter(Boolean); // while the event lasts
   if (!entries.some(entry => entry.isDirectory)) return [...files];
   const found = await Promise.all(entries.map(async entry => {
     const inner = await within(entry);
     const cameras = inner.filter(({ path }) => CAMERAS.test(path));
+    if (entry.isDirectory && inner.some(({ path }) => SOG.test(path)) && !cameras.length) {
+      return [await zipped(inner.map(({ path, file }) => ({ path: path.slice(entry.name.length + 1), file })), `${entry.name}.sog`)];
+    }
     if (!entry.isDirectory || !cameras.length) return inner.map(({ file }) => file);
     const splats = inner.filter(({ path }) => isSplats(path)).sort((one, other) => other.file.lastModified - one.file.lastModified);
     const packs = inner.filter(({ path }) => PACK.test(path));
@@ -92,21 +99,34 @@ export async function gathered(files) {
   return [...files.filter(file => !photos.includes(file)), await zipped(photos.map(file => ({ path: file.name, file })), name)];
 }
 
-// The cameras of a file, in the frame of the splats, to be drawn: those of Inria's cameras.json and of transforms.json.
-// Others are read by the service alone.
+// The cameras of a file, in the frame of the splats, to be drawn: those of Inria's cameras.json, of transforms.json and of
+// a COLMAP model, also in a zip. Others are read by the service alone.
 export async function camerasOf(file) {
-  if (!/\.json$/i.test(file.name)) return [];
   try {
-    const told = JSON.parse(await file.text());
-    if (Array.isArray(told)) return told.filter(one => one.rotation && one.position).map(one => view(one.rotation, one.position, one));
-    return (told.frames ?? []).map(one => {
-      const m = one.transform_matrix;
-      const { w, h, fl_x: fx, fl_y: fy } = { ...told, ...one };
-      return view(m.slice(0, 3).map(row => [row[0], -row[1], -row[2]]), m.slice(0, 3).map(row => row[3]), { width: w, height: h, fx, fy: fy ?? fx });
-    }).filter(one => one.fx > 0);
+    if (/\.zip$/i.test(file.name)) return file.size > READABLE ? [] : await zippedCameras(file);
+    return /\.json$/i.test(file.name) ? camerasOfDocument(JSON.parse(await file.text())) : [];
   } catch {
     return []; // the check of the upload says what is wrong with it
   }
+}
+
+async function zippedCameras(file) {
+  const content = new Uint8Array(await file.arrayBuffer());
+  const parts = await new Promise((done, failed) => {
+    unzip(content, { filter: ({ name }) => CAMERAS.test(name) && !/dataparser_/.test(name) }, (problem, files) => (problem ? failed(problem) : done(files)));
+  });
+  const documents = Object.keys(parts).filter(name => name.endsWith(".json"));
+  const views = colmapViews(parts);
+  return views.length || !documents.length ? views : camerasOfDocument(JSON.parse(new TextDecoder().decode(parts[documents[0]])));
+}
+
+function camerasOfDocument(told) {
+  if (Array.isArray(told)) return told.filter(one => one.rotation && one.position).map(one => view(one.rotation, one.position, one));
+  return (told.frames ?? []).map(one => {
+    const m = one.transform_matrix;
+    const { w, h, fl_x: fx, fl_y: fy } = { ...told, ...one };
+    return view(m.slice(0, 3).map(row => [row[0], -row[1], -row[2]]), m.slice(0, 3).map(row => row[3]), { width: w, height: h, fx, fy: fy ?? fx });
+  }).filter(one => one.fx > 0);
 }
 
 // From a camera's axes in the world, as columns, and its place there.

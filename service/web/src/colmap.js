@@ -1,0 +1,77 @@
+// The views of a COLMAP model, binary or text, as its documentation has the files: world to camera, x right, y down.
+const PARAMETERS = [3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16]; // of each camera model, by its number
+const MODELS = ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"];
+const ONE_FOCAL = new Set([0, 2, 3, 8, 9]); // models whose first parameter is both focal lengths
+const POINT = 24; // bytes of a point in images.bin
+
+// files: contents by path. Of several models the first one that is whole.
+export function colmapViews(files) {
+  for (const path of Object.keys(files).filter(name => /(^|\/)images\.(bin|txt)$/.test(name)).sort()) {
+    const [folder, ending] = [path.slice(0, path.lastIndexOf("/") + 1), path.slice(-3)];
+    const cameras = files[`${folder}cameras.${ending}`];
+    if (cameras) return ending === "bin" ? binary(files[path], cameras) : text(files[path], cameras);
+  }
+  return [];
+}
+
+function camera(model, width, height, parameters) {
+  return { width, height, fx: parameters[0], fy: parameters[ONE_FOCAL.has(model) ? 0 : 1] };
+}
+
+// Of a rotation as a quaternion, real part first, and a translation.
+function viewmat([w, x, y, z], translation) {
+  const rows = [
+    [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+    [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+    [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+  ];
+  return [...rows.map((row, axis) => [...row, translation[axis]]), [0, 0, 0, 1]];
+}
+
+function binary(images, cameras) {
+  const known = new Map();
+  let read = reader(cameras);
+  for (let left = read.u64(); left > 0; left -= 1) {
+    const [id, model, width, height] = [read.u32(), read.u32(), read.u64(), read.u64()];
+    known.set(id, camera(model, width, height, read.f64(PARAMETERS[model])));
+  }
+  const views = [];
+  read = reader(images);
+  for (let left = read.u64(); left > 0; left -= 1) {
+    read.u32();
+    const [rotation, translation, id, name] = [read.f64(4), read.f64(3), read.u32(), read.text()];
+    read.skip(POINT * read.u64());
+    views.push({ name, ...known.get(id), viewmat: viewmat(rotation, translation) });
+  }
+  return views;
+}
+
+function text(images, cameras) {
+  const lines = content => new TextDecoder().decode(content).split("\n").filter(line => !line.startsWith("#"));
+  const known = new Map(lines(cameras).filter(line => line.trim()).map(line => {
+    const [id, model, width, height, ...parameters] = line.trim().split(/\s+/);
+    return [id, camera(MODELS.indexOf(model), Number(width), Number(height), parameters.map(Number))];
+  }));
+  return lines(images).filter((line, place) => place % 2 === 0 && line.trim()).map(line => { // the line after each has its points
+    const [, w, x, y, z, tx, ty, tz, id, ...name] = line.trim().split(/\s+/);
+    return { name: name.join(" "), ...known.get(id), viewmat: viewmat([w, x, y, z].map(Number), [tx, ty, tz].map(Number)) };
+  });
+}
+
+function reader(content) {
+  const view = new DataView(content.buffer, content.byteOffset, content.byteLength);
+  let place = 0;
+  const next = size => { place += size; return place - size; };
+  return {
+    u32: () => view.getUint32(next(4), true),
+    u64: () => Number(view.getBigUint64(next(8), true)),
+    f64: number => Array.from({ length: number }, () => view.getFloat64(next(8), true)),
+    skip: size => { next(size); },
+    text: () => {
+      const end = content.indexOf(0, place);
+      const name = new TextDecoder().decode(content.subarray(place, end));
+      place = end + 1;
+      return name;
+    },
+  };
+}
