@@ -437,14 +437,17 @@ class LiftSettings(Shown):
         if self.aggregation and self.clusters_by_masks and not masks:
             whole.append(f"aggregation_clusters={self.aggregation_clusters} of grids")
         if whole:
+            changes = [f"{name}=0" for name in asked if name in ("cg_steps", "reference_channels", "smoothness")]
+            if len(changes) < len(whole):
+                changes.append("aggregation=false, or aggregation_clusters=graph where views have masks")
+            strength = 1 if self.smoothness == "auto" else self.smoothness
+            after = f", then smooth the lift by `splatlift refine LIFT --smoothness {strength:g}`" if strength else ""
             raise InvalidSettings(
                 "engine",
                 expected="settings that work on blocks of splats: least squares need all rays, smoothness and "
                 "clusters by HDBSCAN all features in one place",
                 got=", ".join(whole),
-                hint="set cg_steps=0 and reference_channels=0, smoothness=0 (splatlift refine smooths the finished "
-                "lift), aggregation_clusters=graph where views have masks, or aggregation=false; or lift without an "
-                "engine",
+                hint=f"set {' and '.join(changes)}{after}; or lift without an engine",
             )
 
     def _compositing(self, opacity_logit_scale: float) -> CompositingParams:

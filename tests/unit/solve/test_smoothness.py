@@ -292,8 +292,19 @@ def test_refinement_that_cannot_be_is_refused_in_words(files: tuple[Path, Path, 
         clustered.refined(splats, smoothness=1)
     with pytest.raises(lc.InvalidSettings, match="smoothness=0"):
         LiftSettings.of(smoothness=1, aggregation=True, aggregation_resolve=True, aggregation_clusters="hdbscan")
-    with pytest.raises(lc.InvalidSettings, match=r"engine: .*got smoothness=2.0; set .*smoothness=0"):
-        LiftSettings.of(smoothness=2).check_blocks(masks=True)
+
+
+def test_lift_in_blocks_refuses_smoothness_and_is_refined(
+    files: tuple[Path, Path, Path], plain: lc.LiftResult
+) -> None:
+    scene = lc.read_splats(files[0]), lc.read_cameras(files[1]), lc.read_features(files[2])
+    for strength, to_take in ((2, "2"), ("auto", "1")):
+        way = rf"got smoothness={strength}.*; set smoothness=0, then .*splatlift refine LIFT --smoothness {to_take}`"
+        with pytest.raises(lc.InvalidSettings, match=way):
+            lc.lift(*scene, smoothness=strength, engine=lc.LocalEngine(1))
+    in_blocks = lc.lift(*scene, engine=lc.LocalEngine(1)).refined(scene[0], smoothness=2)
+    assert in_blocks.settings.smoothness == 2
+    assert torch.equal(in_blocks.features, plain.refined(scene[0], smoothness=2).features)
 
 
 @pytest.mark.parametrize("smoothness", ["0", "auto"])
