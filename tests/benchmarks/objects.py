@@ -37,6 +37,13 @@ CLOTHS = ("tablecloth", "curtain")  # what the things stand on and before
 
 def measure_lift(scene: Scene, answers: dict[int, Answer], owners: np.ndarray) -> dict[str, Any]:
     """The figures of one lift: answers by a thing's number, owners [P] int, the thing of each splat."""
+    boxes, pairs = measure_boxes(scene, answers, owners), list(combinations(answers, 2))
+    apart = sum(_are_two(scene, {thing: answers[thing] for thing in pair}, owners) for pair in pairs)
+    return {**boxes, "pairs": len(pairs), "apart": apart}
+
+
+def measure_boxes(scene: Scene, answers: dict[int, Answer], owners: np.ndarray) -> dict[str, Any]:
+    """The same without pairs."""
     means, ious, of_all, middles, alone = scene.splats.means.numpy(), [], [], [], 0
     for thing, answer in answers.items():
         true = _bounds(means[owners == thing])
@@ -46,11 +53,9 @@ def measure_lift(scene: Scene, answers: dict[int, Answer], owners: np.ndarray) -
         ious.append(box_iou(box, true))
         of_all.append(box_iou(_bounds(means[answer.selected]), true) if found else 0.0)
         middles.append(np.linalg.norm(box.mean(axis=0) - true.mean(axis=0)) / np.linalg.norm(true[1] - true[0]))
-    pairs = list(combinations(answers, 2))
-    apart = sum(_are_two(scene, {thing: answers[thing] for thing in pair}, owners) for pair in pairs)
     return {
         "things": len(answers), "one": alone, "box": float(np.mean(ious)), "worst": float(np.min(ious)),
-        "all": float(np.mean(of_all)), "middle": float(np.mean(middles)), "pairs": len(pairs), "apart": apart,
+        "all": float(np.mean(of_all)), "middle": float(np.mean(middles)),
     }  # fmt: skip
 
 

@@ -12,6 +12,9 @@ line as soon as it is measured, and a row that is there is not measured again: s
                 random unit vectors of 128 channels
 ``edges``       the column ``4, no edges`` of both: what places and colours do alone, without the edges of masks
 ``factors``     reweighting's parts, alone and together, each without smoothness, with 4 and with the chosen one
+``answers``     questions (as ``--alone`` of `tests.benchmarks.thresholds` has them, and 50 words for what is not
+                there), boxes (`tests.benchmarks.objects`) and mIoU of ``segment``, off and with ``auto``
+``aggregation`` accuracy with aggregation, likewise
 ``fidelity``    ``plush``: the mean cosine about the maps' mean of rendered features with the maps of other views
 
 A scene is lifted once, and the step is taken by each lambda on the scores of the classes, which are sums of channels:
@@ -22,7 +25,7 @@ import json
 import zlib
 from argparse import Namespace
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -35,7 +38,10 @@ from torch import Tensor
 from torch.nn.functional import cosine_similarity
 
 import liftcore as lc
+from liftcore.evaluate.accuracy import class_ious
 from liftcore.lifting import in_memory
+from liftcore.query.ask import ask
+from liftcore.query.segment import value_map
 from liftcore.scene.cameras import Camera
 from liftcore.scene.harmonics import SH_C0
 from liftcore.scene.neighbours import SplatGraph
@@ -43,14 +49,19 @@ from liftcore.solve.codebook import Codebook
 from liftcore.solve.mask_edges import weaken_edges
 from liftcore.solve.smooth import smooth
 from liftcore.solve.smooth_by_halves import STRENGTHS, SmoothnessChoice, choose_smoothness
+from liftcore.text.table import TableEncoder
 from liftcore.values.region_weights import RegionWeights
-from liftcore.values.views import FeatureGrid, ViewFeatures
+from liftcore.values.views import NO_LABEL, FeatureGrid, ViewFeatures
 from tests.benchmarks.base import command_line, read_pack, read_scene, table_of, tell
 from tests.benchmarks.consensus import still_life_scene, with_mistakes
+from tests.benchmarks.objects import measure_boxes, things_of
 from tests.benchmarks.tabletop import Figures, Truth, tabletop
+from tests.benchmarks.thresholds import measure_alone
 from tests.still_life.objects import small_things
 
-TABLES = ("strengths", "generated", "factors", "fidelity")
+TABLES = ("strengths", "generated", "factors", "answers", "aggregation", "fidelity")
+STEPS = ("off", "auto")
+ABSENT = 50  # words for what is not there
 COLOURS = ("own", "one", "random")
 STRONG = 4.0
 GENERATED = {"still life": None, "small things": small_things()}
@@ -150,21 +161,36 @@ class Case:
     name: str
     open: Callable[[], tuple[Truth, Mapping[str, ViewFeatures]]]
     colours: Sequence[str] = ("own",)
+    folder: Path | None = None  # of tabletop, whose words are asked
+    settings: Mapping[str, Any] = field(default_factory=dict)
 
     def row_names(self) -> list[tuple[str, str]]:
         """Name and kind (colours, or a factor) of each row."""
-        return [(self.name, kind) for kind in (FACTORS if self.table == "factors" else self.colours)]
+        kinds = {"factors": tuple(FACTORS), "answers": STEPS, "aggregation": STEPS}
+        return [(self.name, kind) for kind in kinds.get(self.table, self.colours)]
 
     def measure(self, missing: Sequence[str]) -> Iterator[Row]:
         """The rows of these kinds."""
         truth, views = self.open()
-        inputs = None if self.table == "factors" else StepInputs.of(truth, views)
-        for kind in missing:
+        for kind, figures in self._figures(truth, views, missing):
             head = {"table": self.table, "features": f"{self.name}, {len(views)} views", "name": self.name}
-            if inputs:
-                yield {**head, "kind": kind, **strengths(inputs, kind)}
-            else:
-                yield {**head, "kind": kind, **with_factor(StepInputs.of(truth, views, **FACTORS[kind]))}
+            yield {**head, "kind": kind, **figures}
+
+    def _figures(
+        self, truth: Truth, views: Mapping[str, ViewFeatures], kinds: Sequence[str]
+    ) -> Iterator[tuple[str, dict[str, Any]]]:
+        if self.table == "factors":
+            yield from ((kind, with_factor(StepInputs.of(truth, views, **FACTORS[kind]))) for kind in kinds)
+        elif self.table == "answers":
+            lifts: Mapping[str, lc.LiftResult] = dict(zip(STEPS, unsmoothed_and_smoothed(truth, views), strict=True))
+            assert self.folder is not None
+            table = TableEncoder.open(self.folder / "text_table.safetensors")
+            yield from ((kind, answers(truth, table, lifts[kind])) for kind in kinds)
+        elif self.table == "aggregation":
+            yield from ((kind, with_aggregation(truth, views, kind)) for kind in kinds)
+        else:
+            inputs = StepInputs.of(truth, views, **self.settings)
+            yield from ((kind, strengths(inputs, kind)) for kind in kinds)
 
 
 def strengths(inputs: StepInputs, colours: str) -> dict[str, Any]:
@@ -182,6 +208,50 @@ def with_factor(inputs: StepInputs) -> dict[str, Any]:
     chosen = inputs.choose(graph)
     steps = {"0": (graph, 0.0), "4": (graph, STRONG), "auto": (graph, chosen)}
     return {"chosen": chosen, **inputs.judge(steps)}
+
+
+def unsmoothed_and_smoothed(truth: Truth, views: Mapping[str, ViewFeatures]) -> tuple[lc.LiftResult, lc.LiftResult]:
+    """A lift before the step, and after it with ``auto``."""
+    before = list[Tensor]()
+
+    def step(X: Tensor, *arguments: Any, **how: Any) -> tuple[Tensor, dict[str, Any]]:
+        before.append(X.clone())
+        return smooth(X, *arguments, **how)
+
+    with mock.patch.object(in_memory, "smooth", step):
+        lifted = truth.lift(views, smoothness="auto", progress=False)
+    return replace(lifted, features=before[0]), lifted
+
+
+def answers(truth: Truth, table: TableEncoder, lifted: lc.LiftResult) -> dict[str, Any]:
+    """What is answered: masks of words alone, words for what is not there, boxes, and the map of all words."""
+    scene = truth.opened(lifted)
+    others = [word for word in table.words if word not in truth.words]
+    absent = np.random.default_rng(0).choice(others, ABSENT, replace=False).tolist()
+    alone = measure_alone(scene, truth, table, absent)
+    of_things = {thing: ask(scene, truth.words[thing], table) for thing in things_of(truth)}
+    boxes = measure_boxes(scene, of_things, truth.objects.numpy())
+    found = scene.segment(truth.words, encoder=table)
+    classes = np.array([0, *(1 + truth.words.index(named.word) for named in found.found)], np.int32)[found.values]
+    shown = torch.stack(list(truth.held_out.values()))
+    maps = [torch.from_numpy(value_map(scene, classes, view)).long() - 1 for view in truth.held_out]
+    best = torch.where(shown < 0, NO_LABEL, torch.stack(maps))
+    return {
+        "masks": f"{alone['mean']:.3f}, {alone['worst']:.2f}",
+        "called absent": alone["called absent"],
+        "absent words select nothing": alone["absent words select nothing"],
+        "one object": boxes["one"],
+        "boxes": f"{boxes['box']:.3f}, {boxes['worst']:.2f}",
+        "segment": float(class_ious(best, shown, len(truth.words)).nanmean()),
+    }
+
+
+def with_aggregation(truth: Truth, views: Mapping[str, ViewFeatures], step: str) -> dict[str, Any]:
+    """Figures of a lift with aggregation."""
+    strength = "auto" if step == "auto" else 0
+    lifted = truth.lift(views, aggregation=True, smoothness=strength, progress=False)
+    chosen = lifted.diagnostics.get("smoothing", {}).get("smoothness", 0.0)
+    return {"chosen": chosen, "aggregated": cell(truth.judge(lifted))}
 
 
 def cases(data: Path, tables: Sequence[str]) -> Iterator[Case]:
@@ -212,12 +282,21 @@ def cases(data: Path, tables: Sequence[str]) -> Iterator[Case]:
     for scene, (kind, seed) in product(GENERATED, (("usual", 7), ("hard", 7), ("exact", 7), ("cone", 8))):
         if "generated" in tables:
             yield Case("generated", f"{scene}, {kind} {seed}", partial(generated, scene, kind, seed), COLOURS)
+            if kind in ("usual", "hard"):
+                name = f"{scene}, {kind} {seed}, masks of things alone"
+                yield Case("generated", name, partial(generated, scene, kind, seed), settings={"levels": 0})
     for name, file, every in (
         ("hard", "features_hard", 1), ("hard", "features_hard", 4), ("noisy", "features", 1),
         ("noisy", "features", 4), ("grids", "grids", 1),
     ):  # fmt: skip
         if "factors" in tables:
             yield Case("factors", f"{name}, every {every}", pack(file, every))
+    for table, (name, file, every) in product(
+        ("answers", "aggregation"),
+        (("hard", "features_hard", 4), ("grids", "grids", 1), ("hard", "features_hard", 1), ("noisy", "features", 1)),
+    ):
+        if table in tables:
+            yield Case(table, f"{name}, every {every}", pack(file, every), folder=folder)
     for scene in GENERATED if "factors" in tables else ():
         yield Case("factors", f"{scene}, hard 7", partial(generated, scene, "hard", 7))
 
