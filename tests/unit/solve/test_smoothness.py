@@ -298,7 +298,8 @@ def test_lift_in_blocks_refuses_smoothness_and_is_refined(
     files: tuple[Path, Path, Path], plain: lc.LiftResult
 ) -> None:
     scene = lc.read_splats(files[0]), lc.read_cameras(files[1]), lc.read_features(files[2])
-    for strength, to_take in ((2, "2"), ("auto", "1")):
+    strengths: list[tuple[Any, str]] = [(2, "2"), ("auto", "1")]
+    for strength, to_take in strengths:
         way = rf"got smoothness={strength}.*; set smoothness=0, then .*splatlift refine LIFT --smoothness {to_take}`"
         with pytest.raises(lc.InvalidSettings, match=way):
             lc.lift(*scene, smoothness=strength, engine=lc.LocalEngine(1))
