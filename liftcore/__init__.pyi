@@ -33,7 +33,6 @@ from liftcore.query.ask import VectorAnswer as VectorAnswer
 from liftcore.query.catalogue import Catalogue as Catalogue
 from liftcore.query.directions import read_example as read_example
 from liftcore.query.question import Answer as Answer
-from liftcore.query.question import BestWord as BestWord
 from liftcore.query.question import CoveringRegion as CoveringRegion
 from liftcore.query.question import FoundObject as FoundObject
 from liftcore.query.question import NamedSplats as NamedSplats
@@ -54,6 +53,7 @@ from liftcore.scene.cameras import Cameras as Cameras
 from liftcore.scene.compositing import CompositingParams as CompositingParams
 from liftcore.scene.kernel import Kernel as Kernel
 from liftcore.scene.splats import Splats as Splats
+from liftcore.scene.world import WorldFrame as WorldFrame
 from liftcore.text import TextEncoder as TextEncoder
 from liftcore.text import open_encoder as open_encoder
 from liftcore.values.pack import read_features as read_features

@@ -21,7 +21,7 @@ from pydantic import (
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError
 
-from liftcore import Answer, CoveringRegion, LiftSettings, Objects, Picture, Query, SceneObject
+from liftcore import Answer, CoveringRegion, LiftSettings, Objects, Picture, Query, SceneObject, WorldFrame
 from liftcore.models import (
     NOTATIONS,
     AskableWords,
@@ -345,6 +345,7 @@ class LiftResult(BaseModel):
         max_length=3,
         description="of the positions of its `.splat` and `.spz`; zeros but in map coordinates",
     )
+    world: WorldFrame = Field(description="which way is up and how long a scene unit is, as far as it is known")
     certificate: dict[str, Any]
     timings: dict[str, float] = Field(description="seconds a stage")
     created: float = Field(description="seconds since 1970")
@@ -363,6 +364,12 @@ class PackChange(Body):
     text_space: Named | None = Field(None, description="the text encoder that shares their space; 'none' for none")
 
 
+class GivenWorld(WorldFrame):
+    """Which way is up in a lift, and how long its unit is; what is left out is not known."""
+
+    error_type: ClassVar = None
+
+
 class LiftChange(Body):
     """What to change of a lift; what is left out stays."""
 
@@ -371,6 +378,9 @@ class LiftChange(Body):
         Annotated[str, Field(max_length=LIFT_NAME_CHARACTERS, pattern=PRINTABLE), AfterValidator(str.strip)] | None
     ) = Field(None, description="for people; null or an empty one takes the name away")
     photos: AssetId | None = Field(None, description="an asset of kind photos; null takes them away")
+    world: GivenWorld | None = Field(
+        None, description="which way is up and how long a scene unit is, in place of all that is known; null: neither"
+    )
 
 
 class Lifts(BaseModel):

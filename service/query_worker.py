@@ -38,6 +38,7 @@ from liftcore import (
     SplatliftError,
     TextEncoder,
     ViewMask,
+    WorldFrame,
     choose_device,
     open_encoder,
 )
@@ -162,7 +163,9 @@ class Answers:
             if self._scenes.currsize == self._scenes.maxsize:  # the old and the new are never here together
                 self._scenes.popitem()
             self._scenes[request["lift"]] = self._open(request)
-        scene = self._scenes[request["lift"]]
+        scene, world = self._scenes[request["lift"]], WorldFrame(**request.get("world", {}))
+        if scene.world != world:
+            scene.world = world
         for name, bits in request.get("selections", {}).items():
             _selected(scene, name, bits)
         if "features" in request:
@@ -211,7 +214,8 @@ class Answers:
 
     def _grouped(self, request: dict[str, Any]) -> Objects:
         answer = self._answer(request)
-        made = self._kept((_key(request), "objects"), lambda: self._scene(request).objects(answer))
+        key = (_key(request), "objects", json.dumps(request.get("world")))
+        made = self._kept(key, lambda: self._scene(request).objects(answer))
         assert isinstance(made, Objects)
         return made
 
@@ -294,7 +298,8 @@ class Answers:
         return Frame(scene.askable(request["text"], request["count"], encoder=encoder).model_dump(mode="json"))
 
     def _catalogue(self, request: dict[str, Any]) -> Frame:
-        key = ("catalogue", request["lift"], request["encoder"], json.dumps(request["encoder_version"]))
+        decides = (request.get(name) for name in ("lift", "encoder", "encoder_version", "world"))
+        key = ("catalogue", json.dumps([*decides]))
         found = self._kept(key, lambda: self._named_objects(request))
         assert isinstance(found, Catalogue)
         first, last = request["first"], request["first"] + request["count"]
@@ -307,7 +312,12 @@ class Answers:
         )
         after = last if last < len(found.objects) else None
         told = {"explanation": found.explanation, "count": len(found.objects), "next": after}
-        return _json(request, told, "objects", things)
+        return _json(
+            request,
+            told | {"world": found.world.model_dump(mode="json"), "unit": found.world.unit},
+            "objects",
+            things,
+        )
 
     def _object_of(self, request: dict[str, Any]) -> tuple[int, int]:
         """The place of a splat's object among all, and the one after it; nothing where it has none."""
@@ -320,7 +330,7 @@ class Answers:
         def make() -> SceneTree:
             return self._named_tree(request, relations=request["relations"], up=_direction(request["up"]))
 
-        decides = (request[name] for name in ("lift", "encoder", "encoder_version", "relations", "up"))
+        decides = (request.get(name) for name in ("lift", "encoder", "encoder_version", "relations", "up", "world"))
         found = self._kept(("tree", json.dumps([*decides])), make)
         assert isinstance(found, SceneTree)
         first, last = request["first"], request["first"] + request["count"]

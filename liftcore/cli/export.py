@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.cli.objects import named_tree
-from liftcore.cli.options import Parser, add_encoder, add_lift, opened_lift, text_encoder, whole
+from liftcore.cli.options import Parser, add_encoder, add_lift, add_world, opened_lift, text_encoder, whole
 from liftcore.cli.query import made_from
 from liftcore.cli.reply import reply, write_files
 from liftcore.cli.segment import read_words
@@ -36,6 +36,7 @@ def add_arguments(parser: Parser) -> None:
     names = "without the options above: name the lift's objects by these words, a file of one a line"
     parser.add_argument("--vocabulary", type=Path, metavar="FILE", help=names)
     add_encoder(parser)
+    add_world(parser)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -66,6 +67,7 @@ def run(options: argparse.Namespace) -> int:
     files = write_files(files, exports)
     splats = int(scene.members(source).sum()) if isinstance(source, int) else len(scene.features)
     document: dict[str, Any] = {"files": files, "splats": splats, "what": what}
+    document["world"] = scene.world.model_dump(mode="json")
     if source is not None and not isinstance(source, int) and what != "object":
         labels = scene.labels(source)
         document |= {

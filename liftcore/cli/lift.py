@@ -8,7 +8,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import Parser, add_settings, add_sources, add_verbose, count, place
+from liftcore.cli.options import Parser, add_settings, add_sources, add_verbose, add_world, count, place, world_of
 from liftcore.cli.reply import reply, shown, smoothing_line
 from liftcore.errors import InvalidInput, InvalidSettings
 
@@ -26,6 +26,7 @@ def add_arguments(parser: Parser) -> None:
     add_sources(parser)
     parser.add_argument("-o", "--output", type=place, required=True, metavar="LIFT", help="the lift to write")
     add_settings(parser)
+    add_world(parser)
     parser.add_argument("--explain", action="store_true", help="print the plan before the work")
     add_verbose(parser)
     goes_on = "a killed lift goes on from there, and one of the same regions with other features walks none again"
@@ -39,7 +40,7 @@ def add_arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Lift, write the lift whole or not at all, and say what came of it."""
-    settings = settings_of(options)
+    settings, world = settings_of(options), world_of(options)
     from liftcore import lift_files, open_engine
     from liftcore.files import check_output, writing
 
@@ -65,7 +66,7 @@ def run(options: argparse.Namespace) -> int:
         on_plan=take,
         checkpoint=options.checkpoint or None,
         engine=engine,
-    )
+    ).with_world(world)
     with writing(out):
         result.save(options.output, progress=True)
     (plan,) = plans
@@ -175,6 +176,7 @@ def _summary(result: LiftResult) -> dict[str, Any]:
         "lifted": list(metadata.views),
         "encoder": metadata.encoder,
         "text_space": metadata.text_space,
+        "world": metadata.world.model_dump(mode="json"),
         "certificate": metadata.certificate,
         "timings": metadata.timings,
         "settings": metadata.settings.model_dump(mode="json"),

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import Parser, add_encoder, place, text_encoder
+from liftcore.cli.options import Parser, add_encoder, add_world, place, sides_of, text_encoder, world_of
 from liftcore.cli.query import made_from
 from liftcore.cli.reply import free_outputs, place_of, reply, write_files
 from liftcore.cli.segment import read_words
@@ -28,13 +28,11 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--vocabulary", type=Path, metavar="FILE", help=named)
     add_encoder(parser)
     parser.add_argument("--tree", action="store_true", help="their parts and groups of them, too")
-    lying = "with --tree: how objects lie to each other"
+    lying = "with --tree: how objects lie to each other; where it is known which way is up, also what is on what"
     parser.add_argument("--relations", action="store_true", help=lying)
-    against = "against gravity, in the frame of the splats: which object is on, under or beside another"
-    lies = parser.add_mutually_exclusive_group()
-    lies.add_argument("--up", type=float, nargs=3, metavar=("X", "Y", "Z"), help=f"with --relations: {against}")
-    held = "the same, of cameras whose photos were taken upright"
-    lies.add_argument("--up-of-cameras", dest="up", action="store_const", const="cameras", help=held)
+    add_world(parser)
+    held = "in place of --up: that of the cameras, whose photos were taken upright"
+    parser.add_argument("--up-of-cameras", action="store_true", help=held)
     parser.add_argument("--features", action="store_true", help="with --json: each one's mean feature, too")
     parser.add_argument("--csv", type=Path, metavar="CSV", help="write the list as a table")
     parser.add_argument("--splats", type=Path, metavar="FOLDER", help="write one PLY an object, object-ID.ply")
@@ -47,7 +45,7 @@ def run(options: argparse.Namespace) -> int:
     free_outputs(files, given)
     from liftcore import Scene
 
-    scene = Scene(options.lift)
+    scene = Scene(options.lift, world=world_of(options))
     if files or options.splats:
         free_outputs(files, made_from(scene))
     if options.tree:
@@ -91,8 +89,11 @@ def _tree(options: argparse.Namespace, scene: Scene) -> int:
     if options.csv or options.features:
         named = "--csv" if options.csv else "--features"
         raise InvalidQuery(named, expected="the list of objects", got="--tree", hint="--json has the tree")
-    up = tuple(options.up) if isinstance(options.up, list) else options.up
-    answer = scene.tree(words, encoder=encoder, relations=options.relations or up is not None, up=up)
+    up = "cameras" if options.up_of_cameras else None
+    if up and options.up is not None:
+        raise InvalidQuery("--up-of-cameras", expected="one of --up and --up-of-cameras", got="both")
+    related = options.relations or up is not None or options.up is not None
+    answer = scene.tree(words, encoder=encoder, relations=related, up=up)
     files, exports = dict[str, Any](), dict[str, Any]()
     for one in answer.nodes if options.splats else ():
         name = "-".join(["object", *map(str, one.path)])
@@ -114,11 +115,12 @@ def _tree_lines(answer: dict[str, Any], files: dict[str, str]) -> Iterable[str]:
         name = "" if one["name"] is None else f" {one['name']} ({one['score']:.3f})"
         yield (
             f"{'  ' * len(one['path'])}{one['id']}{name}, {one['kind']}: {one['splats']} splats, {one['share']:.1%} "
-            f"of the evidence, a mask of it in {one['confidence']:.0%} of the views that see it"
+            f"of the evidence, {sides_of(one['size'], answer['unit'])}, a mask of it in "
+            f"{one['confidence']:.0%} of the views that see it"
         )
         waiting += one["parts"][::-1]
     for one in answer["relations"]:
-        yield f"  {one['node']} is {one['relation']} {one['other']}: {one['gap']:.4g} apart"
+        yield f"  {one['node']} is {one['relation']} {one['other']}: {one['gap']:.4g} {answer['unit']} apart"
     yield from (f"  {kind}: {path}" for kind, path in files.items())
 
 
@@ -140,6 +142,7 @@ def _lines(document: dict[str, Any]) -> Iterable[str]:
         name = "" if one["name"] is None else f" {one['name']} ({one['score']:.3f})"
         yield (
             f"  {one['id']}{name}: {one['splats']} splats, {one['share']:.1%} of the evidence, at "
-            f"{place_of(one['centre'])}, from {place_of(low)} to {place_of(high)}, best in {', '.join(one['views'])}"
+            f"{place_of(one['centre'])}, from {place_of(low)} to {place_of(high)}, "
+            f"{sides_of(one['size'], document['answer']['unit'])}, best in {', '.join(one['views'])}"
         )
     yield from (f"  {kind}: {path}" for kind, path in document["files"].items())

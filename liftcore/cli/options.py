@@ -16,11 +16,11 @@ from liftcore.errors import InvalidInput, InvalidQuery, SplatliftError
 from liftcore.files import is_remote
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from pydantic import BaseModel
 
-    from liftcore import Scene, TextEncoder
+    from liftcore import Scene, TextEncoder, WorldFrame
 
 BAD_INPUT = 2
 ROLES = {  # of arguments that name files: what belongs there
@@ -216,6 +216,44 @@ def add_splats(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--splats", type=place, metavar="FILE", help="its splats; else where they were, or beside it")
 
 
+def add_world(parser: argparse.ArgumentParser) -> None:
+    """Which way is up, and how long a unit is."""
+    against = "the direction against gravity, in the frame of the splats; else as their files say it"
+    parser.add_argument("--up", type=float, nargs=3, metavar=("X", "Y", "Z"), help=against)
+    parser.add_argument("--metres-per-unit", type=float, metavar="M", help="how long a scene unit is; else likewise")
+    known = "in place of that: two points, and how many metres lie between them"
+    parser.add_argument(
+        "--distance", type=float, nargs=7, metavar=("X", "Y", "Z", "X2", "Y2", "Z2", "METRES"), help=known
+    )
+
+
+def world_of(options: argparse.Namespace) -> WorldFrame:
+    """What the options say of the frame of the splats.
+
+    Raises:
+        InvalidInput: a direction of zero, no length above zero, or the length of a unit in two ways.
+    """
+    from liftcore import WorldFrame
+
+    given: dict[str, Any] = {"up": options.up, "metres_per_unit": options.metres_per_unit}
+    if options.distance is not None:
+        *points, metres = options.distance
+        given["distance"] = {"between": (points[:3], points[3:]), "metres": metres}
+    with renamed(
+        {
+            "up": "--up",
+            "metres_per_unit": "--metres-per-unit",
+            **dict.fromkeys(("distance", "distance.between", "distance.metres"), "--distance"),
+        }
+    ):
+        return WorldFrame(**given)
+
+
+def sides_of(size: Sequence[float], unit: str) -> str:
+    """Sides for people: 0.4 x 0.2 x 0.1 metres."""
+    return f"{' x '.join(f'{side:.4g}' for side in size)} {unit}"
+
+
 def opened_lift(options: argparse.Namespace) -> Scene:
     """The lift that the options name.
 
@@ -224,7 +262,10 @@ def opened_lift(options: argparse.Namespace) -> Scene:
     """
     from liftcore import Scene
 
-    return Scene(options.lift, splats=options.splats, cameras=options.cameras)
+    scene = Scene(options.lift, splats=options.splats, cameras=options.cameras)
+    if hasattr(options, "up"):
+        scene.world = world_of(options).known_or(scene.world)
+    return scene
 
 
 def add_verbose(parser: argparse.ArgumentParser) -> None:

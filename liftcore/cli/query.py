@@ -14,7 +14,9 @@ from liftcore.cli.options import (
     add_fields,
     add_lift,
     add_view,
+    add_world,
     opened_lift,
+    sides_of,
     text_encoder,
     view_of,
 )
@@ -55,6 +57,7 @@ def add_arguments(parser: Parser) -> None:
     add_encoder(parser)
     add_fields(parser, Query, (*Query.deciding(), "top"), OWN)
     parser.add_argument("--objects", action="store_true", help="name the things found, with their places and boxes")
+    add_world(parser)
     add_view(parser)
     parser.add_argument("--mask", type=Path, metavar="PNG", help="write the mask of the view")
     parser.add_argument("--attention", type=Path, metavar="PNG", help="write the attention map of the view")
@@ -176,7 +179,8 @@ def _lines(document: dict[str, Any]) -> Iterable[str]:
         low, high = thing["box"]
         yield (
             f"  object {number}: {thing['splats']} splats, {thing['share']:.1%} of what is selected, score "
-            f"{thing['score']:.4g}, at {place_of(thing['centre'])}, from {place_of(low)} to {place_of(high)}"
+            f"{thing['score']:.4g}, at {place_of(thing['centre'])}, from {place_of(low)} to {place_of(high)}, "
+            f"{sides_of(thing['size'], document['answer']['unit'])}"
         )
     if document.get("strays"):
         yield f"  {document['strays']} splats are strays: single or in specks, and of no object"

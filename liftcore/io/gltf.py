@@ -2,8 +2,10 @@
 
 Positions, linear scales, linear opacities, quaternions x y z w and spherical harmonics of degree 0 to 3, which are
 ordered and signed as 3DGS has them. The frame is +Y up, +Z forward, -X right (LUF); PLYs and cameras are in right,
-down, front (RDF): half a turn about z, which is baked in, as few readers turn harmonics by a node. Scenes in map
-coordinates keep their origin as the node's translation, in float64.
+down, front (RDF): half a turn about z, which is baked in, as few readers turn harmonics by a node. The node's
+transform has the origin of scenes in map coordinates, and what brings the splats to +Y up and metres, where these are
+known (`liftcore.scene.world`). ``asset.extras`` has what is known, by which our reader undoes that transform. In
+files of others +Y is up and a unit is a metre, as the format has it.
 
 Labels are feature ids (``EXT_mesh_features``): ``_FEATURE_ID_0`` is the instance, ``_FEATURE_ID_1`` the class, 0 is
 none, and a property table each (``EXT_structural_metadata``) has a row an id. Other columns of splats are attributes
@@ -35,6 +37,7 @@ from liftcore.scene.harmonics import band_rotation
 from liftcore.scene.quaternions import product_matrix, rotation_matrices
 from liftcore.scene.render_mode import mode_of_word
 from liftcore.scene.similarity import Similarity
+from liftcore.scene.world import UPRIGHT, world_of
 
 if TYPE_CHECKING:
     pass
@@ -54,6 +57,8 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 TO_FILE = np.diag([-1.0, -1.0, 1.0])  # RDF to LUF, and back
 TRANSFORM = {"matrix", "rotation", "scale", "translation"}  # of a node
 RENDER_MODE = "SplatRenderMode"
+WORLD = "splatlift_world"  # of asset.extras
+METRES = UPRIGHT.model_copy(update={"metres_per_unit": 1.0})  # of a file that says nothing else
 SRGB = "srgb_rec709_display"
 BOXES = {  # numbers of each
     "box_low": 3, "box_high": 3, "oriented_box_centre": 3, "oriented_box_axes": 9, "oriented_box_half_sizes": 3,
@@ -75,7 +80,8 @@ def read_gltf(path: Path, *, colour: bool = True) -> Fields:
             files; or a node has a scale for each axis.
     """
     asset = _Asset(path)
-    return joined_fields([asset.fields(matrix, primitive, colour=colour) for matrix, primitive in asset.splats()])
+    parts = [asset.fields(matrix, primitive, colour=colour) for matrix, primitive in asset.splats()]
+    return joined_fields(parts) | {"world": asset.world}
 
 
 def read_gltf_document(path: Path) -> dict[str, Any]:
@@ -121,6 +127,9 @@ class _Asset:
         if others:
             raise self._broken("a file without extensions of others", f"one that requires {others[0][:80]}", HINT)
         self._buffers: dict[int, np.ndarray] = {}
+        asset = self.json.get("asset")
+        extras = asset.get("extras") if isinstance(asset, dict) else None
+        self.world = world_of(extras[WORLD]) if isinstance(extras, dict) and WORLD in extras else METRES
 
     def splats(self) -> list[tuple[np.ndarray, dict[str, Any]]]:
         """The primitives of splats with their nodes' matrices [4, 4] f64, as the scene has them."""
@@ -137,7 +146,8 @@ class _Asset:
         roots = [place for place in range(len(nodes)) if place not in inner]
         if scenes:
             roots = self._list(self._at(scenes, chosen, "scene"), "nodes")
-        found, queue, visited = [], [(root, np.eye(4)) for root in reversed(roots)], set[int]()
+        origin = np.linalg.inv(self.world.placement(TO_FILE, in_metres=True))
+        found, queue, visited = [], [(root, origin) for root in reversed(roots)], set[int]()
         while queue:
             place, above = queue.pop()
             node = self._at(nodes, place, "node")

@@ -26,6 +26,7 @@ from liftcore.io.gltf import (
     TABLE_WIDTHS,
     TO_FILE,
     WIDTHS,
+    WORLD,
     harmonic_name,
 )
 from liftcore.io.labels import IDS, KINDS, rows_by_id, stored_columns
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
 
 LARGEST_FILE = (1 << 32) - 1  # bytes, which a .glb counts with 32 bits
+IDENTITY = [1.0, 0.0, 0.0, 0.0]  # w x y z
 CODES = {np.dtype(code): number for number, code in COMPONENTS.items()}
 NEAREST = "{kernel} splats as the nearest Gaussians: the format has the kernel 'ellipse' alone"
 MEMBERS = {  # of the rows of property tables: type, component type
@@ -69,11 +71,11 @@ def gltf_blocks(splats: Splats, document: Mapping[str, Any] | None = None) -> It
     sets = [name for name in IDS if name in columns]
     primitive = _primitive(binary, splats, columns, sets)
     node: dict[str, Any] = {"mesh": 0, "name": "splats"}
-    if splats.origin != FILE_ORIGIN:
-        node["translation"] = (TO_FILE @ splats.origin).tolist()
-    asset: dict[str, Any] = {"version": "2.0", "generator": f"splatlift {__version__}"}
+    node |= _transform(splats)
+    extras: dict[str, Any] = {WORLD: splats.world.model_dump(mode="json")}
     if splats.kernel is not Kernel.GAUSSIAN_3D:
-        asset["extras"] = {"note": NEAREST.format(kernel=splats.kernel)}
+        extras["note"] = NEAREST.format(kernel=splats.kernel)
+    asset: dict[str, Any] = {"version": "2.0", "generator": f"splatlift {__version__}", "extras": extras}
     gltf: dict[str, Any] = {"asset": asset, "extensionsUsed": [EXTENSION]}
     if sets:
         primitive["extensions"][FEATURES] = {"featureIds": [_feature_set(columns, name, sets) for name in sets]}
@@ -90,6 +92,19 @@ def gltf_blocks(splats: Splats, document: Mapping[str, Any] | None = None) -> It
     yield struct.pack("<4sII", MAGIC, 2, size) + struct.pack("<I4s", len(text), JSON_CHUNK) + text
     yield struct.pack("<I4s", binary.size, BINARY_CHUNK)
     yield from binary.parts
+
+
+def _transform(splats: Splats) -> dict[str, Any]:
+    """The transform of the node, which brings the splats to +Y up and metres, as far as these are known."""
+    world, parts = splats.world, dict[str, Any]()
+    if (turn := world.upright(TO_FILE)).tolist() != IDENTITY:
+        parts["rotation"] = np.roll(turn, -1).tolist()
+    if world.metres_per_unit not in (None, 1.0):
+        parts["scale"] = [world.metres_per_unit] * 3
+    if splats.origin != FILE_ORIGIN:
+        place = world.placement(TO_FILE, in_metres=True)[:3, :3]
+        parts["translation"] = (place @ TO_FILE @ splats.origin).tolist()
+    return parts
 
 
 class _Binary:

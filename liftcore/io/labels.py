@@ -89,7 +89,8 @@ def document_bytes(labels: Labels) -> bytes:
 
 def document_lines(labels: Labels) -> bytes:
     """The instances, or the nodes where there are any, as JSON Lines: a line each, with all that is said of it."""
-    whole = {name: labels.document[name] for name in ("format", "made_by", "frame") if name in labels.document}
+    names = ("format", "made_by", "frame", "world", "unit")
+    whole = {name: labels.document[name] for name in names if name in labels.document}
     listed = labels.document.get("nodes") or labels.document.get("instances", [])
     rows = (json.dumps(one | whole, ensure_ascii=False) for one in listed)
     return "".join(f"{row}\n" for row in rows).encode()

@@ -37,11 +37,13 @@ from liftcore.scene.harmonics import constant_terms
 from liftcore.scene.kernel import Kernel, kernel_named
 from liftcore.scene.origin import lies_apart
 from liftcore.scene.render_mode import kernel_of_mode
+from liftcore.scene.world import world_of
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from liftcore.scene.splats import Splats
+    from liftcore.scene.world import WorldFrame
 
 
 PLUGINS = "splatlift.splat_formats"  # the entry points of other packages' readers, by suffix
@@ -283,13 +285,14 @@ def require_kernel(path: Path, kernel: Kernel, source: str) -> None:
         raise InvalidSplats(source, expected="the property 'beta' of a dbs splat", got=f"{found}, which has none")
 
 
-def some_rows(path: Path, kept: np.ndarray, suffix: str = ".ply") -> Iterator[bytes]:
+def some_rows(path: Path, kept: np.ndarray, suffix: str = ".ply", world: WorldFrame | None = None) -> Iterator[bytes]:
     """Some rows of a file, in its order, as the bytes of a PLY or of another format that is written, in blocks.
 
     A PLY gives its own bytes to one (`liftcore.io.ply.some_rows`); of another format comes a PLY of 3DGS.
 
     Args:
         path: the file. kept: [P] bool, the rows to keep. suffix: of what is written.
+        world: of its splats; None: as the file says it.
 
     Raises:
         InvalidSplats: the file is malformed, or has another number of splats.
@@ -298,7 +301,8 @@ def some_rows(path: Path, kept: np.ndarray, suffix: str = ".ply") -> Iterator[by
     if suffix == ".ply" and format_of(path) is SplatFormat.PLY:
         return ply.some_rows(path, kept)
     splats = _of_count(path, len(kept))
-    return write(replace(splats[kept], extras={}, layout=(), header=()), None)
+    own = {} if world is None else {"world": world}
+    return write(replace(splats[kept], extras={}, layout=(), header=(), **own), None)
 
 
 def with_columns(path: Path, columns: Mapping[str, np.ndarray]) -> Iterator[bytes]:
@@ -320,6 +324,7 @@ def labelled(path: Path, labels: Labels, suffix: str = ".ply", kept: np.ndarray 
 
     Args:
         path: the file. labels: of its splats; columns that it has are replaced. suffix: of what is written.
+            The document's ``world`` is that of the splats.
         kept: [P] bool, the rows to keep; None: all.
 
     Raises:
@@ -337,7 +342,8 @@ def labelled(path: Path, labels: Labels, suffix: str = ".ply", kept: np.ndarray 
         splats, labels = splats[kept], labels.chosen(kept)
     own = {name: torch.from_numpy(values) for name, values in labels.columns.items()}
     layout = (*splats.layout, *(name for name in own if name not in splats.layout)) if splats.layout else ()
-    splats = replace(splats, extras={**splats.extras, **own}, layout=layout)
+    world = world_of(labels.document["world"]) if "world" in labels.document else splats.world
+    splats = replace(splats, extras={**splats.extras, **own}, layout=layout, world=world)
     return write(splats, labels.document)
 
 
@@ -356,7 +362,7 @@ def read_labels(path: Path | str) -> Labels:
         hint = "splatlift export writes such files"
         raise InvalidSplats(str(path), expected=f"a column {' or '.join(IDS)}", got="none", hint=hint)
     columns = {name: id_column(values) if name in IDS else values for name, values in columns.items()}
-    return Labels(columns, _document_of(path))
+    return Labels(columns, {"world": splats.world.model_dump(mode="json"), **_document_of(path)})
 
 
 def _document_of(path: Path) -> dict[str, Any]:

@@ -9,7 +9,7 @@ frame of the exported splats; intrinsics are those of the transforms.json that t
 
 import math
 from collections import ChainMap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -34,12 +34,14 @@ from liftcore.scene.cameras import (
 )
 from liftcore.scene.distortion import Distortion
 from liftcore.scene.views import cameras_of_views, view_names
+from liftcore.scene.world import UNKNOWN, WorldFrame
 
 FRAME_FILE = "dataparser_transforms.json"  # as nerfstudio names it, in the folder of a run
 OWN_FRAME = (
     "poses of nerfstudio's own files: it trains in another frame than they are in, unless it was told "
     f"--orientation-method none --center-method none --auto-scale-poses False. Put its run's {FRAME_FILE} beside them"
 )
+LEAST_UPRIGHT = 0.5  # cosine of the mean of the cameras' up axes with +Z
 TOLERANCE = 1e-3  # of a rotation's entries: they were float32 on the way
 LEAST, LARGEST = 1e-9, 1e9  # scales
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
@@ -91,7 +93,8 @@ def parse_transforms(document: Any, source: str, photos: PhotosBeside | None = N
     cameras, warnings = read_views(views, lambda name, keys: _cameras(name, keys, source, photos))
     of_nerfstudio = any(key in document for key in OF_NERFSTUDIO)
     warnings += [OWN_FRAME] if of_nerfstudio else []
-    return Cameras(cameras, of_nerfstudio=of_nerfstudio, warnings=warnings)
+    world = nerfstudio_world(cameras) if of_nerfstudio else UNKNOWN
+    return Cameras(cameras, of_nerfstudio=of_nerfstudio, world=world, warnings=warnings)
 
 
 def is_export(document: Any) -> bool:
@@ -130,7 +133,7 @@ def parse_export(records: Any, source: str, data: Any = None, photos: PhotosBesi
         scoped.append(keys)
     views = zip(names, scoped, strict=True)
     cameras, warnings = read_views(views, lambda name, keys: _cameras(name, keys, source, photos))
-    return Cameras(cameras, warnings=warnings)
+    return Cameras(cameras, world=nerfstudio_world(cameras), warnings=warnings)
 
 
 def _named_frames(frames: Any, source: str, each: str) -> tuple[list[str], list[dict[str, Any]]]:
@@ -139,6 +142,19 @@ def _named_frames(frames: Any, source: str, each: str) -> tuple[list[str], list[
         raise InvalidCameras(source, expected="a list of objects", got=repr(frames)[:60])
     check_count(len(frames), source)
     return view_names([str(entry(frame, "file_path", f"{each} {i}")) for i, frame in enumerate(frames)]), frames
+
+
+def nerfstudio_world(cameras: Sequence[Camera]) -> WorldFrame:
+    """+Z is up by nerfstudio's convention, where its cameras do not say otherwise; its unit is any.
+
+    An ``applied_transform`` and an ``applied_scale`` lead back to the frame that the poses came in, mostly COLMAP's,
+    of which neither is known. A run with the orientation method ``none`` keeps that frame's turn: then cameras stand
+    across or upside down.
+    """
+    ups = np.array([-camera.viewmat[1, :3] for camera in cameras]).reshape(-1, 3)
+    mean = ups.sum(axis=0)
+    agrees = mean[2] >= LEAST_UPRIGHT * np.linalg.norm(mean) > 0
+    return WorldFrame(up=(0.0, 0.0, 1.0)) if agrees else UNKNOWN
 
 
 def transforms_of(cameras: Mapping[str, Camera]) -> dict[str, Any]:
@@ -315,7 +331,7 @@ class Similarity:
             pose[:3, 3] = self.scale * camera.viewmat[:3, 3] - pose[:3, :3] @ self.translation
             views.append(replace(camera, viewmat=pose))
         warnings = [warning for warning in cameras.warnings if warning != OWN_FRAME]
-        return Cameras(tuple(views), frame=FRAME_FILE, warnings=warnings)
+        return Cameras(tuple(views), frame=FRAME_FILE, world=nerfstudio_world(views), warnings=warnings)
 
 
 def read_frame(path: Path, applied: Mapping[str, Any], source: str) -> Similarity:

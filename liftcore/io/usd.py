@@ -2,7 +2,9 @@
 
 Positions, linear scales and opacities, quaternions with the real part first, and harmonics particle by particle, the
 constant term first, ordered as 3DGS has them. The frame that is written is right, up, back (+Y up); what is read is
-turned from the stage's up axis, and each particle field by its transform. Metres a unit are not known, and say 1.
+turned from the stage's up axis, and each particle field by its transform. The stage's up axis and metres a unit are
+those of the splats where they are known (`liftcore.scene.world`); custom data of its layer say which of them are, as
+validators want both.
 
 Columns of splats are primvars of the field. An object is a ``GeomSubset`` with the element type ``point`` and
 ``SemanticsLabelsAPI:class``; it has no family, as validators know families of point-based geometry alone.
@@ -29,6 +31,7 @@ from liftcore.io.quantised import Fields, gaussian_rows, joined_fields, logits
 from liftcore.scene.harmonics import band_rotation, constant_terms
 from liftcore.scene.quaternions import product_matrix
 from liftcore.scene.similarity import Similarity
+from liftcore.scene.world import UNKNOWN, UPRIGHT, WorldFrame, world_of
 
 if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
@@ -39,6 +42,7 @@ MAX_DEGREE = 3  # of harmonics that are written
 MOST_DEGREE = 4  # and read
 MODULES = ("Gf", "Sdf", "Tf", "Usd", "UsdGeom", "UsdSemantics", "UsdUtils", "UsdVol", "Vt")
 FIELD = "ParticleField3DGaussianSplat"
+WORLD = "splatlift_world"  # of the layer's custom data: up and metres a unit as JSON, null where not known
 DOCUMENT = "splatlift"  # of the field's custom data: what labels mean, as JSON
 HINT = "export it again, or as PLY"
 
@@ -74,11 +78,16 @@ def usd_blocks(splats: Splats, document: Mapping[str, Any] | None = None, suffix
         path = Path(folder) / f"scene{'.usdc' if suffix == '.usdz' else suffix}"
         stage = pxr.Usd.Stage.CreateNew(str(path))
         pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.y)
-        pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        world = splats.world
+        pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0 if world.metres_per_unit is None else world.metres_per_unit)
+        stage.SetMetadataByDictKey("customLayerData", WORLD, world.model_dump_json())
         root = pxr.UsdGeom.Xform.Define(stage, "/Scene")
         stage.SetDefaultPrim(root.GetPrim())
         if any(splats.origin):
-            pxr.UsdGeom.XformCommonAPI(root).SetTranslate(tuple((TO_FILE @ splats.origin).tolist()))
+            place = world.placement(TO_FILE, in_metres=False)[:3, :3] @ TO_FILE @ splats.origin
+            root.AddTranslateOp().Set(pxr.Gf.Vec3d(*place.tolist()))
+        if (turn := world.upright(TO_FILE).tolist())[0] < 1:
+            root.AddOrientOp(pxr.UsdGeom.XformOp.PrecisionDouble).Set(pxr.Gf.Quatd(*turn))
         _write_field(stage, splats, columns, document or {})
         stage.GetRootLayer().Save()
         del stage
@@ -163,7 +172,8 @@ def read_usd(path: Path, *, colour: bool = True) -> Fields:
         Unavailable: usd-core is not installed.
     """
     stage = _stage(path)
-    return joined_fields([_field(prim, stage, path, colour=colour) for prim in _fields(stage, path)])
+    fields = joined_fields([_field(prim, stage, path, colour=colour) for prim in _fields(stage, path)])
+    return fields | {"world": _world(stage)}
 
 
 def read_usd_document(path: Path) -> dict[str, Any]:
@@ -195,6 +205,20 @@ def _stage(path: Path) -> Any:
         raise InvalidSplats(str(path), expected="a USD scene", got=got, hint=HINT) from None
 
 
+def _world(stage: Any) -> WorldFrame:
+    """What the layer says in our words, else what it has of the stage's metadata, in the frame of PLYs."""
+    pxr, told = open_library(), (stage.GetMetadata("customLayerData") or {}).get(WORLD)
+    if isinstance(told, str):
+        try:
+            return world_of(json.loads(told))
+        except (ValueError, RecursionError):
+            return UNKNOWN
+    known = {"up": UPRIGHT.up} if stage.HasAuthoredMetadata("upAxis") else {}
+    if pxr.UsdGeom.StageHasAuthoredMetersPerUnit(stage):
+        known["metres_per_unit"] = pxr.UsdGeom.GetStageMetersPerUnit(stage)
+    return world_of(known)
+
+
 def _fields(stage: Any, path: Path) -> list[Any]:
     found = [prim for prim in stage.Traverse() if prim.GetTypeName() == FIELD]
     if not found:
@@ -207,6 +231,7 @@ def _field(prim: Any, stage: Any, path: Path, *, colour: bool) -> Fields:
     matrix = np.array(pxr.UsdGeom.Imageable(prim).ComputeLocalToWorldTransform(pxr.Usd.TimeCode.Default())).T
     if pxr.UsdGeom.GetStageUpAxis(stage) == pxr.UsdGeom.Tokens.z:
         matrix[:3] = Z_UP @ matrix[:3]
+    matrix = np.linalg.inv(_world(stage).placement(TO_FILE, in_metres=False)) @ matrix
     try:
         move = Similarity.of(matrix)
     except InvalidInput as error:

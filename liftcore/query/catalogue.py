@@ -20,7 +20,7 @@ from typing import Any, Literal
 import numpy as np
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.objects import largest_box
+from liftcore.query.objects import largest_box, size_of
 from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.question import ListedObjects, Point, SceneNode, SceneObject, SceneTree
 from liftcore.query.relations import relations as related
@@ -28,6 +28,7 @@ from liftcore.query.relations import upright
 from liftcore.query.scores import cosines, norms_of
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.origin import MAP_REACH
+from liftcore.scene.world import UNKNOWN, WorldFrame
 from liftcore.text import check_texts
 
 MOST_WORDS = 65_536  # of a vocabulary: their vectors take 130 MB at 512 channels
@@ -49,6 +50,8 @@ class Catalogue:
     """why there are as many as there are"""
     features: np.ndarray
     """[N, F] f32, unit means; zero where no splat has a feature"""
+    world: WorldFrame = UNKNOWN
+    """which way is up and how long a unit is, by which sizes are told"""
 
     def __repr__(self) -> str:
         some = ", ".join(f"{one.name or one.id}: {one.splats}" for one in self.objects)
@@ -62,7 +65,8 @@ class Catalogue:
     def summary(self, *, features: bool = False) -> ListedObjects:
         """All of them, as JSON has them."""
         things = tuple(self.listed(features=features))
-        return ListedObjects(explanation=self.explanation, count=len(things), objects=things)
+        facts = {"explanation": self.explanation, "count": len(things), "objects": things}
+        return ListedObjects(**facts, world=self.world, unit=self.world.unit)
 
 
 def catalogue(scene: OpenedLift, words: Sequence[str] = (), vectors: Any = None) -> Catalogue:
@@ -76,13 +80,14 @@ def catalogue(scene: OpenedLift, words: Sequence[str] = (), vectors: Any = None)
         InvalidLift: the splats moved or changed since the lift.
     """
     if scene.object is None or scene.object_views is None:
-        return Catalogue((), NOT_LOOKED_FOR, np.zeros((0, scene.channels), np.float32))
+        return Catalogue((), NOT_LOOKED_FOR, np.zeros((0, scene.channels), np.float32), scene.world)
     number = len(scene.object_views)
     features = object_features(scene)
     facts = _described(scene, scene.object, np.arange(number), scene.object_views, _named(features, words, vectors))
     count = "1 object" if len(facts) == 1 else f"{len(facts)} objects"
     told = f"{count}, which masks of three or more views keep together" if facts else NONE_FOUND
-    return Catalogue(tuple(SceneObject(**one) for one in facts), told, features[[one["id"] for one in facts]])
+    things = tuple(SceneObject(**one) for one in facts)
+    return Catalogue(things, told, features[[one["id"] for one in facts]], scene.world)
 
 
 def tree(
@@ -99,12 +104,13 @@ def tree(
         scene, words, vectors: as of `catalogue`. relations, up: as of `Scene.tree`.
 
     Raises:
-        InvalidQuery, InvalidLift: as `catalogue`; or up has no direction, or the cameras have none in common.
+        InvalidQuery, InvalidLift: as `catalogue`; or the cameras have no up in common. InvalidInput: up has no direction.
     """
+    measured: dict[str, Any] = {"world": scene.world, "unit": scene.world.unit}
     if scene.object is None or scene.object_views is None:
-        return SceneTree(explanation=NOT_LOOKED_FOR, count=0, nodes=())
+        return SceneTree(explanation=NOT_LOOKED_FOR, count=0, nodes=(), **measured)
     if scene.node is None or scene.node_parents is None or scene.node_views is None:
-        return SceneTree(explanation=NO_TREE, count=0, nodes=())
+        return SceneTree(explanation=NO_TREE, count=0, nodes=(), **measured)
     assert scene.node_confidence is not None and scene.node_features is not None
     objects, parents = len(scene.object_views), scene.node_parents
     features = np.concatenate([object_features(scene), scene.node_features[objects:].astype(np.float32)])
@@ -122,13 +128,14 @@ def tree(
         confidence = float(scene.node_confidence[node])
         nodes.append(SceneNode(**one | more, parent=parent, confidence=confidence))
     explanation = _counts(nodes) if nodes else NONE_FOUND
-    answer = SceneTree(explanation=explanation, count=len(nodes), nodes=tuple(nodes))
+    answer = SceneTree(explanation=explanation, count=len(nodes), nodes=tuple(nodes), **measured)
     if not relations:
         return answer
-    if up == "cameras":
-        up = upright(scene.cameras.values())
+    own = upright(scene.cameras.values()) if up == "cameras" else up
+    world = WorldFrame(up=own).known_or(scene.world)
     members = [np.flatnonzero(scene.members(node)) for node in range(objects)]
-    return answer.model_copy(update={"up": up, "relations": related(scene.splats, members, scene.evidence, up)})
+    found = related(scene.splats, members, scene.evidence, world)
+    return answer.model_copy(update={"world": world, "relations": found})
 
 
 def _counts(nodes: Sequence[SceneNode]) -> str:
@@ -174,7 +181,7 @@ def _described(
         share = float(evidence[rows].sum() / whole)
         found.append(
             {"id": one, "name": name, "score": score, "splats": int(rows.size), "share": share, "centre": (x, y, z)}
-            | {"box": box, "views": shown}
+            | {"box": box, "size": size_of(scene.world, box), "views": shown}
         )
     return found
 
@@ -227,13 +234,15 @@ def table_csv(found: Catalogue) -> bytes:
     content = io.StringIO(newline="")
     writer = csv.writer(content)
     corners = [f"{end}_{axis}" for end in ("low", "high") for axis in "xyz"]
-    writer.writerow(["id", "name", "score", "splats", "share", "x", "y", "z", *corners, "views"])
+    sides = [f"size_{axis}" for axis in "xyz"]
+    writer.writerow(["id", "name", "score", "splats", "share", "x", "y", "z", *corners, "views", *sides, "unit"])
     for one in found.objects:
         low, high = one.box
         named = "" if one.name is None else one.name, "" if one.score is None else f"{one.score:.6g}"
         digits = 9 if max(map(abs, (*low, *high))) < MAP_REACH else 15  # as many as the boxes' numbers have
         numbers = (f"{value:.{digits}g}" for value in (one.share, *one.centre, *low, *high))
-        writer.writerow([one.id, *named, one.splats, *numbers, " ".join(one.views)])
+        size = (f"{side:.6g}" for side in one.size)
+        writer.writerow([one.id, *named, one.splats, *numbers, " ".join(one.views), *size, found.world.unit])
     return content.getvalue().encode()
 
 
@@ -246,4 +255,4 @@ def one_object_splats(scene: OpenedLift, number: int, suffix: str = ".ply") -> I
     """
     from liftcore.io.splats import some_rows
 
-    return some_rows(scene.splat_file, scene.members(number), suffix)
+    return some_rows(scene.splat_file, scene.members(number), suffix, scene.world)

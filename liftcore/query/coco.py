@@ -49,7 +49,8 @@ def masks_json(
     if any(one["class_id"] not in kinds for one in (*instances.values(), *parts.values())):
         kinds[0] = "object"
     head = {
-        "info": {"description": "instances of a lift in its views", "contributor": labels.document["made_by"]},
+        "info": {"description": "instances of a lift in its views", "contributor": labels.document["made_by"]}
+        | {name: labels.document[name] for name in ("world", "unit")},
         "categories": [{"id": number, "name": name} for number, name in sorted(kinds.items())],
     }
     chosen = scene.metadata.views if views is None else views

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -187,7 +188,7 @@ def object_splats(scene: OpenedLift, answer: Answer, suffix: str = ".ply") -> It
     kept = answer.selected if whole else objects(scene, answer).numbers >= 0
     if suffix in (".glb", ".spz", ".usdc", ".usdz") and not whole:
         return labelled(scene.splat_file, labels(scene, answer), suffix, kept)
-    return some_rows(scene.splat_file, kept, suffix)
+    return some_rows(scene.splat_file, kept, suffix, scene.world)
 
 
 def coloured_ply(scene: OpenedLift, answer: Answer) -> Iterable[bytes]:
@@ -231,7 +232,7 @@ def splats_as(scene: OpenedLift, suffix: str) -> Iterator[bytes]:
     """
     from liftcore.io.splats import blocks_as
 
-    return blocks_as(scene.splats, suffix)
+    return blocks_as(replace(scene.splats, world=scene.world), suffix)
 
 
 def layer_colours(scene: OpenedLift, what: str) -> np.ndarray:

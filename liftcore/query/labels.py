@@ -50,7 +50,11 @@ def labels(scene: OpenedLift, source: Segmentation | Answer | Mapping[str, Answe
         InvalidLift: the splats moved or changed since the lift.
     """
     parts = dict(source) if isinstance(source, Mapping) else {None: source}  # a copy: theirs may change
-    if scene.labelled is None or not _are_same(scene.labelled[0], parts):
+    if (
+        scene.labelled is None
+        or not _are_same(scene.labelled[0], parts)
+        or scene.labelled[1].document["world"] != scene.world.model_dump(mode="json")
+    ):
         if isinstance(source, Answer | Mapping):
             made = _of_answers(scene, {_name(source): source} if isinstance(source, Answer) else source)
         else:
@@ -201,6 +205,8 @@ def _labels(
         "columns": list(columns),
         "frame": frame,
         "frame_is": FRAMES[frame],
+        "world": scene.world.model_dump(mode="json"),
+        "unit": scene.world.unit,
         "classes": [one | {"instances": members.get(one["class_id"], [])} for one in class_rows],
         "instances": [one | {"provenance": provenance} for one in instance_rows],
     }
@@ -220,7 +226,8 @@ def _facts(scene: OpenedLift, rows: np.ndarray, scores: np.ndarray | None) -> di
         facts["score"] = float(np.average(scores[rows], weights=weights))
     if scene.confidence is not None:
         facts["confidence"] = float(np.average(as_numpy(scene.confidence)[rows], weights=weights))
-    return facts | _boxes(scene.splats.positions(rows).astype(np.float64), weights)
+    boxes = _boxes(scene.splats.positions(rows).astype(np.float64), weights)
+    return facts | boxes | {"size": [scene.world.length(2 * half) for half in boxes["oriented_box"]["half_sizes"]]}
 
 
 def _boxes(means: np.ndarray, weights: np.ndarray) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from liftcore.scene.touching import touching
 
 if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
+    from liftcore.scene.world import WorldFrame
 
 LEAST_EVIDENCE = 0.05  # of an object, as a share of the largest's
 MOST_SPLATS = 1 << 20  # that are grouped: a million take seven seconds of two cores and a gigabyte
@@ -40,7 +41,7 @@ def objects(scene: OpenedLift, answer: Answer) -> Objects:
         raise InvalidQuery("threshold", expected=expected, got=f"{len(rows):,}", hint="name a higher threshold")
     numbers = np.full(len(answer.scores), -1, np.int32)
     if not len(rows):
-        return Objects.of((), numbers, 0)
+        return Objects.of((), numbers, 0, scene.world)
     weights = scene.counted(answer.query.weigh)[rows].astype(np.float64)
     weights = weights if weights.any() else np.ones(len(rows))
     groups = _set_numbers(scene, sets)[rows] if sets else touching(scene.splats, rows)
@@ -68,9 +69,10 @@ def objects(scene: OpenedLift, answer: Answer) -> Objects:
                 score=float(np.average(answer.scores[own], weights=mine)),
                 centre=_point(np.mean(box, axis=0)),
                 box=box,
+                size=size_of(scene.world, box),
             )
         )
-    return Objects.of(found, numbers, int((numbers[rows] < 0).sum()))
+    return Objects.of(found, numbers, int((numbers[rows] < 0).sum()), scene.world)
 
 
 def _set_numbers(scene: OpenedLift, sets: Sequence[SplatSet]) -> np.ndarray:
@@ -110,6 +112,11 @@ def trimmed_box(means: np.ndarray, weights: np.ndarray) -> Box:
         ends = np.searchsorted(sums, [_TAIL * sums[-1], (1 - _TAIL) * sums[-1]])
         corners[:, axis] = means[order[np.minimum(ends, len(order) - 1)], axis]
     return Box(_point(corners[0]), _point(corners[1]))
+
+
+def size_of(world: "WorldFrame", box: Box) -> Point:
+    """The sides of a box, in metres where it is known how long these are."""
+    return _point(np.array([world.length(high - low) for low, high in zip(*box, strict=True)]))
 
 
 def _point(row: np.ndarray) -> Point:

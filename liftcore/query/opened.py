@@ -14,6 +14,7 @@ from liftcore.errors import InvalidLift, InvalidQuery, NotFound
 from liftcore.io.splats import quick_count
 from liftcore.query.scores import mean_direction, norms_of
 from liftcore.scene.kernel import Kernel
+from liftcore.scene.world import UNKNOWN, WorldFrame
 from liftcore.text.table import TableEncoder, own_words
 from liftcore.values.lift_file import NODE_TENSORS, OBJECT_TENSORS, read_lift
 
@@ -77,8 +78,9 @@ class OpenedLift:
         packs: Views | None = None,
         *,
         device: str = "cpu",
+        world: WorldFrame = UNKNOWN,
     ) -> None:
-        self.device = device
+        self.device, self._said_of_world = device, world
         self.labelled: tuple[Any, Any] | None = None  # what was last exported, and its `Labels`, for two files of it
         self.selections: dict[str, Selection] = {}  # by their names; `Scene.select` makes them
         self._encoders: dict[str | None, TextEncoder] = {}
@@ -176,6 +178,11 @@ class OpenedLift:
             if place is not None
         }
         return metadata.model_copy(update=files) if files else metadata
+
+    @cached_property
+    def world(self) -> WorldFrame:
+        """Which way is up and how long a unit is, as somebody says now, else as the lift knows it; may be set."""
+        return self._said_of_world.known_or(self.metadata.world)
 
     @cached_property
     def table(self) -> TableEncoder | None:

@@ -29,6 +29,7 @@ from liftcore.errors import InvalidQuery
 from liftcore.query.terms import NOTATIONS, SETS, Example, SplatSet, Term, Vector, parse_example, parse_set
 from liftcore.runtime.fields import Body, NoBoolean, Shown, takes
 from liftcore.scene.compositing import MAX_SIDE
+from liftcore.scene.world import WorldFrame
 
 if TYPE_CHECKING:
     import numpy as np
@@ -461,6 +462,15 @@ class Answer(Found):
         return self.present is False and self.query.absent == "drop"
 
 
+class Measured(Value):
+    """What tells sizes and distances: in metres where it is known how long a scene unit is."""
+
+    world: WorldFrame = Field(description="which way is up and how long a scene unit is, as far as somebody said it")
+    unit: Literal["metres", "scene units"] = Field(
+        description="of sizes and gaps; places and boxes are in scene units"
+    )
+
+
 class FoundObject(Value):
     """Selected splats that hang together."""
 
@@ -469,9 +479,10 @@ class FoundObject(Value):
     score: float = Field(description="the mean of its splats' scores, by the same")
     centre: Point = Field(description="the middle of its box: x y z, world frame")
     box: Box = Field(description="of its splats' centres, but for a thousandth of the evidence at each end")
+    size: Point = Field(description="the sides of its box, in `unit`")
 
 
-class Objects(Value):
+class Objects(Measured):
     """What an answer found, thing by thing."""
 
     objects: tuple[FoundObject, ...] = Field(description="those with the most evidence first")
@@ -479,9 +490,9 @@ class Objects(Value):
     _numbers: np.ndarray = PrivateAttr()
 
     @classmethod
-    def of(cls, objects: Iterable[FoundObject], numbers: np.ndarray, strays: int) -> Self:
+    def of(cls, objects: Iterable[FoundObject], numbers: np.ndarray, strays: int, world: WorldFrame) -> Self:
         """Objects with the number of each splat's, which JSON leaves out."""
-        made = cls(objects=tuple(objects), strays=strays)
+        made = cls(objects=tuple(objects), strays=strays, world=world, unit=world.unit)
         made._numbers = numbers
         return made
 
@@ -544,13 +555,14 @@ class SceneObject(Value):
     share: float = Field(description="of the evidence of all splats")
     centre: Point = Field(description="the middle of its box: x y z, frame of the splat file")
     box: Box = Field(description="of its largest group of splats that touch, without outliers elsewhere")
+    size: Point = Field(description="the sides of its box, in `unit`")
     views: tuple[str, ...] = Field(description="that show most of it, the best first")
     feature: tuple[float, ...] | None = Field(
         default=None, description="where it is asked for: the mean of its unit features [F], unit"
     )
 
 
-class ListedObjects(Value):
+class ListedObjects(Measured):
     """The things in a scene, or some of them, those with the most evidence first."""
 
     explanation: str = Field(description="why there are so many; or why there are none")
@@ -574,17 +586,16 @@ class Relation(Value):
     node: int
     relation: Literal["touching", "inside", "on", "under", "beside"]
     other: int
-    gap: float = Field(description="scene units; below zero where one sinks into the other")
+    gap: float = Field(description="in `unit`; below zero where one sinks into the other")
     overlap: float | None = Field(description="0 to 1, of what it comes from; null of touching")
 
 
-class SceneTree(Value):
+class SceneTree(Measured):
     """Objects, their parts and groups of them, or some of these; the first are the objects."""
 
     explanation: str = Field(description="why there are so many; or why there are none")
     count: int = Field(description="of all pages")
     nodes: tuple[SceneNode, ...]
-    up: Point | None = Field(default=None, description="that relations were asked with; null: not known")
     relations: tuple[Relation, ...] = Field(default=(), description="of the objects, where they are asked for")
 
 

@@ -14,7 +14,8 @@ Of thing a and thing b, with heights along ``up`` and the ground at right angles
 ``gap`` is between the nearest centres; of on and under between heights, of beside on the ground. ``overlap`` is the
 share of a's splats in b's box, of its footprint above b, or of heights.
 
-Which way is up no splat says: it is given, or that of the cameras (`upright`); or on, under and beside are not told.
+Where it is not known which way is up (`liftcore.scene.world`, or `upright` of cameras), on, under and beside are not
+told. Gaps are in metres where it is known how long a unit is, else in scene units.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from liftcore.errors import InvalidQuery
 from liftcore.query.objects import trimmed_box
 from liftcore.query.question import Point, Relation
 from liftcore.scene.touching import touch_pairwise
+from liftcore.scene.world import UNKNOWN, WorldFrame
 
 if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera
@@ -60,25 +61,22 @@ class _Thing:
 
 
 def relations(
-    splats: Splats, members: Sequence[np.ndarray], weights: np.ndarray, up: Point | None = None
+    splats: Splats, members: Sequence[np.ndarray], weights: np.ndarray, world: WorldFrame = UNKNOWN
 ) -> tuple[Relation, ...]:
     """The relations of some things, by their places among ``members``.
 
     Args:
         splats: the scene. members: rows [n] i64 of the splats of each, the largest things first; the first
             MOST_THINGS are looked at. weights: [P], how much each splat counts.
-        up: a direction of any length; None: not known.
-
-    Raises:
-        InvalidQuery: up has no direction.
+        world: which way is up and how long a unit is, as far as it is known.
     """
-    turn = _turn(up)
+    turn = _turn(world.up)
     things = [_thing(splats, rows, weights, turn) for rows in members[:MOST_THINGS]]
     found = list[Relation]()
     for a, b in combinations(range(len(things)), 2):
         if len(things[a].rows) and len(things[b].rows):
-            found += _of_pair(splats, a, b, things[a], things[b], known=up is not None)
-    return tuple(found)
+            found += _of_pair(splats, a, b, things[a], things[b], known=world.up is not None)
+    return tuple(one.model_copy(update={"gap": world.length(one.gap)}) for one in found)
 
 
 def upright(cameras: Iterable[Camera]) -> Point:
@@ -107,14 +105,7 @@ def _turn(up: Point | None) -> np.ndarray:
     """[3, 3], rows are two directions on the ground and up."""
     if up is None:
         return np.eye(3)
-    try:
-        axis = np.asarray(up, np.float64)
-        length = np.linalg.norm(axis)
-    except (TypeError, ValueError):
-        axis, length = np.zeros(0), 0.0
-    if axis.shape != (3,) or not np.isfinite(length) or length == 0:
-        raise InvalidQuery("up", expected="a direction x y z, finite and not zero", got=repr(up)[:80])
-    axis = axis / length
+    axis = np.array(up)
     first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     first /= np.linalg.norm(first)
     return np.stack([first, np.cross(axis, first), axis])

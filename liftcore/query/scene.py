@@ -53,6 +53,7 @@ class Scene(OpenedLift):
             they lie.
         packs: that were lifted.
         device: that draws: cpu, cuda or auto. Scores are computed on the CPU.
+        world: which way is up and how long a unit is, where the lift does not know it, or wrongly.
 
     Raises:
         InvalidLift: the file is missing, is not a lift, or has other rows than the file of ``splats``, where these
@@ -226,8 +227,8 @@ class Scene(OpenedLift):
         Args:
             words, vectors, encoder: as in `catalogue`.
             relations: whether to say how the objects lie to each other (`liftcore.query.relations`).
-            up: the direction against gravity in the frame of the splats, or ``cameras``, where photos were taken
-                upright; None: not known, and no object is on another.
+            up: in place of what ``world`` knows: the direction against gravity in the frame of the splats, or
+                ``cameras``, where photos were taken upright. Where it is not known, no object is on another.
         """
         from liftcore.query.catalogue import tree
 

@@ -81,7 +81,8 @@ def transfer(lift: AnyLift, old: Splats, new: Splats, matrix: Any = None, progre
         certificate["plan"] = plan | {"kernel": str(new.kernel)}
     changes: dict[str, Any] = {"certificate": certificate, "splats": NO_FILE, "landmarks": landmarks_of(new)}
     changes |= {"origin": new.origin, "settings": lift.settings.model_copy(update={"kernel": str(new.kernel)})}
-    changes |= {} if move is None else {"cameras": NO_FILE, "poses": ""}
+    known = new.world.known_or(lift.metadata.world if move is None else lift.metadata.world.transformed(move))
+    changes |= {"world": known} | ({} if move is None else {"cameras": NO_FILE, "poses": ""})
     return replace(lift, **fields, metadata=lift.metadata.model_copy(update=changes))
 
 

@@ -19,6 +19,7 @@ from liftcore.scene.origin import FILE_ORIGIN, MAP_REACH, Origin
 from liftcore.scene.panorama import TURNS, Face
 from liftcore.scene.similarity import Similarity
 from liftcore.scene.views import cameras_of_views, composed, without_image_suffix
+from liftcore.scene.world import UNKNOWN, WorldFrame
 
 if TYPE_CHECKING:  # torch is taken, and not loaded for it
     from torch import Tensor
@@ -323,6 +324,7 @@ class Cameras(Mapping[str, Camera]):
         views: a mapping of names to cameras, whose names win over those of the cameras; or named cameras.
         frame: the name of the file by which they were moved to the frame of the splats.
         of_nerfstudio: as nerfstudio's own converter writes them, and not moved.
+        world: which way is up, where their file says it.
         warnings: of their reader, for whoever plans or lifts with them: what was skipped, or lies beside unread.
 
     Raises:
@@ -335,10 +337,12 @@ class Cameras(Mapping[str, Camera]):
         *,
         frame: str | None = None,
         of_nerfstudio: bool = False,
+        world: WorldFrame = UNKNOWN,
         warnings: Iterable[str] = (),
     ) -> None:
         self.frame = frame
         self.of_nerfstudio = of_nerfstudio
+        self.world = world
         self.warnings = tuple(warnings)
         alone = _cameras_in(views)
         if isinstance(views, Mapping):
@@ -400,8 +404,12 @@ class Cameras(Mapping[str, Camera]):
         Raises:
             InvalidInput: it is no similarity.
         """
-        move = {"matrix": matrix, "scale": scale, "rotation": rotation, "translation": translation}
-        return Cameras([camera.transformed(**move) for camera in self.values()], warnings=self.warnings)
+        moved = [
+            camera.transformed(matrix, scale=scale, rotation=rotation, translation=translation)
+            for camera in self.values()
+        ]
+        world = self.world.transformed(Similarity.of(matrix, scale, rotation, translation))
+        return Cameras(moved, world=world, warnings=self.warnings)
 
     @property
     def distorted(self) -> tuple[str, ...]:

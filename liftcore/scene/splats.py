@@ -24,6 +24,7 @@ from liftcore.scene.quaternions import product_matrix
 from liftcore.scene.render_mode import RenderMode, RenderModel, render_mode_of
 from liftcore.scene.rows import Rows, chosen_rows
 from liftcore.scene.similarity import Similarity
+from liftcore.scene.world import UNKNOWN, WorldFrame
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -94,6 +95,8 @@ class Splats:
     """how they were trained, where that is said; of a str, the model's name"""
     origin: Origin
     """[3] f64, world frame, scene units; zeros but for scenes in map coordinates"""
+    world: WorldFrame
+    """which way is up and how long a unit is, as far as their file says it"""
     warnings: tuple[str, ...]
     """of what in these splats, or in their file, is not as it should be"""
 
@@ -113,6 +116,7 @@ class Splats:
         header: tuple[str, ...] = (),
         render_mode: RenderMode | str | None = None,
         origin: Sequence[float] | None = None,
+        world: WorldFrame = UNKNOWN,
         warnings: tuple[str, ...] = (),
     ) -> None:
         kernel = kernel_named(kernel)
@@ -143,7 +147,7 @@ class Splats:
         mode = render_mode_of(render_mode)
         doubts = [*_doubts(mode, kernel), *_activation_warnings(columns)]
         told = tuple(dict.fromkeys((*warnings, *repairs, *doubts, *rounding)))
-        fixed |= {"render_mode": mode, "origin": origin, "warnings": told}
+        fixed |= {"render_mode": mode, "origin": origin, "world": world, "warnings": told}
         for name, value in fixed.items():
             object.__setattr__(self, name, value)
         if self.sh is not None and self.sh.shape[1] not in SH_ROWS:
@@ -272,7 +276,7 @@ class Splats:
                 kinds = [self.extras[name].dtype for name in NORMALS]
                 own = {name: one.to(kind) for name, one, kind in zip(NORMALS, columns, kinds, strict=True)}
                 fields["extras"] = {**self.extras, **own}
-        return replace(self, **fields, origin=origin)
+        return replace(self, **fields, origin=origin, world=self.world.transformed(move))
 
     def cpu(self) -> Splats:
         """The same with its tensors on the CPU."""

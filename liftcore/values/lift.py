@@ -14,6 +14,7 @@ from liftcore.errors import InvalidSplats
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.origin import FILE_ORIGIN, Origin
 from liftcore.scene.views import composed
+from liftcore.scene.world import UNKNOWN, WorldFrame
 from liftcore.text.table import TableEncoder, own_words
 from liftcore.values.lift_file import NODE_TENSORS
 from liftcore.values.settings import LiftSettings
@@ -69,6 +70,7 @@ class LiftMetadata(BaseModel):
     views: tuple[Annotated[str, AfterValidator(composed)], ...]  # the views that were lifted
     poses: str = ""  # of their cameras (`liftcore.values.lift_file.poses_of`); "" in older lifts
     origin: Origin = FILE_ORIGIN  # of the splats (`Splats.origin`), and of the positions in ``.splat`` and ``.spz``
+    world: WorldFrame = UNKNOWN  # of the splats: as their file, else that of the cameras says it, or somebody later
     landmarks: tuple[Landmark, ...] = ()  # where some splats lie, by which their rows are known; () in older lifts
     certificate: dict[str, Any]
     timings: dict[str, float]  # seconds a stage
@@ -202,8 +204,14 @@ class Lift:
             if any(metadata.origin)
             else FILE_ORIGIN,
             "landmarks": tuple((row, *place) for row, place in zip(rows, moved, strict=True)),
+            "world": metadata.world.transformed(move),
         }
         return replace(self, metadata=metadata.model_copy(update=changes))
+
+    def with_world(self, world: WorldFrame) -> Self:
+        """The lift with what is said of its frame; what ``world`` does not know stays as it is."""
+        changes = {"world": world.known_or(self.metadata.world)}
+        return replace(self, metadata=self.metadata.model_copy(update=changes))
 
     def require_splats(self, splats: Splats) -> None:
         """Refuse splats that are not those of the lift, row for row, by their number and where some of them lie.

@@ -71,6 +71,7 @@ class LiftViews:
             views=tuple(self.names),
             poses=poses_of(self.lifted),
             origin=splats.origin,
+            world=splats.world.known_or(self.cameras.world),
             landmarks=landmarks_of(splats),
             certificate=diagnostics,
             timings=timings,

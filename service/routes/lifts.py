@@ -112,7 +112,7 @@ async def create_lift(
     tags=["lifts"],
 )
 def change_lift(lift: str, change: models.LiftChange, deps: Deps) -> models.LiftResult:
-    """Give a lift a name, or photos of its views; what is left out stays."""
+    """Give a lift a name, photos of its views, or what is known of its frame; what is left out stays."""
     return shape_lift(deps.store.lifts.change(deps.owner, lift, change.model_dump(exclude_unset=True)))
 
 
@@ -280,7 +280,15 @@ def shape_lift(lift: LiftRecord) -> models.LiftResult:
     links = {"self": own, "job": f"/jobs/{lift.id}", "features": f"{own}/features"}
     links |= {"views": f"{own}/views", "objects": f"{own}/objects", "tree": f"{own}/tree"}
     links |= {"query": f"/query?lift={lift.id}&text="}
-    told = {"views": [], "words": [], "origin": (0.0, 0.0, 0.0), **lift.metadata, **vars(lift), "links": links}
+    told = {
+        "views": [],
+        "words": [],
+        "origin": (0.0, 0.0, 0.0),
+        "world": {},
+        **lift.metadata,
+        **vars(lift),
+        "links": links,
+    }
     return models.LiftResult(**{name: told[name] for name in models.LiftResult.model_fields})
 
 

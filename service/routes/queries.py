@@ -138,6 +138,7 @@ def scene_request(operation: str, lift: LiftRecord, deps: AppState) -> dict[str,
         "splats": str(splats.path),
         "cameras": str(cameras.path),
         "kernel": kernel_of(splats, lift.metadata["settings"]),
+        "world": lift.metadata.get("world", {}),
         "names": {
             str(lift.path): f"lift {lift.id}",
             str(splats.path): f"splats {splats.id}",

@@ -193,8 +193,8 @@ class LiftStore:
             if made.draft != path:
                 self._files.publish(made.draft, path)
 
-    def change(self, owner: Owner, lift: str, changes: Mapping[str, str | None]) -> LiftRecord:
-        """Give a lift another ``name`` or other ``photos``, an asset that is here; None takes them away.
+    def change(self, owner: Owner, lift: str, changes: Mapping[str, Any]) -> LiftRecord:
+        """Give a lift another ``name``, other ``photos``, an asset that is here, or ``world``; None takes them away.
 
         Raises:
             NotFound: there is no such lift, or there are no such photos.
@@ -206,6 +206,9 @@ class LiftStore:
                 self._own_photos(connection, owner, lift, photos)
             for column in changes.keys() & {"name", "photos"}:
                 connection.execute(f"UPDATE lifts SET {column} = ? WHERE id = ?", (changes[column] or None, lift))
+            if "world" in changes:
+                world = "UPDATE lifts SET metadata = json_set(metadata, '$.world', json(?)) WHERE id = ?"
+                connection.execute(world, (json.dumps(changes["world"] or {}), lift))
         return self.get(owner, lift)
 
     def _own_photos(self, connection: sqlite3.Connection, owner: Owner, lift: str, photos: str) -> None:

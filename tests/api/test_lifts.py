@@ -69,6 +69,35 @@ def test_lift_has_the_name_that_somebody_gave_it(client: TestClient, lift: dict[
     assert client.patch(f"/lifts/{'e' * 32}", json={"name": "x"}).status_code == 404
 
 
+def test_sizes_are_in_metres_once_somebody_says_how_long_a_unit_is(client: TestClient, lift: dict[str, Any]) -> None:
+    at, unknown = f"/lifts/{lift['id']}", {"up": None, "metres_per_unit": None}
+
+    def told() -> list[Any]:
+        found = [client.get(f"{at}/{what}").json() for what in ("objects", "tree")]
+        found.append(client.post("/query/objects", json={"lift": lift["id"], "like": ["splat:1"]}).json())
+        assert found[0]["world"] == found[1]["world"] == found[2]["world"] == client.get(at).json()["world"]
+        sizes = [one["size"] for part in found for one in part.get("objects", part.get("nodes"))]
+        return [found[0]["world"], {part["unit"] for part in found}, np.array(sizes)]
+
+    world, unit, plain = told()
+    assert (world, unit) == (unknown, {"scene units"}) and len(plain) > 3
+    known = {"between": [[0, 0, 0], [0, 0, 4]], "metres": 1}
+    assert client.patch(at, json={"world": {"up": [0, -2, 0], "distance": known}}).status_code == 200
+    world, unit, metres = told()
+    assert (world, unit) == ({"up": [0, -1, 0], "metres_per_unit": 0.25}, {"metres"})
+    np.testing.assert_allclose(metres, plain / 4)
+    for wrong in (
+        {"up": [0, 0, 0]},
+        {"metres_per_unit": 0},
+        {"down": [0, 1, 0]},
+        {"up": None, "distance": {"metres": 1}},
+    ):
+        assert assert_problem(client.patch(at, json={"world": wrong})).get("status") == 422
+    assert client.patch(at, json={"name": "x"}).json()["world"]["metres_per_unit"] == 0.25
+    assert client.patch(at, json={"world": None}).json()["world"] == unknown
+    assert told()[:2] == [unknown, {"scene units"}]
+
+
 def test_photos_are_shown_as_they_were_uploaded(client: TestClient, lift: dict[str, Any]) -> None:
     at = f"/lifts/{lift['id']}"
     asset = client.put("/assets/photos", content=photos(left=png())).json()
@@ -271,9 +300,9 @@ def test_relations_of_objects_have_their_numbers_and_come_once(
     with safe_open(tmp_path / "lift", framework="np") as opened:
         route = client.post("/lifts", content=save(tensors, opened.metadata())).json()["links"]["tree"]
     plain = client.get(route).json()
-    assert (plain["relations"], plain["up"]) == ([], None)
+    assert (plain["relations"], plain["world"]["up"]) == ([], None)
     unknown = client.get(route, params={"relations": True}).json()
-    assert unknown["nodes"] == plain["nodes"] and unknown["up"] is None
+    assert unknown["nodes"] == plain["nodes"] and unknown["world"]["up"] is None
     assert {one["relation"] for one in unknown["relations"]} <= {"touching", "inside"}
     whole = client.get(route, params={"relations": True, "up": "0,-1,0"}).json()
     (beside,) = [one for one in whole["relations"] if one["relation"] == "beside"]
@@ -281,7 +310,7 @@ def test_relations_of_objects_have_their_numbers_and_come_once(
     pages = [client.get(route, params={"up": "0,-2,0", "limit": 1, "cursor": at}).json() for at in range(3)]
     assert [one for page in pages for one in page["relations"]] == whole["relations"]
     cameras = client.get(route, params={"up": "cameras"}).json()
-    np.testing.assert_allclose(cameras["up"], (0, 1, 0), atol=1e-6)
+    np.testing.assert_allclose(cameras["world"]["up"], (0, 1, 0), atol=1e-6)
     assert cameras["relations"] == whole["relations"]
     for wrong in ("0,-1", "0,-1,0,0", "nan,0,1", "0,0,0", "1e999,0,0", "up", ""):
         problem = assert_problem(client.get(route, params={"up": wrong}))
@@ -337,7 +366,7 @@ def test_other_kernels_are_shown_as_near_gaussians() -> None:
     shown = []
     for splats in (discs, betas):
         scene = Scene.__new__(Scene)
-        scene.__dict__["splats"] = splats
+        scene.__dict__ |= {"splats": splats, "world": splats.world}
         shown.append(np.frombuffer(b"".join(splats_as(scene, ".splat")), ROW))
     np.testing.assert_allclose(shown[0]["scales"], [[0.5, 0.5, 0.005]] * 2, rtol=1e-5)
     np.testing.assert_allclose(shown[1]["scales"], np.sqrt(1 / 12), rtol=1e-5)  # (1 - r^2)^4 in the image

@@ -481,9 +481,10 @@ def test_every_public_value_is_shown_in_a_line_that_says_its_size(scene):
     others += [opened, query, found, opened.objects(found), opened.look(found, "v0")]
     others += [lc.FeatureGrid(np.ones((3, 4, 5))), lc.Picture(camera=cameras["v0"])]
     others += [models.OwnCamera.of(cameras["v0"])]
-    others += [lc.FoundObject(centre=box[0], **thing), lc.BestWord(word="a" * 99, score=0.5)]
+    sized_thing = thing | {"centre": box[0], "size": box[1]}
+    others += [lc.FoundObject(**sized_thing), opened.world, lc.WorldFrame(up=(0, -3, 0), metres_per_unit=0.1)]
     others += [lc.NamedSplats(word="a" * 99, row=0, value=1, colour=(1, 2, 3), margin=0.1, threshold=0.2, **thing)]
-    others += [lc.SceneObject(id=0, name=None, centre=box[0], views=("v",) * 99, feature=(0.1,) * 512, **thing)]
+    others += [lc.SceneObject(id=0, name=None, views=("v",) * 99, feature=(0.1,) * 512, **sized_thing)]
     others += [lc.CoveringRegion(example="region:v:0:1", view="v" * 99, level=0, region=1, share=0.5)]
     classes = {value for name in lc.__all__ if isinstance(value := getattr(lc, name), type)}
     no_values = [kind for kind in classes if issubclass(kind, Exception) or getattr(kind, "_is_protocol", False)]

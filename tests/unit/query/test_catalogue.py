@@ -92,7 +92,14 @@ def test_the_command_lists_the_tree_and_writes_its_nodes_by_their_paths(
     assert sorted(path.stem for path in (tmp_path / "things").iterdir()) == names
     assert main([*command, "--relations", "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)["answer"]
-    assert answer["up"] is None and {one["relation"] for one in answer["relations"]} <= {"touching", "inside"}
+    assert {one["relation"] for one in answer["relations"]} <= {"touching", "inside"}
+    assert answer["world"] == {"up": None, "metres_per_unit": None} and answer["unit"] == "scene units"
+    sizes = [one["size"] for one in answer["nodes"]]
+    assert main([*command, "--distance", "0", "0", "0", "0", "0", "2", "1", "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)["answer"]
+    assert answer["unit"] == "metres" and answer["world"]["metres_per_unit"] == 0.5
+    assert [[2 * side for side in one["size"]] for one in answer["nodes"]] == sizes
+    assert main([*command[:3], "--up", "0", "0", "0"]) == 2 and "--up: expected" in capsys.readouterr().err
     assert main([*command, "--features"]) != 0
 
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.errors import InvalidQuery
+from liftcore.errors import InvalidInput, InvalidQuery
 from liftcore.query.relations import relations, upright
 from liftcore.scene.cameras import Camera
 from liftcore.scene.splats import Splats
+from liftcore.scene.world import WorldFrame
 
 STEP = 0.1
 
@@ -35,18 +36,22 @@ THINGS = {
 ROWS = np.split(np.arange(sum(map(len, THINGS.values()))), np.cumsum([len(one) for one in THINGS.values()])[:-1])
 
 
-def found(turn: np.ndarray, up: tuple[float, float, float] | None) -> set[tuple[str, str, str]]:
+def scene(turn: np.ndarray) -> Splats:
     means = np.concatenate(list(THINGS.values())) @ turn.T
     count = len(means)
-    splats = Splats(
+    return Splats(
         means=torch.tensor(means).float(),
         quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
         log_scales=torch.full((count, 3), float(np.log(STEP / 3))),
         opacity_logits=torch.zeros(count),
         sh=torch.zeros(count, 1, 3),
     )
-    names = list(THINGS)
-    return {(names[r.node], r.relation, names[r.other]) for r in relations(splats, ROWS, np.ones(count), up)}
+
+
+def found(turn: np.ndarray, up: tuple[float, float, float] | None) -> set[tuple[str, str, str]]:
+    splats, names = scene(turn), list(THINGS)
+    told = relations(splats, ROWS, np.ones(splats.count), WorldFrame(up=up))
+    return {(names[one.node], one.relation, names[one.other]) for one in told}
 
 
 LEFT = np.array([[0, 0, -1.0], [0, 1, 0], [1, 0, 0]])  # the table's up is the frame's -x
@@ -97,5 +102,12 @@ def test_cameras_that_are_rolled_have_no_up() -> None:
 
 
 def test_an_up_without_a_direction_is_refused() -> None:
-    with pytest.raises(InvalidQuery, match="up: expected"):
+    with pytest.raises(InvalidInput, match="up: expected"):
         found(np.eye(3), (0.0, 0.0, 0.0))
+
+
+def test_gaps_are_in_metres_where_a_unit_is_known() -> None:
+    splats, rows = scene(np.eye(3)), np.ones(sum(map(len, ROWS)))
+    up = (0.0, 0.0, 1.0)
+    plain, metres = (relations(splats, ROWS, rows, WorldFrame(up=up, metres_per_unit=m)) for m in (None, 0.5))
+    assert [one.gap for one in metres] == [one.gap / 2 for one in plain] and any(one.gap for one in plain)

@@ -1,0 +1,144 @@
+"""Which way is up in a scene, and how long its unit is, as far as anybody says so.
+
+Splats and COLMAP's models say neither. glTF and USD say both, nerfstudio's frames which way is up; people can say it
+(``--up``, ``--metres-per-unit``, a distance that they know). Nothing is estimated. Without it sizes and distances are
+in scene units, and no object is on another.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+
+from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic_core import PydanticCustomError
+
+from liftcore.errors import InvalidInput
+from liftcore.runtime.fields import Body, NoBoolean
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from liftcore.scene.similarity import Similarity
+
+LARGEST = 1e12  # metres of a unit, and coordinates
+Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST), NoBoolean]
+Positive = Annotated[float, Field(ge=1 / LARGEST, le=LARGEST), NoBoolean]
+Point = tuple[Number, Number, Number]  # x y z, frame of the splats
+
+
+def _direction(given: Point) -> Point:
+    length = math.hypot(*given)
+    if length < 1 / LARGEST:
+        raise _wrong("a direction x y z that is not zero")
+    x, y, z = (axis / length + 0.0 for axis in given)  # 0.0 of -0.0
+    return x, y, z
+
+
+def _apart(given: tuple[Point, Point]) -> tuple[Point, Point]:
+    if math.dist(*given) < 1 / LARGEST:
+        raise _wrong("two points apart")
+    return given
+
+
+class KnownDistance(Body):
+    """Two points of a scene, and how far apart they are."""
+
+    model_config = ConfigDict(frozen=True)
+    between: Annotated[tuple[Point, Point], AfterValidator(_apart)] = Field(
+        description="two points, x y z each, in the frame of the splats"
+    )
+    metres: Positive = Field(description="from one to the other")
+
+
+class WorldFrame(Body):
+    """How the frame of some splats lies in the world; null is not known."""
+
+    model_config = ConfigDict(frozen=True)
+    error_type: ClassVar = InvalidInput
+
+    up: Annotated[Point, AfterValidator(_direction)] | None = Field(
+        default=None, description="the direction against gravity, in the frame of the splats"
+    )
+    metres_per_unit: Positive | None = Field(default=None, description="the length of a scene unit")
+    distance: KnownDistance | None = Field(
+        default=None, exclude=True, description="in place of metres_per_unit: two points whose distance is known"
+    )
+
+    @field_validator("distance")
+    @classmethod
+    def _in_place_of_the_unit(cls, given: KnownDistance | None, info: ValidationInfo) -> KnownDistance | None:
+        if given is not None and info.data.get("metres_per_unit") is not None:
+            raise _wrong("metres_per_unit or a distance, not both")
+        return given
+
+    @model_validator(mode="after")
+    def _measured(self) -> Self:
+        if self.distance is None:
+            return self
+        metres = self.distance.metres / math.dist(*self.distance.between)
+        changes = {"metres_per_unit": min(max(metres, 1 / LARGEST), LARGEST), "distance": None}
+        for name, value in changes.items():
+            object.__setattr__(self, name, value)
+        self.model_fields_set.symmetric_difference_update(changes)
+        return self
+
+    @property
+    def unit(self) -> Literal["metres", "scene units"]:
+        """What lengths are told in."""
+        return "scene units" if self.metres_per_unit is None else "metres"
+
+    def length(self, value: float) -> float:
+        """A length in scene units, in `unit`."""
+        return value * (self.metres_per_unit or 1.0)
+
+    def known_or(self, other: WorldFrame) -> WorldFrame:
+        """What this one knows, and else what the other does."""
+        known = {name: value for name, value in self if value is not None}
+        return other.model_copy(update=known)
+
+    def transformed(self, move: Similarity) -> WorldFrame:
+        """The same of a scene that was moved."""
+        up = None if self.up is None else tuple((move.rotation @ self.up).tolist())
+        metres = None if self.metres_per_unit is None else self.metres_per_unit / move.scale
+        return WorldFrame(up=up, metres_per_unit=metres)
+
+    def upright(self, axes: np.ndarray) -> np.ndarray:
+        """[4] f64, w x y z: the shortest turn that brings up to +Y in a frame; none where it is not known.
+
+        Args:
+            axes: [3, 3], a rotation of the frame of the splats to that frame.
+        """
+        import numpy as np
+
+        x, y, z = (0.0, 1.0, 0.0) if self.up is None else (axes @ self.up).tolist()
+        if y < 1e-9 - 1:  # upside down: half a turn about z
+            return np.array([0.0, 0.0, 0.0, 1.0])
+        turn = np.array([1 + y, -z, 0.0, x])  # 1 + a.b and a x b of the half way between a and b
+        return turn / np.linalg.norm(turn)
+
+    def placement(self, axes: np.ndarray, *, in_metres: bool) -> np.ndarray:
+        """[4, 4] f64: what brings splats in a frame (`upright`) to +Y up, and to metres as far as these are known."""
+        import numpy as np
+
+        from liftcore.scene.quaternions import rotation_matrices
+
+        matrix = np.eye(4)
+        matrix[:3, :3] = rotation_matrices(self.upright(axes)) * (self.length(1.0) if in_metres else 1.0)
+        return matrix
+
+
+UNKNOWN = WorldFrame()
+UPRIGHT = WorldFrame(up=(0.0, -1.0, 0.0))  # of splats in the frame of PLYs that come from one with +Y up
+
+
+def world_of(told: Any) -> WorldFrame:
+    """What a file of ours says of its frame; nothing where that is none."""
+    try:
+        return WorldFrame.model_validate(told if isinstance(told, dict) else {})
+    except InvalidInput:
+        return UNKNOWN
+
+
+def _wrong(expected: str) -> PydanticCustomError:
+    return PydanticCustomError("world", "{expected}", {"expected": expected})

@@ -1,0 +1,170 @@
+"""Which way is up and how long a unit is: known where a file says it, given, carried along, and read back."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import liftcore as lc
+from liftcore.errors import InvalidInput
+from liftcore.io.splats import labelled, read_labels, read_splats, write_splats
+from liftcore.io.transforms import FRAME_FILE
+from liftcore.io.usd import open_library
+from liftcore.scene.world import UNKNOWN, UPRIGHT, WorldFrame
+from liftcore.values.lift import LiftMetadata
+from liftcore.values.lift_file import open_lift
+from tests.unit.scene.test_gltf import FILES, assert_same, join, labels, parts_of, some_splats, write
+from tests.unit.scene.test_usd import needs_usd
+
+SIDEWAYS = WorldFrame(up=(3, 4, 0), metres_per_unit=0.25)
+WORLDS = [UNKNOWN, UPRIGHT, SIDEWAYS, WorldFrame(up=(0, 1, 0)), WorldFrame(metres_per_unit=40)]
+
+
+def frames(turn: np.ndarray) -> list[dict[str, Any]]:
+    """Three cameras that stand upright on the ground z = 0, turned."""
+    poses = []
+    for angle in (0.0, 1.0, 2.0):
+        back = np.array([math.cos(angle), math.sin(angle), 0])
+        up = np.array([0, 0, 1.0])
+        pose = np.eye(4)
+        pose[:3, :3] = turn @ np.stack([np.cross(up, back), up, back], axis=1)
+        poses.append({"file_path": f"{angle}.png", "transform_matrix": pose.tolist()})
+    return poses
+
+
+def nerfstudio(folder: Path, turn: np.ndarray, **more: Any) -> Path:
+    folder.mkdir(exist_ok=True)
+    document = {"w": 64, "h": 48, "fl_x": 50, "frames": frames(turn), **more}
+    (folder / "transforms.json").write_text(json.dumps(document))
+    return folder / "transforms.json"
+
+
+TIPPED = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # z to y
+
+
+def test_nerfstudio_says_that_z_is_up_where_its_cameras_stand_so(tmp_path: Path) -> None:
+    applied = {"applied_transform": np.eye(4)[:3].tolist(), "applied_scale": 2.0}
+    own = lc.read_cameras(nerfstudio(tmp_path, np.eye(3), **applied))
+    assert own.world == WorldFrame(up=(0, 0, 1)), "an applied scale is a ratio, and no length"
+    assert lc.read_cameras(nerfstudio(tmp_path, TIPPED, **applied)).world == UNKNOWN
+    assert lc.read_cameras(nerfstudio(tmp_path, np.eye(3))).world == UNKNOWN, "another program's has no convention"
+    moved = {"transform": np.column_stack([TIPPED.T, np.zeros(3)]).tolist(), "scale": 0.5}
+    (tmp_path / FRAME_FILE).write_text(json.dumps(moved))
+    assert lc.read_cameras(nerfstudio(tmp_path, TIPPED)).world == WorldFrame(up=(0, 0, 1))
+
+
+def test_a_frame_moves_with_its_scene() -> None:
+    move: dict[str, Any] = {"scale": 4.0, "rotation": TIPPED}
+    splats = replace(some_splats(), world=WorldFrame(up=(0, 0, 1), metres_per_unit=2))
+    moved = WorldFrame(up=(0, -1, 0), metres_per_unit=0.5)
+    assert splats.transformed(**move).world == moved and splats[:3].world == splats.world
+    cameras = lc.Cameras([lc.Camera.pinhole("a", 8, 8, 8, 8, 4, 4, np.eye(4))], world=splats.world)
+    assert cameras.transformed(**move).world == moved
+
+
+@pytest.mark.parametrize("world", WORLDS, ids=repr)
+@pytest.mark.parametrize("suffix", [".glb", *(pytest.param(usd, marks=needs_usd) for usd in (".usdc", ".usdz"))])
+def test_a_file_has_its_frame_and_its_splats_as_they_were(world: WorldFrame, suffix: str, tmp_path: Path) -> None:
+    for origin in ((0.0, 0.0, 0.0), (5e5, -2e4, 300.0)):
+        splats = replace(some_splats(), world=world, origin=origin)
+        write_splats(tmp_path / f"s{suffix}", splats)
+        found = read_splats(tmp_path / f"s{suffix}")
+        assert found.world == world
+        np.testing.assert_allclose(found.positions(), splats.positions(), rtol=1e-12, atol=1e-6)
+        assert_same(replace(found, origin=splats.origin, means=splats.means), splats)
+
+
+@pytest.mark.parametrize("world", WORLDS, ids=repr)
+def test_other_readers_of_gltf_see_metres_with_y_up(world: WorldFrame, tmp_path: Path) -> None:
+    """By the format alone, without what our file says of itself."""
+    document, binary = parts_of(write(tmp_path / "s.glb", replace(some_splats(), world=world)))
+    del document["asset"]["extras"]
+    found = read_splats(join(tmp_path / "t.glb", document, binary))
+    assert found.world == WorldFrame(up=(0, -1, 0), metres_per_unit=1)
+    turn = np.eye(3) if world.up is None else shortest_turn(np.array(world.up), np.array([0, -1.0, 0]))
+    assert_same(found, some_splats().transformed(scale=world.metres_per_unit or 1.0, rotation=turn))
+
+
+def shortest_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Rodrigues' formula, for directions that are not opposite; half a turn about z for these."""
+    if np.allclose(a, -b):
+        return np.diag([-1.0, -1, 1])
+    v, c = np.cross(a, b), float(a @ b)
+    k = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    return np.eye(3) + k + k @ k / (1 + c)
+
+
+def test_gltf_of_others_is_in_metres_with_y_up() -> None:
+    assert read_splats(FILES / "degree3.glb").world == WorldFrame(up=(0, -1, 0), metres_per_unit=1)
+    assert read_splats(FILES / "degree3.sog.decoded.ply").world == UNKNOWN
+
+
+@needs_usd
+def test_usd_has_the_metadata_of_the_stage_and_says_only_what_others_wrote(tmp_path: Path) -> None:
+    pxr = open_library()
+    write_splats(tmp_path / "s.usdc", replace(some_splats(), world=SIDEWAYS))
+    stage = pxr.Usd.Stage.Open(str(tmp_path / "s.usdc"))
+    assert pxr.UsdGeom.GetStageMetersPerUnit(stage) == 0.25 and pxr.UsdGeom.GetStageUpAxis(stage) == "Y"
+    stage.GetRootLayer().ClearCustomLayerData()
+    stage.GetRootLayer().Export(str(tmp_path / "other.usdc"))
+    found = read_splats(tmp_path / "other.usdc")
+    assert found.world == WorldFrame(up=(0, -1, 0), metres_per_unit=0.25)
+    assert_same(
+        found, some_splats().transformed(rotation=shortest_turn(np.array(SIDEWAYS.up), np.array([0, -1.0, 0])))
+    )
+    for name in ("upAxis", "metersPerUnit"):
+        stage.ClearMetadata(name)
+    stage.GetRootLayer().Export(str(tmp_path / "silent.usdc"))
+    assert read_splats(tmp_path / "silent.usdc").world == UNKNOWN
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".spz", pytest.param(".usdz", marks=needs_usd)])
+def test_labels_bring_their_frame_along(suffix: str, tmp_path: Path) -> None:
+    write_splats(tmp_path / "s.ply", some_splats())
+    made = labels()
+    made.document["world"] = SIDEWAYS.model_dump(mode="json")
+    (tmp_path / f"o{suffix}").write_bytes(b"".join(labelled(tmp_path / "s.ply", made, suffix)))
+    found = read_labels(tmp_path / f"o{suffix}").document["world"]
+    assert WorldFrame.model_validate(found) == SIDEWAYS
+
+
+WRONG: list[dict[str, Any]] = [
+    {"up": (0, 0, 0)}, {"up": (0, 1)}, {"up": "up"}, {"metres_per_unit": 0}, {"metres_per_unit": math.inf},
+    {"metres_per_unit": True}, {"distance": {"between": ((1, 2, 3), (1, 2, 3)), "metres": 1}},
+    {"metres_per_unit": 1, "distance": {"between": ((1, 2, 3), (1, 2, 4)), "metres": 1}}, {"down": (0, 1, 0)},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("given", WRONG, ids=str)
+def test_what_is_no_direction_or_length_is_refused_by_its_name(given: dict[str, Any]) -> None:
+    with pytest.raises(InvalidInput, match=f"^{list(given)[-1]}.*: expected"):
+        WorldFrame(**given)
+
+
+def test_a_known_distance_gives_the_length_of_a_unit() -> None:
+    known: Any = {"between": ((0, 0, 0), (0, 3, 4)), "metres": 2}
+    assert WorldFrame(distance=known) == WorldFrame(metres_per_unit=0.4)
+
+
+def test_a_lift_knows_its_frame_and_lifts_of_before_know_none(tmp_path: Path) -> None:
+    from tests.scenes import observed, random_splats, write_scene
+
+    _, cameras_file, _ = write_scene(tmp_path, 2)
+    cameras = lc.read_cameras(cameras_file)
+    cameras.world = WorldFrame(up=(0, 0, 1), metres_per_unit=3)
+    splats = replace(random_splats(3), world=WorldFrame(metres_per_unit=2))
+    lift = lc.lift(splats, cameras, {f"v{k}": observed(2, k) for k in range(2)}, preset="row-sum", progress=False)
+    assert lift.metadata.world == WorldFrame(up=(0, 0, 1), metres_per_unit=2), "splats come before cameras"
+    lift.with_world(WorldFrame(up=(0, -1, 0))).save(tmp_path / "l.safetensors")
+    opened = open_lift(tmp_path / "l.safetensors")
+    assert opened.metadata.world == WorldFrame(up=(0, -1, 0), metres_per_unit=2)
+    assert opened.transformed(scale=2.0).metadata.world == WorldFrame(up=(0, -1, 0), metres_per_unit=1)
+    told = opened.metadata.model_dump()
+    del told["world"]
+    assert LiftMetadata(**told).world == UNKNOWN
