@@ -104,7 +104,8 @@ def tree(
         scene, words, vectors: as of `catalogue`. relations, up: as of `Scene.tree`.
 
     Raises:
-        InvalidQuery, InvalidLift: as `catalogue`; or the cameras have no up in common. InvalidInput: up has no direction.
+        InvalidQuery, InvalidLift: as `catalogue`; or the cameras have no up in common.
+        InvalidInput: up has no direction.
     """
     measured: dict[str, Any] = {"world": scene.world, "unit": scene.world.unit}
     if scene.object is None or scene.object_views is None:

@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from liftcore.errors import InvalidQuery
 from liftcore.query.objects import trimmed_box
 from liftcore.query.question import Point, Relation
 from liftcore.scene.touching import touch_pairwise

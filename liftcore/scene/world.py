@@ -22,22 +22,22 @@ if TYPE_CHECKING:
     from liftcore.scene.similarity import Similarity
 
 LARGEST = 1e12  # metres of a unit, and coordinates
-Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST), NoBoolean]
+Number = Annotated[float, NoBoolean]
 Positive = Annotated[float, Field(ge=1 / LARGEST, le=LARGEST), NoBoolean]
 Point = tuple[Number, Number, Number]  # x y z, frame of the splats
 
 
 def _direction(given: Point) -> Point:
     length = math.hypot(*given)
-    if length < 1 / LARGEST:
-        raise _wrong("a direction x y z that is not zero")
+    if not 1 / LARGEST <= length <= LARGEST:
+        raise _wrong("a direction x y z, finite and not zero")
     x, y, z = (axis / length + 0.0 for axis in given)  # 0.0 of -0.0
     return x, y, z
 
 
 def _apart(given: tuple[Point, Point]) -> tuple[Point, Point]:
-    if math.dist(*given) < 1 / LARGEST:
-        raise _wrong("two points apart")
+    if not 1 / LARGEST <= math.dist(*given) <= LARGEST:
+        raise _wrong("two points x y z, finite and apart")
     return given
 
 

@@ -481,7 +481,7 @@ def test_every_public_value_is_shown_in_a_line_that_says_its_size(scene):
     others += [opened, query, found, opened.objects(found), opened.look(found, "v0")]
     others += [lc.FeatureGrid(np.ones((3, 4, 5))), lc.Picture(camera=cameras["v0"])]
     others += [models.OwnCamera.of(cameras["v0"])]
-    sized_thing = thing | {"centre": box[0], "size": box[1]}
+    sized_thing: dict[str, Any] = thing | {"centre": box[0], "size": box[1]}
     others += [lc.FoundObject(**sized_thing), opened.world, lc.WorldFrame(up=(0, -3, 0), metres_per_unit=0.1)]
     others += [lc.NamedSplats(word="a" * 99, row=0, value=1, colour=(1, 2, 3), margin=0.1, threshold=0.2, **thing)]
     others += [lc.SceneObject(id=0, name=None, views=("v",) * 99, feature=(0.1,) * 512, **sized_thing)]
