@@ -145,8 +145,8 @@ class InMemory(Steps[SceneWeights]):
         def apply_agreement(weights: RegionWeights, on_card: bool) -> tuple[SceneWeights, float | None]:
             agreement = agreement_factors(
                 weights, W.geometry.codebook, self.settings.robust_steps, self.timings.progress,
-                means=self.splats.means, threads=self.threads, on_card=on_card,
-                reliability=whole_regions(self.settings.reliability, W.geometry.levels), consensus=W.consensus,
+                principal=self.settings.robust_directions, means=self.splats.means, threads=self.threads,
+                on_card=on_card, reliability=whole_regions(self.settings.reliability, W.geometry.levels), consensus=W.consensus,
             )  # fmt: skip
             result = replace(W.with_factors(weights, agreement.factors), consensus=None, agreement=agreement)
             return result, agreement.reliability

@@ -35,10 +35,10 @@ def warm_up_lift(kernel: Kernel, device: Device, settings: LiftSettings) -> None
     if settings.consensus:
         mask_consensus(W, np.zeros(1, np.int8), 1)
     if settings.reliability:
-        agreement_factors(W, book, 1, threads=1, reliability=torch.ones(1, dtype=torch.bool))
+        agreement_factors(W, book, 1, principal=1, threads=1, reliability=torch.ones(1, dtype=torch.bool))
     if settings.loss == "huber":
         huber_factors(W, book, threads=1)
     if settings.smoothness:
         warm_up_smoothing()
     if settings.aggregation:
-        explained_by(W, RegionDirections.of_weights(W, book), first, one[None], 1)
+        explained_by(W, RegionDirections.of_weights(W, book, 1), first, one[None], 1)

@@ -4,7 +4,7 @@ With u_m the unit vector of region m and ``mu = sum W u / sum W`` the scene's me
 direction is ``e_m = (u_m - mu) / |u_m - mu|``: the vectors of an encoder lie in a narrow cone, so raw cosines are all
 alike. A zero vector and the mean itself have none, and are zero.
 
-Where the channels are many and a region has many entries, directions are written in DIRECTIONS principal ones. Of
+Where the channels are many and a region has many entries, directions are written in a few principal ones. Of
 noise these keep what regions share with one another, so cosines between noisy vectors grow alike.
 
 Of W only the weight of each region is needed, a sum over all splats (`region_totals`); all else is a function of the
@@ -23,10 +23,10 @@ from liftcore.runtime.jit import kernel
 from liftcore.solve.codebook import LEAST_CHANNELS, TABLE_BYTES, Codebook
 from liftcore.solve.sums import PieceSums, added, piece_sums
 from liftcore.values.region_weights import RegionWeights
+from liftcore.values.settings import DIRECTIONS
 
 CPU = torch.device("cpu")
 ROWS = 1 << 14  # of a table in float64 at a time
-DIRECTIONS = 256  # principal ones, in which cosines are taken where regions are few beside entries
 SAMPLE = 1 << 14  # regions that say which directions are principal
 FILE = "directions.safetensors"
 NO_DIRECTION = 1e-6  # a unit vector nearer to the mean than that is the mean
@@ -38,26 +38,29 @@ class RegionDirections:
     Args:
         codebook: E, whose regions are rows.
         totals: [M] f64, the weight of each region before any reweighting. entries: how many W has.
+        principal: D, in which cosines are taken where channels are more and regions few beside entries.
     """
 
     mean: Tensor  # [F] f64, mu
     totals: Tensor  # [M] f64, the weight of each region
 
-    def __init__(self, codebook: Codebook, totals: Tensor, entries: int) -> None:
+    def __init__(self, codebook: Codebook, totals: Tensor, entries: int, principal: int = DIRECTIONS) -> None:
         self._codebook, self.totals = codebook, totals
         self.mean, self._distances = self._measured()
-        self._axes = self._principal(entries)
+        self._axes = self._principal(entries, principal)
 
     @classmethod
-    def of_weights(cls, W: RegionWeights, codebook: Codebook, threads: int | None = None) -> "RegionDirections":
+    def of_weights(
+        cls, W: RegionWeights, codebook: Codebook, principal: int = DIRECTIONS, threads: int | None = None
+    ) -> "RegionDirections":
         """Those of a scene whose W, of all views by rows of codebooks, lies in one place, on the CPU."""
         totals = added(region_totals(W, threads), (1, codebook.regions))[0]
-        return cls(codebook, torch.from_numpy(totals), W.region.shape[0])
+        return cls(codebook, torch.from_numpy(totals), W.region.shape[0], principal)
 
     @property
     def width(self) -> int:
         """D, how many numbers a direction has."""
-        return self.mean.shape[0] if self._axes is None else DIRECTIONS
+        return self.mean.shape[0] if self._axes is None else self._axes.shape[1]
 
     def slices(self) -> Iterator[slice]:
         """The columns that `table` gives at a time, so that it takes TABLE_BYTES."""
@@ -105,17 +108,17 @@ class RegionDirections:
         distances = squares.sqrt()
         return mean, torch.where((distances > NO_DIRECTION) & known, distances, 0.0)
 
-    def _principal(self, entries: int) -> Tensor | None:
-        """The axes [F, DIRECTIONS] f32 in which e spreads most, each region by its weight; None: all channels.
+    def _principal(self, entries: int, number: int) -> Tensor | None:
+        """The axes [F, number] f32 in which e spreads most, each region by its weight; None: all channels.
 
         Where a dense map has a region a few entries, turning them all takes longer than comparing them whole.
         """
         codebook = self._codebook
-        if codebook.channels <= DIRECTIONS or entries <= DIRECTIONS * codebook.regions:
+        if codebook.channels <= number or entries <= number * codebook.regions:
             return None
         step = -(-codebook.regions // SAMPLE)
         e = self._whole_rows(slice(None, None, step)).double()
-        return torch.linalg.eigh((e * self.totals[::step, None]).T @ e)[1][:, -DIRECTIONS:].float().contiguous()
+        return torch.linalg.eigh((e * self.totals[::step, None]).T @ e)[1][:, -number:].float().contiguous()
 
     def _whole_rows(self, chosen: slice) -> Tensor:
         """All channels of e of some regions, [m, F] f32."""

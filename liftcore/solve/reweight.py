@@ -60,6 +60,7 @@ from liftcore.solve.codebook import Codebook
 from liftcore.solve.directions import RegionDirections
 from liftcore.solve.sums import PieceSums, piece_sums
 from liftcore.values.region_weights import MEMORY_LIMIT, RegionWeights, row_blocks, run_each
+from liftcore.values.settings import DIRECTIONS
 
 BLOCK_ROWS, BLOCK_ENTRIES = 1 << 11, 1 << 15  # a splat has a sum for each view of it
 LONG = 256  # terms of a sum that float32 adds up one by one
@@ -114,6 +115,7 @@ def agreement_factors(
     steps: int,
     progress: Progress = silent,
     *,
+    principal: int = DIRECTIONS,
     means: Tensor | None = None,
     threads: int | None = None,
     reliability: Tensor | None = None,
@@ -123,7 +125,8 @@ def agreement_factors(
     """What each entry of W is multiplied with after so many steps, for a scene whose W lies in one place.
 
     Args:
-        W: of all views by rows of codebooks, on the CPU or on the device that works. means: [P, 3] of the splats;
+        W: of all views by rows of codebooks, on the CPU or on the device that works.
+        principal: directions in which regions are compared (`RegionDirections`). means: [P, 3] of the splats;
             neighbours are judged together.
         threads: None takes the cores that this process may use. The number changes no bit.
         reliability: [M] bool, the regions that have factors as a whole; None: none has.
@@ -134,9 +137,10 @@ def agreement_factors(
         from liftcore.solve.reweight_on_card import ViewConsistencyOnCard
 
         block: ViewConsistency | ViewConsistencyOnCard = ViewConsistencyOnCard(W)
-        directions = RegionDirections(codebook, block.totals(), W.region.shape[0])
+        directions = RegionDirections(codebook, block.totals(), W.region.shape[0], principal)
     else:
-        block, directions = ViewConsistency(W, means, threads), RegionDirections.of_weights(W, codebook, threads)
+        block = ViewConsistency(W, means, threads)
+        directions = RegionDirections.of_weights(W, codebook, principal, threads)
     factors, scores, scene = None, torch.zeros(2, 0, dtype=torch.float32), None
     for step in range(steps):
         table = np.zeros((2, codebook.regions + 1))

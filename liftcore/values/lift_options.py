@@ -32,6 +32,7 @@ class LiftOptions(TypedDict, total=False):
     levels: Literal["rows", "composite"] | int
     grid_reading: Literal["bilinear", "nearest"]
     robust_steps: int
+    robust_directions: int
     reliability: bool | Literal["auto"]
     consensus: bool | Literal["auto"]
     objects: bool | Literal["auto"]

@@ -37,6 +37,7 @@ TIKHONOV_GAIN = 1.2  # lambda of the paper's Tikhonov Guidance (App. Tikhonov, l
 VISIBLE_WEIGHT = 0.05  # a splat that weighs less at its centre is hidden there, or hardly there at all
 NO_MASKS = "grids, or maps without a label"
 _SHOWN = 80  # characters of a wrong value in an error
+DIRECTIONS = 256  # that lose nothing on masks; 128 cost .0025 of mask IoU where views are few (docs/results.md)
 NEAREST = 3  # settings that are named where one is unknown
 
 
@@ -80,6 +81,7 @@ _SPEEDS: dict[Speed, dict[str, Any]] = {
     Speed.BALANCED: {"stride": 2, "certificate_rays": 2_000},
     Speed.FAST: {
         "stride": 3,
+        "robust_directions": 128,
         "view_cosine": 0.992,
         "coverage": 40,
         "transmittance_stop": 0.003,
@@ -87,6 +89,8 @@ _SPEEDS: dict[Speed, dict[str, Any]] = {
     },
     Speed.DRAFT: {
         "stride": 4,
+        "robust_directions": 64,
+        "objects": False,
         "view_cosine": 0.98,
         "coverage": 20,
         "transmittance_stop": 0.01,
@@ -103,7 +107,7 @@ GROUPS = {  # of the settings, for people who read all of them
     "weights of a ray that count": ("selection", "k", "mass", "weight_floor", "power"),
     "pixels, views and levels": ("stride", "view_stride", "coverage", "view_cosine", "levels", "grid_reading"),
     "the rasterizer": ("kernel", "antialiased", "lift_gain", "render_gain", "alpha_cap", "transmittance_stop"),
-    "wrong masks": ("robust_steps", "reliability", "consensus", "loss"),
+    "wrong masks": ("robust_steps", "robust_directions", "reliability", "consensus", "loss"),
     "objects and clusters": (
         "objects", "aggregation", "aggregation_clusters", "aggregation_guard", "aggregation_iou",
         "aggregation_cluster_size", "aggregation_neighbours", "aggregation_sample", "aggregation_channels",
@@ -128,7 +132,7 @@ class LiftSettings(Shown):
     )
     speed: Speed = Field(
         Speed.EXACT,
-        description="the dial: `exact`, `balanced`, `fast` or `draft` set five others; what you set yourself wins",
+        description="the dial: `exact`, `balanced`, `fast` or `draft` set others; what you set yourself wins",
     )
     selection: Selection = Field(
         Selection.ALL, description="which weights of a ray count: `all`, `top-k`, `front-mass` or `centre`"
@@ -189,7 +193,14 @@ class LiftSettings(Shown):
         ge=0,
         le=100,
         description="how often each region's weight at a splat is multiplied by its agreement with the other "
-        "views; 1 is enough. 0 turns off the next two and `aggregation_guard` as well",
+        "views; 1 is enough. 0 turns off the next three and `aggregation_guard` as well",
+    )
+    robust_directions: int = Field(
+        DIRECTIONS,
+        ge=1,
+        le=4_096,
+        description="principal directions of the features in which a robust step compares regions, where channels are "
+        "more and regions have many splats each; fewer are faster",
     )
     reliability: bool | Literal["auto"] = Field(
         False,

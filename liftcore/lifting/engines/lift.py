@@ -303,7 +303,8 @@ class InBlocks(Steps[Job]):
         whole = whole_regions(W.settings.reliability, levels)
         totals = _sums(W, "rows", (1, codebook.regions))
         entries = sum(part["region"].size for part in _pieces(W, "rows"))
-        RegionDirections(codebook, torch.from_numpy(totals[0]), entries).save(W.folder)
+        principal = W.settings.robust_directions
+        RegionDirections(codebook, torch.from_numpy(totals[0]), entries, principal).save(W.folder)
         scene = None
         for step in range(W.settings.robust_steps):
             self.run("robust", steps.compare, replace(W, step=step, by_region=whole is not None), W.solutions)
