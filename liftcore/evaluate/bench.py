@@ -10,9 +10,10 @@ from typing import Any
 import torch
 
 from liftcore.errors import InvalidInput
-from liftcore.evaluate.hardware import hardware, peak_memory
+from liftcore.evaluate.hardware import hardware, machine_speed, peak_memory
 from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
 from liftcore.io.remote import local_path
+from liftcore.lifting.pipeline import lift
 from liftcore.lifting.warm_up import warm_up_lift
 from liftcore.raster import open_raster
 from liftcore.raster.base import Raster, ViewRequest
@@ -62,7 +63,8 @@ def run_bench(
         threads: None takes the cores that this process may use. preset: None: all. device: auto, cpu or cuda.
 
     Returns:
-        Plain numbers, ready for JSON: hardware, versions, seconds a view by stage (medians), peak memory.
+        Plain numbers, ready for JSON: hardware, versions, seconds a view by stage (medians), the stages
+        of a whole lift as shares of its geometry, the machine's memory bandwidth and flops, peak memory.
 
     Raises:
         InvalidInput: a size or a folder that makes no workload. InvalidSettings: a count that is none, or an unknown
@@ -92,6 +94,7 @@ def run_bench(
         "compile_or_load_s": compile_seconds,
         "presets": {str(one): time_lift(work, one, place, threads) for one in presets},
         "peak_memory_bytes": peak_memory(),
+        "machine_speed": machine_speed(threads),
         "hardware": hardware() | ({} if place.kind == "cpu" else {"device": place.facts()}),
     }
 
@@ -119,7 +122,17 @@ def time_lift(work: Workload, preset: Preset, device: Device, threads: int | Non
         "solve_s_per_view": statistics.median(solution),
         "total_s_per_view": statistics.median(map(sum, zip(geometry, solution, strict=True))),
         "weights_entries_per_view": entries / len(work.views),
+        "stages_of_geometry": stage_shares(work, preset, device, threads),
     }
+
+
+def stage_shares(work: Workload, preset: Preset, device: Device, threads: int | None = None) -> dict[str, float]:
+    """Seconds of each stage of a whole lift over those of its geometry, and of ``all``; compiling is apart."""
+    cameras = {camera.name: camera for camera, _ in work.views}
+    views = {camera.name: observed for camera, observed in work.views}
+    made = lift(work.splats, cameras, views, preset, device=device.kind, threads=threads, progress=False)
+    stages = {name: seconds for name, seconds in made.metadata.timings.items() if name != "compile"}
+    return {name: seconds / stages["geometry"] for name, seconds in (stages | {"all": sum(stages.values())}).items()}
 
 
 @one_thread()

@@ -36,6 +36,7 @@ KEY = (
 )
 TITLE = "Speed against accuracy"
 LOST = 0.001  # of the splats, that are worth a sentence
+LEAST_SHARE = 0.02  # of any run's seconds, for a stage that the chart shows
 
 
 @dataclass(frozen=True)
@@ -180,17 +181,18 @@ def _number(figure: float | None) -> str:
 
 
 COLOURS = {"dial": "#1b6ca8", "preset": "#b5651d"}
-SIZE = (10.0, 4.6)  # inches
+SIZE = (13.0, 4.6)  # inches
 CLOSE, WIDE = 0.055, 0.22  # of the axes' height and width: labels nearer than both would meet
 
 
 def draw(figure: Figure, document: Mapping[str, Any]) -> None:
-    """Two panels: accuracy against seconds for all runs, and the dial's cosine against the exact run."""
+    """Three panels: accuracy against seconds for all runs, the dial's cosine to the exact run, and its stages."""
     figure.set_size_inches(*SIZE)
-    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
+    left, middle, right = figure.subplots(1, 3, width_ratios=(3, 2, 2))
     choice = document["choice"]
     _accuracy(left, document["runs"], choice)
-    _faithful(right, document["runs"])
+    _faithful(middle, document["runs"])
+    _stages(right, document["runs"])
     views = document["views"]
     verdict = f"take {choice['name']!r}" if choice["recommended"] else "nothing can be recommended"
     figure.suptitle(f"{document['scene']}: {views['lifted']} views lifted, {verdict}", fontsize="medium")
@@ -235,6 +237,24 @@ def _faithful(axes: Axes, runs: Sequence[Mapping[str, Any]]) -> None:
     axes.set_ylim(lowest - 0.6 * room, 1.0 + 0.3 * room)  # the worst splats may lie far below
     _finish(axes, "times less processor time than exact", NAMES["cosine"])
     axes.legend(fontsize="small", loc="lower left", edgecolor="none", framealpha=1.0)
+
+
+def _stages(axes: Axes, runs: Sequence[Mapping[str, Any]]) -> None:
+    """The stages of the dial's runs as shares of their seconds, the fastest run above."""
+    dial = sorted((run for run in runs if run["kind"] == "dial"), key=lambda run: -run["cpu_s"])
+    names = list(dict.fromkeys(name for run in dial for name in run["timings"]))
+    begins = [0.0] * len(dial)
+    for name in names:
+        wholes = [sum(run["timings"].values()) or 1.0 for run in dial]
+        shares = [run["timings"].get(name, 0.0) / whole for run, whole in zip(dial, wholes, strict=True)]
+        if max(shares) < LEAST_SHARE:
+            continue
+        axes.barh([run["name"] for run in dial], shares, left=begins, label=name, height=0.7)
+        begins = [begin + share for begin, share in zip(begins, shares, strict=True)]
+    axes.set_xlim(0, 1)
+    _finish(axes, "share of the lift's seconds", "")
+    if begins:
+        axes.legend(fontsize="x-small", loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, frameon=False)
 
 
 def _label(axes: Axes, runs: Sequence[Mapping[str, Any]], accuracy: str) -> None:

@@ -146,7 +146,8 @@ class InMemory(Steps[SceneWeights]):
             agreement = agreement_factors(
                 weights, W.geometry.codebook, self.settings.robust_steps, self.timings.progress,
                 principal=self.settings.robust_directions, means=self.splats.means, threads=self.threads,
-                on_card=on_card, reliability=whole_regions(self.settings.reliability, W.geometry.levels), consensus=W.consensus,
+                reliability=whole_regions(self.settings.reliability, W.geometry.levels), consensus=W.consensus,
+                on_card=on_card,
             )  # fmt: skip
             result = replace(W.with_factors(weights, agreement.factors), consensus=None, agreement=agreement)
             return result, agreement.reliability

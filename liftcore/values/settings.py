@@ -199,8 +199,8 @@ class LiftSettings(Shown):
         DIRECTIONS,
         ge=1,
         le=4_096,
-        description="principal directions of the features in which a robust step compares regions, where channels are "
-        "more and regions have many splats each; fewer are faster",
+        description="principal directions of the features in which a robust step compares regions, where channels "
+        "are more and regions have many splats each; fewer are faster",
     )
     reliability: bool | Literal["auto"] = Field(
         False,

@@ -19,7 +19,9 @@ def test_every_preset_has_its_seconds_a_view(capsys: pytest.CaptureFixture[str])
     lines = capsys.readouterr().out
     for preset, found in document["presets"].items():
         assert found["geometry_s_per_view"] > 0 and found["weights_entries_per_view"] > 0
+        assert found["stages_of_geometry"]["geometry"] == 1 and found["stages_of_geometry"]["all"] > 1
         assert preset in lines
+    assert min(document["machine_speed"].values()) > 1e6
 
 
 @pytest.mark.parametrize("more", [["--size", "9"], ["--scene", "nowhere"], ["--preset", "magic"]], ids=str)

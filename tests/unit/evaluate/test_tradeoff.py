@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 from safetensors.torch import save, save_file
 
 from liftcore import cli
@@ -42,7 +43,8 @@ def run_of(name: str, seconds: float, cosines: Sequence[float] | np.ndarray, kin
     figures = dict.fromkeys(("cosine", "cosine_plain", "cosine_q05"), 0.9)
     times = dict.fromkeys((f"{part}{end}" for part in ("wall", "cpu") for end in ("_s", "_ratio")), seconds)
     times |= dict.fromkeys(("process_s", "wall_with_reading_s", "cpu_with_reading_s"), seconds)
-    told = {"peak_memory_bytes": 1 << 30, "views": 3, "lost_share": 0.0, "judged": judged_by(cosines)}
+    stages = {"timings": {"plan": 0.01, "geometry": seconds / 2, "solve": seconds / 4}}
+    told = {"peak_memory_bytes": 1 << 30, "views": 3, "lost_share": 0.0, "judged": judged_by(cosines)} | stages
     return {"name": name, "kind": kind, "options": {"speed": name}, **figures, **times, **told}
 
 
@@ -211,6 +213,10 @@ def test_chart_table_and_json_are_written(tmp_path):
     assert [path.name for path in paths] == ["tradeoff.json", "tradeoff.png", "tradeoff.md"]
     assert json.loads(paths[0].read_text())["choice"]["name"] == "equal"
     assert paths[1].read_bytes()[:4] == b"\x89PNG"
+    figure = Figure()
+    report.draw(figure, document)
+    bars = {bar.get_label(): [patch.get_width() for patch in bar] for bar in figure.axes[2].containers}
+    assert bars["geometry"] == pytest.approx([2 * share for share in bars["solve"]]) and len(bars["solve"]) == 3
     page = paths[2].read_text()
     assert "**Take equal**" in page
     assert "told apart leaves 12.5% of the splats without the feature that exact gives them." in page
