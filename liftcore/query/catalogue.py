@@ -83,7 +83,8 @@ def catalogue(scene: OpenedLift, words: Sequence[str] = (), vectors: Any = None)
         return Catalogue((), NOT_LOOKED_FOR, np.zeros((0, scene.channels), np.float32), scene.world)
     number = len(scene.object_views)
     features = object_features(scene)
-    facts = _described(scene, scene.object, np.arange(number), scene.object_views, _named(features, words, vectors))
+    named, ids = _named(features, words, vectors), np.arange(number)
+    facts = _described(scene, ids, scene.object, ids, scene.object_views, named)
     count = "1 object" if len(facts) == 1 else f"{len(facts)} objects"
     told = f"{count}, which masks of three or more views keep together" if facts else NONE_FOUND
     things = tuple(SceneObject(**one) for one in facts)
@@ -119,7 +120,8 @@ def tree(
     place = np.empty(len(parents) + 1, np.int64)
     place[order], place[-1] = np.arange(len(parents)), -1
     splats, above = place[scene.node], place[parents[order]]
-    facts = _described(scene, splats, above, scene.node_views[order], _named(features[order], words, vectors))
+    named = _named(features[order], words, vectors)
+    facts = _described(scene, order, splats, above, scene.node_views[order], named)
     nodes, listed = [], {int(order[one["id"]]): one for one in facts}
     for node, one in sorted(listed.items()):
         path = scene.node_path(node)
@@ -149,6 +151,7 @@ def _counts(nodes: Sequence[SceneNode]) -> str:
 
 def _described(
     scene: OpenedLift,
+    nodes: np.ndarray,
     labels: np.ndarray,
     above: np.ndarray,
     views: np.ndarray,
@@ -156,11 +159,13 @@ def _described(
 ) -> list[dict[str, Any]]:
     """The fields of a `SceneObject` of each of some nodes, whose splats are also those of the nodes above them.
 
-    Nodes without splats, which lifts of other programs may have, are left out.
+    Nodes without splats, which lifts of other programs may have, are left out. Boxes are kept with the scene: they
+    take nearly all the time, and words change none.
 
     Args:
-        labels: [P] i32, the smallest node of each splat, -1 for none. above: [N], the node above each, which comes
-            before it; -1 or itself: none. views: [N, V] i32. named: name and score of each.
+        nodes: [N], their ids. labels: [P] i32, the place of the smallest node of each splat, -1 for none.
+        above: [N], the place of the node above each, which comes before it; -1 or itself: none.
+        views: [N, V] i32. named: name and score of each.
     """
     order = np.argsort(labels, kind="stable")
     ends = np.searchsorted(labels[order], np.arange(len(views) + 1))
@@ -176,7 +181,10 @@ def _described(
             continue
         rows = np.sort(mixed)
         weights = evidence[rows] if evidence[rows].any() else np.ones(rows.size)
-        box = largest_box(scene.splats, rows, weights)
+        key = int(nodes[one]), rows.size
+        if key not in scene.node_boxes:
+            scene.node_boxes[key] = largest_box(scene.splats, rows, weights)
+        box = scene.node_boxes[key]
         x, y, z = np.mean(box, axis=0).tolist()
         shown = tuple(known[view] for view in views[one] if 0 <= view < len(known))
         share = float(evidence[rows].sum() / whole)
@@ -189,6 +197,12 @@ def _described(
 
 def object_features(scene: OpenedLift) -> np.ndarray:
     """[N, F] f32: the unit mean of each object's unit features, by evidence; zeros where none has a feature."""
+    if scene.object_means is None:
+        scene.object_means = _object_means(scene)
+    return scene.object_means
+
+
+def _object_means(scene: OpenedLift) -> np.ndarray:
     from scipy.sparse import csr_array
 
     assert scene.object is not None and scene.object_views is not None

@@ -21,6 +21,7 @@ from liftcore.values.lift_file import NODE_TENSORS, OBJECT_TENSORS, read_lift
 if TYPE_CHECKING:  # these load torch
     from torch import Tensor
 
+    from liftcore.query.question import Box
     from liftcore.query.selections import Selection
     from liftcore.raster.base import Raster
     from liftcore.scene.cameras import Camera, Cameras
@@ -83,6 +84,8 @@ class OpenedLift:
         self.device, self._said_of_world = device, world
         self.labelled: tuple[Any, Any] | None = None  # what was last exported, and its `Labels`, for two files of it
         self.selections: dict[str, Selection] = {}  # by their names; `Scene.select` makes them
+        self.node_boxes: dict[tuple[int, int], Box] = {}  # of listed nodes, by their ids and numbers of splats
+        self.object_means: np.ndarray | None = None  # [N, F], of `liftcore.query.catalogue.object_features`
         self._encoders: dict[str | None, TextEncoder] = {}
         places = {"splats": splats, "cameras": cameras}
         self._moved = {role: Path(at) if isinstance(at, str | Path) else None for role, at in places.items()}
