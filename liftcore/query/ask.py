@@ -295,7 +295,7 @@ def _nearer_words(
         return ()
     names = {plain(base_of(word.word)) for word in asked.asked_as.values()}  # "fish" and "fish (food)" are one
     same = (references.vectors @ own.T >= SAME_WORD).any(axis=1)
-    same |= np.array([plain(base_of(word)) in names for word in references.words])
+    same |= np.array([word in names for word in references.plain_words])
     near, others = products(scene.features[rows], scene.norms[rows], own, references.vectors)
     others[:, same] = -1.0
     nearest = np.where(others.max(axis=1) > near.max(axis=1), others.argmax(axis=1), -1)

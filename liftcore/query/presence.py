@@ -28,7 +28,7 @@ import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Self
 
@@ -37,11 +37,11 @@ import numpy as np
 from liftcore.errors import InvalidQuery, InvalidTable, Unavailable
 from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.question import Presence
-from liftcore.query.scores import cosines
 from liftcore.query.threshold import LEAST_SHARE
 from liftcore.runtime.folders import cache_folder
 from liftcore.text import LVIS_TABLE, RememberingEncoder, TextEncoder
 from liftcore.text.table import TableEncoder
+from liftcore.text.wording import base_of, plain
 
 LEAST_WORDS = 200  # of a table, to be references
 EVERY = 4  # of the shipped words, that another encoder is asked for: 301 take it seconds
@@ -89,6 +89,11 @@ class References:
     def _about_mean(self) -> np.ndarray:
         return _unit(self.vectors - self.mean)
 
+    @cached_property
+    def plain_words(self) -> tuple[str, ...]:
+        """The words as they are compared with others, without what tells their meanings apart."""
+        return tuple(plain(base_of(word)) for word in self.words)
+
     def against(self, direction: np.ndarray) -> tuple[np.ndarray, int]:
         """What a unit vector [F] of the same space is compared with.
 
@@ -116,15 +121,15 @@ def judge(
         return Presence(present=False, presence=0.0, why=f"{name} is not there: no splat has a feature.")
     others, allowed = references.against(direction)
     rows, norms, count = scene.features[best], scene.norms[best], len(references.words)
-    plain, contrast = nearer_counts(rows, norms, scene.rough_mean, direction[None], references.vectors[others])
-    shares = [float(weights[ahead <= allowed].sum() / weights.sum()) for ahead in (plain, contrast)]
+    nearer, contrast = nearer_counts(rows, norms, scene.rough_mean, direction[None], references.vectors[others])
+    shares = [float(weights[ahead <= allowed].sum() / weights.sum()) for ahead in (nearer, contrast)]
     presence = min(shares)
     if presence >= 0.5:
         told = f"at {presence:.0%} of its best splats at most {allowed} of {count} reference words are nearer"
         return Presence(present=True, presence=presence, why=f"{name} is there: {told}.")
-    order = np.argsort(plain, kind="stable")
-    middle = int(plain[order[np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2)]])
-    near = weights @ cosines(rows, norms, references.vectors[others])
+    order = np.argsort(nearer, kind="stable")
+    middle = int(nearer[order[np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2)]])
+    near = weights @ products(rows, norms, direction[None], references.vectors[others])[1]
     nearest = references.words[others[int(near.argmax())]].replace("_", " ")
     told = f"its best splats are nearer to {middle} of {count} reference words, first of all to {nearest!r}"
     first = float(weights[contrast == 0].sum() / weights.sum())
@@ -152,10 +157,10 @@ def nearer_counts(
     if not len(others):
         return np.zeros(len(features), np.int64), np.zeros(len(features), np.int64)
     own, near = products(features, norms, directions, others)
-    plain = (near >= own.max(axis=1, keepdims=True)).sum(axis=1)
+    nearer = (near >= own.max(axis=1, keepdims=True)).sum(axis=1)
     own -= directions @ mean
     near -= others @ mean
-    return plain, (near >= own.max(axis=1, keepdims=True)).sum(axis=1)
+    return nearer, (near >= own.max(axis=1, keepdims=True)).sum(axis=1)
 
 
 def products(
@@ -163,8 +168,8 @@ def products(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The cosines [n, p] and [n, m] f32 of some splats with some words and with many others, by one matrix product.
 
-    Of some thousands of splats and a thousand words it takes a fifth of what `cosines` does, whose bits depend on no
-    other row. Arguments as of `nearer_counts`; a zero row has zeros.
+    Of some thousands of splats and a thousand words it takes a fifth of what `scores.cosines` does, whose bits depend
+    on no other row. Arguments as of `nearer_counts`; a zero row has zeros.
     """
     unit = features.astype(np.float32)
     unit /= np.maximum(norms, np.finfo(np.float32).tiny)[:, None]
@@ -216,7 +221,7 @@ def references_of(encoder: TextEncoder, text_space: str) -> References | str:
     source = encoder.source if isinstance(encoder, RememberingEncoder) else encoder
     if isinstance(source, TableEncoder):
         if len(source.words) >= LEAST_WORDS:
-            return References(source.words, source.embeddings)
+            return _of_table(source)
         return references_beside(source.embeddings, text_space)
     shipped, kept = _shipped(), _kept(encoder.name)
     try:
@@ -258,6 +263,12 @@ def pack_of(encoder: TextEncoder) -> np.ndarray | None:
     if isinstance(source, TableEncoder) and 1 < len(source.words) < LEAST_WORDS:
         return _unit(np.asarray(source.embeddings, np.float32))
     return None
+
+
+@lru_cache(4)
+def _of_table(table: TableEncoder) -> References:
+    """A table's own words, with what questions share of them."""
+    return References(table.words, table.embeddings)
 
 
 @cache
