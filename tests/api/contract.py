@@ -82,11 +82,14 @@ def served(data: Path, *, keys: bool, **settings: Any) -> Iterator[tuple[str, st
 
 
 def _warm_up(address: str, secret: str | None) -> None:
-    """Wait until the query worker has loaded what it needs: a 503 until then is no fault."""
+    """Wait until the query worker has loaded what it needs: a 503 until then is no fault. The document takes a
+    second of an idle machine once, and schemathesis waits 10 s for it.
+    """
     key = {} if secret is None else {"Authorization": f"Bearer {secret}"}
     with httpx.Client(base_url=address, headers=key, timeout=PATIENCE_SECONDS) as client:
         until(lambda: client.get("/readyz").status_code == 200, PATIENCE_SECONDS)
         until(lambda: client.get("/query", params={"text": "apple"}).status_code < 500, PATIENCE_SECONDS)
+        client.get("/openapi.json").raise_for_status()
 
 
 def conformance(
