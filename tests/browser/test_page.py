@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -240,6 +242,44 @@ def test_thing_takes_a_name_and_is_hidden_for_good(page: Browser, served: Served
     assert "1 hidden thing" in text_of(page, "#catalogue-hidden")
     for change in ({"name": None}, {"hidden": False}):
         httpx.patch(f"{served.address}/lifts/{served.lift}/objects/0", json=change).raise_for_status()
+
+
+def test_things_are_joined_split_and_taken_apart_again(page: Browser, served: Served) -> None:
+    names = (
+        "[...document.querySelectorAll('#catalogue-list .thing, #catalogue-own .thing')].map(one => one.textContent)"
+    )
+    counted = f"splatlift.ask.now?.answer && splatlift.ask.now.count === {{}} && {FOUND}"
+    page.until(f"{names}.length === 3")
+    before = page.value(names)
+    for place, more in ((1, False), (2, True)):
+        page.press(f"#catalogue-list li:nth-child({place}) .thing", shift=more)
+        page.until(counted.format(20 * place))
+    page.press("#join")
+    page.until(f"{SETS}.length === 1 && {SETS}[0].startsWith('selection:') && {counted.format(40)}")
+    page.until(f"{names}.length === 2")
+    joined = page.value("splatlift.things.shown()")
+    body = {"lift": served.lift, "of": "questions", "questions": joined}
+    with zipfile.ZipFile(io.BytesIO(httpx.post(f"{served.address}/query/export", json=body).content)) as archive:
+        classes = json.loads(archive.read("labels.json"))["classes"]
+    assert sorted(one["splats"] for one in classes) == [20, 40]
+    page.key("z", ctrl=True)
+    page.until(f"{SETS}.length === 2 && {counted.format(40)}")
+    assert page.value(names) == before
+    page.press("#catalogue-list li:last-child .thing")
+    page.until(counted.format(20))
+    page.press("#by-hand")
+    page.until(f"splatlift.hand.selection?.version && {counted.format(20)}")
+    x, y = splat_at(page, page.value("splatlift.ask.now.shown.findIndex(Boolean)"))
+    page.drag("#scene", (x, y), (x + 0.01, y), alt=True)
+    page.until(f"splatlift.hand.selection.step === 1 && !splatlift.hand.busy && {FOUND}")
+    left = page.value("splatlift.ask.now.count")
+    page.value("[...document.querySelectorAll('#hand button')].find(one => one.textContent === 'Split').click()")
+    page.until("splatlift.things.own.length === 2 && splatlift.things.last")
+    assert sum(page.value("splatlift.things.own.map(one => one.count)")) == 20 and 0 < left < 20
+    page.key("z", ctrl=True)
+    page.until("splatlift.things.own.length === 1 && !splatlift.things.found.some(thing => thing.hidden)")
+    own = page.value("splatlift.things.own[0].id")
+    assert httpx.delete(f"{served.address}/lifts/{served.lift}/selections/{own}").status_code == 204
 
 
 def test_empty_selection_says_how_to_add_to_it(page: Browser, served: Served) -> None:

@@ -1,5 +1,6 @@
 // Correcting by hand: a brush and a box that add to a selection or take away, in 3D and in the photo's view.
 import { at, el, plural, tell } from "./dom.js";
+import { wholeOf } from "./things.js";
 import { call, json, patch, post, words } from "./service.js";
 
 const TERM = /^selection:([0-9a-f]{16})$/;
@@ -9,9 +10,9 @@ const SIZE = 14; // CSS pixels of the brush, from its middle, at first
 const SVG = "http://www.w3.org/2000/svg";
 
 export class Hand {
-  // ask: the questions; label: of one; viewer: gives the 3D view, or null; look: the photo's view; naming: names by terms.
-  constructor({ ask, label, viewer, look, naming }) {
-    Object.assign(this, { ask, label, viewer, look, naming, tool: null, less: false, selection: null, size: SIZE });
+  // ask: the questions; label: of one; viewer: gives the 3D view, or null; look: the photo's view; things: the scene's.
+  constructor({ ask, label, viewer, look, things }) {
+    Object.assign(this, { ask, label, viewer, look, things, tool: null, less: false, selection: null, size: SIZE });
     this.build();
     this.listen(at("scene"), () => this.in3d());
     this.listen(at("picture"), () => this.inView());
@@ -24,13 +25,14 @@ export class Hand {
     this.sides = [false, true].map(less => button(less ? "Take away" : "Add", () => { this.less = less; this.show(); }));
     this.steps = { undo: button("Undo", () => this.go(-1), { title: "Ctrl+Z" }), redo: button("Redo", () => this.go(1), { title: "Ctrl+Shift+Z" }) };
     const size = el("input", { type: "range", min: 3, max: 60, value: SIZE, ariaLabel: "Size of the brush", on: { input: event => { this.size = Number(event.target.value); } } });
+    this.splitting = button("Split", () => this.things.split(this.selection), { title: "The rest of the thing becomes one of its own" });
     this.through = el("input", { type: "checkbox" });
     this.name = el("input", { type: "text", className: "name", maxLength: 100, ariaLabel: "Name of the selection", on: { change: () => this.rename() } });
     const group = (name, ...parts) => el("span", { className: "row", role: "group", ariaLabel: name }, ...parts);
     at("hand").append(this.name, group("Tool", ...Object.values(this.tools), size), group("What it does", ...this.sides),
       el("label", { title: "Also what lies behind" }, this.through, " through"),
       group("By splats that touch", button("Grow", () => this.edit({ how: "grow" })), button("Shrink", () => this.edit({ how: "shrink" }))),
-      group("History", ...Object.values(this.steps)), button("Done", () => { this.take(null); at("hand").hidden = true; }));
+      this.splitting, group("History", ...Object.values(this.steps)), button("Done", () => { this.take(null); at("hand").hidden = true; }));
     this.drawn = document.createElementNS(SVG, "svg");
     this.drawn.id = "stroke";
     at("stage").append(this.drawn);
@@ -51,7 +53,7 @@ export class Hand {
 
   have(selection) {
     this.selection = selection;
-    this.naming.set(`selection:${selection.id}`, selection.name);
+    this.things.changed(selection);
     at("hand").hidden = false;
     this.show();
   }
@@ -138,6 +140,7 @@ export class Hand {
     const { selection } = this;
     if (selection?.version) {
       this.name.value = selection.name;
+      this.splitting.hidden = !wholeOf(selection).length || selection.step === selection.first;
       this.name.title = plural(selection.count, "splat");
       this.steps.undo.disabled = selection.step <= selection.first;
       this.steps.redo.disabled = selection.step >= selection.last;

@@ -34,12 +34,13 @@ const ask = new Ask({ changed, fly: box => viewer?.toBox(box) });
 const look = new Look({ changed: () => { repaint(); link(); }, fly: view => viewer?.to(view), pick: (term, less) => pointed(term, less), hit: (term, shift, alt) => hit(term, null, shift, alt), fallback: !webgl() });
 const names = new Names({ changed, centres: (values, most) => viewer?.mesh ? viewer.centres(values, most) : [], alone: () => ask.reset(true), more: term => { tab("ask"); ask.example(term, false); } });
 const masks = new Masks({ pick: (term, less) => { tab("ask"); ask.example(term, less); }, swap: (old, term) => ask.swap(old, term) });
-const take = new Take({ ask, look, names, shot });
+const things = new Things({ naming, held: () => ask.now?.sets || [], hold: sets => ask.hold(sets), fly: (box, view) => (look.mode === "view" ? look.go(view) : viewer?.toBox(box, look.views.find(({ name }) => name === view))) });
+const take = new Take({ ask, look, names, things, shot });
 const bring = new Bring({ opened: id => open(id, true), gone: () => refreshLifts(), open: () => lift?.id ?? null, raised: () => tab("bring"), preview });
 const beside = new Beside({ viewer: () => viewer, made: plain, now: () => String(linked()), changed: () => { beside.follow(ask.questions, lift); link(); } });
 const lifts = new Lifts({ opened: id => open(id, true), changed: () => refreshLifts(), beside: async id => { if (!beside.link) beside.hold(linked()); await open(id, true); } });
-const hand = new Hand({ ask, label, look, naming, viewer: () => (viewer?.mesh ? viewer : null) });
-const things = new Things({ naming, held: () => ask.now?.sets || [], hold: sets => ask.hold(sets), fly: (box, view) => (look.mode === "view" ? look.go(view) : viewer?.toBox(box, look.views.find(({ name }) => name === view))) });
+
+const hand = new Hand({ ask, label, look, things, viewer: () => (viewer?.mesh ? viewer : null) });
 
 look.asked = view => {
   const question = ask.painted().length ? ask.now : null;
@@ -455,7 +456,7 @@ async function shot() {
 addEventListener("keydown", event => {
   if (event.key.toLowerCase() !== "z" || !(event.ctrlKey || event.metaKey) || event.target.matches("input[type=text], textarea")) return;
   event.preventDefault();
-  if (!hand.go(event.shiftKey ? 1 : -1)) history.go(event.shiftKey ? 1 : -1);
+  if (!(!event.shiftKey && things.undo()) && !hand.go(event.shiftKey ? 1 : -1)) history.go(event.shiftKey ? 1 : -1);
 });
 
 // Keys that work wherever no text is typed.

@@ -4,9 +4,11 @@ import { label } from "./ask.js";
 import { search } from "./question.js";
 import { keyOf, save, saveBlob, words } from "./service.js";
 
+const MOST = 16; // questions of a ZIP
+
 export class Take {
-  constructor({ ask, look, names, shot }) {
-    Object.assign(this, { ask, look, names, shot });
+  constructor({ ask, look, names, things, shot }) {
+    Object.assign(this, { ask, look, names, things, shot });
     for (const button of document.querySelectorAll("[data-take]")) button.addEventListener("click", () => this.take(button.dataset.take));
     at("shot").addEventListener("click", async () => saveBlob(await this.shot(), "splatlift.png"));
     for (const [id, all] of [["take-everything", false], ["take-things", true]]) at(id).addEventListener("click", () => this.everything(all));
@@ -26,9 +28,11 @@ export class Take {
   async everything(things) {
     const { questions, lift } = this.ask;
     const named = this.names.shown ? { of: "words", ...this.names.asked } : { of: "questions", questions: questions.filter(({ answer }) => answer).map(one => ({ ...this.ask.body(one), name: label(one).slice(0, 100) })) };
+    const own = this.things.shown();
+    if (own.length > MOST && this.things.own.length) tell(`A ZIP has ${MOST} things of your own list: the first ones are in it.`);
     const space = lift.text_space === "none" ? {} : { encoder: lift.text_space };
-    const body = { lift: lift.id, ...(things ? { of: "things", ...space } : named) };
-    tell("Making the ZIP: masks of all views take a while.");
+    const body = { lift: lift.id, ...(things && this.things.own.length ? { of: "questions", questions: own.slice(0, MOST).map(one => ({ lift: lift.id, ...one, name: one.name.slice(0, 100) })) } : things ? { of: "things", ...space } : named) };
+    if (own.length <= MOST || !things) tell("Making the ZIP: masks of all views take a while.");
     try {
       await save("/query/export", "splats.zip", body).catch(problem => (problem.argument === "encoder" ? save("/query/export", "splats.zip", { lift: lift.id, of: "things" }) : Promise.reject(problem)));
       tell("The ZIP is here.");

@@ -1,8 +1,8 @@
 // The things in the scene, which the lift found by masks alone, and their parts: a list before anything is asked, and
 // what a click takes.
-import { at, el, plural, tell } from "./dom.js";
+import { at, el, plural, tell, twice } from "./dom.js";
 import { search } from "./question.js";
-import { json, patch, words } from "./service.js";
+import { json, patch, post, remove, words } from "./service.js";
 
 const MOST = 100; // things in the list
 const NODES = 1000; // of the tree, things among them
@@ -12,13 +12,15 @@ export class Things {
   // hold: with the terms that are taken; held: those; fly: with a box to look at, and the view that shows most of it;
   // naming: names by terms.
   constructor({ hold, held, fly, naming }) {
-    Object.assign(this, { hold, held, fly, naming, found: [], nodes: new Map(), open: new Set() });
+    Object.assign(this, { hold, held, fly, naming, found: [], own: [], nodes: new Map(), open: new Set() });
+    at("join").addEventListener("click", () => this.join());
     at("catalogue-hidden").addEventListener("click", () => { this.all = !this.all; this.show(); });
   }
 
   async of(lift) {
-    Object.assign(this, { lift, found: [], nodes: new Map(), open: new Set(), all: false });
+    Object.assign(this, { lift, found: [], own: [], last: null, nodes: new Map(), open: new Set(), all: false });
     this.show();
+    if (lift) json(`/lifts/${lift.id}/selections`).then(({ selections }) => { if (lift === this.lift) this.have(this.found, selections); }).then(() => this.show(), () => {});
     if (!lift?.links.objects) return; // of a lift from before there were any
     try {
       const route = `/lifts/${lift.id}/objects?limit=${MOST}`;
@@ -35,8 +37,9 @@ export class Things {
   }
 
   // Things of one name are numbered.
-  have(objects) {
-    this.found = objects;
+  have(objects, own = this.own) {
+    Object.assign(this, { found: objects, own });
+    for (const { id, name } of own) this.naming.set(`selection:${id}`, name);
     const times = new Map();
     for (const { name } of objects) times.set(name, (times.get(name) || 0) + 1);
     const seen = new Map();
@@ -70,7 +73,12 @@ export class Things {
     const held = this.held();
     const shown = this.found.filter(thing => !this.background(thing) && (this.all || !thing.hidden));
     const hidden = this.found.filter(thing => thing.hidden).length;
-    at("catalogue").hidden = !this.found.length;
+    at("catalogue").hidden = !this.found.length && !this.own.length;
+    at("join").hidden = held.length < 2;
+    at("catalogue-own").replaceChildren(...this.own.map(one => el("li", {},
+      el("button", { type: "button", className: "thing", "aria-pressed": String(held.includes(`selection:${one.id}`)), on: { click: event => this.pressOwn(one, event.shiftKey) } },
+        el("span", {}, one.name, el("small", {}, `${plural(one.count, "splat")}, yours`))),
+      twice("Delete", () => this.forget([one.id]).then(() => this.hold(this.held().filter(term => term !== `selection:${one.id}`)))))));
     at("catalogue-hidden").hidden = !hidden;
     at("catalogue-hidden").textContent = this.all ? "Leave out what is hidden" : `Show ${plural(hidden, "hidden thing")}`;
     const focus = document.activeElement?.dataset.unfolds; // which is made anew
@@ -110,8 +118,77 @@ export class Things {
     if (!more) this.fly(thing.box, thing.views[0]);
   }
 
+  pressOwn(one, more) {
+    this.take(`selection:${one.id}`, more);
+    if (!more && one.box) this.fly(one.box);
+  }
+
+  // Several that are taken become one, and are hidden themselves.
+  async join() {
+    const sets = [...this.held()];
+    const named = this.found.find(thing => thing.name && sets.includes(term(thing)));
+    await this.make(sets, sets, async add => [await add(named?.name ?? this.naming.get(sets[0]), sets)]);
+  }
+
+  // What a selection leaves of the thing that it was begun from becomes another one.
+  async split(selection) {
+    const [from] = wholeOf(selection);
+    const corrected = `selection:${selection.id}`;
+    await this.make([from], [corrected], async add => {
+      const rest = await add(`${this.naming.get(from)}, the rest`, [from]);
+      return [await post(`${this.route}/${rest.id}/edits`, { how: "remove", query: { sets: [corrected] } })];
+    }, corrected);
+  }
+
+  // Things of one's own in place of others, which can be undone. then: what is taken afterwards, if not those.
+  async make(hidden, before, how, then = null) {
+    try {
+      const made = await how((name, sets) => post(this.route, { name: name.slice(0, 100), edit: { how: "set", query: { sets } } }));
+      await this.conceal(hidden, true);
+      const after = then ?? `selection:${made[0].id}`;
+      this.last = { made: made.map(({ id }) => id), hidden, before, after };
+      this.have(this.found, [...made, ...this.own]);
+      this.hold([after]);
+    } catch (problem) { tell(words(problem), true); }
+  }
+
+  // Take the last of these back, where it is still what is asked; whether there was one.
+  undo() {
+    const { last } = this;
+    if (!last || String(this.held()) !== last.after) return false;
+    this.last = null;
+    this.forget(last.made).then(() => this.conceal(last.hidden, false)).then(() => this.hold(last.before)).catch(problem => tell(words(problem), true));
+    return true;
+  }
+
+  async forget(ids) {
+    for (const id of ids) await remove(`${this.route}/${id}`);
+    this.have(this.found, this.own.filter(({ id }) => !ids.includes(id)));
+    this.show();
+  }
+
+  async conceal(terms, hidden) {
+    for (const thing of this.found.filter(one => terms.includes(term(one)))) Object.assign(thing, await patch(`/lifts/${this.lift.id}/objects/${thing.id}`, { hidden }), { name: thing.name });
+  }
+
+  // A selection that was begun, changed or named elsewhere.
+  changed(selection) {
+    this.have(this.found, [selection, ...this.own.filter(({ id }) => id !== selection.id)]);
+    this.show();
+  }
+
+  get route() {
+    return `/lifts/${this.lift.id}/selections`;
+  }
+
+  // What a ZIP of all things has: those that are shown, and one's own.
+  shown() {
+    return [...this.own.map(({ id, name }) => ({ sets: [`selection:${id}`], name })),
+      ...this.found.filter(thing => !thing.hidden && !this.background(thing)).map(thing => ({ sets: [term(thing)], name: thing.title }))];
+  }
+
   take(own, more) {
-    const held = more ? this.held().filter(one => one.startsWith("object:")) : [];
+    const held = more ? this.held().filter(one => /^(object|selection):/.test(one)) : [];
     this.hold(held.includes(own) ? held.filter(one => one !== own) : [...held, own]);
   }
 
@@ -154,4 +231,9 @@ export class Things {
   }
 }
 
+// The one thing that a selection was begun from, in a list.
+export const wholeOf = ({ history }) => {
+  const sets = history?.[0].edit.query?.sets ?? [];
+  return sets.length === 1 && sets[0].startsWith("object:") ? sets : [];
+};
 const term = thing => `object:${thing.id}`;
