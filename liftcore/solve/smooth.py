@@ -12,10 +12,8 @@ channel by its energy. In the form of Stiefel (1958) a step needs the last two i
     x <- x + alpha M^-1 (b - K x) + beta (x - x_before),
 
 and with alpha and beta known it is one pass over the graph, by blocks of channels, without any sum over the scene.
-The matrix knows no channel, so coordinates in any orthonormal basis do as well: where X0's rows span few directions,
-as those of few views or of a closed list of words do, these are solved for in place of channels. Every sum has a
-fixed order, so that the number of threads changes no bit. The solution is a mean of X0's rows, so no channel of it
-leaves the range of X0's; nor does what is delivered.
+Every sum has a fixed order, so that the number of threads changes no bit. The solution
+is a mean of X0's rows, so no channel of it leaves the range of X0's; nor does what is delivered.
 
 A splat without evidence has no term of its own. It takes the limit of the solution for w_j towards zero, the mean of
 its neighbours by ``a_jk sqrt(w_k)``, and those behind it the mean of these, ring by ring.
@@ -23,6 +21,7 @@ its neighbours by ``a_jk sqrt(w_k)``, and those behind it the mean of these, rin
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -34,7 +33,6 @@ import torch
 from torch import Tensor
 
 from liftcore.raster.cpu.simd import LANES, in_all_lanes, keep_lanes, lanes_at, plus, plus_product, times
-from liftcore.runtime.cores import cores
 from liftcore.runtime.device import CPU, Device
 from liftcore.runtime.jit import kernel
 from liftcore.runtime.one_thread import one_thread
@@ -48,8 +46,6 @@ LEAST_WEIGHT = 1e-30  # of the largest; a splat below it has no evidence
 BLOCK = 8 * LANES  # channels solved at a time: three [P, 64] f32
 ROWS = 1 << 13  # splats of one piece of work
 PROBES = LANES  # random sums of all channels, by which steps are found
-SAMPLE = 1 << 12  # rows of X that show the space they span
-FEW = 0.5  # of the channels: at most so many directions are solved for in place of channels
 TOLERANCE = 2e-3  # of the gradient, relative to that at X0, over sqrt(1 + lambda): what varies slowly over the scene
 # has little of the gradient, the less the larger lambda
 ROUGHLY = 2e-2  # a tolerance by which features are compared, not delivered
@@ -128,20 +124,53 @@ def smooth(
     has_evidence, has_feature = weights > 0, weights > 0
     for rows, _ in rings:
         has_feature[rows] = True
-    steps, residual, moved, whole = list[Step](), 0.0, 0.0, 0.0
-    with ThreadPoolExecutor(threads or cores()) as pool:
+    count, channels = X.shape
+    squares, steps, residual = np.zeros((2, channels)), list[Step](), 0.0
+    card = None if device.kind == "cpu" else system.on_card(device.place)
+    block = BLOCK if card is None else min(card.channels, channels)
+    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         if smoothness and has_evidence.any():
-            signs = _random_signs(X.shape[1])
-            probes = _probe(X, graph.order, has_evidence, signs, pool)
-            _, steps, residual = _conjugate_gradients(system, probes, pool)
-            solver = _Solver(system, steps, rings, has_feature, pool, device)
-            basis = _row_space(X, graph.order[has_evidence])
-            if basis is not None:
-                left = _probe(X, graph.order, has_evidence, signs - basis @ (basis.T @ signs), pool)
-                whole_space = np.square(left).sum() <= _rounding(X) ** 2 * np.square(probes).sum()
-                basis = basis if whole_space else None
-            solve = solver.solve if basis is None else partial(solver.solve_coordinates, basis)
-            moved, whole = solve(X, progress)
+            _, steps, residual = _conjugate_gradients(system, _probe(X, graph.order, has_evidence, pool), pool)
+            staged = torch.empty(count, block, dtype=X.dtype)  # a block in the graph's order, in X's dtype
+            source, target = _in_words(X, staged)
+            values, *iterates = (np.zeros((count, block), np.float32) for _ in range(3 if card is None else 1))
+            for begin in range(0, channels, block):
+                width = min(block, channels - begin)
+
+                def read(rows: slice, begin: int = begin, width: int = width) -> tuple[np.ndarray, np.ndarray]:
+                    """Take rows of X in the graph's order; their least and greatest value in each channel."""
+                    take_rows(rows.start, rows.stop, graph.order, source, begin // block * target.shape[1], target)
+                    torch.from_numpy(values[rows, :width]).copy_(staged[rows, :width])
+                    low, high = np.full(width, np.inf, np.float32), np.full(width, -np.inf, np.float32)
+                    bound_rows(rows.start, rows.stop, has_evidence, values, low, high)
+                    for iterate in iterates:
+                        iterate[rows] = values[rows]
+                    return low, high
+
+                lows, highs = zip(*_map_rows(read, count, pool), strict=True)
+                low, high = np.min(lows, axis=0), np.max(highs, axis=0)
+                if card is None:
+                    solution = _descend(system, values, iterates, steps, pool)
+                else:
+                    start = torch.from_numpy(values[:, :width]).to(device.place).double()
+                    solution = card.descend(start, [(float(length), float(turn)) for length, turn in steps])
+                    solution = solution.float().cpu().numpy()
+                arguments = system.weights, values, low, high, solution
+                squares[:, begin : begin + width] = _row_sums(clip_rows, arguments, (2, width), count, pool)
+                for rows, shares in rings:
+                    solution[rows] = shares @ solution
+
+                def write(
+                    rows: slice, begin: int = begin, width: int = width, solution: np.ndarray = solution
+                ) -> None:
+                    """Put rows into their places in X."""
+                    staged[rows, :width].copy_(torch.from_numpy(solution[rows, :width]))
+                    first_word = begin // block * target.shape[1]
+                    put_rows(rows.start, rows.stop, graph.order, has_feature, target, first_word, source)
+
+                _map_rows(write, count, pool)
+                progress("smooth", begin + width, channels, "channels")
+    moved, whole = squares.sum(axis=1).tolist()
     facts: dict[str, Any] = {
         "smoothness": smoothness,
         "steps": len(steps),
@@ -156,88 +185,6 @@ def smooth(
             "features are less smooth than asked for"
         )
     return X, facts
-
-
-@dataclass(frozen=True)
-class _Solver:
-    """Steps that are known, taken by blocks of channels."""
-
-    system: _System
-    steps: Sequence[Step]
-    rings: Sequence[tuple[np.ndarray, Any]]  # as `_rings` has them
-    has_feature: np.ndarray  # [P] bool, rows that get one
-    pool: Executor
-    device: Device
-
-    def solve(self, X: Tensor, progress: Progress) -> tuple[float, float]:
-        """Change X [P, C] in place; ``sum_j w_j |x_j - x0_j|^2`` and ``sum_j w_j |x0_j|^2``."""
-        (count, channels), system, order, pool = X.shape, self.system, self.system.graph.order, self.pool
-        card = None if self.device.kind == "cpu" else system.on_card(self.device.place)
-        block = BLOCK if card is None else min(card.channels, channels)
-        squares, has_evidence = np.zeros((2, channels)), system.weights > 0
-        staged = torch.empty(count, block, dtype=X.dtype)  # a block in the graph's order, in X's dtype
-        source, target = _in_words(X, staged)
-        values, *iterates = (np.zeros((count, block), np.float32) for _ in range(3 if card is None else 1))
-        for begin in range(0, channels, block):
-            width, first_word = min(block, channels - begin), begin // block * target.shape[1]
-
-            def read(rows: slice, width: int = width, first_word: int = first_word) -> tuple[np.ndarray, np.ndarray]:
-                """Take rows of X in the graph's order; their least and greatest value in each channel."""
-                take_rows(rows.start, rows.stop, order, source, first_word, target)
-                torch.from_numpy(values[rows, :width]).copy_(staged[rows, :width])
-                low, high = np.full(width, np.inf, np.float32), np.full(width, -np.inf, np.float32)
-                bound_rows(rows.start, rows.stop, has_evidence, values, low, high)
-                for iterate in iterates:
-                    iterate[rows] = values[rows]
-                return low, high
-
-            lows, highs = zip(*_map_rows(read, count, pool), strict=True)
-            low, high = np.min(lows, axis=0), np.max(highs, axis=0)
-            if card is None:
-                solution = _descend(system, values, iterates, self.steps, pool)
-            else:
-                start = torch.from_numpy(values[:, :width]).to(self.device.place).double()
-                solution = card.descend(start, [(float(length), float(turn)) for length, turn in self.steps])
-                solution = solution.float().cpu().numpy()
-            arguments = system.weights, values, low, high, solution
-            squares[:, begin : begin + width] = _row_sums(clip_rows, arguments, (2, width), count, pool)
-            for rows, shares in self.rings:
-                solution[rows] = shares @ solution
-
-            def write(
-                rows: slice, width: int = width, first_word: int = first_word, solution: np.ndarray = solution
-            ) -> None:
-                """Put rows into their places in X."""
-                staged[rows, :width].copy_(torch.from_numpy(solution[rows, :width]))
-                put_rows(rows.start, rows.stop, order, self.has_feature, target, first_word, source)
-
-            _map_rows(write, count, pool)
-            progress("smooth", begin + width, channels, "channels")
-        moved, whole = squares.sum(axis=1).tolist()
-        return moved, whole
-
-    def solve_coordinates(self, basis: Tensor, X: Tensor, progress: Progress) -> tuple[float, float]:
-        """The same, of the coordinates of X's rows in a basis [C, r] f32 of the space that they span."""
-        count, places = len(X), torch.from_numpy(self.system.graph.order[self.has_feature]).long()
-        known = torch.from_numpy(self.system.graph.order[self.system.weights > 0]).long()
-        ranges = torch.stack([torch.stack(X[own].float().aminmax(dim=0)) for own in known.split(ROWS)])
-        low, high = ranges[:, 0].amin(dim=0), ranges[:, 1].amax(dim=0)
-        moved = whole = 0.0
-        for first in range(0, basis.shape[1], BLOCK):
-            axes = basis[:, first : first + BLOCK]
-            start = torch.cat(_map_rows(lambda rows, axes=axes: X[rows].float() @ axes, count, self.pool))
-            solution = start.clone()
-            sums = self.solve(solution, silent)
-            moved, whole = moved + sums[0], whole + sums[1]
-
-            def write(rows: slice, axes: Tensor = axes, start: Tensor = start, solution: Tensor = solution) -> None:
-                own = places[rows]
-                features = X[own].float() + (solution[own] - start[own]) @ axes.T
-                X[own] = torch.clamp(features, low, high).to(X.dtype)
-
-            _map_rows(write, len(places), self.pool)
-            progress("smooth", min(first + BLOCK, basis.shape[1]), basis.shape[1], "directions")
-        return moved, whole
 
 
 def smooth_channels(
@@ -304,39 +251,15 @@ def _rings(graph: SplatGraph, weights: np.ndarray) -> list[tuple[np.ndarray, Any
     return rings
 
 
-def _random_signs(channels: int) -> Tensor:
-    """[F, PROBES] f32, minus one or one."""
-    return torch.from_numpy(np.random.default_rng(0).choice(np.array([-1.0, 1.0], np.float32), (channels, PROBES)))
-
-
-def _probe(X: Tensor, order: np.ndarray, known: np.ndarray, factors: Tensor, pool: Executor) -> np.ndarray:
-    """[P, n] f32, in the graph's order: sums of X's channels with factors [F, n], zero where not known [P]."""
+def _probe(X: Tensor, order: np.ndarray, known: np.ndarray, pool: Executor) -> np.ndarray:
+    """[P, PROBES] f32, in the graph's order: sums of X's channels with random signs, zero where not known [P]."""
+    signs = torch.from_numpy(np.random.default_rng(0).choice(np.array([-1.0, 1.0], np.float32), (X.shape[1], PROBES)))
 
     def add(rows: slice) -> np.ndarray:
-        return (X.index_select(0, torch.from_numpy(order[rows])).float() @ factors).numpy()
+        return (X.index_select(0, torch.from_numpy(order[rows])).float() @ signs).numpy()
 
     sums = np.concatenate(_map_rows(add, len(X), pool))
     return np.where(known[:, None] & np.isfinite(sums), sums, np.float32(0.0))
-
-
-def _row_space(X: Tensor, known: np.ndarray) -> Tensor | None:
-    """An orthonormal basis [F, r] f32 of what some of the rows known [n] span, up to their rounding.
-
-    None if it has more than FEW of the channels.
-    """
-    rows = torch.from_numpy(known[:: -(-len(known) // SAMPLE)]).long()
-    sample = X[rows].double()
-    if not bool(torch.isfinite(sample).all()):
-        return None
-    values, axes = torch.linalg.eigh(sample.T @ sample)
-    energy = values.clamp_min(0.0).cumsum(dim=0)
-    spare = int((energy <= (_rounding(X) / 2) ** 2 * energy[-1]).sum())  # ascending: the axes that say nothing
-    return axes[:, spare:].float().contiguous() if len(values) - spare <= FEW * len(values) else None
-
-
-def _rounding(X: Tensor) -> float:
-    """Of a value, at most, relative to it."""
-    return torch.finfo(X.dtype).eps / 2
 
 
 def _conjugate_gradients(system: _System, start: np.ndarray, pool: Executor) -> tuple[np.ndarray, list[Step], float]:

@@ -73,32 +73,6 @@ def test_features_are_those_of_the_least_sum(device: Device, seed: int, count: i
     assert np.linalg.norm(apart) <= 1e-2 * np.linalg.norm(moved) + 1e-6 * np.sqrt(weights.sum())
 
 
-@pytest.mark.parametrize("device", [CPU, CARD], ids=["processor", "card"])
-@settings(max_examples=10, deadline=None)
-@given(seed=SEEDS, smoothness=st.sampled_from([0.1, 4.0]))
-def test_features_of_few_directions_are_those_of_the_least_sum(device: Device, seed: int, smoothness: float) -> None:
-    scene = Scene(seed, 120, channels=3)
-    scene.X = scene.X @ torch.randn(3, 70, generator=torch.Generator().manual_seed(seed))
-    X, weights = scene.minimum(smoothness)
-    apart = np.sqrt(weights[:, None]) * (scene.smooth(smoothness, device=device).double().numpy() - X)
-    moved = np.sqrt(weights[:, None]) * (scene.X.double().numpy() - X)
-    assert np.linalg.norm(apart) <= 1e-2 * np.linalg.norm(moved) + 1e-6 * np.sqrt(weights.sum())
-    one, three = (scene.smooth(smoothness, threads=threads) for threads in (1, 3))
-    assert torch.equal(one, three)
-
-
-def test_feature_of_one_splat_in_a_direction_of_its_own_reaches_its_neighbours() -> None:
-    scene = Scene(5, 9_000, channels=1, unseen=0.0)
-    scene.evidence.fill_(1.0)
-    alone = torch.zeros(9_000, 1)
-    alone[int(SplatGraph.of(scene.splats).order[1])] = 9.0
-    scene.X = torch.cat([scene.X.repeat(1, 20), alone], dim=1)
-    both = scene.smooth(1.0)[:, 20]
-    scene.X = alone
-    apart, reached = both - scene.smooth(1.0)[:, 0], both[alone[:, 0] == 0]
-    assert 0 < float(reached.norm()) > 20 * float(apart.norm())
-
-
 @settings(max_examples=20, deadline=None)
 @given(seed=SEEDS, unseen=st.floats(0.05, 0.99))
 def test_splats_without_evidence_take_the_mean_of_their_neighbours(seed: int, unseen: float) -> None:
