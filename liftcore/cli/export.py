@@ -32,6 +32,8 @@ def add_arguments(parser: Parser) -> None:
     source.add_argument("--all-words", action="store_true", help="label every splat by the best word of the encoder")
     source.add_argument("--object", type=whole, metavar="ID", help="one object of the lift, and no other splat")
     only = "with --text: the splats that were found, and no others"
+    parted = "of a .usdc or .usdz: a prim an object, in place of a subset of one prim"
+    parser.add_argument("--prims", action="store_true", help=parted)
     parser.add_argument("--only", action="store_true", help=only)
     names = "without the options above: name the lift's objects by these words, a file of one a line"
     parser.add_argument("--vocabulary", type=Path, metavar="FILE", help=names)
@@ -59,6 +61,12 @@ def run(options: argparse.Namespace) -> int:
         what = "object"
     elif suffix == ".splat" or source is None:
         what, source = "splats", None
+    if options.prims:
+        if what != "labelled" or suffix not in (".usdc", ".usdz"):
+            raise InvalidInput(
+                "--prims", expected="labels as .usdc or .usdz", got=f"{what} as {suffix or 'no suffix'}"
+            )
+        what = "prims"
     files, exports = {"output": options.output}, {"output": partial(scene.export, source=source, what=what)}
     if what == "labelled" and suffix == ".ply":
         names = options.output.with_name(f"{options.output.name}.json")

@@ -104,6 +104,11 @@ class FileKind:
     recognised: bool = True  # False: nothing is known of it but its first bytes
 
     @property
+    def sent(self) -> tuple[str, ...]:
+        """Those of ``splats`` that HTTP takes, where no pickle is opened."""
+        return tuple(name for name in self.splats if name.lower().endswith(SPLATS_SENT))
+
+    @property
     def suffix(self) -> str:
         """Of splats, the usual suffix of their format; empty of others."""
         return "" if self.format is None else SUFFIX[self.format]

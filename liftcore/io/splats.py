@@ -317,7 +317,9 @@ def with_columns(path: Path, columns: Mapping[str, np.ndarray]) -> Iterator[byte
     return labelled(path, Labels(dict(columns), {}))
 
 
-def labelled(path: Path, labels: Labels, suffix: str = ".ply", kept: np.ndarray | None = None) -> Iterator[bytes]:
+def labelled(
+    path: Path, labels: Labels, suffix: str = ".ply", kept: np.ndarray | None = None, *, prims: bool = False
+) -> Iterator[bytes]:
     """A file with labels a splat, as the bytes of a PLY or of another format that holds columns, in blocks.
 
     A PLY of a PLY has all else of its own bytes; one of another format is of its kernel.
@@ -325,12 +327,16 @@ def labelled(path: Path, labels: Labels, suffix: str = ".ply", kept: np.ndarray 
     Args:
         path: the file. labels: of its splats; columns that it has are replaced. suffix: of what is written.
             The document's ``world`` is that of the splats.
-        kept: [P] bool, the rows to keep; None: all.
+        kept: [P] bool, the rows to keep; None: all. prims: of USD, whether each object is a prim (`usd_blocks`).
 
     Raises:
         InvalidSplats: the file is malformed or has another number of splats, or the format holds no columns.
     """
     write = _writer_of(suffix, "suffix")
+    if prims:
+        if suffix not in (".usdc", ".usdz"):
+            raise InvalidSplats("suffix", expected=".usdc or .usdz, which have prims", got=repr(suffix))
+        write = partial(usd_blocks, suffix=suffix, prims=True)
     if suffix not in WITH_COLUMNS:
         raise InvalidSplats("suffix", expected=" or ".join(WITH_COLUMNS) + ", which hold labels", got=repr(suffix))
     if suffix == ".ply" and kept is None and format_of(path) is SplatFormat.PLY:

@@ -7,7 +7,8 @@ those of the splats where they are known (`liftcore.scene.world`); custom data o
 validators want both.
 
 Columns of splats are primvars of the field. An object is a ``GeomSubset`` with the element type ``point`` and
-``SemanticsLabelsAPI:class``; it has no family, as validators know families of point-based geometry alone.
+``SemanticsLabelsAPI:class``; it has no family, as validators know families of point-based geometry alone. Or it is a
+field of its own, with the rows that its splats were, by which they come back in their order.
 
 Files are opened by ``usd-core`` (the extra ``formats``), which follows references to other files.
 """
@@ -16,7 +17,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -43,6 +44,7 @@ MOST_DEGREE = 4  # and read
 MODULES = ("Gf", "Sdf", "Tf", "Usd", "UsdGeom", "UsdSemantics", "UsdUtils", "UsdVol", "Vt")
 FIELD = "ParticleField3DGaussianSplat"
 WORLD = "splatlift_world"  # of the layer's custom data: up and metres a unit as JSON, null where not known
+ROW = "splatlift_row"  # primvar of the fields of parted splats: the rows that they were
 DOCUMENT = "splatlift"  # of the field's custom data: what labels mean, as JSON
 HINT = "export it again, or as PLY"
 
@@ -63,17 +65,24 @@ def open_library() -> Any:
     return modules
 
 
-def usd_blocks(splats: Splats, document: Mapping[str, Any] | None = None, suffix: str = ".usdc") -> Iterator[bytes]:
+def usd_blocks(
+    splats: Splats, document: Mapping[str, Any] | None = None, suffix: str = ".usdc", *, prims: bool = False
+) -> Iterator[bytes]:
     """The bytes of a USD file of any splats (`gaussian_rows`), with their extras and what these mean.
 
     Args:
         splats: P. document: of `liftcore.io.labels`; None: splats without labels. suffix: .usdc, .usda or .usdz.
+        prims: whether each object is a particle field of its own, ``/Scene/instance_N``, and what is of none
+            ``/Scene/Splats``; else all are one field, and an object is a subset.
 
     Raises:
-        InvalidSplats: the format does not hold the columns.
+        InvalidSplats: the format does not hold the columns, or prims are asked for without ``instance_id``.
         Unavailable: usd-core is not installed.
     """
     pxr, columns = open_library(), stored_columns(splats)
+    if prims and IDS[0] not in columns:
+        hint = "export labels, such as the objects of a lift"
+        raise InvalidSplats("prims", expected=f"a column {IDS[0]}", got="splats without it", hint=hint)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"scene{'.usdc' if suffix == '.usdz' else suffix}"
         stage = pxr.Usd.Stage.CreateNew(str(path))
@@ -88,7 +97,20 @@ def usd_blocks(splats: Splats, document: Mapping[str, Any] | None = None, suffix
             root.AddTranslateOp().Set(pxr.Gf.Vec3d(*place.tolist()))
         if (turn := world.upright(TO_FILE).tolist())[0] < 1:
             root.AddOrientOp(pxr.UsdGeom.XformOp.PrecisionDouble).Set(pxr.Gf.Quatd(*turn))
-        _write_field(stage, splats, columns, document or {})
+        named = rows_by_id(dict(document or {}), KINDS[0])
+        if prims:
+            for number, rows in _instances(columns[IDS[0]]):
+                own = {name: column[rows] for name, column in columns.items()} | {ROW: rows.astype("i4")}
+                prim = _write_field(stage, f"instance_{number}" if number else "Splats", splats[rows], own)
+                _name(prim, named, number)
+        else:
+            prim = _write_field(stage, "Splats", splats, columns)
+            for number, rows in _instances(columns[IDS[0]]) if IDS[0] in columns else ():
+                if number:
+                    _write_subset(stage, prim, named, number, rows)
+        if document:
+            first = next(iter(stage.GetPrimAtPath("/Scene").GetChildren()))
+            first.SetCustomDataByKey(DOCUMENT, json.dumps(document, ensure_ascii=False))
         stage.GetRootLayer().Save()
         del stage
         if suffix == ".usdz":
@@ -99,7 +121,8 @@ def usd_blocks(splats: Splats, document: Mapping[str, Any] | None = None, suffix
         yield path.read_bytes()
 
 
-def _write_field(stage: Any, splats: Splats, columns: Mapping[str, np.ndarray], document: Mapping[str, Any]) -> None:
+def _write_field(stage: Any, name: str, splats: Splats, columns: Mapping[str, np.ndarray]) -> Any:
+    """The prim of a new particle field."""
     pxr = open_library()
     rows = list(gaussian_rows(splats))
 
@@ -118,7 +141,7 @@ def _write_field(stage: Any, splats: Splats, columns: Mapping[str, np.ndarray], 
         axis=1,
     )
     quats = np.roll(joined("quats") @ product_matrix(TO_FILE).T, -1, axis=1)  # in memory the real part is last
-    field = pxr.UsdVol.ParticleField3DGaussianSplat.Define(stage, "/Scene/Splats")
+    field = pxr.UsdVol.ParticleField3DGaussianSplat.Define(stage, f"/Scene/{name}")
 
     def vectors(values: np.ndarray) -> Any:
         return pxr.Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, "f4"))
@@ -134,32 +157,36 @@ def _write_field(stage: Any, splats: Splats, columns: Mapping[str, np.ndarray], 
     low, high = (means - reach).min(axis=0).tolist(), (means + reach).max(axis=0).tolist()
     field.CreateExtentAttr(pxr.Vt.Vec3fArray([pxr.Gf.Vec3f(*low), pxr.Gf.Vec3f(*high)]))
     primvars = pxr.UsdGeom.PrimvarsAPI(field)
-    for name, column in columns.items():
-        if not pxr.Sdf.Path.IsValidIdentifier(name):
-            raise InvalidSplats("columns", expected="names of letters, digits and underscores", got=repr(name))
+    for key, column in columns.items():
+        if not pxr.Sdf.Path.IsValidIdentifier(key):
+            raise InvalidSplats("columns", expected="names of letters, digits and underscores", got=repr(key))
         is_float = column.dtype.kind == "f"
         kind = pxr.Sdf.ValueTypeNames.FloatArray if is_float else pxr.Sdf.ValueTypeNames.IntArray
         array = pxr.Vt.FloatArray if is_float else pxr.Vt.IntArray
-        own = primvars.CreatePrimvar(name, kind, pxr.UsdGeom.Tokens.vertex)
+        own = primvars.CreatePrimvar(key, kind, pxr.UsdGeom.Tokens.vertex)
         own.Set(array.FromNumpy(column))
-    if document:
-        field.GetPrim().SetCustomDataByKey(DOCUMENT, json.dumps(document, ensure_ascii=False))
-    if IDS[0] in columns:
-        _write_subsets(stage, columns[IDS[0]], rows_by_id(dict(document), KINDS[0]))
+    return field.GetPrim()
 
 
-def _write_subsets(stage: Any, instances: np.ndarray, rows: list[dict[str, Any]]) -> None:
-    pxr = open_library()
+def _instances(instances: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """Each number of a column of ids, and its rows."""
     order = np.argsort(instances, kind="stable")
     numbers, firsts = np.unique(instances[order], return_index=True)
-    for number, own in zip(numbers.tolist(), np.split(order, firsts[1:]), strict=True):
-        if number < 1:
-            continue
-        subset = pxr.UsdGeom.Subset.Define(stage, f"/Scene/Splats/instance_{number}")
-        subset.CreateElementTypeAttr(pxr.UsdGeom.Tokens.point)
-        subset.CreateIndicesAttr(pxr.Vt.IntArray.FromNumpy(own.astype("i4")))
-        if (name := rows[number].get("name") if number < len(rows) else None) is not None:
-            pxr.UsdSemantics.LabelsAPI.Apply(subset.GetPrim(), "class").CreateLabelsAttr([name])
+    yield from zip(numbers.tolist(), np.split(order, firsts[1:]), strict=True)
+
+
+def _write_subset(stage: Any, field: Any, named: Sequence[Mapping[str, Any]], number: int, rows: np.ndarray) -> None:
+    pxr = open_library()
+    subset = pxr.UsdGeom.Subset.Define(stage, field.GetPath().AppendChild(f"instance_{number}"))
+    subset.CreateElementTypeAttr(pxr.UsdGeom.Tokens.point)
+    subset.CreateIndicesAttr(pxr.Vt.IntArray.FromNumpy(rows.astype("i4")))
+    _name(subset.GetPrim(), named, number)
+
+
+def _name(prim: Any, named: Sequence[Mapping[str, Any]], number: int) -> None:
+    """Give a prim the semantic label of an instance, if it has a name."""
+    if number and number < len(named) and (name := named[number].get("name")) is not None:
+        open_library().UsdSemantics.LabelsAPI.Apply(prim, "class").CreateLabelsAttr([name])
 
 
 def read_usd(path: Path, *, colour: bool = True) -> Fields:
@@ -172,8 +199,23 @@ def read_usd(path: Path, *, colour: bool = True) -> Fields:
         Unavailable: usd-core is not installed.
     """
     stage = _stage(path)
-    fields = joined_fields([_field(prim, stage, path, colour=colour) for prim in _fields(stage, path)])
+    prims = _fields(stage, path)
+    fields = joined_fields([_field(prim, stage, path, colour=colour) for prim in prims])
+    order = _row_order(prims, len(fields["means"]))
+    if order is not None:
+        extras = {name: column[order] for name, column in fields["extras"].items()}
+        fields = {name: value[order] if isinstance(value, np.ndarray) else value for name, value in fields.items()}
+        fields["extras"] = extras
     return fields | {"world": _world(stage)}
+
+
+def _row_order(prims: Sequence[Any], count: int) -> np.ndarray | None:
+    """[P], places of the rows that were parted into prims; None where that is not known, or some are not there."""
+    found = [
+        prim.GetAttribute(f"primvars:{ROW}").Get() if prim.HasAttribute(f"primvars:{ROW}") else None for prim in prims
+    ]
+    rows = np.concatenate([np.array([] if one is None else one, np.int64) for one in found])
+    return np.argsort(rows) if len(rows) == count and len(np.unique(rows)) == count else None
 
 
 def read_usd_document(path: Path) -> dict[str, Any]:
@@ -288,7 +330,7 @@ def _extras(prim: Any, count: int) -> dict[str, np.ndarray]:
     extras: dict[str, np.ndarray] = {}
     for primvar in pxr.UsdGeom.PrimvarsAPI(prim).GetPrimvars():
         name, values = str(primvar.GetPrimvarName()), primvar.Get()
-        if not COLUMN.fullmatch(name) or MODEL.fullmatch(name) or values is None:
+        if name == ROW or not COLUMN.fullmatch(name) or MODEL.fullmatch(name) or values is None:
             continue
         column = np.array(values)
         if column.shape == (count,) and column.dtype.kind in "iuf":

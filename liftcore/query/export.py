@@ -27,7 +27,7 @@ if TYPE_CHECKING:  # these load torch
     from liftcore.query.segment import Segmentation
     from liftcore.scene.cameras import Camera
 
-OF_LABELS = ("labelled", "names", "lines", "masks", "bundle")  # files of what every splat is
+OF_LABELS = ("labelled", "prims", "names", "lines", "masks", "bundle")  # files of what every splat is
 FILES = {  # of what a file is made -> the files that there are of it
     "answer": ("object", "coloured", "scores", "selection", "mask", "attention", "overlay", *OF_LABELS),
     "answers": OF_LABELS,
@@ -145,8 +145,9 @@ def _of_labels(
         from liftcore.query.bundle import bundle
 
         return bundle(scene, made, view if isinstance(view, str) else None)
-    if what == "labelled":
-        return labelled(scene.splat_file, made, suffix or ".ply")
+    if what in ("labelled", "prims"):
+        prims = what == "prims"
+        return labelled(scene.splat_file, made, suffix or (".usdc" if prims else ".ply"), prims=prims)
     if what == "masks":
         from liftcore.query.coco import masks_json
 

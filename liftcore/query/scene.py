@@ -377,10 +377,10 @@ class Scene(OpenedLift):
                 object or another node, or an array; None: the scene.
             what: of an answer object, coloured, scores, selection, mask, attention or overlay; of a segmentation
                 coloured, labels, picture or splat_labels; of a catalogue csv; of all these and of a tree labelled
-                (splats with labels), names (what these mean), lines (an object a line, JSON), masks (COCO's JSON, in
-                the views) or bundle (all of it in a ZIP); of the scene what `render` draws, or splats; of an array
-                npy, or mask of booleans [H, W]. Empty: the first of these; of a segmentation or a catalogue as a .glb
-                labelled, .json masks, .jsonl lines; as a .zip the bundle.
+                (splats with labels), prims (of USD, a prim an object), names (what these mean), lines (an object a
+                line, JSON), masks (COCO's JSON, in the views) or bundle (all of it in a ZIP); of the scene what
+                `render` draws, or splats; of an array npy, or mask of booleans [H, W]. Empty: the first of these; of
+                a segmentation or a catalogue as a .glb labelled, .json masks, .jsonl lines; as a .zip the bundle.
             view: of pictures, as in `look`. suffix: of its name, where there are several formats.
             seen: the answer as the view shows it, where that is known. photo: of the view, for an overlay.
 

@@ -7,6 +7,7 @@ mean S, and base colours in 0..1, the weight of an old splat k at a new one j is
     w_jk = (|S_j| |S_k|)^(1/4) / |S|^(1/2) exp(-d^T S^-1 d / 8) exp(-(|rgb_j - rgb_k| / 0.1)^2 / 2)
 
 A new splat that is nearly one of the old takes from that one alone, so rows that a file keeps come back as they were.
+Of exact copies among the old, which nothing tells apart, it takes the mean.
 All others take the mean of what is per splat by w^2 over the 16 nearest old ones, and the cluster and object of the
 largest sum. The evidence of an old splat is divided among those that take from it, so that decimated splats have that
 of all that they stand for. What overlaps with none has no feature.
@@ -207,8 +208,8 @@ def _mixed(lift: Lift, index: _Index, new: Splats, progress: Progress) -> tuple[
     for rows, near, overlaps in index.partners(new):
         best = overlaps.argmax(axis=1)
         top = np.take_along_axis(overlaps, best[:, None], axis=1)
-        alone = np.arange(near.shape[1]) == best[:, None]
-        shares = np.where(top >= SAME, alone, overlaps**2 * (overlaps >= LEAST_OVERLAP))
+        copies = overlaps >= top  # the best, and what lies, looks and is shaped exactly as it
+        shares = np.where(top >= SAME, copies, overlaps**2 * (overlaps >= LEAST_OVERLAP))
         shares /= np.maximum(shares.sum(axis=1, keepdims=True), 1e-300)
         taken.append((near.astype(np.int32), shares.astype(np.float32)))
         known = shares * old["seen"][near]
@@ -216,14 +217,16 @@ def _mixed(lift: Lift, index: _Index, new: Splats, progress: Progress) -> tuple[
         seen[rows] = sums >= 0.5
         is_row, is_mixed = top[:, 0] >= SAME, (top[:, 0] < SAME) & (top[:, 0] >= LEAST_OVERLAP)
         rows_of, mixed = rows_of + int(is_row.sum()), mixed + int(is_mixed.sum())
-        own = near[is_row, best[is_row]]
-        features[rows.start + np.flatnonzero(is_row)] = old_features[own]
-        elected[rows][is_row] = own_tuple[own]
-        several = rows.start + np.flatnonzero(is_mixed)
-        known = torch.from_numpy((known[is_mixed] / np.maximum(sums[is_mixed, None], 1e-300)).astype(np.float32))
-        mixture = torch.einsum("nk,nkf->nf", known, old_features[near[is_mixed]].float())
+        is_one = is_row & (copies.sum(axis=1) == 1)
+        own = near[is_one, best[is_one]]
+        features[rows.start + np.flatnonzero(is_one)] = old_features[own]
+        elected[rows][is_one] = own_tuple[own]
+        is_mean = (is_row | is_mixed) & ~is_one
+        several = rows.start + np.flatnonzero(is_mean)
+        known = torch.from_numpy((known[is_mean] / np.maximum(sums[is_mean, None], 1e-300)).astype(np.float32))
+        mixture = torch.einsum("nk,nkf->nf", known, old_features[near[is_mean]].float())
         features[several] = mixture.to(features.dtype)
-        elected[several] = _elected(own_tuple[near[is_mixed]], shares[is_mixed])
+        elected[several] = _elected(own_tuple[near[is_mean]], shares[is_mean])
         for name, column in values.items():
             column[rows] = (shares * old[name][near]).sum(axis=1)
         progress("transfer", rows.stop, count, "splats")

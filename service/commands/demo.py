@@ -342,7 +342,6 @@ def _lines(found: Finding) -> list[str]:
 
 SHIPPED = Path(__file__).with_name("tabletop")
 _CAMERA_FILES = ("cameras.json", "transforms.json", "cameras.zip")
-SPLATS_SENT = (".ply", ".splat", ".spz", ".sog")  # over HTTP, where no pickle is opened
 _TABLE = "text_table.safetensors"
 _ENCODERS = {space: encoder for encoder, space in BUILT_IN.items()}
 _PHRASES = 3  # asked when nobody says which
@@ -460,10 +459,11 @@ def find_scene(folder: Path, phrases: Sequence[str], scratch: Path, pack: Path |
 
 def _splats(folder: Path) -> Path:
     """The splats of a folder, or of the last iteration that a 3DGS trainer kept in it."""
-    found = next((name for name in identify(folder).splats if name.lower().endswith(SPLATS_SENT)), None)
-    if found is None:
-        raise InvalidInput(f"splats of {folder.name}", expected=f"a file of {', '.join(SPLATS_SENT)}", got="none")
-    return folder / found
+    found = identify(folder)
+    if not found.sent:
+        got = f"{found.splats[0]} alone" if found.splats else "none"
+        raise InvalidInput(f"splats of {folder.name}", expected="splats that the service takes", got=got)
+    return folder / found.sent[0]
 
 
 def _cameras(folder: Path, scratch: Path) -> Path:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +47,25 @@ def test_rows_that_are_kept_come_back_as_they_were(lifted: tuple[LiftResult, Spl
     facts = found.diagnostics["transfer"]
     assert (facts["rows"], facts["mixed"], facts["without_partner"], facts["moved"]) == (45, 0, 0, None)
     found.require_splats(splats[order])
+
+
+def test_exact_copies_share_what_the_lift_says_of_them(lifted: tuple[LiftResult, Splats]) -> None:
+    whole, splats = lifted
+    twice = np.r_[np.arange(splats.count), [3, 3]]  # three splats where one was
+    result, copied = whole[twice], splats[twice]
+    rows = [3, splats.count, splats.count + 1]
+    features = result.features.clone()
+    features[rows[1]] = -features[3]  # which views saw otherwise
+    result = replace(result, features=features)
+    for order in (twice * 0 + np.arange(len(twice)), np.arange(len(twice))[::-1].copy()):
+        found = result.transferred(copied, copied[order])
+        mean = features[rows].float().mean(dim=0)
+        for place in np.flatnonzero(np.isin(order, rows)):
+            torch.testing.assert_close(found.features[place].float(), mean, atol=1e-3, rtol=0)
+        others = ~np.isin(order, rows)
+        assert torch.equal(found.features[others], features[order][others])
+        assert float(found.evidence.sum()) == pytest.approx(float(result.evidence.sum()), rel=1e-5)
+        assert found.diagnostics["transfer"]["rows"] == len(twice)
 
 
 def test_quantised_rows_are_still_rows(lifted: tuple[LiftResult, Splats], tmp_path: Path) -> None:

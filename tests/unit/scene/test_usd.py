@@ -11,8 +11,8 @@ import pytest
 from liftcore.errors import InvalidSplats, Unavailable
 from liftcore.evaluate.inspect import inspect_file
 from liftcore.io.kinds import SplatFormat
-from liftcore.io.splats import format_of, labelled, read_labels, read_splats, write_splats
-from liftcore.io.usd import open_library
+from liftcore.io.splats import format_of, labelled, read_labels, read_places, read_splats, write_splats
+from liftcore.io.usd import open_library, usd_blocks
 from liftcore.scene.kernel import Kernel
 from tests.unit.scene.test_gltf import P, assert_same, labels, some_splats
 
@@ -74,6 +74,43 @@ def test_objects_are_subsets_index_for_index_and_validators_find_nothing(tmp_pat
     validation = import_module("pxr.UsdValidation")
     validators = validation.ValidationRegistry().GetOrLoadAllValidators()
     assert len(validators) > 10 and not validation.ValidationContext(validators).Validate(stage)
+
+
+@needs_usd
+@pytest.mark.parametrize("suffix", [".usdc", ".usdz"])
+@pytest.mark.parametrize("kernel", Kernel)
+def test_objects_as_prims_of_their_own_come_back_row_for_row(kernel: Kernel, suffix: str, tmp_path: Path) -> None:
+    pxr, expected = open_library(), labels()
+    write_splats(tmp_path / "s.ply", some_splats(kernel))
+    (tmp_path / f"s{suffix}").write_bytes(b"".join(labelled(tmp_path / "s.ply", expected, suffix, prims=True)))
+    found, splats = read_labels(tmp_path / f"s{suffix}"), read_splats(tmp_path / f"s{suffix}")
+    assert_same(splats, some_splats(kernel))
+    np.testing.assert_array_equal(read_places(tmp_path / f"s{suffix}"), splats.positions())
+    assert {kind: found.document[kind] for kind in expected.document} == expected.document
+    assert found.columns.keys() == expected.columns.keys()
+    for name, values in expected.columns.items():
+        np.testing.assert_array_equal(found.columns[name], values)
+    stage = pxr.Usd.Stage.Open(str(tmp_path / f"s{suffix}"))
+    for row in expected.document["instances"]:
+        prim = stage.GetPrimAtPath(f"/Scene/instance_{row['instance_id']}")
+        inside = np.flatnonzero(expected.columns["instance_id"] == row["instance_id"])
+        assert len(prim.GetAttribute("positions").Get()) == len(inside)
+        assert list(pxr.UsdSemantics.LabelsAPI(prim, "class").GetLabelsAttr().Get()) == [row["name"]]
+    validation = import_module("pxr.UsdValidation")
+    validators = validation.ValidationRegistry().GetOrLoadAllValidators()
+    assert len(validators) > 10 and not validation.ValidationContext(validators).Validate(stage)
+    stage.RemovePrim("/Scene/instance_1")
+    stage.GetRootLayer().Export(str(tmp_path / "cut.usdc"))
+    assert read_splats(tmp_path / "cut.usdc").count == P - np.count_nonzero(expected.columns["instance_id"] == 1)
+
+
+@needs_usd
+def test_prims_are_of_usd_and_of_labels_alone(tmp_path: Path) -> None:
+    write_splats(tmp_path / "s.ply", some_splats())
+    with pytest.raises(InvalidSplats, match="which have prims"):
+        labelled(tmp_path / "s.ply", labels(), ".glb", prims=True)
+    with pytest.raises(InvalidSplats, match="prims: expected a column instance_id"):
+        b"".join(usd_blocks(some_splats(), prims=True))
 
 
 @needs_usd
