@@ -57,12 +57,12 @@ def test_exact_copies_share_what_the_lift_says_of_them(lifted: tuple[LiftResult,
     features = result.features.clone()
     features[rows[1]] = -features[3]  # which views saw otherwise
     result = replace(result, features=features)
-    for order in (twice * 0 + np.arange(len(twice)), np.arange(len(twice))[::-1].copy()):
+    for order in (np.arange(len(twice)), np.arange(len(twice))[::-1].copy()):
         found = result.transferred(copied, copied[order])
         mean = features[rows].float().mean(dim=0)
         for place in np.flatnonzero(np.isin(order, rows)):
             torch.testing.assert_close(found.features[place].float(), mean, atol=1e-3, rtol=0)
-        others = ~np.isin(order, rows)
+        others = np.flatnonzero(~np.isin(order, rows))
         assert torch.equal(found.features[others], features[order][others])
         assert float(found.evidence.sum()) == pytest.approx(float(result.evidence.sum()), rel=1e-5)
         assert found.diagnostics["transfer"]["rows"] == len(twice)

@@ -1,0 +1,91 @@
+"""Every export of every kernel, read back: equal to 1e-6, or to half a step where the format has steps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from liftcore.io.quantised import gaussian_rows
+from liftcore.io.splats import blocks_as, labelled, read_labels, read_splats, write_splats
+from liftcore.scene.harmonics import SH_C0
+from liftcore.scene.kernel import Kernel
+from liftcore.scene.quaternions import rotation_matrices
+from liftcore.scene.splats import Splats
+from tests.unit.scene.test_gltf import P, labels, some_splats
+from tests.unit.scene.test_usd import needs_usd
+
+BYTE = 0.5 / 255
+EXACT = {"means": 1e-6, "log_scales": 1e-6, "opacities": 1e-6, "turns": 1e-6, "base": 1e-6, "sh": 1e-6}
+SPZ_COLOUR = BYTE / 0.15  # of its bytes: (colour - 0.5) / SH_C0 times 0.15
+STEPS = {  # the largest difference; of means as a share of the largest
+    ".glb": EXACT,
+    ".usdc": EXACT,
+    ".usdz": EXACT,
+    ".spz": {
+        "means": 2**-23,
+        "log_scales": 1 / 32,
+        "opacities": BYTE,
+        "turns": 4e-3,
+        "base": SPZ_COLOUR,
+        "sh": 1 / 16,
+    },
+    ".splat": {"means": 0, "log_scales": 1e-6, "opacities": BYTE, "turns": 0.02, "base": BYTE / SH_C0},
+}
+SUFFIXES = [".glb", ".spz", ".splat", *(pytest.param(usd, marks=needs_usd) for usd in (".usdc", ".usdz"))]
+
+
+def scene(kernel: Kernel) -> Splats:
+    """Splats whose colours bytes can say."""
+    splats = some_splats(kernel)
+    assert splats.sh is not None
+    sh = splats.sh.clamp(-3, 3) / 3
+    sh[:, 1:] *= 0.9
+    return replace(splats, sh=sh, opacity_logits=splats.opacity_logits.clamp(-4, 4))
+
+
+def parts(splats: Splats) -> dict[str, np.ndarray]:
+    """What a viewer draws, of any kernel as Gaussians: logarithms of scales, and turns that quaternions mean."""
+    (rows,) = gaussian_rows(splats)
+    assert splats.sh is not None
+    sh = splats.sh.numpy()
+    found = {"means": splats.positions(), "log_scales": np.log(rows.scales), "opacities": rows.opacities}
+    return found | {"turns": rotation_matrices(rows.quats), "base": sh[:, 0], "sh": sh[:, 1:]}
+
+
+@pytest.mark.parametrize("kernel", Kernel)
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_every_kernel_comes_back_through_every_format(kernel: Kernel, suffix: str, tmp_path: Path) -> None:
+    expected, made, path = scene(kernel), labels(), tmp_path / f"s{suffix}"
+    write_splats(tmp_path / "s.ply", expected)
+    if suffix == ".splat":
+        path.write_bytes(b"".join(blocks_as(expected, suffix)))
+    else:
+        path.write_bytes(b"".join(labelled(tmp_path / "s.ply", made, suffix)))
+        columns = read_labels(path).columns
+        assert columns.keys() == made.columns.keys()
+        for name, values in made.columns.items():
+            np.testing.assert_array_equal(columns[name], values)
+    one, other = parts(read_splats(path)), parts(expected)
+    for name, step in STEPS[suffix].items():
+        size = np.abs(other[name]).max() if name == "means" or suffix in (".glb", ".usdc", ".usdz") else 1.0
+        most = step * max(1.0, size) * 1.001 + 1e-6
+        np.testing.assert_allclose(one[name], other[name], rtol=0, atol=most, err_msg=name)
+    assert suffix != ".splat" or one["sh"].shape == (P, 0, 3)
+
+
+@pytest.mark.parametrize("kernel", Kernel)
+def test_a_ply_keeps_every_number_of_every_kernel(kernel: Kernel, tmp_path: Path) -> None:
+    expected, made = some_splats(kernel), labels()
+    write_splats(tmp_path / "s.ply", expected)
+    (tmp_path / "t.ply").write_bytes(b"".join(labelled(tmp_path / "s.ply", made, ".ply")))
+    found = read_splats(tmp_path / "t.ply")
+    assert found.kernel is kernel
+    for name in ("means", "quats", "log_scales", "opacity_logits", "beta", "sh", "sb_params"):
+        one, other = getattr(found, name), getattr(expected, name)
+        assert (one is None) == (other is None) and (one is None or torch.equal(one, other)), name
+    for name, values in made.columns.items():
+        np.testing.assert_array_equal(found.extras[name].numpy(), values)
