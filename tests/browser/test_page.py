@@ -597,7 +597,7 @@ def test_lines_to_take_away_ask_the_same(page: Browser) -> None:
 
 
 def test_page_asks_for_a_key_where_one_is_needed(page: Browser, served: Served) -> None:
-    """The last one: from here on the service is closed."""
+    """From here on the service is closed."""
     key, secret = served.store.keys.create("page", frozenset({Scope.READ}), Quota())
     try:
         page.open(served.address)
@@ -613,3 +613,33 @@ def test_page_asks_for_a_key_where_one_is_needed(page: Browser, served: Served) 
         assert page.value("document.querySelector('#door').open") is False
     finally:
         served.store.keys.revoke(key.id)
+
+
+def test_shared_scene_is_asked_by_its_link_and_changed_by_nobody(browser: Browser, served: Served) -> None:
+    """An owner makes the link on the page; who has it sees that scene, and nothing to change it with."""
+    owner, secret = served.store.keys.create("owner", frozenset({Scope.ADMIN}), Quota())
+    try:
+        browser.open(f"{served.address}/?lift={served.lift}#key={secret}")
+        browser.until(f"{READY} && !location.hash && document.querySelector('#whose').textContent === 'owner'")
+        browser.press("#tab-take")
+        browser.write("#share-name", "Bob")
+        browser.press("#share button")
+        browser.until("document.querySelectorAll('#shares li').length === 1")
+        link = browser.value("document.querySelector('#share-link').value")
+        browser.value("sessionStorage.clear()")
+        browser.open("about:blank#")
+        browser.open(link)
+        browser.until(f"{READY} && document.querySelector('#whose').textContent.startsWith('Shared with Bob until')")
+        assert browser.value("location.href").startswith(f"{served.address}/?lift={served.lift}")
+        assert link.partition("#key=")[2] not in browser.value("location.href + document.cookie")
+        for selector in ("#tab-bring", "#sharing", "#by-hand", "#catalogue-list .edit"):
+            shown = f"[...document.querySelectorAll('{selector}')].some(one => one.checkVisibility())"
+            assert browser.value(shown) is False, selector
+        ask(browser, "lamp")
+        assert columns(browser, AMBER)
+        served.store.keys.revoke(owner.id)
+        browser.open(f"{served.address}/?again")
+        browser.until("document.querySelector('#door').open")
+    finally:
+        served.store.keys.revoke(owner.id)
+        browser.value("sessionStorage.clear()")

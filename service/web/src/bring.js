@@ -40,7 +40,8 @@ export class Bring {
     addEventListener("drop", event => {
       stop(event);
       document.body.classList.remove("dragging");
-      if (event.dataTransfer.files.length) { this.raised(); dropped(event.dataTransfer).then(files => this.add(files)).catch(problem => tell(words(problem), true)); }
+      if (document.body.classList.contains("reader")) tell("Your key is for looking and asking: it brings no files.", true);
+      else if (event.dataTransfer.files.length) { this.raised(); dropped(event.dataTransfer).then(files => this.add(files)).catch(problem => tell(words(problem), true)); }
     });
     at("choose").addEventListener("click", () => at("files").click());
     at("files").addEventListener("change", () => { this.add([...at("files").files]); at("files").value = ""; });

@@ -45,6 +45,15 @@ export function tell(text, bad = false) {
   quiet = setTimeout(() => { toast.hidden = true; }, bad ? 12000 : 4000);
 }
 
+export async function copied(text) {
+  try {
+    await navigator.clipboard.writeText(text);
+    tell("Copied.");
+  } catch {
+    tell("This browser does not let the page copy: mark the text and copy it by hand.", true);
+  }
+}
+
 export const still = () => matchMedia("(prefers-reduced-motion: reduce)").matches;
 
 // A button that asks once more before it does what cannot be undone.

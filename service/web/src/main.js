@@ -10,6 +10,7 @@ import { Masks } from "./masks.js";
 import { Names } from "./names.js";
 import { COLOURS, rgb } from "./painter.js";
 import { bytes, json, keyOf, onHeard, onRefused, picture, useKey, words } from "./service.js";
+import { Share } from "./share.js";
 import { Take } from "./take.js";
 import { Things } from "./things.js";
 import { MOST, Viewer, webgl } from "./viewer.js";
@@ -39,7 +40,7 @@ const take = new Take({ ask, look, names, things, shot });
 const bring = new Bring({ opened: id => open(id, true), gone: () => refreshLifts(), open: () => lift?.id ?? null, raised: () => tab("bring"), preview });
 const beside = new Beside({ viewer: () => viewer, made: plain, now: () => String(linked()), changed: () => { beside.follow(ask.questions, lift); link(); } });
 const lifts = new Lifts({ opened: id => open(id, true), changed: () => refreshLifts(), beside: async id => { if (!beside.link) beside.hold(linked()); await open(id, true); } });
-
+const share = new Share();
 const hand = new Hand({ ask, label, look, things, viewer: () => (viewer?.mesh ? viewer : null) });
 
 look.asked = view => {
@@ -240,6 +241,7 @@ async function open(id, fresh = false) {
     of(lift);
     at("mask").hidden = at("outline").hidden = true;
     refreshLifts().catch(problem => tell(words(problem), true));
+    share.of(lift).catch(problem => tell(words(problem), true));
     if (fresh) tab("ask");
     viewer?.clear();
     at("stage").classList.remove("ready");
@@ -517,11 +519,13 @@ async function begin() {
   look.showLayer("rgb");
   tab("ask");
   try {
+    const { changes } = await share.begin();
     const known = await refreshLifts();
     const wanted = started.get("lift") || known[0]?.id;
     if (wanted) return await open(wanted);
     busy = false;
-    tab("bring");
+    if (changes) tab("bring");
+    else at("example-state").textContent = "There is no scene that your key may see. Ask whoever gave it to you.";
   } catch (problem) {
     if (problem.status !== 401) trouble(words(problem));
   }

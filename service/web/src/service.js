@@ -2,6 +2,15 @@
 const KEY = "splatlift-key";
 let refused = () => {}; // what to do when a key is wanted
 
+// A link may carry a key after the #, which browsers send nobody: it is taken over, and out of the address bar.
+const carried = /^#key=([\w.~+/-]+)$/.exec(location.hash);
+if (carried) {
+  sessionStorage.setItem(KEY, carried[1]);
+  history.replaceState(history.state, "", location.pathname + location.search);
+}
+
+addEventListener("hashchange", () => location.hash.startsWith("#key=") && location.reload());
+
 export const keyOf = () => sessionStorage.getItem(KEY);
 export const onRefused = action => { refused = action; };
 

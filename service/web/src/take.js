@@ -1,5 +1,5 @@
 // The panel of taking away: files of the question on the screen, and the lines that ask it elsewhere.
-import { at, el, tell } from "./dom.js";
+import { at, copied, el, tell } from "./dom.js";
 import { label } from "./ask.js";
 import { search } from "./question.js";
 import { keyOf, save, saveBlob, words } from "./service.js";
@@ -106,15 +106,6 @@ function posted(what, body, printed) {
   return [...(key ? ["import os", ""] : []), "import httpx", "", `asked = ${body}`,
     ...(key ? [`headers = {"Authorization": f"Bearer {os.environ['KEY']}"}`] : []),
     `found = httpx.post("${address(what)}", json=asked${key ? ", headers=headers" : ""}, timeout=600).raise_for_status().json()`, ...printed].join("\n");
-}
-
-async function copied(text) {
-  try {
-    await navigator.clipboard.writeText(text);
-    tell("Copied.");
-  } catch {
-    tell("This browser does not let the page copy: mark the text and copy it by hand.", true);
-  }
 }
 
 const quote = text => (/^[\w=.:,-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);

@@ -83,8 +83,8 @@ export class Things {
     at("catalogue-hidden").textContent = this.all ? "Leave out what is hidden" : `Show ${plural(hidden, "hidden thing")}`;
     const focus = document.activeElement?.dataset.unfolds; // which is made anew
     at("catalogue-list").replaceChildren(...shown.map(thing => el("li", { className: thing.hidden ? "hidden-thing" : "" }, ...this.line(thing, held),
-      el("button", { type: "button", className: "plain", title: "Give it a name", "aria-label": `Name ${thing.title}`, on: { click: event => this.write(thing, event.target.closest("li")) } }, "\u270e"),
-      el("button", { type: "button", className: "plain", "aria-label": `${thing.hidden ? "Show" : "Hide"} ${thing.title}`, on: { click: () => this.change(thing, { hidden: !thing.hidden }) } }, thing.hidden ? "Show" : "Hide"),
+      el("button", { type: "button", className: "plain edit", title: "Give it a name", "aria-label": `Name ${thing.title}`, on: { click: event => this.write(thing, event.target.closest("li")) } }, "\u270e"),
+      el("button", { type: "button", className: "plain edit", "aria-label": `${thing.hidden ? "Show" : "Hide"} ${thing.title}`, on: { click: () => this.change(thing, { hidden: !thing.hidden }) } }, thing.hidden ? "Show" : "Hide"),
       ...this.below(thing, held))));
     if (focus) at("catalogue-list").querySelector(`[data-unfolds="${focus}"]`)?.focus();
   }
