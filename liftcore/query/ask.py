@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,7 @@ import numpy as np
 from liftcore.errors import InvalidQuery
 from liftcore.io.json_file import finite
 from liftcore.query.candidates import candidates
-from liftcore.query.directions import directions, wordings
+from liftcore.query.directions import directions, part_phrase, table_of, wordings
 from liftcore.query.objects import objects
 from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.presence import (
@@ -41,13 +41,21 @@ from liftcore.query.question import (
     TopSplat,
 )
 from liftcore.query.scores import LEAST_LIKENESS, LOWEST_COSINE, combine, cosines, cosines_about
-from liftcore.query.selection import LEAST_FIRST, SAME_WORD, Rivals, contest, nearer_than_rivals, with_things
+from liftcore.query.selection import (
+    LEAST_FIRST,
+    SAME_WORD,
+    Rivals,
+    contest,
+    nearer_than_rivals,
+    with_parts,
+    with_things,
+)
 from liftcore.query.selections import set_members
 from liftcore.query.terms import Vector
 from liftcore.query.threshold import find_threshold, nothing_alike
 from liftcore.runtime.cores import cores
 from liftcore.text import TextEncoder, check_texts
-from liftcore.text.wording import Wording, base_of, plain
+from liftcore.text.wording import PartPhrase, Wording, base_of, plain
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -56,6 +64,7 @@ if TYPE_CHECKING:
 MOST_RIVALS = 3  # words that are named as nearer than what was asked
 MOST_OF_IT = 0.5  # the same where an answer is clear
 LEAST_RIVAL = 0.1  # of what is looked at, by evidence, to which such a word is the nearest
+_OF_ANSWER = ("rivals", "candidates", "threshold", "clear", "statistics", "present", "presence", "why")
 _QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 
 
@@ -70,6 +79,16 @@ class Question:
     asked_as: Mapping[int, Wording]  # of the texts, by their places among the terms
     pack: np.ndarray | None = None  # [n, F] f32, unit, all words of a table that has too few to be references
     candidates: tuple[Candidate, ...] = ()  # what clicks among them may mean
+    part: PartQuestion | None = None  # of a phrase that names a part of a thing
+
+
+@dataclass(frozen=True)
+class PartQuestion:
+    """A phrase that is asked as a part within a thing."""
+
+    phrase: PartPhrase
+    thing: Question
+    part: Question
 
 
 @dataclass(frozen=True)
@@ -194,9 +213,33 @@ def question(scene: OpenedLift, query: Query, encoder: TextEncoder | None, names
     Args:
         names: what errors call each of the terms; () = what they are themselves.
     """
+    phrase = part_phrase(scene, query, encoder)
+    if phrase is None:
+        return _question(scene, query, encoder, names)
+    thing = _question(scene, Query(text=[phrase.thing], weigh=query.weigh, absent=query.absent), encoder)
+    asked = _question(scene, query, encoder, names) if not phrase.sure else replace(thing, query=query)
+    return replace(asked, part=PartQuestion(phrase, thing, _question(scene, query, encoder, names, phrase)))
+
+
+def _question(
+    scene: OpenedLift,
+    query: Query,
+    encoder: TextEncoder | None,
+    names: Sequence[str] = (),
+    phrase: PartPhrase | None = None,
+) -> Question:
+    """The same as a whole, or of the part that a phrase names.
+
+    An encoder that reads any text reads the phrase, which says more of the part than its word alone.
+    """
     words = np.array([isinstance(term, str) for term in query.terms], np.bool_)
-    asked_as = wordings(scene, query, encoder, names)
+    read = query
+    if phrase is not None and table_of(encoder or scene.table) is not None:
+        read = query.model_copy(update={"text": [phrase.part]})
+    asked_as = wordings(scene, read, encoder, names)
     rows = directions(scene, query, encoder, names, asked_as)
+    if phrase is not None:
+        asked_as = asked_as | {0: Wording(query.text[0], str(phrase), "part")}
     scene.counted(query.weigh)
     encoder = encoder or scene.table
     if encoder is None or not words[: len(query.positives)].any():
@@ -206,11 +249,35 @@ def question(scene: OpenedLift, query: Query, encoder: TextEncoder | None, names
 
 def answers(scene: OpenedLift, questions: Sequence[Question]) -> list[Answer]:
     """Answer several queries in one pass over the features; each to the same bits as alone."""
+    if any(asked.part for asked in questions):
+        return [_part_answer(scene, asked) if asked.part else answers(scene, [asked])[0] for asked in questions]
     similarities = _similarities(scene, questions)
     if len(questions) == 1:
         return [_answer(scene, questions[0], similarities[0])]
     with ThreadPoolExecutor(cores()) as pool:
         return list(pool.map(lambda asked, similar: _answer(scene, asked, similar), questions, similarities))
+
+
+def _part_answer(scene: OpenedLift, asked: Question) -> Answer:
+    """The part of a thing: the thing first, then the part among its splats and nodes alone.
+
+    What may mean something else than a part (`PartPhrase`) is asked as a whole where no such part is found.
+    """
+    assert asked.part is not None
+    sure, part = asked.part.phrase.sure, asked.part.part
+    (thing,) = answers(scene, [asked.part.thing])
+    if thing.count:
+        (found,) = answers(scene.within(with_parts(scene, thing.selected)), [part])
+        told = f"{asked.part.phrase.thing!r} has {thing.count:,} splats. Within it: {found.why}"
+    else:
+        found, told = thing, f"{thing.why} So it has no parts."
+    if not found.count and not sure:
+        return answers(scene, [replace(asked, part=None)])[0]
+    fields = {name: getattr(found, name) for name in _OF_ANSWER} | {"why": told}
+    if thing.present is False:
+        fields |= {"present": False, "presence": thing.presence}
+    wording = tuple(AskedAs(**word._asdict()) for word in part.asked_as.values() if word.how)
+    return Answer.of(asked.query, found.scores, found.seen, found.selected, **fields, wording=wording)
 
 
 def located(scene: OpenedLift, answer: Answer, count: int | None = None) -> Answer:

@@ -21,7 +21,7 @@ from liftcore.query.selections import set_members
 from liftcore.query.terms import Area, Example, OneSplat, Region, SplatSet, Term, Vector, parse_example
 from liftcore.text import RememberingEncoder, TextEncoder, check_texts
 from liftcore.text.table import TableEncoder
-from liftcore.text.wording import Wording
+from liftcore.text.wording import PartPhrase, Wording, part_phrases, shipped_words
 
 
 def wordings(
@@ -35,10 +35,9 @@ def wordings(
     Raises:
         InvalidQuery: no word of the table stands for a text; ``nearest`` has those that could be asked.
     """
-    encoder = encoder or scene.table
-    source = encoder.source if isinstance(encoder, RememberingEncoder) else encoder
+    source = table_of(encoder or scene.table)
     texts = {place: term for place, term in enumerate(query.terms) if isinstance(term, str)}
-    if not isinstance(source, TableEncoder):
+    if source is None:
         return {place: Wording(text, text, "") for place, text in texts.items()}
     found: dict[int, Wording] = {}
     for place, text in texts.items():
@@ -51,10 +50,31 @@ def wordings(
     return found
 
 
+def table_of(encoder: TextEncoder | None) -> TableEncoder | None:
+    """An encoder that is a table of words; None for any other."""
+    source = encoder.source if isinstance(encoder, RememberingEncoder) else encoder
+    return source if isinstance(source, TableEncoder) else None
+
+
+def part_phrase(scene: OpenedLift, query: Query, encoder: TextEncoder | None) -> PartPhrase | None:
+    """The part of a thing that the only positive of a query names; None where it is something else.
+
+    A table that has the whole text as a word asks that; so does any encoder where the shipped words have it.
+    """
+    encoder = encoder or scene.table
+    if encoder is None or len(query.positives) != 1 or not query.text:
+        return None
+    source = table_of(encoder)
+    if source is not None:
+        return source.vocabulary.find_part(query.text[0])
+    known = shipped_words().find_part(query.text[0])
+    return known or next((phrase for phrase in part_phrases(query.text[0]) if phrase.sure), None)
+
+
 def askable_words(scene: OpenedLift, encoder: TextEncoder, text: str, count: int) -> AskableWords:
     """What a lift can be asked (`Scene.askable`)."""
-    source = encoder.source if isinstance(encoder, RememberingEncoder) else encoder
-    if isinstance(source, TableEncoder):
+    source = table_of(encoder)
+    if source is not None:
         here = named_things(scene, source.words, source.embeddings)
         words = tuple(AskableWord(**one._asdict()) for one in source.vocabulary.complete(text, count))
         return AskableWords(any_text=False, words=words, here=here)

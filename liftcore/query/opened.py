@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 
@@ -301,6 +302,23 @@ class OpenedLift:
             below[:-1] |= above == number
             above = np.where(above >= 0, self.node_parents[above], -1)
         return below[self.node]  # the last place is of no node
+
+    def within(self, members: np.ndarray) -> Self:
+        """The same lift as if nothing but some of its splats [P] bool were seen; the tree's nodes are its things.
+
+        Means and shares of evidence are those of these splats, so that a question tells them from one another.
+        """
+        inner = copy(self)
+        for name in ("seen", "all_seen", "weights", "mean", "thing_means", "principal"):
+            inner.__dict__.pop(name, None)
+        inner._has_feature = self.seen & members
+        inner.evidence = np.where(members, self.evidence, np.float32(0.0))
+        rows = np.flatnonzero(inner._has_feature)
+        rows = rows[:: -(-len(rows) // MOST_SAMPLED) or 1]
+        inner.__dict__["rough_mean"] = mean_direction(self.features[rows], self.norms[rows], self.evidence[rows])
+        if self.node is not None and self.node_views is not None:
+            inner.object, inner.object_views = self.node, self.node_views
+        return inner
 
     def mean_of(self, rows: np.ndarray) -> np.ndarray:
         """[F] f32, the unit mean of the unit features of splats [n] by evidence; of many, of evenly chosen ones."""

@@ -381,10 +381,10 @@ class AskedAs(Value):
     """A text that the encoder's table lacks, and the word of it that stands for the text."""
 
     text: str
-    word: str
-    how: Literal["spelling", "qualifier", "synonym", "number", "head"] = Field(
-        description="what makes them one: letters, a word that says which is meant, meaning, one or several, or the "
-        "head of a phrase"
+    word: str = Field(description="of a part: the part of the thing that it is looked for within")
+    how: Literal["spelling", "qualifier", "synonym", "number", "head", "part"] = Field(
+        description="what makes them one: letters, a word that says which is meant, meaning, one or several, the "
+        "head of a phrase, or a part that it names"
     )
 
 

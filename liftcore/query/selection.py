@@ -183,6 +183,17 @@ def with_things(
     return changed, ", ".join(told)
 
 
+def with_parts(scene: OpenedLift, selected: np.ndarray) -> np.ndarray:
+    """[P] bool: the selected splats and the things of which `SOME` or more is, with parts that other words name."""
+    if scene.object is None or scene.object_views is None or len(scene.object) != len(selected):
+        return selected
+    of_thing, number = scene.seen & (scene.object >= 0), len(scene.object_views)
+    whole, inside = (
+        np.bincount(scene.object[rows], scene.evidence[rows], number) for rows in (of_thing, of_thing & selected)
+    )
+    return selected | (of_thing & np.append((inside > 0) & (inside >= SOME * whole), False)[scene.object])
+
+
 def _counted(count: int, what: str) -> str:
     return f"{count:,} {what}{'' if count == 1 else 's'}"
 

@@ -9,6 +9,8 @@ it. `Vocabulary.find` tries in this order, and says which of them it was:
 4. these of the singular, or of the plural;
 5. the head of a phrase, "the red cup" as "cup", "a photo of two cows" as "cow".
 
+`Vocabulary.find_part` reads a phrase as a part within a thing, "the mug's handle", "handle of the mug", "mug handle".
+
 A word that is there is never replaced by another. What none of this finds is refused, with the nearest words.
 """
 
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
 SYNONYMS = Path(__file__).with_name("synonyms.json")
 SUGGESTED = 5  # words named where one is not known
 _ARTICLES = frozenset({"a", "an", "the"})
+_OWNERS = frozenset({"my", "your", "his", "her", "its", "our", "their", "this", "that"})
 _AROUND = " .,;:!?\"'\u2018\u2019\u201c\u201d()"
 _QUALIFIER = re.compile(r"\s*\([^)]*\).*$")
 _BETWEEN = re.compile(r"[\s\-'\u2019.]+")
@@ -64,7 +67,39 @@ class Wording(NamedTuple):
 
     text: str
     word: str
-    how: str  # "" for the word itself, else "spelling", "qualifier", "synonym", "number" or "head"
+    how: str  # "" for the word itself, else "spelling", "qualifier", "synonym", "number", "head" or "part"
+
+
+class PartPhrase(NamedTuple):
+    """A phrase that names a part of a thing."""
+
+    thing: str
+    part: str
+    sure: bool  # it says so by its grammar; two nouns in a row, as in "mug handle", may mean something else
+
+    def __str__(self) -> str:
+        return f"{self.part} of the {self.thing}"
+
+
+def part_phrases(text: str) -> Iterator[PartPhrase]:
+    """The ways to read a text as a part of a thing, the likeliest first.
+
+    "The cat's tail" and "tail of the cat" say so. Of "a cup of coffee", where no article follows, nothing is a part
+    of the other; nor of what is said of a thing, as "a photo of a cat".
+    """
+    parts = [part.strip(_AROUND) for part in text.casefold().replace("_", " ").split()]
+    parts = parts[1:] if parts and parts[0] in _ARTICLES else parts
+    if len(parts) > _HEAD_WORDS:
+        return
+    for place, part in enumerate(parts[:-1]):
+        if part.endswith(("'s", "\u2019s")):
+            yield PartPhrase(" ".join([*parts[:place], part[:-2]]), " ".join(parts[place + 1 :]), True)
+        follows = parts[place + 1] in _ARTICLES | _OWNERS and place + 2 < len(parts)
+        if part == "of" and place and follows and parts[place - 1] not in _PARTS:
+            yield PartPhrase(" ".join(parts[place + 2 :]), " ".join(parts[:place]), True)
+    if len(parts) > 1 and not any(part in _BEHIND | {"of"} for part in parts):
+        for place in range(len(parts) - 1, 0, -1):
+            yield PartPhrase(" ".join(parts[:place]), " ".join(parts[place:]), False)
 
 
 class Completion(NamedTuple):
@@ -133,6 +168,16 @@ class Vocabulary:
             found = self._look_up(head)
             if found is not None:
                 return Wording(text, found[0], "head")
+        return None
+
+    def find_part(self, text: str) -> PartPhrase | None:
+        """The words of a part and its thing, where a text names both and is no word as a whole; None else."""
+        if self.word_of(text) is not None:
+            return None
+        for phrase in part_phrases(text):
+            thing, part = (self.word_of(name) for name in (phrase.thing, phrase.part))
+            if thing is not None and part is not None:
+                return PartPhrase(thing, part, phrase.sure)
         return None
 
     def word_of(self, text: str) -> str | None:
@@ -326,6 +371,11 @@ def _synonyms() -> dict[str, list[str]]:
             for form in {_key(word), _key(base_of(word))}:
                 found.setdefault(form, []).extend(synonyms)
     return found
+
+
+def shipped_words() -> Vocabulary:
+    """The words of the table that ships."""
+    return _shipped()[0]
 
 
 @cache

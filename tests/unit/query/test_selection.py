@@ -157,3 +157,40 @@ def test_of_a_thing_that_holds_two_what_is_nearest_to_it_is_taken(scene: Scene, 
     found = ask(lifted(scene, rows, object=torch.from_numpy(things), object_views=views), "cat", table)
     assert cut.selected[250:300].mean() < 0.5 < found.selected[250:300].mean()
     assert not found.selected[300:].any()
+
+
+@pytest.fixture
+def handles(scene: Scene, table: TableEncoder) -> Scene:
+    """Two mugs with handles, of which one has two, a cat without, and the handle of nothing."""
+    rows = pictures(table, ["mug"] * 600 + ["cat"] * 300 + ["handle"] * 60 + ["curtain"] * 1200, 0.1)
+    for first in (140, 300, 500):
+        part = slice(first, first + 50)
+        rows[part] = 0.4 * rows[part] + 0.6 * pictures(table, ["handle"] * 50, 0.1)
+    things = torch.from_numpy(np.repeat([0, 1, 2, 3, 4], [200, 400, 300, 60, 1200]).astype(np.int32))
+    return lifted(scene, rows, object=things, object_views=torch.zeros((5, 5), dtype=torch.int32))
+
+
+@pytest.mark.parametrize("phrase", ["mug handle", "handle of the mug", "the mug's handles", "a handle of my mug"])
+def test_phrase_finds_the_part_within_the_thing_alone(phrase: str, handles: Scene, table: TableEncoder) -> None:
+    answer = ask(handles, phrase, table)
+    wanted = np.concatenate([np.arange(first, first + 50) for first in (140, 300, 500)])
+    assert answer.selected[wanted].mean() > 0.9 and not np.delete(answer.selected, wanted).any()
+    (wording,) = answer.wording
+    assert (wording.text, wording.word, wording.how) == (phrase, "handle of the mug", "part")
+    assert answer.present is not False and "Within it" in answer.why and answer.query.text == [phrase]
+    together = answers(handles, [question(handles, Query.of(some), table) for some in ("cat", phrase)])
+    assert (together[1].scores == answer.scores).all() and (together[1].selected == answer.selected).all()
+
+
+def test_part_of_a_thing_without_one_or_of_none_is_not_there(handles: Scene, table: TableEncoder) -> None:
+    for phrase in ("handle of the cat", "the cat's handle", "handle of the teapot"):
+        answer = ask(handles, phrase, table)
+        assert answer.count == 0 and answer.present is False, phrase
+    assert "teapot" in answer.why and "no parts" in answer.why
+    loose = ask(handles, "cat handle", table)  # two nouns in a row, which may mean something else
+    assert loose.count == ask(handles, "handle", table).count > 0 and loose.wording[0].how == "head"
+
+
+def test_phrase_that_a_table_has_as_a_word_is_asked_as_it_is(handles: Scene, table: TableEncoder) -> None:
+    words = TableEncoder("words", ["mug handle", "mug", "handle"], table.encode(["handle", "mug", "cat"]))
+    assert ask(handles, "mug handle", words).wording == ()

@@ -70,6 +70,20 @@ def test_what_is_like_nothing_has_no_words_near_to_it(text: str) -> None:
     assert lvis().find(text) is None and lvis().nearest(text) == ()
 
 
+@pytest.mark.parametrize(
+    ("text", "thing", "part"),
+    [
+        ("the mug's handle", "mug", "handle"), ("handles of the mug", "mug", "handle"),
+        ("mug handle", "mug", "handle"), ("wheel of my old car", None, None),
+        ("cup of tea", None, None), ("a photo of the cat", None, None),
+        ("lamp shade", None, None), ("the red cup", None, None), ("a " * 500, None, None), ("cat", None, None),
+    ],
+)  # fmt: skip
+def test_part_and_thing_of_a_phrase_are_found(text: str, thing: str | None, part: str | None) -> None:
+    found = lvis().find_part(text)
+    assert (found.thing, found.part) == (thing, part) if found else thing is None
+
+
 def test_words_of_a_short_table_are_found_by_meaning() -> None:
     own = Vocabulary(OF_SCENE)
     assert [own.find(text) for text in ("kitten", "teacup", "bull", "wolf")] == [None] * 4
