@@ -47,6 +47,7 @@ from liftcore.query.selection import (
     Rivals,
     contest,
     nearer_than_rivals,
+    part_nodes,
     with_parts,
     with_things,
 )
@@ -421,7 +422,12 @@ def _selected(
     found = found.model_copy(update={"clear": found.clear and standing.first >= LEAST_FIRST})
     if rivals[-1].allowed == 0:
         selected = nearer_than_rivals(scene, selected, rivals[-1])
-    selected, told = with_things(scene, selected, weights, rivals[0])
+    parts = part_nodes(scene, rivals[0])
+    if parts:
+        selected = scene.seen & np.logical_or.reduce([scene.members(node) for node in parts])
+        told = f"levels say different things, so the parts that it names are taken: {', '.join(map(str, parts))}"
+    else:
+        selected, told = with_things(scene, selected, weights, rivals[0])
     if told:
         found = found.model_copy(update={"explanation": f"{found.explanation.removesuffix('.')}; {told}."})
     return found, selected

@@ -318,6 +318,7 @@ class OpenedLift:
         inner.__dict__["rough_mean"] = mean_direction(self.features[rows], self.norms[rows], self.evidence[rows])
         if self.node is not None and self.node_views is not None:
             inner.object, inner.object_views = self.node, self.node_views
+        inner.node_features = None  # of all splats of the nodes
         return inner
 
     def mean_of(self, rows: np.ndarray) -> np.ndarray:

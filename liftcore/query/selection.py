@@ -42,6 +42,7 @@ SAMPLED = 256  # splats of each octave of the ranking that are looked at: a mill
 MOST = 2 / 3  # of a thing: it is mostly selected
 SOME = 1 / 3  # of a thing, below which its mean says nothing of what was asked
 LEAST_FIRST = 0.1  # of the evidence at which the word is the nearest of all, that a clear answer selects
+LEVELS_AGREE = 0.9  # cosine of parts and wholes, about the mean, from which splats say it all: alike, they have .95
 SAME_WORD = 1 - 1e-4  # cosine from which two words of a table are one
 _AT_ONCE = 1 << 10  # splats that are compared with a pack's words at once: what stays in a cache
 
@@ -181,6 +182,36 @@ def with_things(
         changed &= ~left
         told += [f"{_counted(int(left.sum()), 'splat')} of things to which another word is nearer do not"]
     return changed, ", ".join(told)
+
+
+def part_nodes(scene: OpenedLift, rivals: Rivals) -> list[int]:
+    """The parts that a query's words name in a lift whose levels say different things; none where splats know better.
+
+    A splat's feature is the sum of what all levels say, which the words of parts answer with their wholes. A node
+    keeps what its own masks say. So the node that is nearest of all is taken, or the largest node above it that says
+    the same, if the word is among the nearest there, and if it is a part of what says something else. Nodes that are
+    nearer to the words than halfway from that whole to that part are parts of the same name.
+    """
+    facts = scene.metadata.certificate.get("objects") or {}
+    agreement, parents = facts.get("level_agreement"), scene.node_parents
+    if agreement is None or agreement >= LEVELS_AGREE or parents is None or scene.node_features is None:
+        return []
+    vectors = scene.node_features.astype(np.float32)
+    known = np.linalg.norm(vectors, axis=1) > 0
+    scores = np.where(known, (vectors @ rivals.directions.T).max(axis=1), -1.0)
+    node = int(scores.argmax())
+    while parents[node] >= 0 and _about(scene, vectors[parents[node]][None], vectors[node])[0] >= LEVELS_AGREE:
+        node = int(parents[node])
+    whole = int(parents[node])
+    sure = known & (rivals.ahead_of_means(scene, vectors) <= rivals.allowed)
+    if whole < 0 or not known[whole] or not sure[node]:
+        return []
+    others = np.flatnonzero(sure & (scores > (scores[node] + scores[whole]) / 2) & (parents >= 0))
+    found = [node]
+    for other in sorted(others.tolist(), key=lambda one: len(scene.node_path(one))):
+        if not any(one in scene.node_path(other) or other in scene.node_path(one) for one in found):
+            found.append(other)
+    return found
 
 
 def with_parts(scene: OpenedLift, selected: np.ndarray) -> np.ndarray:

@@ -194,3 +194,25 @@ def test_part_of_a_thing_without_one_or_of_none_is_not_there(handles: Scene, tab
 def test_phrase_that_a_table_has_as_a_word_is_asked_as_it_is(handles: Scene, table: TableEncoder) -> None:
     words = TableEncoder("words", ["mug handle", "mug", "handle"], table.encode(["handle", "mug", "cat"]))
     assert ask(handles, "mug handle", words).wording == ()
+
+
+@pytest.mark.parametrize(("agreement", "by_node"), [(0.5, True), (0.95, False)])
+def test_word_of_a_part_takes_its_node_where_levels_disagree(
+    scene: Scene, table: TableEncoder, agreement: float, by_node: bool
+) -> None:
+    rows = pictures(table, ["mug"] * 300 + ["cat"] * 300 + ["curtain"] * 900, 0.1)
+    rows[:60] = 0.85 * rows[:60] + 0.15 * pictures(table, ["handle"] * 60, 0.1)  # the sum of both levels
+    own = pictures(table, ["mug", "cat", "curtain", "handle", "mug"], 0.02)
+    tree = {
+        "object": np.repeat([0, 1, 2], [300, 300, 900]), "object_views": np.zeros((3, 5)),
+        "node": np.repeat([3, 4, 1, 2], [60, 240, 300, 900]), "node_parents": np.array([-1, -1, -1, 0, 0]),
+        "node_views": np.zeros((5, 5)),
+    }  # fmt: skip
+    fields: dict[str, Any] = {name: torch.from_numpy(values.astype(np.int32)) for name, values in tree.items()}
+    fields |= {"node_confidence": torch.ones(5), "node_features": torch.from_numpy(own).half()}
+    facts = {"certificate": {"objects": {"level_agreement": agreement}}}
+    told = lifted(scene, rows, metadata=scene.lift.metadata.model_copy(update=facts), **fields)
+    found = ask(told, Query.of(("handle",), absent="keep"), table)
+    assert (np.flatnonzero(found.selected).tolist() == list(range(60))) == by_node
+    assert ("parts that it names" in found.threshold.explanation) == by_node
+    assert np.flatnonzero(ask(told, "mug", table).selected)[[0, -1]].tolist() == [0, 299]
