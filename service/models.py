@@ -769,7 +769,7 @@ class AskedForTree(AskedForNodes):
         None,
         pattern=UP,
         description="with relations: the direction against gravity in the frame of the splats, x,y,z, or cameras, "
-        "where photos were taken upright; left out, nothing is on, under or beside another",
+        "where photos were taken upright; left out, that of the lift, without which nothing is on, under or beside",
     )
 
 

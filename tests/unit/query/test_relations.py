@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 import pytest
 import torch
@@ -36,8 +38,8 @@ THINGS = {
 ROWS = np.split(np.arange(sum(map(len, THINGS.values()))), np.cumsum([len(one) for one in THINGS.values()])[:-1])
 
 
-def scene(turn: np.ndarray) -> Splats:
-    means = np.concatenate(list(THINGS.values())) @ turn.T
+def scene(turn: np.ndarray, things: Iterable[np.ndarray] = tuple(THINGS.values())) -> Splats:
+    means = np.concatenate(list(things)) @ turn.T
     count = len(means)
     return Splats(
         means=torch.tensor(means).float(),
@@ -88,6 +90,18 @@ def circling(turn: np.ndarray, *, roll: float = 0.0, over: float = np.pi) -> lis
         viewmat[:3, :3] = np.stack([*sides, forward]) @ turn.T
         cameras.append(Camera.pinhole("", 64, 48, 50.0, 50.0, 32.0, 24.0, viewmat))
     return cameras
+
+
+def test_what_stands_before_a_slanting_wall_is_not_inside_of_it() -> None:
+    side, height = np.meshgrid(np.arange(-5, 5, STEP), np.arange(0, 6, STEP))
+    wall = np.stack([side, side, height], axis=-1).reshape(-1, 3)  # its box is as deep as it is wide
+    cup = shell((1, -1.5, 2), (1.5, -1, 2.5))
+    diagonal = np.array([[1, -1, 0], [1, 1, 0], [0, 0, 2**0.5]]) / 2**0.5
+    hut = shell((-4, -4, 0), (4, 4, 5)) @ diagonal.T
+    for around, expected in ((wall, False), (hut, True)):
+        splats, rows = scene(np.eye(3), (around, cup)), [np.arange(len(around)), len(around) + np.arange(len(cup))]
+        told = relations(splats, rows, np.ones(splats.count), WorldFrame())
+        assert any(one.relation == "inside" for one in told) == expected
 
 
 @pytest.mark.parametrize("over", [2 * np.pi, np.pi / 2, 0.6])
