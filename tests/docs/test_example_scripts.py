@@ -11,9 +11,51 @@ from PIL import Image
 import liftcore as lc
 from liftcore.text.table import TableEncoder
 from liftcore.values.pack import write_pack
+from tests.api import tiny_scene
 from tests.scenes import write_scene
 
 from .readme import ROOT
+
+
+def run(script: str, *arguments: object) -> str:
+    """What an example prints."""
+    command = [sys.executable, str(ROOT / "examples" / script), *map(str, arguments)]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+
+@pytest.fixture
+def tiny(tmp_path: Path) -> Path:
+    """A folder with the files of the tiny scene, whose cluster k is class k and word k, and its lift."""
+    scene = tiny_scene.make_scene()
+    for name in ("splats.ply", "cameras.json", "features.safetensors", "table.safetensors"):
+        (tmp_path / name).write_bytes(getattr(scene, name.partition(".")[0]))
+    (tmp_path / "labels").mkdir()
+    for view, labels in tiny_scene.labels().items():
+        Image.fromarray(labels[0].astype(np.uint8)).save(tmp_path / "labels" / f"{view}.png")
+    paths = (tmp_path / "splats.ply", tmp_path / "cameras.json", [tmp_path / "features.safetensors"])
+    lc.lift_files(*paths).save(tmp_path / "lift.safetensors")
+    return tmp_path
+
+
+@pytest.mark.slow
+def test_label_voting_gives_each_splat_its_class_and_how_sure_it_is(tiny: Path) -> None:
+    run("label_voting.py", tiny / "splats.ply", tiny / "cameras.json", tiny / "labels", tiny / "voted.ply")
+    columns = lc.read_splats(tiny / "voted.ply").extras
+    expected = np.repeat(np.arange(3), tiny_scene.SPLATS_A_CLUSTER)
+    assert np.array_equal(np.asarray(columns["class_id"]), expected)
+    assert (np.asarray(columns["share"]) > 0.5).all() and (np.asarray(columns["entropy"]) < np.log(2)).all()
+
+
+@pytest.mark.slow
+def test_where_is_it_tells_places_before_the_camera_that_asks(tiny: Path) -> None:
+    asked = (tiny / "lift.safetensors", "lamp", "--view", "middle", "--table", tiny / "table.safetensors")
+    x, y, z = (float(word) for word in run("where_is_it.py", *asked).split() if word[0] in "+-")
+    assert np.allclose([x, y, z], [1.2, 0.0, tiny_scene.DISTANCE], atol=0.25)
+
+
+@pytest.mark.slow
+def test_training_loop_finds_the_red_blob_alone() -> None:
+    assert run("training_loop.py") == "200 of 200 red splats, 0 others\n"
 
 
 @pytest.mark.slow
@@ -22,8 +64,7 @@ def test_lift_and_mask_writes_masks_of_all_views_and_the_scores(tmp_path: Path) 
     words = TableEncoder("words", ["red", "green", "blue"], np.eye(3, 6, dtype=np.float32))
     write_pack(tmp_path / "with_words.safetensors", lc.read_features(pack), {"encoder": "random"}, table=words)
     pack = tmp_path / "with_words.safetensors"
-    script = [sys.executable, str(ROOT / "examples" / "lift_and_mask.py")]
-    subprocess.run([*script, str(splats), str(cameras), str(pack), "red", str(tmp_path / "out")], check=True)
+    run("lift_and_mask.py", splats, cameras, pack, "red", tmp_path / "out")
     for name, camera in lc.read_cameras(cameras).items():
         mask = np.asarray(Image.open(tmp_path / "out" / "masks" / f"{name}.png"))
         assert mask.shape == (camera.height, camera.width) and set(np.unique(mask)) <= {0, 255}
