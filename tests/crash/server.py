@@ -10,14 +10,13 @@ from __future__ import annotations
 import argparse
 import os
 import signal
-import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from service.app import create_app, job_limits
-from service.commands.serve import keep_pauses_short, server_of
+from service.commands.serve import bind, keep_pauses_short, server_of
 from service.query_client import Frame, QueryClient
 from service.settings import ServiceSettings
 from service.store.files import DataDirectory
@@ -119,7 +118,7 @@ def main() -> None:
     command = stand_in(given.behaviour) if given.behaviour else CHILD
     runner = Supervisor(store, job_limits(settings), command=command)
     app = create_app(settings, store, runner, cast("QueryClient", NoQueries()))
-    listener = socket.create_server(("127.0.0.1", 0))
+    listener = bind("127.0.0.1", 0)
     keep_pauses_short()
     server_of(app, settings).run(sockets=[listener])
     store.close()
