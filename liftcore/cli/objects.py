@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import Parser, add_encoder, add_world, place, sides_of, text_encoder, world_of
+from liftcore.cli.options import Parser, add_encoder, add_splats, add_world, place, sides_of, text_encoder, world_of
 from liftcore.cli.query import made_from
 from liftcore.cli.reply import free_outputs, place_of, reply, write_files
 from liftcore.cli.segment import read_words
@@ -35,18 +36,20 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--up-of-cameras", action="store_true", help=held)
     parser.add_argument("--features", action="store_true", help="with --json: each one's mean feature, too")
     parser.add_argument("--csv", type=Path, metavar="CSV", help="write the list as a table")
-    parser.add_argument("--splats", type=Path, metavar="FOLDER", help="write one PLY an object, object-ID.ply")
+    parser.add_argument("--into", type=Path, metavar="FOLDER", help="write one PLY an object, object-ID.ply")
+    add_splats(parser)
 
 
 def run(options: argparse.Namespace) -> int:
     """List the objects, and write what was asked for."""
+    _read_splats(options)
     files = {"csv": options.csv} if options.csv else {}
     given = [path for path in (options.lift, options.table, options.vocabulary) if path]
     free_outputs(files, given)
     from liftcore import Scene
 
-    scene = Scene(options.lift, world=world_of(options))
-    if files or options.splats:
+    scene = Scene(options.lift, splats=options.splats, world=world_of(options))
+    if files or options.into:
         free_outputs(files, made_from(scene))
     if options.tree:
         return _tree(options, scene)
@@ -61,14 +64,23 @@ def run(options: argparse.Namespace) -> int:
     ]
     document |= {"explanation": found.explanation, "objects": objects}
     exports: dict[str, Any] = {"csv": partial(scene.export, source=found)}
-    if options.splats:
+    if options.into:
         for one in found.objects:
             name = f"object-{one.id}"
-            files[name] = check_output(options.splats / f"{name}.ply", [*given, *made_from(scene)], "ply")
+            files[name] = check_output(options.into / f"{name}.ply", [*given, *made_from(scene)], "ply")
             exports[name] = partial(scene.export, source=one.id)
     document["files"] = write_files(files, exports)
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
+
+
+def _read_splats(options: argparse.Namespace) -> None:
+    """Take ``--splats`` with a folder, as releases before called ``--into``, for that."""
+    folder = options.splats
+    if not isinstance(folder, Path) or options.into or folder.suffix or (folder / "meta.json").is_file():  # of a SOG
+        return
+    print("splatlift: --splats FOLDER is now --into FOLDER; the old name goes with the next release", file=sys.stderr)
+    options.into, options.splats = folder, None
 
 
 def named_catalogue(options: argparse.Namespace, scene: Scene) -> tuple[TextEncoder | None, Catalogue]:
@@ -95,10 +107,10 @@ def _tree(options: argparse.Namespace, scene: Scene) -> int:
     related = options.relations or up is not None or options.up is not None
     answer = scene.tree(words, encoder=encoder, relations=related, up=up)
     files, exports = dict[str, Any](), dict[str, Any]()
-    for one in answer.nodes if options.splats else ():
+    for one in answer.nodes if options.into else ():
         name = "-".join(["object", *map(str, one.path)])
         given = [path for path in (options.lift, options.table, options.vocabulary) if path]
-        files[name] = check_output(options.splats / f"{name}.ply", [*given, *made_from(scene)], "ply")
+        files[name] = check_output(options.into / f"{name}.ply", [*given, *made_from(scene)], "ply")
         exports[name] = partial(scene.export, source=one.id)
     document: dict[str, Any] = {"encoder": None if encoder is None else encoder.name}
     document |= {"answer": answer.model_dump(mode="json"), "files": write_files(files, exports)}

@@ -87,12 +87,16 @@ def document_bytes(labels: Labels) -> bytes:
     return json.dumps(labels.document, ensure_ascii=False, indent=1).encode() + b"\n"
 
 
+# What JSON leaves as it is, and readers of lines take for the end of one
+LINE_ENDS = {ord(one): f"\\u{ord(one):04x}" for one in "\x85\u2028\u2029"}
+
+
 def document_lines(labels: Labels) -> bytes:
     """The instances, or the nodes where there are any, as JSON Lines: a line each, with all that is said of it."""
     names = ("format", "made_by", "frame", "world", "unit")
     whole = {name: labels.document[name] for name in names if name in labels.document}
     listed = labels.document.get("nodes") or labels.document.get("instances", [])
-    rows = (json.dumps(one | whole, ensure_ascii=False) for one in listed)
+    rows = (json.dumps(one | whole, ensure_ascii=False).translate(LINE_ENDS) for one in listed)
     return "".join(f"{row}\n" for row in rows).encode()
 
 

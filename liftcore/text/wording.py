@@ -39,8 +39,10 @@ _BETWEEN = re.compile(r"[\s\-'\u2019.]+")
 _LAST = frozenset({"here", "there", "please", "now", "too"})  # words behind a question
 _BEHIND = frozenset({
     "on", "in", "with", "at", "under", "near", "by", "beside", "behind", "from", "for", "that", "which", "who", "to",
-    "made", "is", "are", "and", "or", "without", "over", "inside",
+    "made", "is", "are", "and", "or", "without", "over", "inside", "next", "above", "below", "beneath", "underneath",
+    "between", "among", "against", "around", "across", "along", "atop", "opposite", "close", "outside", "upon",
 })  # fmt: skip
+_PLACED = ("ing", "ed", "left", "right")  # ends of what stands between a thing and where it is, as in "sitting on"
 # What is said of another thing, as in "a piece of pizza".
 _PARTS = frozenset({
     "photo", "photos", "photograph", "picture", "pictures", "image", "images", "piece", "pieces", "slice", "slices",
@@ -334,7 +336,10 @@ def _heads(text: str) -> Iterator[str]:
     for some in (parts[:behind], parts[behind + 1 :]):
         of = [place for place, part in enumerate(some) if part == "of" and 0 < place < len(some) - 1]
         left, right = (some[: of[0]], some[of[0] + 1 :]) if of else (some, [])
-        for side in (right, left) if of and left[-1] in _PARTS else (left, right):
+        sides = (right, left) if of and left[-1] in _PARTS else (left, right)
+        if len(left) > 1 and left[-1].endswith(_PLACED) and (of or behind < len(parts)):
+            sides = (left, left[:-1], right)
+        for side in sides:
             for first in range(max(0, len(side) - _HEAD_WORDS), len(side)):
                 yield " ".join(side[first:])
     for part in parts:

@@ -326,6 +326,7 @@ def test_any_other_notation_is_refused(notation: str) -> None:
 @pytest.mark.parametrize("notation", [
     "", ":1,2", "v:1.5,2", "v:1", "splat:-1", "region:v:1", "splat:" + "9" * 5000, "v:box:1,2,3", "v:box:1,2,3,4,5,6",
     "v:box:nan,2,3,4", "v:box:1,2,3,inf", "v:box:", "v:stroke:1,2,3", "v:stroke:1,2,3,4,", "v:stroke:1;2,3,4",
+    "v:box:3,4", "v:stroke:3,4",
 ])  # fmt: skip
 def test_what_points_nowhere_is_refused(notation: str) -> None:
     with pytest.raises(InvalidQuery, match="like"):

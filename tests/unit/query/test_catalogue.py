@@ -84,7 +84,7 @@ def test_the_command_lists_the_tree_and_writes_its_nodes_by_their_paths(
     scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with_parts(scene).save(tmp_path / "parts.lift.safetensors")
-    command = ["objects", str(tmp_path / "parts.lift.safetensors"), "--tree", "--splats", str(tmp_path / "things")]
+    command = ["objects", str(tmp_path / "parts.lift.safetensors"), "--tree", "--into", str(tmp_path / "things")]
     assert main([*command, "--up", "0", "-1", "0"]) == 0
     told = capsys.readouterr().out
     assert "3 objects with 2 parts\n" in told and "3, part: " in told
@@ -141,11 +141,17 @@ def test_the_command_lists_names_and_writes_them(
     files = ["--csv", str(tmp_path / "things.csv"), "--splats", str(tmp_path / "things")]
     named = ["--vocabulary", str(tmp_path / "words.safetensors"), "--features", "--json"]
     assert main(["objects", str(tiny_lift), *named, *files]) == 0
-    told = json.loads(capsys.readouterr().out)
+    printed = capsys.readouterr()
+    assert "--splats FOLDER is now --into FOLDER" in printed.err
+    told = json.loads(printed.out)
     assert {one["name"] for one in told["objects"]} == set(WORDS) and len(told["objects"][0]["feature"]) == CHANNELS
     assert told["answer"]["count"] == 3 and told["answer"]["objects"][2]["feature"] == told["objects"][2]["feature"]
     assert (tmp_path / "things.csv").read_text().count("\n") == 4
     assert sorted(path.name for path in (tmp_path / "things").iterdir()) == [f"object-{k}.ply" for k in range(3)]
+    (splats,) = tiny_lift.parent.glob("*.ply")
+    again = ["--splats", str(splats), "--into", str(tmp_path / "again")]
+    assert main(["objects", str(tiny_lift), *again]) == 0 and "--into FOLDER" not in capsys.readouterr().err
+    assert len(list((tmp_path / "again").iterdir())) == 3
     assert main(["objects", str(tiny_lift)]) == 0 and "3 objects" in capsys.readouterr().out
     assert main(["objects", str(tiny_lift), "--json"]) == 0
     plain = json.loads(capsys.readouterr().out)

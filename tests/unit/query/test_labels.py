@@ -10,7 +10,7 @@ import pytest
 
 from liftcore.cli import main
 from liftcore.errors import InvalidQuery
-from liftcore.io.labels import Labels
+from liftcore.io.labels import Labels, document_lines
 from liftcore.io.splats import read_labels, read_splats
 from liftcore.query.coco import run_lengths
 from liftcore.query.question import Query
@@ -100,6 +100,9 @@ def test_lines_and_masks_of_a_tree_have_its_parts(parted: Scene, tmp_path: Path)
     parted.export(tmp_path / "o.jsonl", tree)
     lines = [json.loads(line) for line in (tmp_path / "o.jsonl").read_text(encoding="utf-8").splitlines()]
     assert [one["path"] for one in lines] == [[1], [2], [3], [1, 4], [1, 5]]
+    written = document_lines(Labels({}, {"instances": [{"name": "a\u2028b\x85\u2029"}]}))
+    (line,) = written.decode().splitlines()
+    assert json.loads(line)["name"] == "a\u2028b\x85\u2029"
     parted.export(tmp_path / "m.json", tree)
     document = json.loads((tmp_path / "m.json").read_text(encoding="utf-8"))
     assert document["categories"] == [{"id": 0, "name": "object"}]

@@ -43,7 +43,10 @@ def test_every_word_of_a_table_is_asked_as_it_is() -> None:
         ("slice of pizza", "pizza", "head"), ("a pizza slice", "pizza", "head"), ("man with a hat", "person", "head"),
         ("the cat on the mat", "cat", "head"), ("where is the cat?", "cat", "head"),
         ("is there a dog here", "dog", "head"), ("the fish's tail", "fish", "head"),
-        ("wooden boat", "boat", "head"),
+        ("wooden boat", "boat", "head"), ("the small cow next to the plane", "cow", "head"),
+        ("cat sitting on the table", "cat", "head"), ("the cow left of the plane", "cow", "head"),
+        ("teapot above the pizza", "teapot", "head"), ("a bird flying over the boat", "bird", "head"),
+        ("earring on the table", "earring", "head"),
     ],
 )  # fmt: skip
 def test_text_is_asked_as_the_word_that_stands_for_it(text: str, word: str, how: str) -> None:
