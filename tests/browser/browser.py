@@ -138,6 +138,10 @@ class Browser:
         found = self.value("axe.run(document).then(all => all.violations)")
         return {rule["id"]: [node["html"] for node in rule["nodes"]] for rule in found if rule["impact"] != "minor"}
 
+    def screenshot(self) -> str:
+        """The window as a PNG, in base64."""
+        return self._call("Page.captureScreenshot", format="png")["data"]
+
     def give(self, selector: str, files: list[Path]) -> None:
         """Choose files in an input for them."""
         node = self._call("DOM.getDocument")["root"]["nodeId"]

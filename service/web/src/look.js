@@ -15,6 +15,7 @@ const LAYERS = {
   photo: "The photo of the view, where one was brought.",
   depth: "The depth of the splats: near is bright.",
 };
+const ENDS = { evidence: ["little", "much"], agreement: ["not", "well"], confidence: ["not surely", "surely"], depth: ["far", "near"] }; // of the scale
 const MODES = ["scene", "both", "view"];
 const SHIFTED = 5; // pixels that the pointer may move in a click
 const IN_VIEWS = ["rgb", "pca", "cluster", "confidence", "depth"]; // that the service draws of a view
@@ -40,6 +41,10 @@ export class Look {
 
   get what() {
     return document.querySelector("input[name=layer]:checked").value;
+  }
+
+  get title() {
+    return document.querySelector("input[name=layer]:checked + span").textContent;
   }
 
   // The views of a lift; the first page is awaited, the others come after it.
@@ -107,6 +112,8 @@ export class Look {
     document.querySelector(`input[name=layer][value=${what}]`).checked = true;
     at("layer-words").textContent = LAYERS[what];
     at("cover-label").hidden = what === "rgb";
+    at("layer-scale").hidden = !Object.hasOwn(ENDS, what);
+    if (Object.hasOwn(ENDS, what)) at("layer-scale").querySelectorAll("span").forEach((end, place) => { end.textContent = ENDS[what][place]; });
   }
 
   async choose(what) {

@@ -439,17 +439,37 @@ function keyed(event, built) {
   event.preventDefault();
 }
 
+// What is on the screen, with a legend below it: words by their colours, a layer by its name.
 async function shot() {
-  if (look.mode !== "view" && viewer) return viewer.picture();
+  const parts = look.mode !== "view" && viewer ? [viewer.frameNow()] : [at("render"), at("over"), at("mask"), at("outline")].filter(part => !part.hidden);
+  const [wide, high] = [parts[0].naturalWidth ?? parts[0].width, parts[0].naturalHeight ?? parts[0].height];
+  const legend = [...ask.painted().map(({ question }) => [label(question), question.colour]), ...names.entries(), ...(look.what === "rgb" ? [] : [[look.title, null]])];
   const canvas = document.createElement("canvas");
-  const image = at("render");
-  canvas.width = image.naturalWidth;
-  canvas.height = image.naturalHeight;
   const context = canvas.getContext("2d");
-  for (const part of [image, at("over"), at("mask"), at("outline")]) {
-    if (part.hidden) continue;
-    context.globalAlpha = part === image ? 1 : Number(part.style.opacity || 1);
-    context.drawImage(part, 0, 0, canvas.width, canvas.height);
+  const size = Math.max(14, Math.round(wide / 60));
+  const font = `${size}px Inter, sans-serif`;
+  context.font = font;
+  const places = [];
+  let [x, y] = [size, high + size * 1.5];
+  for (const [name, colour] of legend) {
+    const long = context.measureText(name).width + size * (colour ? 2.6 : 1.2);
+    if (x > size && x + long > wide) [x, y] = [size, y + size * 1.7];
+    places.push([name, colour, x, y]);
+    x += long;
+  }
+  Object.assign(canvas, { width: wide, height: legend.length ? Math.ceil(y + size) : high });
+  context.fillStyle = ground();
+  context.fillRect(0, 0, canvas.width, canvas.height);
+  for (const part of parts) {
+    context.globalAlpha = part === parts[0] ? 1 : Number(part.style.opacity || 1);
+    context.drawImage(part, 0, 0, wide, high);
+  }
+  Object.assign(context, { globalAlpha: 1, font, textBaseline: "middle" });
+  for (const [name, colour, left, middle] of places) {
+    context.fillStyle = colour ?? "#edf0f4";
+    if (colour) context.fillRect(left, middle - size / 2, size, size);
+    context.fillStyle = "#edf0f4";
+    context.fillText(name, left + (colour ? size * 1.5 : 0), middle);
   }
   return new Promise(done => canvas.toBlob(done, "image/png"));
 }

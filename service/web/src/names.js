@@ -127,6 +127,11 @@ export class Names {
     return this.shown ? this.layer : null;
   }
 
+  // The words that are shown, with their colours.
+  entries() {
+    return this.shown ? this.found.found.filter(({ value }) => this.is(value)).map(({ word, colour }) => [word, hex(colour)]) : [];
+  }
+
   // Where words stand, for their labels: points, which are boxes without a size.
   boxes() {
     const spot = this.spot?.point && this.spot.words.length && !at("panel-name").hidden

@@ -419,9 +419,10 @@ export class Viewer {
     this.draw();
   }
 
-  picture() {
+  // The canvas as it is now.
+  frameNow() {
     this.renderer.render(this.scene, this.camera);
-    return new Promise(done => this.canvas.toBlob(done, "image/png"));
+    return this.canvas;
   }
 }
 
