@@ -94,8 +94,8 @@ def circling(turn: np.ndarray, *, roll: float = 0.0, over: float = np.pi) -> lis
 
 def test_what_stands_before_a_slanting_wall_is_not_inside_of_it() -> None:
     side, height = np.meshgrid(np.arange(-5, 5, STEP), np.arange(0, 6, STEP))
-    wall = np.stack([side, side, height], axis=-1).reshape(-1, 3)  # its box is as deep as it is wide
-    cup = shell((1, -1.5, 2), (1.5, -1, 2.5))
+    wall = np.stack([0.3 * side, side, height], axis=-1).reshape(-1, 3)  # its box is as deep as a cupboard
+    cup = shell((0.8, -0.2, 2), (1.2, 0.2, 2.4))
     diagonal = np.array([[1, -1, 0], [1, 1, 0], [0, 0, 2**0.5]]) / 2**0.5
     hut = shell((-4, -4, 0), (4, 4, 5)) @ diagonal.T
     for around, expected in ((wall, False), (hut, True)):
