@@ -6,7 +6,7 @@ Of thing a and thing b, with heights along ``up`` and the ground at right angles
 | relation | when |
 |---|---|
 | a is touching b | two of their splats touch (`touching`) |
-| a is inside b | its splats lie in b's box, its middle in b's hull, and b on SIDES of the six sides of that |
+| a is inside b | its splats lie in b's box, and b lies in AROUND of the directions from its middle |
 | a is on b | b lies below COVERED of its footprint, and it touches b or begins NEAR above |
 | b is under a | a is on it, or begins higher above it |
 | a is beside b | their heights overlap by half, and on the ground they are less apart than the smaller is wide |
@@ -38,8 +38,9 @@ if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
 
 NEAR = 0.15  # of its own height: what stands on something sinks in, or floats, by less
-SIDES = 5  # of six, on which what surrounds a thing lies: a cup in a bowl has nothing above it
-DIRECTIONS = 128  # in which what surrounds a thing must go beyond its middle
+AROUND = 0.66  # of all directions, in which what surrounds a thing lies: a bowl has nothing above, a wall before it
+DIRECTIONS = 128  # evenly over the sphere
+NEARLY = 0.966  # cosine, 15 degrees, of which a wall is seen in 0.63 of all directions
 WITHIN = 0.9  # of a thing's splats, in the box of what it is inside of
 COVERED = 0.3  # of a thing's footprint, above what it stands on: a chair stands on four small places
 MOST_THINGS = 64
@@ -133,7 +134,7 @@ def _of_pair(splats: Splats, a: int, b: int, one: _Thing, other: _Thing, *, know
         yield Relation(node=a, other=b, relation="touching", gap=gap, overlap=None)
     for x, y, small, large in ((a, b, one, other), (b, a, other, one)):
         share = float(((small.places >= large.low) & (small.places <= large.high)).all(axis=1).mean())
-        if share >= WITHIN and _sides(small, large) >= SIDES and _hull_holds(large, small):
+        if share >= WITHIN and _around(small, large) >= AROUND:
             yield Relation(node=x, other=y, relation="inside", gap=gap, overlap=share)
             return
     if not known:
@@ -163,22 +164,15 @@ def _nearest(splats: Splats, one: _Thing, other: _Thing) -> tuple[float, bool]:
     return float(distances[closest[0]]), bool(touches.any())
 
 
-def _sides(small: _Thing, large: _Thing) -> int:
-    """On how many of the six sides of the middle of one thing another lies."""
-    offsets = large.places - (small.low + small.high) / 2
-    side = np.abs(offsets).argmax(axis=1)
-    signs = offsets[np.arange(len(offsets)), side] > 0
-    return int(np.unique(2 * side + signs).size)
-
-
-def _hull_holds(large: _Thing, small: _Thing) -> bool:
-    """Whether in each of DIRECTIONS some of a thing lies beyond the middle of another: of a wall it does not."""
+def _around(small: _Thing, large: _Thing) -> float:
+    """In what share of DIRECTIONS from the middle of one thing some splat of another lies, to within NEARLY."""
     place = np.arange(DIRECTIONS) + 0.5
     height, angle = 1 - 2 * place / DIRECTIONS, np.pi * (1 + 5**0.5) * place  # a spiral over the sphere
-    around = np.sqrt(1 - height**2)
-    directions = np.stack([around * np.cos(angle), around * np.sin(angle), height])
+    ring = np.sqrt(1 - height**2)
+    directions = np.stack([ring * np.cos(angle), ring * np.sin(angle), height])
     offsets = large.places - (small.low + small.high) / 2
-    return bool(((offsets @ directions).max(axis=0) > 0).all())
+    offsets /= np.linalg.norm(offsets, axis=1, keepdims=True).clip(min=1e-30)
+    return float(((offsets @ directions).max(axis=0) >= NEARLY).mean())
 
 
 def _above(upper: _Thing, lower: _Thing) -> tuple[float, float, float]:
