@@ -6,6 +6,9 @@ finds what is most like it; beside other words such a word wins hardly a splat t
 their own. So a word is there if it is the nearest of all words for at least a quarter of its answer, by evidence, and
 if reference words do not say that it is not (`liftcore.query.presence`; the words themselves, where they are many).
 Words that are not there name nothing.
+
+The lift's tree has its say: a word that names parts, where levels say different things, names their nodes
+(`liftcore.query.selection.part_nodes`); and what has no word in a node gets the one that names most of the node.
 """
 
 from __future__ import annotations
@@ -27,6 +30,7 @@ from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.presence import LEAST_WORDS, References, judge, references_beside
 from liftcore.query.question import BestWord, FoundWords, NamedSplats, Query
 from liftcore.query.scores import cosines, norms_of
+from liftcore.query.selection import Rivals, levels_disagree, part_nodes
 from liftcore.query.terms import Example
 from liftcore.query.threshold import find_threshold
 from liftcore.runtime.one_line import one_line
@@ -146,18 +150,24 @@ def segment(
     if references is None:
         many = len(words) >= LEAST_WORDS
         references = References(words, unit) if many else references_beside(unit, scene.metadata.text_space)
-    for row, scores in _scores(scene, rows, np.flatnonzero(shares >= LEAST_OWN).tolist()):
+    parts = _parts(scene, unit, references)
+    for row, scores in _scores(scene, rows, np.flatnonzero((shares >= LEAST_OWN) | parts.any(axis=1)).tolist()):
         if (
             isinstance(references, References)
             and judge(scene, words[row], unit[row], scores, references).present is False
         ):
+            parts[row] = False
             continue
-        named.take(row, np.where(scene.seen & (scores >= thresholds[row]), scores, -np.inf))
+        if shares[row] >= LEAST_OWN and not parts[row].any():
+            named.take(row, np.where(scene.seen & (scores >= thresholds[row]), scores, -np.inf))
     labels = np.where(named.score > -np.inf, named.row, NO_WORD).astype(np.int32)
-    other = np.where(named.row == nearest.row, nearest.second, nearest.score)
-    score = np.where(labels != NO_WORD, named.score, 0.0).astype(np.float32)
+    labels = _by_nodes(scene, labels, weights, parts)
+    score = np.zeros(len(labels), np.float32)
+    for row, scores in _scores(scene, rows, np.unique(labels[labels != NO_WORD]).tolist()):
+        score[labels == row] = scores[labels == row]
+    other = np.where(labels == nearest.row, nearest.second, nearest.score)
     apart = (labels != NO_WORD) & (other > -np.inf)
-    margin = np.subtract(named.score, other, out=np.zeros_like(score), where=apart)
+    margin = np.subtract(score, other, out=np.zeros_like(score), where=apart)
     groups = [
         (float(weights[mine].sum() / weights.sum()), row, mine)
         for row in np.unique(labels[labels != NO_WORD]).tolist()
@@ -173,7 +183,7 @@ def segment(
             colour=palette[value],
             splats=len(mine),
             share=share,
-            score=float(np.average(named.score[mine], weights=weights[mine])),
+            score=float(np.average(score[mine], weights=weights[mine])),
             margin=float(np.average(margin[mine], weights=weights[mine])),
             threshold=float(thresholds[row]),
             box=trimmed_box(scene.splats.positions(mine), weights[mine]),
@@ -181,6 +191,38 @@ def segment(
         for value, (share, row, mine) in enumerate(groups, 1)
     )
     return Segmentation(words, labels, score, margin, found)
+
+
+def _parts(scene: OpenedLift, unit: np.ndarray, references: References | str | None) -> np.ndarray:
+    """[n, N] bool: the nodes of parts that each of some words [n, F] f32 names."""
+    found = np.zeros((len(unit), 0 if scene.node_parents is None else len(scene.node_parents)), np.bool_)
+    if isinstance(references, References) and levels_disagree(scene):
+        for row in range(len(unit)):
+            found[row, part_nodes(scene, Rivals.among(references, unit[row : row + 1]))] = True
+    return found
+
+
+def _by_nodes(scene: OpenedLift, labels: np.ndarray, weights: np.ndarray, parts: np.ndarray) -> np.ndarray:
+    """[P] i32: labels after what nodes say: of parts that a word names, and of splats without a word.
+
+    Args:
+        labels: [P] i32, NO_WORD for none. weights: [P] f64. parts: [n, N] bool, the nodes that words name.
+    """
+    if scene.node is None or scene.node_parents is None:
+        return labels
+    changed = labels.copy()
+    for node in sorted(np.flatnonzero(parts.any(axis=0)).tolist(), key=lambda one: len(scene.node_path(one))):
+        changed[scene.seen & scene.members(node)] = int(parts[:, node].argmax())
+    own, words = np.where(scene.seen, scene.node, -1), len(parts)
+    within = own >= 0
+    shape = len(scene.node_parents), words + 1
+    places = own[within].astype(np.int64) * shape[1] + np.where(changed < 0, words, changed)[within]
+    table = np.bincount(places, weights[within], shape[0] * shape[1]).reshape(shape)
+    word = table[:, :words].argmax(axis=1)
+    most = 2 * table[np.arange(len(table)), word] >= np.maximum(table.sum(axis=1), 1e-30)
+    empty = within & (changed == NO_WORD) & most[own]
+    changed[empty] = word[own[empty]]
+    return changed
 
 
 class _Nearest:

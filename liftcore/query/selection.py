@@ -184,6 +184,12 @@ def with_things(
     return changed, ", ".join(told)
 
 
+def levels_disagree(scene: OpenedLift) -> bool:
+    """Tell whether masks of parts say something else than masks of their wholes: a splat's feature is their sum."""
+    agreement = (scene.metadata.certificate.get("objects") or {}).get("level_agreement")
+    return agreement is not None and agreement < LEVELS_AGREE
+
+
 def part_nodes(scene: OpenedLift, rivals: Rivals) -> list[int]:
     """The parts that a query's words name in a lift whose levels say different things; none where splats know better.
 
@@ -192,9 +198,8 @@ def part_nodes(scene: OpenedLift, rivals: Rivals) -> list[int]:
     the same, if the word is among the nearest there, and if it is a part of what says something else. Nodes that are
     nearer to the words than halfway from that whole to that part are parts of the same name.
     """
-    facts = scene.metadata.certificate.get("objects") or {}
-    agreement, parents = facts.get("level_agreement"), scene.node_parents
-    if agreement is None or agreement >= LEVELS_AGREE or parents is None or scene.node_features is None:
+    parents = scene.node_parents
+    if parents is None or scene.node_features is None or not levels_disagree(scene):
         return []
     vectors = scene.node_features.astype(np.float32)
     known = np.linalg.norm(vectors, axis=1) > 0

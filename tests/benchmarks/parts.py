@@ -116,7 +116,7 @@ def measured(scene: Scene, truth: Truth, owners: np.ndarray) -> dict[str, Any]:
         "nodes": facts["nodes"], "largest": facts["largest_share"], "agreement": facts["level_agreement"],
         "thing": float(best_nodes(scene, truth, truth.objects.numpy()).mean()),
         "part": float(parts.mean()), "worst part": float(parts.min()), "clicks": len(clicks["best"]),
-        **{name: float(np.mean(values)) for name, values in clicks.items()},
+        **{name: float(np.mean(values)) for name, values in clicks.items()}, **named_miou(scene, truth),
         **seconds(scene.metadata.timings),
     }  # fmt: skip
 
@@ -142,6 +142,14 @@ def seconds_of(folder: Path, packs: list[str], every: list[int]) -> Iterator[dic
             spent = seconds(lifted.metadata.timings)
             name = f"{pack}, {len(lifted.views)} views"
             yield {"features": name} | spent | {"share": spent["seconds"] / spent["of"]}
+
+
+def named_miou(scene: Scene, truth: Truth) -> dict[str, float]:
+    """The mIoU of each splat's nearest class, and of the classes that `Scene.segment` gives."""
+    labels = torch.from_numpy(scene.segment(truth.words, truth.classes).labels)
+    scores = torch.nn.functional.one_hot(labels.long() + 1, len(truth.words) + 1)[:, 1:].float()
+    plain, params = torch.from_numpy(scene.features).float() @ truth.classes.T, scene.compositing
+    return {"argmax": truth.judge_scores(plain, params).miou, "segment": truth.judge_scores(scores, params).miou}
 
 
 def look(folder: Path, clicks: list[str]) -> None:

@@ -73,6 +73,28 @@ def test_splats_of_no_word_and_unseen_ones_are_named_none(clear: Scene) -> None:
     assert segment(flat, ["apple", "book"], EYE[:2]).found == ()
 
 
+def test_splat_of_no_word_gets_the_one_of_most_of_its_node(clear: Scene) -> None:
+    rows = clear.lift.features.clone()
+    rows[:3], odd = torch.from_numpy(EYE[6]), [0, 1, 2]
+    nodes = torch.from_numpy(np.where(np.arange(COUNT) == 2, -1, CLUSTER).astype(np.int32))
+    views = torch.zeros((3, 5), dtype=torch.int32)
+    tree = {
+        "object": nodes,
+        "object_views": views,
+        "node": nodes,
+        "node_parents": views[:, 0] - 1,
+        "node_views": views,
+    }
+    tree |= {"node_confidence": torch.ones(3), "node_features": torch.from_numpy(EYE[:3]).half()}
+    alone = replace(clear.lift, features=rows, seen=torch.arange(COUNT) != 1)
+    plain, kept = (Scene(replace(alone, **some), clear.splats) for some in (dict.fromkeys(tree), tree))
+    words = ["apple", "book", "lamp"]
+    assert segment(plain, words, EYE[:3]).labels[odd].tolist() == [-1, -1, -1]
+    found = segment(kept, words, EYE[:3])
+    assert found.labels[odd].tolist() == [0, -1, -1] and found.score[0] < 0.2 and found.margin[0] <= 0
+    assert np.array_equal(found.labels[3:], CLUSTER[3:])
+
+
 def test_order_and_number_of_words_change_no_label(clear: Scene) -> None:
     words, vectors = [f"w{k}" for k in range(40)], np.random.default_rng(1).normal(size=(40, CHANNELS))
     words[:3], vectors[:3] = ["apple", "book", "lamp"], EYE[:3]
