@@ -274,7 +274,7 @@ def _run(spec: RunSpec, candidate: Candidate) -> dict[str, Any]:
     try:
         done = subprocess.run(command, input=pickle.dumps(own), capture_output=True, check=False, timeout=LONGEST)
     except subprocess.TimeoutExpired:
-        hint = "lift fewer views (--set view_stride=n)"
+        hint = "lift fewer views (view_stride=n; on the command line --set view_stride=n)"
         raise Unavailable(candidate.name, expected=f"an end within {LONGEST} s", got="none yet", hint=hint) from None
     answer = json.loads(done.stdout.splitlines()[-1]) if done.stdout.strip() else {}
     if "error" in answer:

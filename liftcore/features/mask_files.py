@@ -98,7 +98,8 @@ def binary_picture(path: Path, unlabelled: int | None = None) -> tuple[np.ndarra
     told = grey[inside]
     if len(told) and told.min() != told.max():
         got = f"values from {told.min()} to {told.max()} beside it"
-        hint = "label pictures need their --names; of a mask with soft edges save where it is at least half"
+        needed = "label pictures need their names (--names, in Python names=)"
+        hint = f"{needed}; of a mask with soft edges save where it is at least half"
         raise InvalidFeatures(str(path), expected="one value beside 0, a mask", got=got, hint=hint)
     return inside, void
 

@@ -382,7 +382,7 @@ def _panoptic(content: Any, path: Path, names: Mapping[int, str]) -> Iterator[Im
             kind = _id(segment, "category_id") if isinstance(segment, dict) else None
             phrase = categories.get(kind, {}).get("name", names.get(kind) if isinstance(kind, int) else None)
             if not isinstance(phrase, str) or not isinstance(segment.get("id"), int):
-                hint = "name the categories with --names FILE, JSON from their numbers to names"
+                hint = "name the categories with --names FILE (in Python names=), JSON from their numbers to names"
                 raise InvalidFeatures(where, expected="an id and a named category", got=repr(segment)[:80], hint=hint)
             phrases[segment["id"]] = phrase
         image = images.get(_id(record, "image_id"))

@@ -173,12 +173,16 @@ def picture_labels(path: Path, rows: int, unlabelled: int) -> np.ndarray:
     high = int(values.max(initial=0, where=labelled))
     if unlabelled == 0 and high != rows:
         other = "is there a vector for 0 too, or does another value mean none (--unlabelled 255)?"
-        hint = other if high < rows else "name the value that means none with --unlabelled (255, 65535)"
+        hint = (
+            other
+            if high < rows
+            else "name the value that means none with --unlabelled (255, 65535), in Python unlabelled="
+        )
         expected = f"values 1..{rows} for {rows} vectors, and 0 for none"
         raise InvalidFeatures(str(path), expected=expected, got=f"values up to {high}", hint=hint)
     if unlabelled and high >= rows:
         expected = f"values 0..{rows - 1} for {rows} vectors, and {unlabelled} for none"
-        hint = "where 0 means none, value 1 has the first vector: --unlabelled 0"
+        hint = "where 0 means none, value 1 has the first vector: --unlabelled 0, in Python unlabelled=0"
         raise InvalidFeatures(str(path), expected=expected, got=f"the value {high}", hint=hint)
     return np.where(labelled, values - (unlabelled == 0), NO_LABEL).astype(np.int32)[None]
 

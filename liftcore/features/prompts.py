@@ -197,7 +197,7 @@ def prompt_views(
                 str(folder),
                 expected=f"one of {LAYOUTS}",
                 got=got,
-                hint=f"name the file of names with --names, {hint}",
+                hint=f"name the file of names with --names (in Python names=), {hint}",
             )
         if unlabelled is not None:
             raise InvalidFeatures("unlabelled", expected="pictures, whose values it is of", got=documents[0].name)
@@ -214,7 +214,11 @@ def prompt_views(
     else:
         suffix, count = Counter(path.suffix.lower() for path in files).most_common(1)[0] if files else ("", 0)
         hint = OTHER_FILES.get(suffix, "")
-        hint = "ids need their names: give --names, or the folder that holds json_data too" if arrays else hint
+        hint = (
+            "ids need their names: give --names (in Python names=), or the folder that holds json_data too"
+            if arrays
+            else hint
+        )
         got = f"{len(files)} other files" + (f", {count} of them {suffix}" if suffix else "")
         raise InvalidFeatures(str(folder), expected=f"one of {LAYOUTS}", got=got, hint=hint)
     seen_in = Counter(phrase for view in index.views.values() for phrase in view.phrases)
@@ -356,7 +360,8 @@ def _add_labels(index: _MaskIndex, path: Path, name: str, names: Mapping[int, st
     for value in np.unique(values[(values != 0) | (unlabelled == 0)]).tolist():
         if value not in phrases:
             expected = f"a name for each value but 0 ({', '.join(map(str, known[:6]))})"
-            hint = f"where it marks pixels that nobody decided on, give --unlabelled {value}"
+            option = f"--unlabelled {value} (in Python unlabelled={value})"
+            hint = f"where it marks pixels that nobody decided on, give {option}"
             raise InvalidFeatures(str(path), expected=expected, got=f"the value {value}", hint=hint)
     _add_ids(index, index.view(name, path), name, path, values, phrases)
 

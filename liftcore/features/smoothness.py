@@ -53,7 +53,8 @@ def unlike_maps(grids: Sequence[np.ndarray]) -> list[str]:
     agree = f"neighbouring cells agree to {found.neighbours:.2f}"
     if found.readings[best] - found.neighbours > LEAST_SMOOTHNESS:
         told = f"read as {best} they would to {found.readings[best]:.2f}: the bytes lie in that order"
-        hint = "pack maps of channels first with --layout chw, and write others from contiguous arrays"
+        chosen = "--layout chw (in Python layout='chw')"
+        hint = f"pack maps of channels first with {chosen}, and write others from contiguous arrays"
         return [f"features: {agree}, {told}; {hint}"]
     if found.share < LEAST_SMOOTHNESS:
         return [f"features: {agree}, as any two cells do: the maps show nothing of the photos"]

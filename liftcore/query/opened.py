@@ -480,7 +480,7 @@ class OpenedLift:
         found = found_input(role, remembered, self.metadata, None if moved else self.path)
         if found is not None:
             return found
-        option = f"say where they are with --{role}, or " if role in ("splats", "cameras") else ""
+        option = f"say where they are with --{role} (in Python {role}=), or " if role in ("splats", "cameras") else ""
         if not path.exists():
             raise InvalidLift(
                 str(self.path), expected=f"its {role} at {path}, or beside the lift", got="nothing there",
