@@ -47,11 +47,11 @@ def write_room(folder: Path, room: Room) -> None:
     splats, cameras = room_splats(room.splats, room.seed), room_cameras(room.views, *room.size)
     write_splats(folder / "point_cloud.ply", splats)
     write_inria_cameras(lc.Cameras(tuple(cameras)), folder / "cameras.json")
-    views = as_views(_observed(CpuRaster(splats), cameras, room))
+    views = as_views(observed_views(CpuRaster(splats), cameras, room))
     write_pack(folder / "features.safetensors", views, {"encoder": "random parts", "normalised": "true"})
 
 
-def _observed(raster: CpuRaster, cameras: Sequence[lc.Camera], room: Room) -> Iterator[tuple[str, ViewFeatures]]:
+def observed_views(raster: CpuRaster, cameras: Sequence[lc.Camera], room: Room) -> Iterator[tuple[str, ViewFeatures]]:
     """What each view observes, by its name."""
     parts = room_parts(room.splats, room.seed)  # [P, PART_LEVELS], numbers of parts on each level
     fine, counts = parts[:, -1], parts.max(axis=0) + 1
