@@ -1,0 +1,84 @@
+"""What a stranger does: things are found, corrected, named, taken away and compared, and a link opens it all again.
+
+Set SPLATLIFT_PICTURES to a folder to have a picture of each step.
+"""
+
+from __future__ import annotations
+
+import base64
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import httpx
+import pytest
+
+from tests.api.tiny_scene import make_scene
+
+from .browser import Browser
+from .conftest import Served
+from .looking import AMBER, FOUND, READY, ask, columns, splat_at, text_of
+
+pytestmark = pytest.mark.slow
+APPLE = 5  # a splat of it
+ZIP = "splatlift.take.everything(true).then(() => document.querySelector('#toast').textContent)"
+BOTH = "splatlift.beside.scene && splatlift.beside.left.settled && splatlift.viewer.settled"
+
+
+def pictures(page: Browser, width: int) -> Callable[[str], None]:
+    folder = os.environ.get("SPLATLIFT_PICTURES")
+
+    def shown(name: str) -> None:
+        assert page.value("document.documentElement.scrollWidth") <= width, name
+        assert page.violations() == {}, name
+        if folder:
+            (Path(folder) / f"{width}-{name}.png").write_bytes(base64.b64decode(page.screenshot()))
+
+    return shown
+
+
+@pytest.mark.parametrize(("width", "height"), [(1440, 900), (390, 844)])
+def test_ten_tasks_are_done_without_a_manual(
+    browser: Browser, served: Served, tmp_path: Path, width: int, height: int
+) -> None:
+    page, shown = browser, pictures(browser, width)
+    page.window(width, height)
+    page.open(served.address)  # open a scene
+    page.until(READY)
+    shown("1-open")
+    for word in ("book", "apple", "lamp"):  # find three things
+        ask(page, word)
+        assert len(columns(page, AMBER)) > 50
+    shown("2-found")
+    page.press("#by-hand")  # correct one
+    page.until(f"splatlift.hand.selection?.version && {FOUND}")
+    shown("3-by-hand")
+    x, y = splat_at(page, APPLE)
+    page.drag("#scene", (x, y), (x, y + 0.02))
+    page.until(f"splatlift.hand.selection.step === 1 && !splatlift.hand.busy && {FOUND}")
+    assert page.value("splatlift.ask.now.count") > 20
+    page.write("#hand .name", "lamp and a bit")  # rename it
+    page.key("Enter")
+    page.until("splatlift.things.own[0]?.name === 'lamp and a bit'")
+    assert page.value(ZIP) == "The ZIP is here."  # export all with names
+    page.press("#hand button[title='Ctrl+Z']")  # undo
+    page.until(f"splatlift.hand.selection.step === 0 && !splatlift.hand.busy && {FOUND}")
+    assert page.value("splatlift.ask.now.count") == 20
+    own = page.value("splatlift.things.own[0].id")
+    page.press("#panel-ask [data-compare]")  # compare
+    page.until(BOTH)
+    ask(page, "apple")
+    shown("4-compared")
+    link = page.value("location.href")  # share, and come back by the link
+    page.open("about:blank#")
+    page.open(link)
+    page.until(f"{READY} && {BOTH} && splatlift.ask.now?.answer")
+    assert page.value("splatlift.ask.now.text") == ["apple"] and "lamp and a bit" in text_of(page, "#beside-said")
+    shown("5-link")
+    page.press("#end-compare")
+    (tmp_path / "again.ply").write_bytes(make_scene().splats)  # bring a scene
+    page.drop([tmp_path / "again.ply"])
+    page.until("document.querySelector('#sent .file.done')")
+    shown("6-brought")
+    page.press("#sent .file .away")
+    assert httpx.delete(f"{served.address}/lifts/{served.lift}/selections/{own}").status_code == 204
