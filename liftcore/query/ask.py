@@ -65,6 +65,7 @@ if TYPE_CHECKING:
 MOST_RIVALS = 3  # words that are named as nearer than what was asked
 MOST_OF_IT = 0.5  # the same where an answer is clear
 LEAST_RIVAL = 0.1  # of what is looked at, by evidence, to which such a word is the nearest
+WHOLE = 0.9  # of a thing's splats, from which what is found of it is no part
 _OF_ANSWER = ("rivals", "candidates", "threshold", "clear", "statistics", "present", "presence", "why")
 _QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 
@@ -268,8 +269,15 @@ def _part_answer(scene: OpenedLift, asked: Question) -> Answer:
     sure, part = asked.part.phrase.sure, asked.part.part
     (thing,) = answers(scene, [asked.part.thing])
     if thing.count:
-        (found,) = answers(scene.within(with_parts(scene, thing.selected)), [part])
+        inside = with_parts(scene, thing.selected)
+        (found,) = answers(scene.within(inside), [part])
         told = f"{asked.part.phrase.thing!r} has {thing.count:,} splats. Within it: {found.why}"
+        if found.count >= WHOLE * inside.sum() and asked.query.absent == "drop":
+            told = (
+                f"{asked.part.phrase.thing!r} is there, but {part.query.text[0]!r} tells no part of it from the rest."
+            )
+            fields = {name: getattr(found, name) for name in _OF_ANSWER} | {"clear": False, "present": False}
+            found = Answer.of(found.query, found.scores, found.seen, np.zeros_like(inside), **fields)
     else:
         found, told = thing, f"{thing.why} So it has no parts."
     if not found.count and not sure:

@@ -191,6 +191,13 @@ def test_part_of_a_thing_without_one_or_of_none_is_not_there(handles: Scene, tab
     assert loose.count == ask(handles, "handle", table).count > 0 and loose.wording[0].how == "head"
 
 
+def test_part_that_is_nearly_all_of_the_thing_is_none(handles: Scene, table: TableEncoder) -> None:
+    words = TableEncoder("words", ["cat", "handle"], table.encode(["cat", "cat"]))
+    answer = ask(handles, Query.of(("handle of the cat",), threshold=0.0), words)
+    assert answer.count == 0 and answer.present is False and "no part" in answer.why
+    assert ask(handles, Query.of(("handle of the cat",), threshold=0.0, absent="keep"), words).count == 300
+
+
 def test_phrase_that_a_table_has_as_a_word_is_asked_as_it_is(handles: Scene, table: TableEncoder) -> None:
     words = TableEncoder("words", ["mug handle", "mug", "handle"], table.encode(["handle", "mug", "cat"]))
     assert ask(handles, "mug handle", words).wording == ()
