@@ -27,7 +27,7 @@ napoleon_numpy_docstring = False
 suppress_warnings = ["ref.python"]  # a value that several public modules offer has one text
 
 
-NAMES = "(all names of liftcore)"  # in reference.md: autodoc does not see what is loaded at first use
+NAMES = "(all names of liftcore)"  # in reference.rst: autodoc does not see what is loaded at first use
 
 
 def list_names() -> str:

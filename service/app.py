@@ -6,6 +6,7 @@ The layers around the routes are below: every exchange is recorded, HEAD is GET'
 from __future__ import annotations
 
 import asyncio
+import os
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -19,7 +20,6 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from liftcore import __version__
 from liftcore.files import PhotoIndexes
-from liftcore.runtime.cores import cores
 from service import problems
 from service.auth import CALLER, STRANGER, Gate
 from service.content import EventStreams
@@ -130,10 +130,10 @@ def query_limits(settings: ServiceSettings) -> QueryLimits:
 
 def job_limits(settings: ServiceSettings) -> JobLimits:
     """What the settings allow a job."""
-    count = cores()
+    cores = len(os.sched_getaffinity(0))  # the service runs on Linux alone
     return JobLimits(
         parallel=settings.parallel_lifts,
-        threads=settings.lift_threads or max(1, count // settings.parallel_lifts),
+        threads=settings.lift_threads or max(1, cores // settings.parallel_lifts),
         seconds=settings.lift_seconds,
         memory_bytes=settings.lift_memory_bytes,
         lease_seconds=settings.lease_seconds,
