@@ -18,7 +18,7 @@ from service.errors import Misconfigured, StaleDatabase
 from service.models import AssetKind, JobKind, JobState
 from service.store import database as markers
 from service.store.assets import ALL
-from service.store.database import DATABASE, SCHEMA
+from service.store.database import DATABASE, STEPS
 from service.store.files import DataDirectory
 from service.store.keys import Quota
 from service.store.owners import SERVICE, Owner, Scope
@@ -290,7 +290,7 @@ def test_database_of_release_0_4_opens_with_all_that_it_holds(tmp_path: Path) ->
 
 
 def test_schema_that_breaks_off_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.store.database.SCHEMA", f"{SCHEMA};\nCREATE TABLE keys (a);\n")
+    monkeypatch.setitem(STEPS, 0, f"{STEPS[0]};\nCREATE TABLE keys (a);\n")
     with pytest.raises(Misconfigured, match="already exists"):
         Store.open(tmp_path / "data")
     monkeypatch.undo()
