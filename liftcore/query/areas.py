@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from liftcore.errors import InvalidQuery
+from liftcore.errors import InvalidQuery, NotFound
 from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.scores import LEAST_LIKENESS, cosines_about, norms_of
-from liftcore.query.terms import Area, Pixel, PixelBox, Stroke
+from liftcore.query.terms import AREAS, NOTATIONS, Area, Pixel, PixelBox, Stroke
 
 if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera
@@ -34,15 +34,26 @@ def feature_shown(scene: OpenedLift, area: Area) -> np.ndarray:
 
     Raises:
         NotFound: no camera has this name.
-        InvalidQuery: the area is empty, reaches out of the image, lies at the rim of a wide lens, or shows no scene.
+        InvalidQuery: the area is empty, reaches out of the image, lies at the rim of a wide lens, or shows no scene;
+            or a box or a stroke lacks corners.
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
-    camera = scene.cameras[area.view]
+    camera = _camera(scene, area)
     inside, around = _pixels(area, *camera.photo_size)
     rows = _rendered(scene, camera, area, inside)
     if len(rows) == 1:
         return rows[0]
     return _common(scene, rows, _rendered(scene, camera, None, around))
+
+
+def _camera(scene: OpenedLift, area: Area) -> Camera:
+    """The camera of an area. Where no view is named "VIEW:box", `VIEW:box:x,y` is a box without all its corners."""
+    try:
+        return scene.cameras[area.view]
+    except NotFound:
+        if isinstance(area, Pixel) and area.view.endswith(AREAS):
+            raise InvalidQuery(str(area), expected=NOTATIONS, got="two numbers", hint="give all corners") from None
+        raise
 
 
 def _pixels(area: Area, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
@@ -102,7 +113,7 @@ def splats_shown(scene: OpenedLift, area: Area) -> tuple[np.ndarray, np.ndarray]
     Raises:
         NotFound, InvalidQuery, InvalidLift: as `feature_shown`.
     """
-    camera = scene.cameras[area.view]
+    camera = _camera(scene, area)
     rays = _rays(scene, camera, area, _pixels(area, *camera.photo_size)[0])
     splats, weights = zip(*rays, strict=True)
     return np.concatenate(splats), np.concatenate(weights)

@@ -25,7 +25,7 @@ SETS = "object:N or selection:NAME"
 NOTATIONS = f"VIEW:x,y, VIEW:box:x0,y0,x1,y1, VIEW:stroke:x0,y0,x1,y1,..., region:VIEW:LEVEL:ID, splat:J, {SETS}"
 _PIXEL = re.compile(r"(.+):\s*(-?\d{1,9})\s*,\s*(-?\d{1,9})\s*", re.ASCII | re.DOTALL)
 _AREA = re.compile(r"(.+):(box|stroke):([^:]*)", re.ASCII | re.DOTALL)
-_AREAS = (":box", ":stroke")
+AREAS = (":box", ":stroke")  # ends of a pixel's view that look like an area without its corners
 _WHOLE = re.compile(r"\s*-?\d{1,9}\s*", re.ASCII)
 _REGION = re.compile(r"region:(.+):(\d{1,9}):(\d{1,9})", re.ASCII | re.DOTALL)
 _SPLAT = re.compile(r"splat:(\d{1,18})", re.ASCII)
@@ -120,7 +120,7 @@ Term = str | Example  # a text, or an example
 def parse_example(notation: str, argument: str = "like") -> Example:
     """Read the notation of an example.
 
-    A pixel's comma decides first, so a camera named "splat" can be asked too.
+    A pixel's comma decides first, so a camera named "splat" or "v:box" can be asked too.
 
     Args:
         notation: as in the table above.
@@ -129,7 +129,7 @@ def parse_example(notation: str, argument: str = "like") -> Example:
     Raises:
         InvalidQuery: it is none of them.
     """
-    if (pixel := _PIXEL.fullmatch(notation)) and not pixel[1].endswith(_AREAS):  # of a view "v:box" none is meant
+    if pixel := _PIXEL.fullmatch(notation):
         return Pixel(pixel[1], int(pixel[2]), int(pixel[3]))
     if region := _REGION.fullmatch(notation):
         return Region(region[1], int(region[2]), int(region[3]))

@@ -23,6 +23,7 @@ from liftcore.query.result import LiftResult, load_lift
 from liftcore.query.scene import Scene
 from liftcore.query.terms import Example, OneSplat, Pixel, PixelBox, Region, Stroke, Vector, parse_example
 from liftcore.query.threshold import find_threshold
+from liftcore.scene.cameras import Cameras
 from liftcore.values.lift_file import save_lift
 from service.query_worker import open_scene
 from tests.api.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH
@@ -326,11 +327,20 @@ def test_any_other_notation_is_refused(notation: str) -> None:
 @pytest.mark.parametrize("notation", [
     "", ":1,2", "v:1.5,2", "v:1", "splat:-1", "region:v:1", "splat:" + "9" * 5000, "v:box:1,2,3", "v:box:1,2,3,4,5,6",
     "v:box:nan,2,3,4", "v:box:1,2,3,inf", "v:box:", "v:stroke:1,2,3", "v:stroke:1,2,3,4,", "v:stroke:1;2,3,4",
-    "v:box:3,4", "v:stroke:3,4",
 ])  # fmt: skip
 def test_what_points_nowhere_is_refused(notation: str) -> None:
     with pytest.raises(InvalidQuery, match="like"):
         parse_example(notation)
+
+
+@pytest.mark.parametrize("area", ["box", "stroke"])
+def test_an_area_without_corners_is_a_pixel_only_of_a_view_so_named(scene: Scene, area: str) -> None:
+    unfinished = Query(like=[f"middle:{area}:6,12"])
+    with pytest.raises(InvalidQuery, match="VIEW:box:x0,y0,x1,y1"):
+        scene.ask(unfinished)
+    scene.cameras = Cameras({**scene.cameras, f"middle:{area}": scene.cameras["middle"]})
+    selected = scene.ask(unfinished).selected
+    assert selected.any() and np.array_equal(selected, scene.ask(Query(like=["middle:6,12"])).selected)
 
 
 def test_vectors_come_from_numpy_files(tmp_path: Path) -> None:
