@@ -235,10 +235,9 @@ def _question(
     An encoder that reads any text reads the phrase, which says more of the part than its word alone.
     """
     words = np.array([isinstance(term, str) for term in query.terms], np.bool_)
-    read = query
+    asked_as = wordings(scene, query, encoder, names)
     if phrase is not None and table_of(encoder or scene.table) is not None:
-        read = query.model_copy(update={"text": [phrase.part]})
-    asked_as = wordings(scene, read, encoder, names)
+        asked_as = asked_as | {0: Wording(query.text[0], phrase.part, "part")}
     rows = directions(scene, query, encoder, names, asked_as)
     if phrase is not None:
         asked_as = asked_as | {0: Wording(query.text[0], str(phrase), "part")}

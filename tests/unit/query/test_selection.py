@@ -182,6 +182,12 @@ def test_phrase_finds_the_part_within_the_thing_alone(phrase: str, handles: Scen
     assert (together[1].scores == answer.scores).all() and (together[1].selected == answer.selected).all()
 
 
+def test_part_is_asked_by_its_own_word(handles: Scene, table: TableEncoder) -> None:
+    words = TableEncoder("words", ["tea mug", "mug handle", "handle"], table.encode(["mug", "cat", "handle"]))
+    phrase = question(handles, Query.of("tea mug handle"), words).part
+    assert phrase is not None and np.array_equal(phrase.part.rows, words.encode(["handle"]))
+
+
 def test_part_of_a_thing_without_one_or_of_none_is_not_there(handles: Scene, table: TableEncoder) -> None:
     for phrase in ("handle of the cat", "the cat's handle", "handle of the teapot"):
         answer = ask(handles, phrase, table)
