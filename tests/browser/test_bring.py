@@ -9,20 +9,26 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
+import numpy as np
 import pytest
 from PIL import Image
 
+from liftcore.io.cameras import read_cameras
+from liftcore.io.inria import write_inria_cameras
+from liftcore.io.splats import read_splats
 from liftcore.lifting.files import lift_files
 from liftcore.values.settings import LiftSettings
-from tests.api.tiny_scene import cameras_document, colmap_zip, make_scene
+from tests.api.tiny_scene import cameras_document, colmap_zip, make_scene, ply, splat_rows
 from tests.still_life.files import write_still_life
 from tests.still_life.scene import still_life
+from tests.unit.scene.camera_files import binary_files, text_files, write_files
 
 from .browser import Browser
 from .conftest import Served, serving
 from .looking import AMBER, READY, ask, columns, text_of
 
 pytestmark = pytest.mark.slow
+SOG_FILE = Path(__file__).parents[1] / "data" / "splats" / "degree1.sog"
 OPEN = "globalThis.splatlift && !document.querySelector('#panel-bring').hidden"
 SHORTEST = "(budget => { budget.add(new Option('10')); budget.value = '10'; })(document.querySelector('#budget'))"
 LONG = 1200.0  # seconds, for what runs a job on a busy machine, kernels and all
@@ -148,6 +154,56 @@ def test_dropped_folder_brings_its_cameras(empty: Browser, files: dict[str, Path
     empty.until("splatlift.bring.cameras[0].name !== 'left.png'")
     same = empty.value("[...splatlift.viewer.cones.geometry.attributes.position.array]")
     assert len(drawn) == 3 * 16 * 3 and drawn == pytest.approx(same, abs=1e-5)
+
+
+def test_binary_and_text_colmap_model_are_drawn_as_they_are_lifted(empty: Browser, tmp_path: Path) -> None:
+    for folder, content in (("binary", binary_files()), ("text", text_files())):
+        model = write_files(tmp_path / folder, content)
+        lifted = list(read_cameras(model).values())
+        empty.value("splatlift.bring.cameras = []")
+        empty.drop([model])
+        empty.until(f"splatlift.bring.cameras.length === {len(lifted)}")
+        views = empty.value("splatlift.bring.cameras")
+        for key in ("width", "height", "fx", "fy"):
+            assert [view[key] for view in views] == [getattr(camera, key) for camera in lifted], (folder, key)
+        for view, camera in zip(views, lifted, strict=True):
+            assert np.array(view["viewmat"]) == pytest.approx(camera.viewmat, abs=1e-6), (folder, view["name"])
+
+
+@pytest.mark.parametrize("beside", [False, True], ids=["alone", "with its cameras"])
+def test_folder_of_a_sog_is_sent_as_one_file(
+    empty: Browser, files: dict[str, Path], tmp_path: Path, beside: bool
+) -> None:
+    with zipfile.ZipFile(SOG_FILE) as archive:
+        archive.extractall(tmp_path / "my garden" / "splats")
+    if beside:
+        write_inria_cameras(read_cameras(files["cameras"]), tmp_path / "my garden" / "cameras.json")
+    empty.drop([tmp_path / "my garden"])
+    names = ["cameras.json"] * beside + ["my garden.sog"]
+    empty.until(f"document.querySelectorAll('.file.done').length === {len(names)}")
+    told = "[...document.querySelectorAll('.file.done .name')].map(name => name.textContent).sort()"
+    assert empty.value(told) == names
+    assert f"{read_splats(SOG_FILE).count} splats" in text_of(empty, "#sent")
+
+
+def test_dragging_turns_about_the_way_up_of_the_cameras(
+    empty: Browser, files: dict[str, Path], tmp_path: Path
+) -> None:
+    document = cameras_document()
+    for frame, x in zip(document["frames"], (-0.1, 0.0, 0.1), strict=True):  # they look along y, and z is up
+        frame["transform_matrix"] = [[1, 0, 0, x], [0, 0, -1, -4], [0, 1, 0, 0], [0, 0, 0, 1]]
+    (tmp_path / "upright.json").write_text(json.dumps(document), encoding="utf-8")
+    rows = splat_rows()
+    rows[:, 1:3] = rows[:, [2, 1]]  # from y up to z up
+    (tmp_path / "upright.ply").write_bytes(ply(rows))
+    empty.drop([tmp_path / "upright.ply", tmp_path / "upright.json"])
+    empty.until("splatlift.viewer?.draft && splatlift.viewer.camera.up.z > 0.99 && !splatlift.viewer.asked")
+    before = empty.value("splatlift.viewer.place3d")
+    empty.drag("#scene", (0.5, 0.5), (0.7, 0.5))
+    empty.until(f"splatlift.viewer.place3d.join() !== '{','.join(map(str, before))}' && !splatlift.viewer.asked")
+    after = empty.value("splatlift.viewer.place3d")
+    assert after[2] == pytest.approx(before[2], abs=1e-3) and abs(after[0] - before[0]) > 0.1
+    assert after[3:] == pytest.approx(before[3:], abs=1e-6)
 
 
 def test_zip_of_streamed_splats_is_taken_as_splats(empty: Browser, tmp_path: Path) -> None:

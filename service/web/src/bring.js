@@ -2,7 +2,7 @@
 // is here already.
 import { Chart } from "./chart.js";
 import { ago, at, count, el, plural, size, tell, twice } from "./dom.js";
-import { camerasOf, dropped, gathered, kindOf, named, remember } from "./files.js";
+import { camerasOf, dropped, gathered, kindOf, named, remember, suffixes } from "./files.js";
 import { space } from "./lifts.js";
 import { bytes, events, json, patch, post, remove, upload, words } from "./service.js";
 
@@ -16,7 +16,7 @@ const USUAL = /^(point_cloud|splat|splats|scene|iteration_\d+|\d+)$/i; // names 
 const ENDED = ["succeeded", "failed", "canceled"];
 const KINDS = { splats: "Splats", cameras: "Cameras", features: "Features" };
 const OTHERS = { photos: "Photos", lift: "Lift", masks: "Masks", table: "Words" };
-const WANTED = { splats: ".ply, .splat, .spz, .sog or .glb", cameras: "cameras.json, transforms.json, or a COLMAP model: its folder or a .zip", features: ".safetensors packs" };
+const WANTED = { splats: suffixes("splats"), cameras: "cameras.json, transforms.json, or a COLMAP model: its folder or a .zip", features: `${suffixes("features")} packs` };
 const PRESETS = {
   default: ["Careful", "Masks that other views contradict count less; splats get a confidence."],
   tikhonov: ["Sharp", "The paper's best: strong weights count more."],

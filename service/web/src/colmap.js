@@ -18,8 +18,10 @@ function camera(model, width, height, parameters) {
   return { width, height, fx: parameters[0], fy: parameters[ONE_FOCAL.has(model) ? 0 : 1] };
 }
 
-// Of a rotation as a quaternion, real part first, and a translation.
-function viewmat([w, x, y, z], translation) {
+// Of a rotation as a quaternion of any length, real part first, and a translation.
+function viewmat(quaternion, translation) {
+  const length = Math.hypot(...quaternion);
+  const [w, x, y, z] = quaternion.map(value => value / length);
   const rows = [
     [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
     [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],

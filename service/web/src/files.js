@@ -7,12 +7,17 @@ const HEADER = 32 << 20; // bytes of a safetensors header that are read here
 const TAIL = 1 << 20; // of a zip: its list of names lies at its end
 const DEPTH = 5; // folders down
 const CAMERAS = new RegExp(table.cameras);
+const INRIA = /(^|\/)cameras\.json$/; // which the service reads alone, and of no zip
 const PACK = /\.safetensors$/i;
 const SOG = /(^|[^\w-])(lod-meta\.json|means_[lu]\.webp)/; // of an unbundled or a streamed one
 const READABLE = 512e6; // bytes of a zip whose cameras are read here
 const PHOTO = /\.(jpe?g|png)$/i;
 const suffix = name => /\.[^.]*$/.exec(name.toLowerCase())?.[0] ?? "";
 const isSplats = name => table.kinds[suffix(name)] === "splats";
+const either = names => `${names.slice(0, -1).join(", ")}${names.length > 1 ? " or " : ""}${names.at(-1)}`;
+
+// The suffixes of a kind, to be read.
+export const suffixes = kind => either(Object.keys(table.kinds).filter(one => table.kinds[one] === kind));
 
 // {kind} of a file, null for what is not sent, with a word on `why` where there is one; a lift file brings what it `needs`:
 // [{kind, id, name}]. The server looks at the content, and its answer names a file that is something else.
@@ -47,23 +52,35 @@ async function safetensors(file) {
   }
 }
 
-// What was dropped: files, and of folders the cameras as one zip, the newest splats and the packs; a SOG's folder as one
-// zip; or all files where there are no cameras. Photos of a folder stay: they may be gigabytes.
+// What was dropped: files, and of folders the cameras as one zip or as their cameras.json, a SOG's folder as one zip or
+// else the newest splats, and the packs; or all files where there is neither. Photos of a folder stay: they may be gigabytes.
 export async function dropped({ items, files }) {
   const entries = [...items].map(item => item.webkitGetAsEntry?.()).filter(Boolean); // while the event lasts
   if (!entries.some(entry => entry.isDirectory)) return [...files];
   const found = await Promise.all(entries.map(async entry => {
     const inner = await within(entry);
     const cameras = inner.filter(({ path }) => CAMERAS.test(path));
-    if (entry.isDirectory && inner.some(({ path }) => SOG.test(path)) && !cameras.length) {
-      return [await zipped(inner.map(({ path, file }) => ({ path: path.slice(entry.name.length + 1), file })), `${entry.name}.sog`)];
-    }
-    if (!entry.isDirectory || !cameras.length) return inner.map(({ file }) => file);
+    const sog = entry.isDirectory ? sogOf(inner.filter(one => !cameras.includes(one))) : [];
+    if (!entry.isDirectory || !(cameras.length || sog.length)) return inner.map(({ file }) => file);
     const splats = inner.filter(({ path }) => isSplats(path)).sort((one, other) => other.file.lastModified - one.file.lastModified);
-    const packs = inner.filter(({ path }) => PACK.test(path));
-    return [await zipped(cameras, `${entry.name}.zip`), ...[...splats.slice(0, 1), ...packs].map(({ file }) => file)];
+    const packs = inner.filter(({ path }) => PACK.test(path)).map(({ file }) => file);
+    return [...(cameras.length ? [cameras.every(({ path }) => INRIA.test(path)) ? cameras.reduce(outer).file : await zipped(cameras, `${entry.name}.zip`)] : []),
+      ...(sog.length ? [await zipped(sog, `${entry.name}.sog`)] : splats.slice(0, 1).map(({ file }) => file)), ...packs];
   }));
   return found.flat();
+}
+
+// Of two files that which lies higher.
+const depth = ({ path }) => path.split("/").length;
+const outer = (one, other) => (depth(other) < depth(one) ? other : one);
+
+// The files of a SOG among those of a folder, which may lie deeper in it: paths from where the SOG begins.
+function sogOf(parts) {
+  const own = parts.filter(({ path }) => SOG.test(path));
+  if (!own.length) return [];
+  const { path: first } = own.reduce(outer);
+  const folder = first.slice(0, first.lastIndexOf("/") + 1);
+  return parts.filter(({ path }) => path.startsWith(folder)).map(({ path, file }) => ({ path: path.slice(folder.length), file }));
 }
 
 // The files at or below an entry: [{path, file}].

@@ -474,11 +474,13 @@ async function shot() {
   return new Promise(done => canvas.toBlob(done, "image/png"));
 }
 
-// Undo and redo: of the selection that is corrected, else of what was asked.
+// Undo and redo: of things that were joined or split, else of the selection that is corrected, else of what was asked.
 addEventListener("keydown", event => {
-  if (event.key.toLowerCase() !== "z" || !(event.ctrlKey || event.metaKey) || event.target.matches("input[type=text], textarea")) return;
+  const key = event.key.toLowerCase();
+  if (!["z", "y"].includes(key) || !(event.ctrlKey || event.metaKey) || event.target.matches("input[type=text], textarea")) return;
   event.preventDefault();
-  if (!(!event.shiftKey && things.undo()) && !hand.go(event.shiftKey ? 1 : -1)) history.go(event.shiftKey ? 1 : -1);
+  const by = key === "y" || event.shiftKey ? 1 : -1;
+  if (!things.go(by, hand.selection) && !hand.go(by)) history.go(by);
 });
 
 // Keys that work wherever no text is typed.

@@ -160,7 +160,7 @@ export function words(problem) {
 const OURS = /\b(GET|PUT|POST|PATCH|DELETE) \/|SPLATLIFT_|\b\w+=[A-Z]|in the (body|query|path) of the request/;
 const FIELD = /^(text|like|unlike|negatives|settings|features|labels|words|query|lift|body)(\.|$)/;
 const plainly = text => text.replace(/(splats|cameras|features|table|masks|photos|lift) (sha256:)?[0-9a-f]{32,}/g, "the $1")
-  .replace(/sha256:[0-9a-f]{8,}/g, "a file").replace(/\b[0-9a-f]{32,}\b/g, "it").replace(/text table \S+\.safetensors/g, "the scene's vocabulary");
+  .replace(/sha256:[0-9a-f]{8,}/g, "a file").replace(/\b[0-9a-f]{32,}\b/g, "it");
 
 const sentence = text => `${text[0].toUpperCase()}${text.slice(1)}${/[.!?]$/.test(text) ? "" : "."}`;
 

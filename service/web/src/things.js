@@ -2,7 +2,7 @@
 // what a click takes.
 import { at, el, plural, tell, twice } from "./dom.js";
 import { search } from "./question.js";
-import { json, patch, post, remove, words } from "./service.js";
+import { json, patch, picture, post, remove, words } from "./service.js";
 
 const MOST = 100; // things in the list
 const NODES = 1000; // of the tree, things among them
@@ -18,7 +18,7 @@ export class Things {
   }
 
   async of(lift) {
-    Object.assign(this, { lift, found: [], own: [], last: null, nodes: new Map(), open: new Set(), all: false });
+    Object.assign(this, { lift, found: [], own: [], last: null, undone: null, nodes: new Map(), open: new Set(), all: false });
     this.show();
     if (lift) json(`/lifts/${lift.id}/selections`).then(({ selections }) => { if (lift === this.lift) this.have(this.found, selections); }).then(() => this.show(), () => {});
     if (!lift?.links.objects) return; // of a lift from before there were any
@@ -127,37 +127,47 @@ export class Things {
   async join() {
     const sets = [...this.held()];
     const named = this.found.find(thing => thing.name && sets.includes(term(thing)));
-    await this.make(sets, sets, async add => [await add(named?.name ?? this.naming.get(sets[0]), sets)]);
+    await this.make({ hidden: sets, before: sets, how: async add => [await add(named?.name ?? this.naming.get(sets[0]), sets)] });
   }
 
   // What a selection leaves of the thing that it was begun from becomes another one.
   async split(selection) {
     const [from] = wholeOf(selection);
     const corrected = `selection:${selection.id}`;
-    await this.make([from], [corrected], async add => {
+    await this.make({ hidden: [from], before: [corrected], then: corrected, step: selection.step, how: async add => {
       const rest = await add(`${this.naming.get(from)}, the rest`, [from]);
       return [await post(`${this.route}/${rest.id}/edits`, { how: "remove", query: { sets: [corrected] } })];
-    }, corrected);
+    } });
   }
 
-  // Things of one's own in place of others, which can be undone. then: what is taken afterwards, if not those.
-  async make(hidden, before, how, then = null) {
+  // Things of one's own in place of others, which can be undone and redone. then: what is taken afterwards, if not
+  // those; step: of the selection that they are made of.
+  async make(change) {
+    const { hidden, before, how, then } = change;
+    this.undone = null;
     try {
       const made = await how((name, sets) => post(this.route, { name: name.slice(0, 100), edit: { how: "set", query: { sets } } }));
       await this.conceal(hidden, true);
       const after = then ?? `selection:${made[0].id}`;
-      this.last = { made: made.map(({ id }) => id), hidden, before, after };
+      this.last = { change, made: made.map(({ id }) => id), hidden, before, after };
       this.have(this.found, [...made, ...this.own]);
       this.hold([after]);
     } catch (problem) { tell(words(problem), true); }
   }
 
-  // Take the last of these back, where it is still what is asked; whether there was one.
-  undo() {
-    const { last } = this;
+  // Take the last of these back, or make it again, where what is asked is still what it left; whether there was one.
+  // selection: what is corrected by hand.
+  go(by, selection) {
+    const { last, undone } = this;
+    if (by > 0) {
+      if (!undone || String(this.held()) !== String(undone.before) || undone.step !== selection?.step) return false;
+      this.make(undone);
+      return true;
+    }
     if (!last || String(this.held()) !== last.after) return false;
     this.last = null;
-    this.forget(last.made).then(() => this.conceal(last.hidden, false)).then(() => this.hold(last.before)).catch(problem => tell(words(problem), true));
+    this.forget(last.made).then(() => this.conceal(last.hidden, false)).then(() => this.hold(last.before))
+      .then(() => { this.undone = last.change; }).catch(problem => tell(words(problem), true));
     return true;
   }
 
@@ -200,17 +210,46 @@ export class Things {
       const { candidates } = await json(`/query?${search({ lift: this.lift.id, like: example, top: 0 })}`);
       const nested = candidates.filter(one => one.kind !== "group" && !this.background(one)).reverse(); // the largest first
       if (!nested.length) return false;
+      nested.unshift(...await this.heir(example, nested));
       const held = this.held();
       const taken = more || held.length !== 1 ? -1 : nested.findIndex(one => one.set === held[0]);
       if (taken === nested.length - 1) return false;
       const chosen = nested[taken + 1];
-      for (const { id } of nested.slice(0, taken + 1)) this.open.add(id);
+      for (const { id } of nested.slice(0, taken + 1)) if (id !== undefined) this.open.add(id);
       this.take(chosen.set, more);
       return true;
     } catch (problem) {
       tell(words(problem), true);
       return true;
     }
+  }
+
+  // The one of one's own things that stands for a hidden one where a click is: what was joined, or a side of what was
+  // split. [] where nothing does.
+  async heir(example, nested) {
+    const hidden = this.found.filter(thing => thing.hidden).map(term);
+    const here = nested.map(({ set }) => set).filter(set => hidden.includes(set));
+    if (!here.length) return [];
+    const own = await Promise.all(this.own.map(({ id }) => json(`${this.route}/${id}?bits=true`)));
+    const stands = ({ history }) => begunFrom(history).some(set => here.includes(set) || own.some(one => set === `selection:${one.id}` && stands(one)));
+    const heirs = own.filter(stands);
+    const splat = /^splat:(\d+)$/.exec(example);
+    for (const one of heirs) {
+      const set = `selection:${one.id}`;
+      if (splat ? bit(one.bits, Number(splat[1])) : heirs.length === 1 || await this.drawn(set, example)) return [{ set }];
+    }
+    return [];
+  }
+
+  // Whether a picture's mask of a set has the pixel of an example.
+  async drawn(set, example) {
+    const [, view, x, y] = /^(.*):(\d+),(\d+)$/.exec(example) ?? [];
+    if (view === undefined) return false;
+    const context = Object.assign(document.createElement("canvas"), { width: 1, height: 1 }).getContext("2d");
+    const mask = await picture(`/query/mask?${search({ lift: this.lift.id, sets: set, view })}`);
+    context.drawImage(mask, -x, -y);
+    URL.revokeObjectURL(mask.src);
+    return context.getImageData(0, 0, 1, 1).data[0] > 127;
   }
 
   write(thing, item) {
@@ -231,9 +270,15 @@ export class Things {
   }
 }
 
+// The sets that a selection was begun from.
+const begunFrom = history => history?.[0]?.edit.query?.sets ?? [];
+
+// Whether a splat is in bits of a selection, in base64, the first the lowest of its byte.
+const bit = (bits, splat) => atob(bits).charCodeAt(splat >> 3) >> (splat & 7) & 1;
+
 // The one thing that a selection was begun from, in a list.
 export const wholeOf = ({ history }) => {
-  const sets = history?.[0].edit.query?.sets ?? [];
+  const sets = begunFrom(history);
   return sets.length === 1 && sets[0].startsWith("object:") ? sets : [];
 };
 const term = thing => `object:${thing.id}`;

@@ -29,14 +29,8 @@ export class Viewer {
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 1.5));
     this.scene = new THREE.Scene();
     this.camera = new THREE.PerspectiveCamera(50, 1, 0.01, 1000);
-    this.controls = new OrbitControls(this.camera, canvas);
-    this.controls.enableDamping = !still();
-    this.controls.dampingFactor = 0.12;
-    this.controls.zoomToCursor = true;
-    this.controls.addEventListener("change", () => this.draw());
-    this.controls.addEventListener("start", () => { this.flight = null; this.lead(); });
     this.moved = () => {};
-    this.controls.addEventListener("end", () => this.moved());
+    this.control();
     this.boxes = new THREE.Group();
     this.scene.add(this.boxes);
     this.middle = new THREE.Vector3();
@@ -61,6 +55,26 @@ export class Viewer {
     this.draw();
   }
 
+  // Controls turn about the up vector that the camera has when they are made: another one needs others.
+  control() {
+    const target = this.controls?.target;
+    this.controls?.dispose();
+    const controls = this.controls = new OrbitControls(this.camera, this.canvas);
+    if (target) controls.target.copy(target);
+    controls.enableDamping = !still();
+    controls.dampingFactor = 0.12;
+    controls.zoomToCursor = true;
+    controls.addEventListener("change", () => this.draw());
+    controls.addEventListener("start", () => { this.flight = null; this.lead(); });
+    controls.addEventListener("end", () => this.moved());
+  }
+
+  upright(up) {
+    if (this.camera.up.equals(up)) return;
+    this.camera.up.copy(up);
+    this.control();
+  }
+
   // One camera for two viewers: the one that was moved last leads.
   pair(partner) {
     this.partner = partner;
@@ -81,7 +95,7 @@ export class Viewer {
     const [position, target] = [camera.position.clone().add(shift), controls.target.clone().add(shift)];
     if (position.equals(this.camera.position) && target.equals(this.controls.target) && lens === this.lens && camera.up.equals(this.camera.up)) return;
     this.flight = null;
-    this.camera.up.copy(camera.up);
+    this.upright(camera.up);
     this.camera.position.copy(position);
     this.controls.target.copy(target);
     this.lens = lens;
@@ -190,7 +204,7 @@ export class Viewer {
       this.settle(views);
       this.to(views[0], true);
     } else {
-      this.camera.up.set(0, -1, 0);
+      this.upright(new THREE.Vector3(0, -1, 0));
       this.camera.position.copy(this.middle).add(new THREE.Vector3(0, -0.6, -2.4).multiplyScalar(this.reach));
       this.controls.target.copy(this.middle);
     }
@@ -260,7 +274,7 @@ export class Viewer {
     const mean = poses.reduce((sum, pose) => sum.add(pose.up), new THREE.Vector3());
     this.up = mean.applyMatrix3(outer(poses.map(pose => pose.right), 1, 0.002 * poses.length).invert()).normalize();
     if (this.up.lengthSq() < 0.5) this.up.set(0, 0, 1);
-    this.camera.up.copy(this.up);
+    this.upright(this.up);
     const across = outer(poses.map(pose => pose.forward), -1, poses.length); // sum of I - d d^T
     const side = poses.reduce((sum, { position, forward }) => sum.add(position).addScaledVector(forward, -position.dot(forward)), new THREE.Vector3());
     const found = Math.abs(across.determinant()) > 1e-6 * poses.length ** 3 ? side.applyMatrix3(across.invert()) : null;
