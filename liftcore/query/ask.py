@@ -270,7 +270,8 @@ def _part_answer(scene: OpenedLift, asked: Question) -> Answer:
     if thing.count:
         inside = with_parts(scene, thing.selected)
         (found,) = answers(scene.within(inside), [part])
-        told = f"{asked.part.phrase.thing!r} has {thing.count:,} splats. Within it: {found.why}"
+        nothing = "" if found.count or found.present is False else " Nothing stands out there."
+        told = f"{asked.part.phrase.thing!r} has {thing.count:,} splats. Within it: {found.why}{nothing}"
         if found.count >= WHOLE * inside.sum() and asked.query.absent == "drop":
             told = (
                 f"{asked.part.phrase.thing!r} is there, but {part.query.text[0]!r} tells no part of it from the rest."
@@ -278,7 +279,8 @@ def _part_answer(scene: OpenedLift, asked: Question) -> Answer:
             fields = {name: getattr(found, name) for name in _OF_ANSWER} | {"clear": False, "present": False}
             found = Answer.of(found.query, found.scores, found.seen, np.zeros_like(inside), **fields)
     else:
-        found, told = thing, f"{thing.why} So it has no parts."
+        found, nothing = thing, "it" if thing.present is False else f"{asked.part.phrase.thing!r} is not found, and"
+        told = f"{thing.why} So {nothing} has no parts."
     if not found.count and not sure:
         return answers(scene, [replace(asked, part=None)])[0]
     fields = {name: getattr(found, name) for name in _OF_ANSWER} | {"why": told}
