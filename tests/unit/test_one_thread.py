@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from threading import Barrier, Event
 
 import pytest
 import torch
@@ -57,3 +59,37 @@ def test_a_lift_has_no_threads_of_torch(tmp_path, monkeypatch):
     lift_files(splats, cameras, [features], LiftSettings.of(robust_steps=1))
     assert seen == dict.fromkeys(("as_regions", "stacked", "row_blocks", "bag_sums"), 1)
     assert torch.get_num_threads() == 3
+
+
+@pytest.mark.parametrize("first_fails", [False, True])
+def test_two_threads_within_it_at_once_leave_nothing_behind(first_fails: bool):
+    both, first_left, looked = Barrier(2), Event(), Event()
+
+    def number_of_a_new_thread() -> int:
+        with ThreadPoolExecutor(1) as pool:
+            return pool.submit(torch.get_num_threads).result()
+
+    def first() -> int:
+        torch.set_num_threads(3)
+        with suppress(ValueError), one_thread():
+            both.wait(10)
+            if first_fails:
+                raise ValueError("no")
+        first_left.set()
+        assert looked.wait(10)
+        return torch.get_num_threads()
+
+    def second() -> tuple[int, int, int]:
+        torch.set_num_threads(3)
+        with one_thread():
+            both.wait(10)
+            assert first_left.wait(10)
+            within = torch.get_num_threads(), number_of_a_new_thread()
+            looked.set()
+        return *within, torch.get_num_threads()
+
+    with ThreadPoolExecutor(2) as pool:
+        ended = pool.submit(first), pool.submit(second)
+        assert ended[1].result() == (1, 1, 3)
+        assert ended[0].result() == 3
+    assert number_of_a_new_thread() == 3
