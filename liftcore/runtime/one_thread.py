@@ -4,9 +4,9 @@ What it cuts into parts for several threads may end in other last bits, and its 
 after every call: beside threads that walk and solve they took a tenth of a lift.
 
 Torch keeps two numbers: one of each thread, and one of the process, which threads take that begin later. Setting
-either sets both. So where several threads of a process are in `one_thread` at once (a caller's own, each with a lift),
-the process's number stays 1 until the last of them leaves, or workers of a lift that goes on would take the number of
-the lift that ended before it.
+either sets both. So where several threads of a process are in `one_thread` at once (a caller's own, a lift each), the
+process's number stays 1 until the last of them leaves, or workers of a lift that goes on would take the number of the
+lift that ended before it.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict
+from pydantic import AfterValidator, BaseModel, ConfigDict, field_validator
 
 from liftcore.errors import InvalidSplats
 from liftcore.runtime.one_line import one_line
@@ -74,6 +74,13 @@ class LiftMetadata(BaseModel):
     landmarks: tuple[Landmark, ...] = ()  # where some splats lie, by which their rows are known; () in older lifts
     certificate: dict[str, Any]
     timings: dict[str, float]  # seconds a stage
+
+    @field_validator("settings", mode="before")
+    @classmethod
+    def _as_before_they_came(cls, told: Any) -> Any:
+        """Settings that came after the lift have their own default, which is what lifts did before; not the dial's."""
+        defaults = {name: field.default for name, field in LiftSettings.model_fields.items()}
+        return defaults | told if isinstance(told, dict) else told
 
 
 @dataclass(frozen=True)

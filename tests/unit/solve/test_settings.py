@@ -9,8 +9,9 @@ import pytest
 import torch
 
 from liftcore.errors import InvalidSettings
+from liftcore.values.lift import LiftMetadata
 from liftcore.values.lift_options import LiftOptions
-from liftcore.values.settings import LiftSettings, Preset
+from liftcore.values.settings import LiftSettings, Preset, Speed
 
 LEVELS = "'rows' or 'composite' or a valid integer"
 
@@ -87,6 +88,17 @@ def test_a_preset_only_fills_what_is_not_said(preset: Preset) -> None:
     assert (said.power, said.weight_floor, said.selection, said.mass) == (1, 0.25, "front-mass", 0.5)
     assert said.render_gain == plain.render_gain
     assert LiftSettings.of(**plain.model_dump(mode="json")) == plain
+
+
+@pytest.mark.parametrize("speed", Speed)
+def test_a_lift_from_before_a_setting_does_not_tell_what_the_dial_sets_today(speed: Speed) -> None:
+    settings = LiftSettings.of(speed=speed)
+    made = LiftMetadata(version="1", settings=settings, views=("a",), certificate={}, timings={})
+    told = made.model_dump(mode="json")
+    assert LiftMetadata.model_validate(told).settings == settings
+    del told["settings"]["robust_directions"], told["settings"]["consensus"]
+    old = LiftMetadata.model_validate(told).settings
+    assert old == settings.model_copy(update={"robust_directions": 256, "consensus": False})
 
 
 def test_keyword_arguments_of_a_lift_are_typed_as_its_settings() -> None:
