@@ -32,10 +32,6 @@ from liftcore.scene.world import UNKNOWN, WorldFrame
 from liftcore.text import check_texts
 
 MOST_WORDS = 65_536  # of a vocabulary: their vectors take 130 MB at 512 channels
-NOT_LOOKED_FOR = (
-    "this lift holds no objects: they are found by lifts of masks, by the preset default or the setting objects; "
-    "grids have no masks"
-)
 NO_TREE = "this lift holds no tree: it was made before lifts had one; lift again"
 NONE_FOUND = "no object: masks of three views never keep the same splats together"
 _BLOCK = 1 << 14  # rows of features widened at once
@@ -80,7 +76,7 @@ def catalogue(scene: OpenedLift, words: Sequence[str] = (), vectors: Any = None)
         InvalidLift: the splats moved or changed since the lift.
     """
     if scene.object is None or scene.object_views is None:
-        return Catalogue((), NOT_LOOKED_FOR, np.zeros((0, scene.channels), np.float32), scene.world)
+        return Catalogue((), scene.lack_of_objects(), np.zeros((0, scene.channels), np.float32), scene.world)
     number = len(scene.object_views)
     features = object_features(scene)
     named, ids = _named(features, words, vectors), np.arange(number)
@@ -110,7 +106,7 @@ def tree(
     """
     measured: dict[str, Any] = {"world": scene.world, "unit": scene.world.unit}
     if scene.object is None or scene.object_views is None:
-        return SceneTree(explanation=NOT_LOOKED_FOR, count=0, nodes=(), **measured)
+        return SceneTree(explanation=scene.lack_of_objects(), count=0, nodes=(), **measured)
     if scene.node is None or scene.node_parents is None or scene.node_views is None:
         return SceneTree(explanation=NO_TREE, count=0, nodes=(), **measured)
     assert scene.node_confidence is not None and scene.node_features is not None

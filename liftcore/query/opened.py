@@ -283,6 +283,17 @@ class OpenedLift:
             return "object"
         return "part" if min(self.node_path(node)) < objects else "group"
 
+    def lack_of_objects(self) -> str:
+        """Why a lift has none, and what gives it some."""
+        settings = self.metadata.settings
+        if settings.objects is False:
+            why = "speed=draft sets it" if settings.speed == "draft" else "they were not asked for"
+            return f"this lift looked for no objects, with objects=false ({why}): lift again with objects=auto"
+        return (
+            "this lift holds no objects: they are found by lifts of masks, by the preset default or the setting "
+            "objects; grids have no masks"
+        )
+
     def members(self, number: int) -> np.ndarray:
         """[P] bool, the splats of an object, or of another node of the tree with its parts.
 
@@ -293,7 +304,7 @@ class OpenedLift:
         nodes = count if self.node_parents is None else len(self.node_parents)
         if self.object is None or not 0 <= number < nodes:
             expected = f"a number from 0 to {nodes - 1}" if nodes else "a lift with objects"
-            hint = "the list of the lift's objects has them"
+            hint = "the list of the lift's objects has them" if nodes else self.lack_of_objects()
             raise NotFound("object", expected=expected, got=str(number), hint=hint)
         if self.node is None or self.node_parents is None:
             return self.object == number

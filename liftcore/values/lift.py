@@ -78,7 +78,7 @@ class LiftMetadata(BaseModel):
     @field_validator("settings", mode="before")
     @classmethod
     def _as_before_they_came(cls, told: Any) -> Any:
-        """Settings that came after the lift have their own default, which is what lifts did before; not the dial's."""
+        """Settings that came after the lift have their own default, what lifts did before; not the dial's."""
         defaults = {name: field.default for name, field in LiftSettings.model_fields.items()}
         return defaults | told if isinstance(told, dict) else told
 

@@ -14,10 +14,11 @@ import torch
 
 from liftcore.cli import main
 from liftcore.errors import InvalidLift, InvalidQuery, NotFound
-from liftcore.query.catalogue import NOT_LOOKED_FOR, catalogue, table_csv
+from liftcore.query.catalogue import catalogue, table_csv
 from liftcore.query.result import LiftResult, load_lift
 from liftcore.query.scene import Scene
 from liftcore.values.lift_file import save_lift
+from liftcore.values.settings import LiftSettings
 from tests.api.tiny_scene import CHANNELS, SPLATS_A_CLUSTER, VIEWS, WORDS, text_table
 
 EYE = np.eye(3, CHANNELS, dtype=np.float32)
@@ -41,10 +42,21 @@ def test_each_object_has_its_place_its_views_and_the_nearest_word(scene: Scene) 
 def test_a_lift_from_before_opens_and_says_that_it_holds_none(scene: Scene, tmp_path: Path) -> None:
     save_lift(replace(scene.lift, object=None, object_views=None), tmp_path / "old.lift")
     old = catalogue(Scene(tmp_path / "old.lift"))
-    assert (old.objects, old.explanation) == ((), NOT_LOOKED_FOR)
+    assert old.objects == () and "grids have no masks" in old.explanation
     save_lift(replace(scene.lift, object_views=None), tmp_path / "half.lift")
     with pytest.raises(InvalidLift, match="object and object_views, or neither"):
         load_lift(tmp_path / "half.lift")
+
+
+def test_a_draft_says_that_it_looked_for_no_objects_and_what_finds_them(scene: Scene, tmp_path: Path) -> None:
+    metadata = scene.lift.metadata.model_copy(update={"settings": LiftSettings.of(speed="draft")})
+    bare = {field: None for field in vars(LiftResult.of(scene.lift)) if field.startswith(("object", "node"))}
+    save_lift(replace(scene.lift, metadata=metadata, **bare), tmp_path / "draft.lift")
+    draft = Scene(tmp_path / "draft.lift")
+    for told in (draft.catalogue().explanation, draft.tree().explanation):
+        assert "speed=draft" in told and "objects=auto" in told
+    with pytest.raises(NotFound, match="objects=auto"):
+        draft.export(tmp_path / "object.ply", source=0)
 
 
 def with_parts(scene: Scene) -> LiftResult:
