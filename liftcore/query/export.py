@@ -39,9 +39,10 @@ FILES = {  # of what a file is made -> the files that there are of it
 }
 
 BY_SUFFIX = {  # what a name asks for of many things
-    **dict.fromkeys((".glb", ".usdc", ".usdz"), "labelled"), ".json": "masks", ".jsonl": "lines",
+    **dict.fromkeys((".glb", ".spz", ".usdc", ".usdz"), "labelled"), ".json": "masks", ".jsonl": "lines",
     ".zip": "bundle",
 }  # fmt: skip
+OF_CATALOGUE = BY_SUFFIX | {".ply": "labelled"}  # as a segmentation's has its colours
 
 
 def blocks_of(
@@ -61,7 +62,7 @@ def blocks_of(
     kind = "object" if isinstance(source, int) else "scene" if source is None else type(source).__name__.lower()
     kind = "answers" if isinstance(source, Mapping) else kind
     usual = (
-        BY_SUFFIX.get(suffix)
+        (OF_CATALOGUE if kind == "catalogue" else BY_SUFFIX).get(suffix)
         if kind in ("segmentation", "catalogue", "scenetree", "answers") or suffix == ".zip"
         else None
     )

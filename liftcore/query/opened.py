@@ -7,6 +7,7 @@ from copy import copy
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
@@ -348,11 +349,18 @@ class OpenedLift:
 
     @cached_property
     def splat_file(self) -> Path:
-        """The file of the splats that were lifted.
+        """The file of the splats that were lifted; of values in memory one that goes with the scene.
 
         Raises:
             InvalidLift: it moved, is another than the one that was lifted, or has another number of splats.
         """
+        if not self.metadata.splats.path and "splats" in self.__dict__:
+            from liftcore.io.splats import write_splats
+
+            self._folder = TemporaryDirectory(prefix="splatlift-")
+            path = Path(self._folder.name) / "splats.ply"
+            write_splats(path, self.splats)
+            return path
         path = self._unchanged("splats", self.metadata.splats)
         self._require_rows(quick_count(path))
         return path

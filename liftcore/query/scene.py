@@ -380,7 +380,8 @@ class Scene(OpenedLift):
                 (splats with labels), prims (of USD, a prim an object), names (what these mean), lines (an object a
                 line, JSON), masks (COCO's JSON, in the views) or bundle (all of it in a ZIP); of the scene what
                 `render` draws, or splats; of an array npy, or mask of booleans [H, W]. Empty: the first of these; of
-                a segmentation or a catalogue as a .glb labelled, .json masks, .jsonl lines; as a .zip the bundle.
+                a segmentation or a catalogue as a .glb, .spz or .usdz labelled (a catalogue as a .ply, too), .json
+                masks, .jsonl lines; as a .zip the bundle.
             view: of pictures, as in `look`. suffix: of its name, where there are several formats.
             seen: the answer as the view shows it, where that is known. photo: of the view, for an overlay.
 

@@ -47,6 +47,17 @@ def test_label_voting_gives_each_splat_its_class_and_how_sure_it_is(tiny: Path) 
 
 
 @pytest.mark.slow
+def test_sam_masks_become_things_that_are_exported(tiny: Path) -> None:
+    (tiny / "masks").mkdir()
+    for view, labels in tiny_scene.labels().items():
+        masks = labels[0] == np.arange(3)[:, None, None]
+        np.savez(tiny / "masks" / f"{view}.npz", masks=masks, vectors=tiny_scene.codebook())
+    told = run("sam_masks.py", tiny / "splats.ply", tiny / "cameras.json", tiny / "masks", tiny / "things.ply")
+    assert told.count("20 splats about") == 3
+    assert sorted(np.unique(lc.read_splats(tiny / "things.ply").extras["instance_id"])) == [1, 2, 3]  # 0 is none
+
+
+@pytest.mark.slow
 def test_where_is_it_tells_places_before_the_camera_that_asks(tiny: Path) -> None:
     asked = (tiny / "lift.safetensors", "lamp", "--view", "middle", "--table", tiny / "table.safetensors")
     x, y, z = (float(word) for word in run("where_is_it.py", *asked).split() if word[0] in "+-")
