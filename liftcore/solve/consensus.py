@@ -52,8 +52,8 @@ from liftcore.values.region_weights import RegionWeights, run_each
 
 OBSERVES = 0.3  # of a region, that a level of a view must see to say anything of it
 PRIOR = 2.0  # views' worth of the scene's mean: one view alone may be the one that is wrong
-MOST_SPLATS = 1 << 12
-MOST_WITNESSES = 24
+MOST_SPLATS = 1 << 12  # of equal weight give a share to a standard error of .5 / 64 = .008 at most
+MOST_WITNESSES = 24  # give a mean q to .1 at most, and PRIOR draws it by 2 in 26; more cost time (docs/results.md)
 BLOCK_ENTRIES = 1 << 23  # a pass over all rows each
 PIECES = 16  # of the rows, for threads
 STEPS = 1 << 30  # of a share
