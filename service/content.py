@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -67,22 +68,32 @@ def kept(etag: str) -> dict[str, str]:
     return {"ETag": etag, "Cache-Control": "private, no-cache"}
 
 
-def file_answer(request: Request, path: Path, size: int, sha256: str, name: str) -> Response:
+def file_answer(
+    request: Request, path: Path, size: int, sha256: str, name: str, header: bytes | None = None
+) -> Response:
     """A stored file, whose bytes never change: 200, 206 for one range, 304 when the client has it.
 
     Args:
         path: of the file. size: in bytes, when it was stored. sha256: of the bytes. name: for who saves it.
+        header: of a safetensors file, what the answer begins with in place of the file's own length and header.
 
     Raises:
         RangeNotSatisfiable: the range begins beyond the end.
         NotFound: the file is not there, or no longer what was stored.
     """
+    status, offset = require_whole(path, size), 0
+    if header is not None:
+        with path.open("rb") as handle:
+            offset = 8 + int.from_bytes(handle.read(8), "little")
+        size += len(header) - offset
+        sha256 = hashlib.sha256(header + sha256.encode()).hexdigest()
     etag = f'"{sha256}"'
-    status = require_whole(path, size)
     if (same := unchanged(request, etag)) is not None:
         return same
     asked, condition = request.headers.get("range"), request.headers.get("if-range", etag)
     part = _range_of(asked, size) if asked is not None and condition == etag else None
+    if header is not None:
+        return _ChangedFile(path, header, offset, part, size, kept(etag) | _saved_as(name))
     return _FileAnswer(part, path, headers=kept(etag), filename=name, stat_result=status)
 
 
@@ -119,28 +130,59 @@ class _FileAnswer(FileResponse):
         await super().__call__({**scope, "headers": headers}, receive, send)
 
 
-class Draft(StreamingResponse):
-    """A file that was made for this answer alone, perhaps to be saved under a name.
+class _OpenFile(StreamingResponse):
+    """An answer from a file that is closed with it, however it ends."""
 
-    It is held open, so its entry may go as soon as this is made; its room goes with the answer, however that ends.
-    """
-
-    def __init__(self, draft: Path, media_type: str, *, filename: str | None, headers: Mapping[str, str]) -> None:
-        self.file: BinaryIO = draft.open("rb")
-        told = {
-            "Content-Length": str(os.fstat(self.file.fileno()).st_size),
-            "Cache-Control": "private, no-cache",
-        }
-        if filename is not None:
-            told["Content-Disposition"] = f'attachment; filename="{filename}"'
-        super().__init__(iter(lambda: self.file.read(BLOCK_BYTES), b""), 200, told | dict(headers), media_type)
+    file: BinaryIO
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         try:
             await super().__call__(scope, receive, send)
         finally:
             with anyio.CancelScope(shield=True):
-                await anyio.to_thread.run_sync(self.file.close)  # gigabytes take their time to go
+                await anyio.to_thread.run_sync(self.file.close)  # gigabytes of a draft take their time to go
+
+
+class _ChangedFile(_OpenFile):
+    """A file with another header before all that lies behind an offset in it, or a part of that."""
+
+    def __init__(
+        self, path: Path, header: bytes, offset: int, part: tuple[int, int] | None, size: int, headers: dict[str, str]
+    ) -> None:
+        first, last = part or (0, size - 1)
+        told = {"Content-Length": str(last + 1 - first), "Accept-Ranges": "bytes"}
+        told |= {"Content-Range": f"bytes {first}-{last}/{size}"} if part else {}
+        self.file = path.open("rb")
+        blocks = self._blocks(header, offset, first, last + 1)
+        super().__init__(blocks, 206 if part else 200, told | headers, BINARY)
+
+    def _blocks(self, header: bytes, offset: int, first: int, end: int) -> Iterator[bytes]:
+        yield header[first:end]
+        first = max(first, len(header))
+        self.file.seek(first - len(header) + offset)
+        while first < end and (block := self.file.read(min(BLOCK_BYTES, end - first))):
+            first += len(block)
+            yield block
+
+
+class Draft(_OpenFile):
+    """A file that was made for this answer alone, perhaps to be saved under a name.
+
+    It is held open, so its entry may go as soon as this is made; its room goes with the answer, however that ends.
+    """
+
+    def __init__(self, draft: Path, media_type: str, *, filename: str | None, headers: Mapping[str, str]) -> None:
+        self.file = draft.open("rb")
+        told = {
+            "Content-Length": str(os.fstat(self.file.fileno()).st_size),
+            "Cache-Control": "private, no-cache",
+        }
+        told |= {} if filename is None else _saved_as(filename)
+        super().__init__(iter(lambda: self.file.read(BLOCK_BYTES), b""), 200, told | dict(headers), media_type)
+
+
+def _saved_as(name: str) -> dict[str, str]:
+    return {"Content-Disposition": f'attachment; filename="{name}"'}
 
 
 def listed(

@@ -324,8 +324,8 @@ class LiftResult(BaseModel):
 
     id: JobId
     name: str | None = Field(description="that somebody gave it")
-    bytes: int
-    sha256: str
+    bytes: int = Field(description="of its file, as it was made")
+    sha256: str = Field(description="likewise; of the download after its `world` was changed the ETag tells")
     splats: AssetId
     cameras: AssetId
     features: list[AssetId]

@@ -13,7 +13,7 @@ from liftcore.cli.query import made_from
 from liftcore.cli.reply import free_outputs, place_of, reply, write_files
 from liftcore.cli.segment import read_words
 from liftcore.errors import InvalidQuery
-from liftcore.files import check_output
+from liftcore.files import check_output, identify
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -77,7 +77,9 @@ def run(options: argparse.Namespace) -> int:
 def _read_splats(options: argparse.Namespace) -> None:
     """Take ``--splats`` with a folder, as releases before called ``--into``, for that."""
     folder = options.splats
-    if not isinstance(folder, Path) or options.into or folder.suffix or (folder / "meta.json").is_file():  # of a SOG
+    if not isinstance(folder, Path) or options.into:
+        return
+    if identify(folder).kind == "splats" if folder.is_dir() else folder.suffix or folder.exists():
         return
     print("splatlift: --splats FOLDER is now --into FOLDER; the old name goes with the next release", file=sys.stderr)
     options.into, options.splats = folder, None

@@ -101,12 +101,14 @@ def misplaced(options: argparse.Namespace) -> InvalidInput | None:
 
     given = {name: _paths(getattr(options, name, None)) for name in ROLES}
     for name, wanted in ROLES.items():
+        is_ordered = options.command in ORDERED and name in ORDER
+        argument = name.upper() if is_ordered or name == "lift" else f"--{name}"
         for path in given[name]:
-            error = wrong_kind(path, wanted, InvalidInput, expected=f"{wanted} as {name.upper()}")
+            error = wrong_kind(path, wanted, InvalidInput, expected=f"{wanted} as {argument}")
             if error is None:
                 continue
             others = (identify(path).kind for other in ORDER if other != name for path in given[other])
-            if options.command in ORDERED and name in ORDER and wanted in others:
+            if is_ordered and wanted in others:
                 hint = "the order is SPLATS CAMERAS FEATURES"
                 error = InvalidInput(error.argument, expected=error.expected, got=error.got, hint=hint)
             return error

@@ -38,6 +38,7 @@ from liftcore.io.quantised import (
 from liftcore.io.spz_labels import label_record, read_label_record, records
 from liftcore.scene.harmonics import SH_C0, band_rotation
 from liftcore.scene.render_mode import RenderMode, RenderModel
+from liftcore.scene.world import world_of
 
 if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
@@ -118,7 +119,7 @@ def read_spz(path: Path, *, colour: bool = True) -> Fields:
         (table,) = struct.unpack_from("<I", start, HEADER_BYTES)
         zone = content[STREAMS_HEADER_BYTES : max(table, STREAMS_HEADER_BYTES)]
         frame, sections = _declared_frame(zone, path), _streams(content, table, streams, sizes, path)
-        labels = read_label_record(zone, count) if colour and flags & HAS_EXTENSIONS else None
+        labels = read_label_record(zone, count) if flags & HAS_EXTENSIONS else None
     else:
         body = np.frombuffer(_inflated(unpacking, unpacking.unconsumed_tail, sum(sizes), path), np.uint8)
         behind = _inflated(unpacking, unpacking.unconsumed_tail, 0, path)
@@ -126,7 +127,9 @@ def read_spz(path: Path, *, colour: bool = True) -> Fields:
         sections, labels = np.split(body, np.cumsum(sizes)[:-1]), None
     fields = _decoded(sections, version, degree if colour else 0, 2.0**-bits, frame, colour=colour)
     fields["render_mode"] = RenderMode(RenderModel.ANTIALIASED, FLAG) if flags & ANTIALIASED else None
-    return fields | ({"extras": labels.columns} if labels else {})
+    if labels:
+        fields |= {"world": world_of(labels.document.get("world"))} | ({"extras": labels.columns} if colour else {})
+    return fields
 
 
 def read_spz_document(path: Path) -> dict[str, Any]:
@@ -166,6 +169,7 @@ def spz_blocks(splats: Splats, document: Mapping[str, Any] | None = None) -> Ite
     flags = ANTIALIASED if splats.antialiased else 0
     if columns := stored_columns(splats):
         head = (MAGIC, 4, splats.count, degree, bits, flags | HAS_EXTENSIONS)
+        document = {"world": splats.world.model_dump(mode="json"), **(document or {})}
         yield from _version_4(head, label_record(columns, document), [b"".join(section) for section in sections])
         return
     packing = zlib.compressobj(wbits=31)

@@ -132,9 +132,10 @@ def get_lift(lift: str, deps: Deps) -> models.LiftResult:
 
 @router.get("/lifts/{lift}/features", response_class=Response, responses=FILE, tags=["lifts"])
 def get_lift_features(lift: str, request: Request, deps: Deps) -> Response:
-    """The lift file (safetensors), or a range of it."""
+    """The lift file (safetensors), or a range of it; it has the ``world`` that a PATCH gave the lift."""
     found = deps.store.lifts.get(deps.owner, lift)
-    return file_answer(request, found.path, found.bytes, found.sha256, f"lift-{found.id}.safetensors")
+    name, header = f"lift-{found.id}.safetensors", found.changed_header()
+    return file_answer(request, found.path, found.bytes, found.sha256, name, header)
 
 
 @router.get("/tradeoffs/{tradeoff}", response_model=models.Tradeoff, tags=["trade-offs"])

@@ -14,7 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from safetensors import SafetensorError, safe_open
+
 from liftcore.errors import NotFound
+from liftcore.files import with_metadata
 from service.errors import InvalidRequest
 from service.store.assets import own
 from service.store.database import Database, Page, insert, page_of, parsed, record_of
@@ -23,6 +26,10 @@ from service.store.jobs import JobOrder, succeed, told
 from service.store.owners import SEEN, SHOWN_JOBS, Owner, require_quota
 
 BY_HAND = "set by hand"  # of the rendering that a lift's plan tells: the setting was not auto
+WORLD_CHANGED = "world_changed"  # of a lift's metadata in the database: its file has another world
+SET_WORLD = f"""
+    UPDATE lifts SET metadata = json_set(metadata, '$.world', json(?), '$.{WORLD_CHANGED}', json('true')) WHERE id = ?
+"""
 
 
 @dataclass(frozen=True)
@@ -55,6 +62,23 @@ class LiftRecord:
     cameras: str
     features: tuple[str, ...]
     photos: str | None  # of its views
+
+    def changed_header(self) -> bytes | None:
+        """What the lift's file begins with, its length and header, with the ``world`` of now; None: with its own.
+
+        Raises:
+            NotFound: the file is not there, or no longer a lift.
+        """
+        if not self.metadata.get(WORLD_CHANGED):
+            return None
+        try:
+            handle: Any
+            with safe_open(str(self.path), framework="np") as handle:
+                told = json.loads(handle.metadata()["splatlift"]) | {"world": self.metadata["world"]}
+            return next(with_metadata(self.path, {"splatlift": json.dumps(told, ensure_ascii=False)}))
+        except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
+            got = f"one that does not open: {error}"[:200]
+            raise NotFound("content", expected="the file of a lift", got=got, hint="lift again") from None
 
 
 @dataclass(frozen=True)
@@ -207,8 +231,7 @@ class LiftStore:
             for column in changes.keys() & {"name", "photos"}:
                 connection.execute(f"UPDATE lifts SET {column} = ? WHERE id = ?", (changes[column] or None, lift))
             if "world" in changes:
-                world = "UPDATE lifts SET metadata = json_set(metadata, '$.world', json(?)) WHERE id = ?"
-                connection.execute(world, (json.dumps(changes["world"] or {}), lift))
+                connection.execute(SET_WORLD, (json.dumps(changes["world"] or {}), lift))
         return self.get(owner, lift)
 
     def _own_photos(self, connection: sqlite3.Connection, owner: Owner, lift: str, photos: str) -> None:

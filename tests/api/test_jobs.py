@@ -18,8 +18,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from fastapi.testclient import TestClient
 
+from liftcore import WorldFrame, load_lift
 from liftcore.errors import Unavailable
 from liftcore.lifting.files import open_files
 from liftcore.lifting.pipeline import plan as plan_of
@@ -323,6 +325,36 @@ def test_lift_and_its_files_are_found_where_they_were_downloaded(
     scene = Scene(made)
     assert scene.splats.count == COUNT and {camera.name for camera in scene.cameras.values()} == set(VIEWS)
     assert set(scene.packs.views) == set(VIEWS)
+
+
+def test_downloaded_lift_has_the_world_that_it_was_given_later(
+    client: TestClient, lift: dict[str, Any], tmp_path: Path
+) -> None:
+    path, at = lift["links"]["features"], f"/lifts/{lift['id']}"
+    before = client.get(path)
+    client.patch(at, json={"world": {"up": [0, -1, 0], "metres_per_unit": 0.5}})
+    try:
+        after = client.get(path)
+        tag, content = after.headers["etag"], after.content
+        (tmp_path / "lift.safetensors").write_bytes(content)
+        opened, bare = load_lift(tmp_path / "lift.safetensors"), tmp_path / "before.safetensors"
+        bare.write_bytes(before.content)
+        assert opened.metadata.world == WorldFrame(up=(0, -1, 0), metres_per_unit=0.5)
+        assert opened.metadata == load_lift(bare).with_world(opened.metadata.world).metadata
+        assert torch.equal(opened.features, load_lift(bare).features)
+        assert int(after.headers["content-length"]) == len(content) and tag != before.headers["etag"]
+        assert client.get(path, headers={"If-None-Match": tag}).status_code == 304
+        header = 8 + int.from_bytes(content[:8], "little")
+        for first, last in ((0, 7), (header - 3, header + 3), (header + 9, header + 20), (len(content) - 5, "")):
+            part = client.get(path, headers={"Range": f"bytes={first}-{last}", "If-Range": tag})
+            end = len(content) if last == "" else int(last) + 1
+            assert (part.status_code, part.content) == (206, content[first:end])
+            assert part.headers["content-range"] == f"bytes {first}-{end - 1}/{len(content)}"
+        assert client.get(path, headers={"Range": f"bytes={len(content)}-"}).status_code == 416
+    finally:
+        client.patch(at, json={"world": None})
+    (tmp_path / "lift.safetensors").write_bytes(client.get(path).content)
+    assert load_lift(tmp_path / "lift.safetensors").metadata.world == WorldFrame()
 
 
 # The process of a job: a device that is not there, a full disk, and no path of the server

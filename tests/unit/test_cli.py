@@ -123,6 +123,7 @@ def test_files_in_each_others_place_are_told_as_that(scene: Path, capsys: pytest
         (["plan", splats, cameras, cameras], "cameras.json: expected features as FEATURES, got cameras"),
         (["plan", splats, cameras, maps], "got a folder; make packs with 'splatlift pack'"),
         (["query", pack, "word"], "pack.safetensors: expected lift as LIFT, got features"),
+        (["query", scene / "none", "word", "--splats", pack], "expected splats as --splats, got features"),
     ):
         status, out, err = run(capsys, *arguments)
         assert (status, out) == (2, "") and told in err

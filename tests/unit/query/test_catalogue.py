@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -168,6 +169,29 @@ def test_the_command_lists_names_and_writes_them(
     assert main(["objects", str(tiny_lift), "--json"]) == 0
     plain = json.loads(capsys.readouterr().out)
     assert [one.keys() for one in plain["objects"]] == [one.keys() - {"feature"} for one in told["objects"]]
+
+
+def test_a_folder_of_before_is_not_blamed_for_another_argument(
+    tiny_lift: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (splats,) = tiny_lift.parent.glob("*.ply")
+    folder = tmp_path / "things.v1"
+    folder.mkdir()
+    shutil.copy(splats, folder / "object-0.ply")
+    assert main(["objects", str(tiny_lift), "--splats", str(folder), "--up", "0", "0", "0"]) == 2
+    told = capsys.readouterr().err
+    assert "--up: expected" in told and "expected splats" not in told
+    assert main(["objects", str(tiny_lift), "--splats", str(folder)]) == 0
+    assert len(list(folder.iterdir())) == 3
+
+
+def test_a_folder_that_is_splats_gets_no_objects(tiny_lift: Path, tmp_path: Path) -> None:
+    for name in ("meta.json", "lod-meta.json"):
+        folder = tmp_path / name.removesuffix(".json")
+        folder.mkdir()
+        (folder / name).write_text(json.dumps({part: {} for part in ("means", "scales", "quats")}))
+        assert main(["objects", str(tiny_lift), "--splats", str(folder)]) == 2
+        assert [one.name for one in folder.iterdir()] == [name]
 
 
 def test_objects_without_splats_are_left_out(scene: Scene, tmp_path: Path) -> None:

@@ -132,6 +132,11 @@ def test_labels_bring_their_frame_along(suffix: str, tmp_path: Path) -> None:
     (tmp_path / f"o{suffix}").write_bytes(b"".join(labelled(tmp_path / "s.ply", made, suffix)))
     found = read_labels(tmp_path / f"o{suffix}").document["world"]
     assert WorldFrame.model_validate(found) == SIDEWAYS
+    for colour in (True, False):
+        splats = read_splats(tmp_path / f"o{suffix}", colour=colour)
+        assert splats.world == SIDEWAYS
+    write_splats(tmp_path / f"again{suffix}", read_splats(tmp_path / f"o{suffix}"))
+    assert read_splats(tmp_path / f"again{suffix}").world == SIDEWAYS
 
 
 WRONG: list[dict[str, Any]] = [
