@@ -7,6 +7,7 @@ const MARGIN = { left: 58, right: 24, top: 16, bottom: 46 };
 const NAMES = { centred_cosine: "likeness to views that were not lifted", mask_iou: "overlap with the masks", phrase_iou: "overlap of words with the masks" };
 const PAGE = 100; // lifts among which one of the same settings is looked for
 const LINE = 15; // pixels from a name to the next below it
+const REACH = 9; // of a point, to its sides
 
 export class Chart {
   // opened: with a lift that is to be shown; ordered: with the job of one that is to be, and its name.
@@ -60,7 +61,7 @@ export class Chart {
     return made;
   }
 
-  // Names beside the points, one below another where they would meet.
+  // Names beside the points, lower where they would meet another name or point.
   names(place, width) {
     const taken = [];
     return [...this.shown].sort((one, other) => place(one)[1] - place(other)[1]).map(run => {
@@ -69,7 +70,10 @@ export class Chart {
       const long = 7.2 * run.name.length;
       const [from, to] = half > 0 ? [x, x + long + 14] : [x - long - 14, x];
       let low = y + 4;
-      while (taken.some(one => Math.abs(one.low - low) < LINE && one.from < to && from < one.to)) low += 2;
+      const others = this.shown.filter(one => one !== run).map(place); // whose points stay free, too
+      const meets = () => taken.some(one => Math.abs(one.low - low) < LINE && one.from < to && from < one.to)
+        || others.some(([left, high]) => Math.abs(high + 4 - low) < LINE && from < left + REACH && left - REACH < to && Math.abs(left - x) > REACH);
+      while (meets()) low += 2;
       taken.push({ low, from, to });
       return text(run.name, x + half * 14, low, half > 0 ? "start" : "end", "name");
     });
