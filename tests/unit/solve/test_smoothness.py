@@ -73,6 +73,15 @@ def test_features_are_those_of_the_least_sum(device: Device, seed: int, count: i
     assert np.linalg.norm(apart) <= 1e-2 * np.linalg.norm(moved) + 1e-6 * np.sqrt(weights.sum())
 
 
+@pytest.mark.parametrize("channels", [31, 65, 130])
+def test_features_of_more_channels_than_are_solved_at_a_time_are_those_of_the_least_sum(channels: int) -> None:
+    scene = Scene(5, 90, channels=channels)
+    X, weights = scene.minimum(1.0)
+    roots = np.sqrt(weights[:, None])
+    apart, moved = (roots * (Y.double().numpy() - X) for Y in (scene.smooth(1.0), scene.X))
+    assert (np.linalg.norm(apart, axis=0) <= 2e-2 * np.linalg.norm(moved, axis=0)).all()
+
+
 @settings(max_examples=20, deadline=None)
 @given(seed=SEEDS, unseen=st.floats(0.05, 0.99))
 def test_splats_without_evidence_take_the_mean_of_their_neighbours(seed: int, unseen: float) -> None:

@@ -233,6 +233,17 @@ def test_objects_by_blocks_are_those_of_the_whole_scene(
         np.testing.assert_array_equal(getattr(got.tree, name), part)
 
 
+def test_shares_of_regions_in_nodes_are_plain_sums(W: RegionWeights) -> None:
+    labels, others = np.random.default_rng(5).integers(-1, 4, SPLATS).astype(np.int32), np.array([1, 4, 5])
+    table = added(over_files(list(objects.node_shares(W, labels, 4, others, 2))), (1, 5 * others.size))
+    dense = np.zeros((SPLATS, int(W.offsets[-1])))
+    rows = np.repeat(np.arange(SPLATS), np.diff(W.indptr.numpy()))
+    np.add.at(dense, (rows, W.region.numpy()), W.weight.double().numpy())
+    expected = np.stack([dense[labels == label][:, others].sum(axis=0) for label in range(-1, 4)])
+    np.testing.assert_allclose(table.reshape(5, -1), expected, rtol=1e-12)
+    assert expected.any(axis=1).all()
+
+
 def test_hubers_loss_in_blocks_is_that_of_the_whole_scene(
     W: RegionWeights, means: torch.Tensor, codebook: Codebook, blocks: list[tuple[int, int]]
 ) -> None:
