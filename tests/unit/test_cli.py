@@ -296,9 +296,9 @@ def test_commands_and_the_page_of_a_missing_service_say_what_to_install(
     monkeypatch.setattr(plugins, "_entries", lambda group: ())
     for command in (["serve"], ["keys", "list"]):
         status, out, err = run(capsys, *command)
-        assert (status, out) == (2, "") and "pip install splatlift" in err
+        assert (status, out) == (2, "") and "pip install 'splatlift[service]'" in err
         assert_one_line(err)
-    with pytest.raises(Unavailable, match="pip install splatlift"):
+    with pytest.raises(Unavailable, match=r"pip install 'splatlift\[service\]'"):
         load_lift(scene / "lift.safetensors").show()
     assert "run the HTTP service" in run(capsys, "--help")[1]
 
