@@ -422,11 +422,14 @@ def test_what_a_comparison_refuses_is_the_users_problem_and_names_no_path(
 
 
 def test_order_that_the_services_engine_cannot_lift_is_refused_with_what_to_set(store: Store) -> None:
-    for settings in ({"cg_steps": 2}, {"aggregation": True, "aggregation_clusters": "hdbscan"}):
+    for settings, change in (
+        ({"cg_steps": 2}, "cg_steps=0"),
+        ({"aggregation": True, "aggregation_clusters": "hdbscan"}, "aggregation=false"),
+    ):
         with standing_in(store, "answer", engine="local") as (client, body):
             reply = client.post("/lift", json=body | {"settings": settings})
             problem = assert_problem(reply)
-            assert reply.status_code == 422 and "aggregation=false" in problem["detail"]
+            assert reply.status_code == 422 and change in problem["detail"]
     with standing_in(store, "answer", engine="local") as (client, body):
         assert client.post("/lift", json=body).status_code == 202  # the default
     with standing_in(store, "answer") as (client, body):

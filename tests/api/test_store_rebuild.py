@@ -55,7 +55,7 @@ def all_told(client: TestClient) -> dict[str, Any]:
     job = client.get(f"/jobs/{lift['id']}").json()
     answer = client.get("/query", params={"text": "lamp", "top": 3}).json()
     for each in (*assets.values(), lift):
-        del each["created"]
+        del each["created"], each["created_at"]
     return {"assets": assets, "lift": lift, "settings": job["settings"], "state": job["state"], "answer": answer}
 
 
