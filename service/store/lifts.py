@@ -75,7 +75,9 @@ class LiftRecord:
             handle: Any
             with safe_open(str(self.path), framework="np") as handle:
                 told = json.loads(handle.metadata()["splatlift"]) | {"world": self.metadata["world"]}
-            return next(with_metadata(self.path, {"splatlift": json.dumps(told, ensure_ascii=False)}))
+            return next(
+                with_metadata(self.path, {"splatlift": json.dumps(told, ensure_ascii=False, separators=(",", ":"))})
+            )
         except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
             got = f"one that does not open: {error}"[:200]
             raise NotFound("content", expected="the file of a lift", got=got, hint="lift again") from None

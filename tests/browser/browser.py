@@ -111,6 +111,10 @@ class Browser:
             mouse = {"button": "left", "buttons": 1, "clickCount": 1, "modifiers": SHIFT * shift + ALT * alt}
             self._call("Input.dispatchMouseEvent", type=kind, **mouse, **point)
 
+    def forget_history(self) -> None:
+        """Take away what Back leads to: Chromium keeps 50 entries, and then counts no further."""
+        self._call("Page.resetNavigationHistory")
+
     def key(self, name: str, *, shift: bool = False, ctrl: bool = False) -> None:
         """Press a key and let it go."""
         told = {

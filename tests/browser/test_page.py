@@ -329,6 +329,7 @@ def test_answer_is_corrected_by_hand_and_undone(page: Browser) -> None:
 
 
 def test_back_undoes_what_was_asked_and_stays_on_the_page(page: Browser) -> None:
+    page.forget_history()
     before = page.value("history.length")
     ask(page, "lamp")
     ask(page, "apple")
