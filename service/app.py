@@ -29,7 +29,7 @@ from service.observe import Metrics, access, chosen_id, versions, working_for
 from service.problems import CLOSE, answer_to
 from service.query_client import QueryClient, QueryLimits
 from service.requests import KnownParameters
-from service.routes import assets, jobs, lifts, operations, queries, selections, shares
+from service.routes import assets, jobs, lifts, operations, queries, selections
 from service.settings import ServiceSettings
 from service.state import AppState, Readiness, Stopping
 from service.store.store import Collector, Store
@@ -106,7 +106,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
     app.add_middleware(Turns)
     problems.install(app)
     app.include_router(operations.router)  # probes and links to the page may carry what they like
-    for module in (assets, jobs, lifts, queries, selections, shares):
+    for module in (assets, jobs, lifts, queries, selections):
         app.include_router(module.router, dependencies=[KnownParameters])
     return app
 

@@ -1,8 +1,9 @@
-"""/lifts and /tradeoffs: what jobs made, with the id of its job; and what a viewer draws of a lift."""
+"""/lifts and /tradeoffs: what jobs made, with the id of its job; who reads a lift; what a viewer draws of it."""
 
 from __future__ import annotations
 
 import hashlib
+import time
 from functools import partial
 from typing import Annotated, Any, Literal
 
@@ -13,6 +14,7 @@ from liftcore.errors import NotFound
 from liftcore.files import in_camera_orientation
 from service import models
 from service.content import FILE, TAGGED, Cursor, Limit, file_answer, kept, listed, unchanged
+from service.errors import InvalidRequest, OverLimit
 from service.requests import JsonRoute
 from service.routes.assets import RAW_BODY, Sha256, taken
 from service.routes.jobs import Key
@@ -30,9 +32,12 @@ from service.routes.queries import (
 )
 from service.settings import encoder_label
 from service.state import AppState, Deps
+from service.store.keys import KeyRecord, Quota
 from service.store.lifts import LiftRecord, TradeoffRecord
+from service.store.owners import Scope
 from service.uploads import LIFT, LiftIntake
 
+MOST_SHARES = 100  # of a lift that are valid
 MARKDOWN_TYPE = "text/markdown; charset=utf-8"
 MARKDOWN: dict[int | str, dict[str, Any]] = {200: {"content": {MARKDOWN_TYPE: {"schema": {"type": "string"}}}}}
 
@@ -52,6 +57,7 @@ ViewsCursor = Annotated[int, Query(ge=0, le=10**9, description="the `next` of th
 Pixel = Annotated[int, Query(ge=0, le=10**9, description="of the photo: x from the left, y from the top")]
 Level = Annotated[int, Query(ge=0, le=10**9, description="as GET /lifts/{lift}/regions tells it")]
 ObjectId = Annotated[int, Path(ge=0, le=10**9, description="the id of an object of the lift")]
+ShareId = Annotated[str, Path(pattern=r"^[0-9a-f]{12}$", description="the id of a share of the lift")]
 Layer = Annotated[
     Literal["pca", "cluster", "evidence", "agreement", "confidence"],
     Query(description="principal components of features, clusters, or one of the others through a colour map"),
@@ -156,6 +162,61 @@ def get_tradeoff_chart(tradeoff: str, request: Request, deps: Deps) -> Response:
 def get_tradeoff_table(tradeoff: str, deps: Deps) -> Response:
     """The runs as a table, with what it says and how it was made."""
     return Response(deps.store.tradeoffs.get(deps.owner, tradeoff).page, headers={"Content-Type": MARKDOWN_TYPE})
+
+
+# Keys that others read a lift with
+
+
+@router.get("/key", response_model=models.OwnKey, tags=["keys"])
+def get_key(deps: Deps) -> models.OwnKey:
+    """What the key of this request may do, and whose it is."""
+    key = deps.caller.record
+    if key is None:
+        return models.OwnKey(name=None, scopes=[Scope.ADMIN], lifts=[], expires=None)
+    return models.OwnKey(name=key.name, scopes=sorted(key.scopes), lifts=list(key.lifts), expires=key.expires)
+
+
+@router.get("/lifts/{lift}/shares", response_model=models.Shares, tags=["keys"])
+def list_shares(lift: str, deps: Deps) -> models.Shares:
+    """The keys that the lift was given to and that are valid, newest first, without their secrets."""
+    found = deps.store.lifts.get(deps.owner, lift)
+    return models.Shares(shares=[shape_share(key, found.id) for key in deps.store.keys.of_lift(found.id)])
+
+
+@router.post("/lifts/{lift}/shares", response_model=models.NewShare, status_code=201, tags=["keys"])
+def create_share(lift: str, asked: models.AskedShare, deps: Deps) -> Response:
+    """Make a key that looks at this lift and asks it. It is shown this once, and in a link of the page."""
+    found = deps.store.lifts.get(deps.owner, lift)
+    if deps.caller.key is None:
+        raise InvalidRequest(
+            "Authorization", expected="a service that wants keys", got="one that is open to its machine",
+            hint="the operator makes a first key with splatlift keys create",
+        )  # fmt: skip
+    if len(deps.store.keys.of_lift(found.id)) >= MOST_SHARES:
+        raise OverLimit("share", expected=f"at most {MOST_SHARES} of a lift", got="more", hint="delete some first")
+    key, secret = deps.store.keys.create(
+        asked.name, frozenset({Scope.SHARED}), Quota(), expires=time.time() + asked.expires_s,
+        lifts=[found.id], maker=deps.caller.key,
+    )  # fmt: skip
+    share = shape_share(key, found.id)
+    # After the #, which browsers send nobody: neither the log of a proxy nor another site comes to know it.
+    links = share.links | {"page": f"/?lift={found.id}#key={secret}"}
+    made = models.NewShare(**share.model_dump(exclude={"links"}), links=links, key=secret)
+    headers = {"Location": share.links["self"], "Cache-Control": "no-store"}
+    return JSONResponse(made.model_dump(mode="json"), 201, headers=headers)
+
+
+@router.delete("/lifts/{lift}/shares/{share}", status_code=204, tags=["keys"])
+def delete_share(lift: str, share: ShareId, deps: Deps) -> Response:
+    """Take the lift away from a key, from the next request on; a key that then has none ends."""
+    deps.store.keys.take_away(share, deps.store.lifts.get(deps.owner, lift).id)
+    return Response(status_code=204)
+
+
+def shape_share(key: KeyRecord, lift: str) -> models.Share:
+    """A key as the one who gave it a lift gets it, without its secret."""
+    links = {"self": f"/lifts/{lift}/shares/{key.id}", "lift": f"/lifts/{lift}"}
+    return models.Share(id=key.id, name=key.name, created=key.created, expires=key.expires, links=links)
 
 
 # What a viewer draws of a lift

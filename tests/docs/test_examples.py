@@ -36,13 +36,13 @@ from liftcore.values.pack import read_features, write_pack
 from service import models
 from service.auth import OPEN
 from service.commands.demo import find_scene
-from service.routes import assets, jobs, lifts, operations, queries, selections, shares
+from service.routes import assets, jobs, lifts, operations, queries, selections
 from tests.api.tiny_scene import HEIGHT, WIDTH, WORDS, cameras_document, codebook, colmap_zip, labels, make_scene
 from tests.run_lengths import sam_records
 
 from .readme import FOR_USERS, GUIDE, PYTHON, ROOT, SERVICE, SETTINGS, blocks, text
 
-ROUTES: tuple[ModuleType, ...] = (operations, assets, jobs, lifts, queries, selections, shares)
+ROUTES: tuple[ModuleType, ...] = (operations, assets, jobs, lifts, queries, selections)
 SHAPES: dict[str, type[BaseModel]] = {  # a field that no other answer has -> the answer
     "counts": models.Asset,
     "attempt": models.Job,
