@@ -39,6 +39,9 @@ from service.store.store import Store
 FILES_A_CONNECTION = 2  # itself, and what it is sent
 SWITCH_SECONDS = 0.0005  # that a thread may compute on while the event loop waits; Python's own is ten times that
 MARGIN = " " * 6  # of what --help says of a variable
+# That a connection is kept after an answer: longer than the pools of clients and proxies keep theirs (httpx 5 s,
+# aiohttp 15 s, nginx 60 s). At the same number one sends its next request in the moment in which it is closed.
+KEEP_ALIVE_SECONDS = 75
 IDLE_SECONDS = 1.0  # without a request in progress; then a connection may be closed for one that comes
 FILES_BESIDE = 128  # of the database, checks, jobs and the query worker
 
@@ -59,22 +62,24 @@ class AnnouncingServer(uvicorn.Server):
         self._max_connections = max_connections
         self._stopping = stopping
         self._announce = announce
-        self._idle_since: dict[Any, float] = {}  # connection -> seconds of the monotonic clock
+        # Connection and the last request of it, which is over -> seconds of the monotonic clock
+        self._idle_since: dict[tuple[Any, Any], float] = {}
 
     async def on_tick(self, counter: int) -> bool:
         """Close the connections that are idle the longest where the next one would be too many. uvicorn calls this
         ten times a second.
         """
         now, connections = time.monotonic(), self.server_state.connections
+        requests = ((each, getattr(each, "cycle", None)) for each in connections)
         self._idle_since = {
-            each: self._idle_since.get(each, now)
-            for each in connections
-            if (cycle := getattr(each, "cycle", None)) is None or cycle.response_complete
+            last: self._idle_since.get(last, now)  # another request since the last look: idle from now on
+            for last in requests
+            if last[1] is None or last[1].response_complete
         }
         surplus = len(connections) - self._max_connections + 1  # with the next one
-        for each in sorted(self._idle_since, key=self._idle_since.__getitem__)[: max(0, surplus)]:
-            if now - self._idle_since[each] >= IDLE_SECONDS and not each.transport.is_closing():
-                each.shutdown()
+        for last in sorted(self._idle_since, key=self._idle_since.__getitem__)[: max(0, surplus)]:
+            if now - self._idle_since[last] >= IDLE_SECONDS and not last[0].transport.is_closing():
+                last[0].shutdown()
         return await super().on_tick(counter)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
@@ -250,6 +255,7 @@ def server_of(app: FastAPI, settings: ServiceSettings, announce: Callable[[str],
     config = uvicorn.Config(
         app, http="h11", ws="none", log_config=None, log_level="warning", access_log=False, server_header=False,
         limit_concurrency=settings.max_connections + 1,  # with the one that asks
+        timeout_keep_alive=KEEP_ALIVE_SECONDS,
         timeout_graceful_shutdown=math.ceil(settings.stop_seconds),
         proxy_headers=bool(proxies), forwarded_allow_ips=proxies,
     )  # fmt: skip

@@ -6,6 +6,7 @@ import contextlib
 import itertools
 import json
 import socket
+import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -148,6 +149,32 @@ def test_connections_without_a_request_make_room_for_others(tmp_path: Path) -> N
         until(lambda: answers(address))
         busy.sendall(b"{}".ljust(5000))
         assert busy.recv(1 << 16).startswith(b"HTTP/1.1 422 ")
+
+
+def test_connection_that_is_used_again_and_again_is_not_closed_for_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.commands.serve.IDLE_SECONDS", 0.25)
+    with contextlib.ExitStack() as stack, running(tmp_path / "data", max_connections=3) as server:
+        address = address_of(server)
+        busy = stack.enter_context(client_of(address))
+        time.sleep(0.15)  # so that it is the oldest
+        for _ in range(2):  # the next one is one too many
+            stack.enter_context(client_of(address))
+        for _ in range(8):  # each is over between two looks of the server, ten of which come in a second
+            busy.sendall(HEALTH)
+            said = b""
+            while not said.endswith(b'{"status":"ok"}'):
+                piece = busy.recv(1 << 16)
+                assert piece, "the connection was closed"
+                said += piece
+            time.sleep(0.08)
+        until(lambda: len(server.server_state.connections) < 3)
+
+
+def test_connections_outlive_the_pools_of_clients(tmp_path: Path) -> None:
+    with running(tmp_path / "data") as server:
+        assert server.config.timeout_keep_alive > 60 > 2 * cast("float", httpx.Limits().keepalive_expiry)
 
 
 def test_no_answer_waits_for_the_client_to_confirm_the_one_before(tmp_path: Path) -> None:
