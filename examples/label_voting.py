@@ -1,3 +1,6 @@
+# pyright: strict
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+# numpy, scipy and torch leave types of what they compute open
 """Give each splat the class that most of its rays have, and say how sure that is; no encoder, no words.
 
 python examples/label_voting.py scene.ply sparse/0 labels voted.ply

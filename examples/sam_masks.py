@@ -1,3 +1,6 @@
+# pyright: strict
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+# numpy, scipy and torch leave types of what they compute open
 """Lift masks of a segmenter with a vector each, as SAM and CLIP give them, and export every thing that was found.
 
 python examples/sam_masks.py scene.ply sparse/0 masks things.zip

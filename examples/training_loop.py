@@ -1,3 +1,6 @@
+# pyright: strict
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+# numpy, scipy and torch leave types of what they compute open
 """Lift within a training loop: tensors as gsplat's trainer holds them, and a map of features a photo at a time.
 
 python examples/training_loop.py

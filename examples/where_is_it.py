@@ -1,3 +1,6 @@
+# pyright: strict
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+# numpy, scipy and torch leave types of what they compute open
 """Where is it? What a robot asks: a place in front of its camera, a size, and whether it is there at all.
 
 python examples/where_is_it.py scene.lift.safetensors mug --view 0001 [--table words.safetensors]
