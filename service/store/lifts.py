@@ -74,7 +74,14 @@ class LiftRecord:
         try:
             handle: Any
             with safe_open(str(self.path), framework="np") as handle:
-                told = json.loads(handle.metadata()["splatlift"]) | {"world": self.metadata["world"]}
+                told = json.loads(handle.metadata()["splatlift"])
+            own, now = (
+                {name: value for name, value in (world or {}).items() if value is not None}
+                for world in (told.get("world"), self.metadata["world"])
+            )
+            if own == now:
+                return None
+            told |= {"world": self.metadata["world"]}
             return next(
                 with_metadata(self.path, {"splatlift": json.dumps(told, ensure_ascii=False, separators=(",", ":"))})
             )

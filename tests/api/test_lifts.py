@@ -94,8 +94,9 @@ def test_sizes_are_in_metres_once_somebody_says_how_long_a_unit_is(client: TestC
     ):
         assert assert_problem(client.patch(at, json={"world": wrong})).get("status") == 422
     assert client.patch(at, json={"name": "x"}).json()["world"]["metres_per_unit"] == 0.25
-    assert client.patch(at, json={"world": None}).json()["world"] == unknown
+    assert client.patch(at, json={"world": None, "name": " "}).json()["world"] == unknown
     assert told()[:2] == [unknown, {"scene units"}]
+    assert len(client.get(lift["links"]["features"]).content) == lift["bytes"]  # the file as it was made
 
 
 def test_photos_are_shown_as_they_were_uploaded(client: TestClient, lift: dict[str, Any]) -> None:
@@ -298,7 +299,8 @@ def test_relations_of_objects_have_their_numbers_and_come_once(
     tensors["object"][:] = tensors["node"][:] = 2
     tensors["object"][cluster] = tensors["node"][cluster] = splat_rows()[cluster, 0] > -1.2  # its halves
     with safe_open(tmp_path / "lift", framework="np") as opened:
-        route = client.post("/lifts", content=save(tensors, opened.metadata())).json()["links"]["tree"]
+        links = client.post("/lifts", content=save(tensors, opened.metadata())).json()["links"]
+    route = links["tree"]
     plain = client.get(route).json()
     assert (plain["relations"], plain["world"]["up"]) == ([], None)
     unknown = client.get(route, params={"relations": True}).json()
@@ -315,6 +317,7 @@ def test_relations_of_objects_have_their_numbers_and_come_once(
     for wrong in ("0,-1", "0,-1,0,0", "nan,0,1", "0,0,0", "1e999,0,0", "up", ""):
         problem = assert_problem(client.get(route, params={"up": wrong}))
         assert (problem["status"], problem["argument"]) == (422, "up")
+    assert client.delete(links["self"]).status_code == 204
 
 
 def test_objects_are_there_without_words_and_a_table_names_them(
