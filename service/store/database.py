@@ -23,12 +23,11 @@ from service.store.files import remove, sync_directory
 VERSION = 15  # SQLite's user_version
 OF_0_4 = 13  # that of release 0.4, which takes databases of any version before to it
 MIGRATING_RELEASE = "0.4.0"
-TABLES_OF_0_4, SELECTIONS, SHARES = (
-    Path(__file__).with_name(f"{name}.sql").read_text(encoding="utf-8")
-    for name in ("schema_of_0_4", "selections", "shares")
+TABLES_OF_0_4, SINCE_0_4 = (
+    Path(__file__).with_name(f"{name}.sql").read_text(encoding="utf-8") for name in ("schema_of_0_4", "since_0_4")
 )
-# By the version of a database, what it lacks; a new one has version 0.
-STEPS = {0: TABLES_OF_0_4 + SELECTIONS + SHARES, OF_0_4: SELECTIONS + SHARES, 14: SHARES}
+# By the version of a database, what it lacks; a new one has version 0. No release had version 14.
+STEPS = {0: TABLES_OF_0_4 + SINCE_0_4, OF_0_4: SINCE_0_4}
 DATABASE = "service.sqlite"  # in the data directory, beside two files that know an empty or older one from it:
 GENERATION = "generation"  # the number that the newest counted transaction had
 KEYS_REQUIRED = "keys.required"  # there when a key was ever made
@@ -95,7 +94,7 @@ class Database:
                 raise StaleDatabase(self._path.parent, "an empty one")
             if version != VERSION and version not in STEPS:
                 hint = "use the release that wrote it, or another data directory"
-                if version < VERSION:
+                if version < OF_0_4:
                     hint = f"start a service of release {MIGRATING_RELEASE} over it once, which migrates it"
                 expected = f"a database of schema version {VERSION}"
                 raise Misconfigured("data", expected=expected, got=f"{version}", hint=hint)

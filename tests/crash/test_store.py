@@ -7,6 +7,7 @@ import shutil
 import sqlite3
 import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -250,7 +251,10 @@ def test_marker_that_holds_no_number_is_one_line(data: Path, capsys: pytest.Capt
 # Of another release
 
 
-@pytest.mark.parametrize(("version", "hint"), [(99, "the release that wrote it"), (12, "release 0.4.0")])
+@pytest.mark.parametrize(
+    ("version", "hint"),
+    [(99, "the release that wrote it"), (14, "the release that wrote it"), (12, "release 0.4.0")],
+)
 def test_database_of_another_schema_is_refused_with_a_way_on(tmp_path: Path, version: int, hint: str) -> None:
     store = Store.open(tmp_path)
     with store.database.read() as connection:
@@ -287,6 +291,15 @@ def test_database_of_release_0_4_opens_with_all_that_it_holds(tmp_path: Path) ->
     store.close()
     assert (tmp_path / "data" / markers.GENERATION).read_text() == "8\n"
     Store.open(tmp_path / "data").close()
+    Store.open(tmp_path / "new").close()
+    assert columns_of(tmp_path / "data" / DATABASE) == columns_of(tmp_path / "new" / DATABASE)
+
+
+def columns_of(database: Path) -> set[tuple[str, str, str]]:
+    """Table, column and type of all that a database has."""
+    columns = "SELECT m.name, c.name, c.type FROM sqlite_master m, pragma_table_info(m.name) c WHERE m.type = 'table'"
+    with closing(sqlite3.connect(database)) as connection:
+        return set(connection.execute(columns))
 
 
 def test_schema_that_breaks_off_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
