@@ -19,6 +19,7 @@ from liftcore.errors import SplatliftError
 
 FIELDS = ("argument", "expected", "got", "hint")
 PIECE = 1 << 16
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # for libraries, before they are loaded
 ORPHANED = 3  # the exit status of a process whose server is gone
 
 

@@ -5,4 +5,6 @@ A limit on memory counts the stack and the buffers of each thread, and cores may
 
 import os
 
-os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+from service.child import ONE_THREAD
+
+os.environ |= ONE_THREAD

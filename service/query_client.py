@@ -17,15 +17,14 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from liftcore.errors import SplatliftError
-from service.child import error_of, is_stopped
+from service.child import ONE_THREAD, error_of, is_stopped
 from service.errors import Busy, ClientLeft, Crashed, TimedOut, require_share
 
 # Without the first two each array of a query is mapped anew and its pages are faulted in one by one: a fifth of its
 # time. A query is a row of small operations, each of which would wait for a team of threads of its library to meet,
 # late beside a lift: more than half of its time. The kernels bring threads of their own.
 ENVIRONMENT = {
-    "MALLOC_MMAP_THRESHOLD_": str(64 << 20), "MALLOC_TRIM_THRESHOLD_": str(256 << 20),
-    "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1",
+    "MALLOC_MMAP_THRESHOLD_": str(64 << 20), "MALLOC_TRIM_THRESHOLD_": str(256 << 20), **ONE_THREAD
 }  # fmt: skip
 STDERR = 2  # where what libraries of the worker print goes
 PIPE_BYTES = 256 << 10  # of an answer; the HTTP process holds it in memory while a client reads it: more is a file

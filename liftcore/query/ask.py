@@ -55,6 +55,7 @@ from liftcore.query.selections import set_members
 from liftcore.query.terms import Vector
 from liftcore.query.threshold import find_threshold, nothing_alike
 from liftcore.runtime.cores import cores
+from liftcore.runtime.one_thread import one_thread
 from liftcore.text import TextEncoder, check_texts
 from liftcore.text.wording import PartPhrase, Wording, base_of, plain
 
@@ -248,6 +249,7 @@ def _question(
     return Question(query, rows, words, references_of(encoder, scene.metadata.text_space), asked_as, pack_of(encoder))
 
 
+@one_thread()
 def answers(scene: OpenedLift, questions: Sequence[Question]) -> list[Answer]:
     """Answer several queries in one pass over the features; each to the same bits as alone."""
     if any(asked.part for asked in questions):

@@ -34,6 +34,7 @@ from liftcore.query.selection import Rivals, levels_disagree, part_nodes
 from liftcore.query.terms import Example
 from liftcore.query.threshold import find_threshold
 from liftcore.runtime.one_line import one_line
+from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, silent
 from liftcore.text import check_texts
 
@@ -105,6 +106,7 @@ def words_of(encoder: TextEncoder) -> list[str]:
     return words
 
 
+@one_thread()
 def segment(
     scene: OpenedLift,
     words: Sequence[str],

@@ -4,9 +4,8 @@ A splat's **direction** is its unit feature less the scene's mean of these, made
 lie in a narrow cone, and the angle at the cone's axis tells objects apart where the angle at the origin does not.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +14,7 @@ import torch
 from torch import Tensor
 
 from liftcore.runtime.cores import cores
+from liftcore.runtime.one_thread import one_thread
 from liftcore.scene.splats import Splats
 from liftcore.scene.touching import touching
 from liftcore.values.settings import LiftSettings
@@ -78,7 +78,7 @@ def cluster_splats(
     directions = directions_of(sample, settings.aggregation_channels)
     if directions is None:
         return nothing
-    with one_blas_thread():
+    with one_thread():
         points = directions.coordinates(sample)
     found = hdbscan_labels(points, smallest, settings.aggregation_neighbours, settings.seed)
     clusters = int(found.max()) + 1
@@ -187,7 +187,7 @@ def assign(
         inside = known[block] & (distances <= reaches[nearest])
         labels[block][inside] = nearest[inside]
 
-    with one_blas_thread(), ThreadPoolExecutor(threads or cores()) as pool:
+    with one_thread(), ThreadPoolExecutor(threads or cores()) as pool:
         list(pool.map(assign_block, range(0, features.shape[0], BLOCK)))
     return labels
 
@@ -207,15 +207,6 @@ _ITERATIONS = 6
 _SEED = 0
 
 
-@contextmanager
-def one_blas_thread() -> Iterator[None]:
-    """Products of NumPy on one thread each: their sums have one order then, whatever the machine's cores."""
-    from threadpoolctl import threadpool_limits
-
-    with threadpool_limits(limits=1, user_api="blas"):
-        yield
-
-
 def principal_axes(centred: np.ndarray, count: int) -> np.ndarray:
     """The directions of the largest variance.
 
@@ -231,7 +222,7 @@ def principal_axes(centred: np.ndarray, count: int) -> np.ndarray:
     """
     channels = centred.shape[1]
     count = min(count, channels)
-    with one_blas_thread():
+    with one_thread():
         if channels <= EXACT_CHANNELS:
             covariance = (centred.T @ centred).astype(np.float64)
             axes = np.linalg.eigh(covariance)[1][:, ::-1][:, :count]

@@ -1,13 +1,16 @@
-"""Torch keeps to the thread that calls it, as long as it is told to."""
+"""Torch and linear algebra keep to the thread that calls them, as long as they are told to."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from threading import Barrier, Event
 
 import pytest
 import torch
+from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from liftcore.lifting import geometry
 from liftcore.lifting.files import lift_files
@@ -21,22 +24,33 @@ from tests.scenes import write_scene
 def three_threads():
     before = torch.get_num_threads()
     torch.set_num_threads(3)
-    yield
+    with threadpool_limits(3, user_api="blas"):
+        yield
     torch.set_num_threads(before)
+
+
+def threads_of_linear_algebra() -> list[int]:
+    libraries = ThreadpoolController().select(user_api="blas").lib_controllers
+    assert libraries
+    return [library.num_threads for library in libraries]
+
+
+def all_are(number: int) -> bool:
+    return set(threads_of_linear_algebra()) == {number}
 
 
 def test_it_is_one_thread_within_and_as_many_as_before_after_it():
     with one_thread():
-        assert torch.get_num_threads() == 1
+        assert torch.get_num_threads() == 1 and all_are(1)
         with one_thread():
-            assert torch.get_num_threads() == 1
-        assert torch.get_num_threads() == 1
+            assert torch.get_num_threads() == 1 and all_are(1)
+        assert torch.get_num_threads() == 1 and all_are(1)
         with ThreadPoolExecutor(1) as pool:
             assert pool.submit(torch.get_num_threads).result() == 1
-    assert torch.get_num_threads() == 3
+    assert torch.get_num_threads() == 3 and all_are(3)
     with pytest.raises(ValueError, match="no"), one_thread():
         raise ValueError("no")
-    assert torch.get_num_threads() == 3
+    assert torch.get_num_threads() == 3 and all_are(3)
 
 
 def test_a_lift_has_no_threads_of_torch(tmp_path, monkeypatch):
@@ -83,7 +97,7 @@ def test_two_threads_within_it_at_once_leave_nothing_behind(first_fails: bool):
         torch.set_num_threads(3)
         with one_thread():
             both.wait(10)
-            assert first_left.wait(10)
+            assert first_left.wait(10) and all_are(1)
             within = torch.get_num_threads(), number_of_a_new_thread()
             looked.set()
         return *within, torch.get_num_threads()
@@ -92,4 +106,28 @@ def test_two_threads_within_it_at_once_leave_nothing_behind(first_fails: bool):
         ended = pool.submit(first), pool.submit(second)
         assert ended[1].result() == (1, 1, 3)
         assert ended[0].result() == 3
-    assert number_of_a_new_thread() == 3
+    assert number_of_a_new_thread() == 3 and all_are(3)
+
+
+def test_libraries_that_are_loaded_within_it_are_held_by_whoever_comes_next():
+    code = """
+import numpy
+from threadpoolctl import ThreadpoolController
+from liftcore.runtime.one_thread import one_thread
+
+def numbers():
+    libraries = ThreadpoolController().select(user_api="blas").lib_controllers
+    return {one.filepath: one.num_threads for one in libraries}
+
+with one_thread():
+    before = numbers()
+    import scipy.linalg
+    usual = numbers()
+    with one_thread():
+        within = numbers()
+assert set(before) < set(within) and set(within.values()) == {1}, within
+assert {path: one for path, one in numbers().items() if path not in before} == {
+    path: one for path, one in usual.items() if path not in before
+}
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

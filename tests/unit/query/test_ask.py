@@ -7,15 +7,20 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from liftcore.errors import InvalidLift, InvalidQuery, NotFound, SplatliftError
 from liftcore.io.splats import some_rows
+from liftcore.query import ask as ask_module
+from liftcore.query import segment as segment_module
 from liftcore.query.ask import answers, ask, located, question
 from liftcore.query.directions import directions, read_vector
 from liftcore.query.question import Query
@@ -108,6 +113,26 @@ def test_questions_together_have_the_bits_of_each_alone(scene: Scene) -> None:
     for together, one in zip(answers(scene, asked), asked, strict=True):
         (alone,) = answers(scene, [one])
         assert np.array_equal(together.scores, alone.scores) and together.threshold == alone.threshold
+
+
+@pytest.mark.parametrize("module", [ask_module, segment_module])
+def test_questions_use_one_thread_of_linear_algebra(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, module: ModuleType
+) -> None:
+    libraries = ThreadpoolController().select(user_api="blas").lib_controllers
+    find_threshold, numbers = module.find_threshold, set[int]()
+
+    def watched(*given: Any) -> Any:
+        numbers.update(library.num_threads for library in libraries)
+        return find_threshold(*given)
+
+    monkeypatch.setattr(module, "find_threshold", watched)
+    with threadpool_limits(3, user_api="blas"):
+        if module is ask_module:
+            scene.ask("x", encoder=Axes())
+        else:
+            scene.segment(["x", "y"], encoder=Axes())
+        assert numbers == {1} and {library.num_threads for library in libraries} == {3}
 
 
 def test_what_cannot_be_asked_is_refused(scene: Scene) -> None:
