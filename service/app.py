@@ -10,12 +10,14 @@ import os
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from http import HTTPStatus
 from typing import Any
 
 import anyio
 from fastapi import FastAPI
-from starlette.datastructures import MutableHeaders
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.middleware.cors import CORSMiddleware
+from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from liftcore import __version__
@@ -24,7 +26,7 @@ from service import problems
 from service.auth import CALLER, STRANGER, Gate
 from service.content import EventStreams
 from service.errand import revive
-from service.errors import Busy
+from service.errors import Busy, ForeignOrigin
 from service.observe import Metrics, access, chosen_id, versions, working_for
 from service.problems import CLOSE, answer_to
 from service.query_client import QueryClient, QueryLimits
@@ -156,11 +158,40 @@ class RecordedApp(FastAPI):
         """The usual layers within the recorder; refusals too are read by pages that may read."""
         stack: ASGIApp = super().build_middleware_stack()
         if readers := self.state.readers:
-            stack = CORSMiddleware(
+            stack = PagesOfOthers(
                 stack, readers, ("GET", "HEAD", "POST"), CORS_HEADERS,
                 allow_credentials=False, expose_headers=CORS_EXPOSED,
             )  # fmt: skip
         return Recorder(stack, self.state.metrics)
+
+
+class PagesOfOthers(CORSMiddleware):
+    """Lets pages of other sites read. A preflight that is refused is a problem, as every error is."""
+
+    def preflight_response(self, request_headers: Headers) -> Response:
+        """Answer the browser that asks whether a page may send a request."""
+        reply = super().preflight_response(request_headers)
+        if reply.status_code == HTTPStatus.OK:
+            return reply
+        headers = request_headers.get("Access-Control-Request-Headers", "").lower().split(",")
+        terms = {
+            "Origin": (
+                self.is_allowed_origin(request_headers["Origin"]),
+                "this service's own page, or one of SPLATLIFT_CORS_ORIGINS",
+            ),
+            "Access-Control-Request-Method": (
+                request_headers["Access-Control-Request-Method"] in self.allow_methods,
+                f"one of {', '.join(self.allow_methods)}",
+            ),
+            "Access-Control-Request-Headers": (
+                {header.strip() for header in headers} <= {"", *self.allow_headers},
+                f"some of {', '.join(CORS_HEADERS)}",
+            ),
+            "Access-Control-Request-Private-Network": (False, "none"),
+        }
+        name, expected = next((name, expected) for name, (fits, expected) in terms.items() if not fits)
+        error = ForeignOrigin(name, expected=expected, got=request_headers.get(name, "none")[:200])
+        return answer_to(error, {"Vary": "Origin"})
 
 
 class Recorder:
