@@ -163,8 +163,19 @@ class Problem(BaseModel):
     request_id: Annotated[str | None, Field(description="as in X-Request-ID; the log has it too")] = None
 
 
+FIRST_MOMENT, LAST_MOMENT = (datetime(*day, tzinfo=UTC).timestamp() for day in ((1, 1, 1), (9999, 12, 31)))
+
+
+def within_calendar(seconds: float) -> float:
+    """Seconds since 1970, or the nearest that ISO 8601 has a date for: a database may hold any number."""
+    return max(FIRST_MOMENT, min(LAST_MOMENT, seconds))
+
+
+Seconds = Annotated[float, Field(description="seconds since 1970"), AfterValidator(within_calendar)]
+
+
 def iso_of(name: str, *, optional: bool = False) -> Any:
-    """A field for the moment of the field of that name, which is in seconds since 1970: ISO 8601, in UTC."""
+    """A field for the moment of the field of that name, which are `Seconds`: ISO 8601, in UTC."""
 
     def moment(self: BaseModel) -> datetime | None:
         seconds = getattr(self, name)
@@ -182,7 +193,7 @@ class Asset(BaseModel):
     bytes: int
     counts: dict[str, Any] = Field(description="what is in it: splats, views, channels and so on")
     warnings: list[str]
-    created: float = Field(description="seconds since 1970")
+    created: Seconds
     created_at = iso_of("created")
     links: dict[str, str]
 
@@ -286,9 +297,9 @@ class Job(BaseModel):
     plan: Plan | None = Field(description="of a lift, from before its first view is walked; the latest attempt's")
     progress: Progress | None
     problem: Problem | None
-    created: float = Field(description="seconds since 1970, as started and ended are")
-    started: float | None
-    ended: float | None
+    created: Seconds
+    started: Seconds | None
+    ended: Seconds | None
     created_at = iso_of("created")
     started_at = iso_of("started", optional=True)
     ended_at = iso_of("ended", optional=True)
@@ -315,7 +326,7 @@ class LogLine(BaseModel):
     """The data of a ``log`` event."""
 
     line: str
-    time: float = Field(description="seconds since 1970")
+    time: Seconds
     time_at = iso_of("time")
 
 
@@ -348,7 +359,7 @@ class LiftResult(BaseModel):
     world: WorldFrame = Field(description="which way is up and how long a scene unit is, as far as it is known")
     certificate: dict[str, Any]
     timings: dict[str, float] = Field(description="seconds a stage")
-    created: float = Field(description="seconds since 1970")
+    created: Seconds
     created_at = iso_of("created")
     links: dict[str, str]
 
@@ -429,7 +440,7 @@ class Tradeoff(BaseModel):
     views: dict[str, int] = Field(description="how many were lifted, of how many, and held out")
     budget_s: float
     seconds: float = Field(description="that it took")
-    created: float = Field(description="seconds since 1970")
+    created: Seconds
     created_at = iso_of("created")
     links: dict[str, str]
 
@@ -672,8 +683,8 @@ class ListedSelection(OfLift):
     first: int = Field(description="the steps that it can go to, by PATCH")
     last: int
     version: int = Field(description="its ETag, for If-Match")
-    created: float = Field(description="seconds since 1970, as changed is")
-    changed: float
+    created: Seconds
+    changed: Seconds
     created_at = iso_of("created")
     changed_at = iso_of("changed")
     links: dict[str, str]
@@ -706,7 +717,7 @@ class OwnKey(BaseModel):
     name: str | None = Field(description="whose it is, or what for; null where no key is needed")
     scopes: list[str]
     lifts: list[JobId] = Field(description="of the scope `shared`: those that it was given")
-    expires: float | None = Field(description="seconds since 1970; null for never")
+    expires: Seconds | None = Field(description="null for never")
     expires_at = iso_of("expires", optional=True)
 
 
@@ -725,8 +736,8 @@ class Share(BaseModel):
 
     id: str
     name: str
-    created: float = Field(description="seconds since 1970, as expires is")
-    expires: float | None = Field(description="null for never")
+    created: Seconds
+    expires: Seconds | None = Field(description="null for never")
     created_at = iso_of("created")
     expires_at = iso_of("expires", optional=True)
     links: dict[str, str]

@@ -7,7 +7,7 @@ import json
 import re
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -18,6 +18,7 @@ from liftcore.cli import Parser, whole
 from liftcore.errors import NotFound
 from service.commands.serve import data_directory_errors
 from service.errors import InvalidRequest
+from service.models import LAST_MOMENT, within_calendar
 from service.settings import read_settings
 from service.store.database import DATABASE, Database
 from service.store.keys import KeyRecord, KeyStore, Quota
@@ -49,7 +50,12 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
     rotate.add_argument(
         "--grace", metavar="TIME", help="how long the secret before counts, such as 24h; else not at all"
     )
-    revoke = actions.add_parser("revoke", parents=[shared], help="end a key; what it made stays, for admins")
+    rotate.add_argument(
+        "--keep-shares",
+        action="store_true",
+        help="keep the keys that it shared lifts with; else they end with the secret before",
+    )
+    revoke = actions.add_parser("revoke", parents=[shared], help="end a key and keys that it made; its results stay")
     revoke.add_argument("key", metavar="ID", help="as keys list shows it")
     for action in (create, listing, rotate, revoke):
         action.add_argument("--data", type=Path, metavar="DIR", help="the service's directory")
@@ -98,12 +104,15 @@ def _create(keys: KeyStore, given: argparse.Namespace) -> None:
 
 def _rotate(keys: KeyStore, given: argparse.Namespace) -> None:
     grace = 0.0 if given.grace is None else _seconds("grace", given.grace)
-    _show(*keys.rotate(given.key, grace=grace), given)
+    key, secret, shares = keys.rotate(given.key, grace=grace, keep_shares=given.keep_shares)
+    _show(key, secret, given, ended_shares=[share.id for share in shares])
+    if shares and not given.json:
+        print(f"The secret before ends{_with(shares)}. With --keep-shares they would stay.", file=sys.stderr)
 
 
-def _show(key: KeyRecord, secret: str, given: argparse.Namespace) -> None:
+def _show(key: KeyRecord, secret: str, given: argparse.Namespace, **more: Any) -> None:
     if given.json:
-        print(json.dumps({**_document(key), "key": secret}))
+        print(json.dumps({**_document(key), **more, "key": secret}))
         return
     print(secret)
     until = "" if key.expires is None else f", until {_when(key.expires)}"
@@ -112,23 +121,25 @@ def _show(key: KeyRecord, secret: str, given: argparse.Namespace) -> None:
     )
 
 
-def _seconds(argument: str, text: str) -> float:
+def _seconds(argument: str, text: str, more: str = "") -> float:
     """A time such as 30d."""
     match = re.fullmatch(r"(\d{1,6})([smhd])", text.strip(), re.ASCII)
     if match is None:
-        raise InvalidRequest(argument, expected="a time such as 30d, 12h, 90m or 45s", got=repr(text)[:80])
+        expected = f"a number of at most 6 digits with d, h, m or s, such as 30d or 12h{more}"
+        raise InvalidRequest(argument, expected=expected, got=repr(text)[:80])
     return int(match[1]) * UNITS[match[2]]
 
 
 def _moment(text: str) -> float:
     """A time from now, or a date, in seconds since 1970."""
+    now = time.time()
     try:
         date = datetime.fromisoformat(text.strip())
+        moment = (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
     except ValueError:
-        return time.time() + _seconds("expires", text)
-    moment = (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
-    if moment <= time.time():
-        raise InvalidRequest("expires", expected="a moment that is to come", got=text)
+        moment = now + _seconds("expires", text, ", or a date (UTC) such as 2030-12-31")
+    if not now < moment <= LAST_MOMENT:
+        raise InvalidRequest("expires", expected="a moment after now and at most 9999-12-31 (UTC)", got=text)
     return moment
 
 
@@ -138,9 +149,8 @@ def _list(keys: KeyStore, given: argparse.Namespace) -> None:
         print(json.dumps({"keys": [_document(key) for key in found]}))
         return
     for key in found:
-        print(
-            "  ".join([key.id, _when(key.created), _state(key), ",".join(sorted(key.scopes)), _limits(key), key.name])
-        )
+        scopes = ",".join(sorted(key.scopes)) + ("" if key.maker is None else f" by {key.maker}")
+        print("  ".join([key.id, _when(key.created), _state(key), scopes, _limits(key), key.name]))
     if not found:
         lost = "no keys, but there were some: nobody is let in until one is made"
         none = "no keys: the service is open to this machine, and to no other"
@@ -148,11 +158,20 @@ def _list(keys: KeyStore, given: argparse.Namespace) -> None:
 
 
 def _revoke(keys: KeyStore, given: argparse.Namespace) -> None:
-    key = keys.revoke(given.key)
+    key, shares = keys.revoke(given.key)
     if given.json:
-        print(json.dumps(_document(key)))
+        print(json.dumps({**_document(key), "ended_shares": [share.id for share in shares]}))
     else:
-        print(f"key {key.id} of {key.name} is revoked")
+        print(f"key {key.id} of {key.name} is revoked{_with(shares)}")
+
+
+def _with(shares: Sequence[KeyRecord]) -> str:
+    """The keys that end with one; nothing where there are none."""
+    if not shares:
+        return ""
+    return f", and with it {len(shares)} that it made: " + ", ".join(
+        f"{share.id} of {share.name}" for share in shares
+    )
 
 
 def _document(key: KeyRecord) -> dict[str, Any]:
@@ -175,4 +194,5 @@ def _limits(key: KeyRecord) -> str:
 
 
 def _when(seconds: float) -> str:
-    return time.strftime("%Y-%m-%d %H:%M", time.gmtime(seconds)) + "Z"
+    moment = datetime.fromtimestamp(within_calendar(seconds), UTC)
+    return moment.replace(tzinfo=None).isoformat(" ", "minutes") + "Z"

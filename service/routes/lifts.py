@@ -32,7 +32,7 @@ from service.routes.queries import (
 )
 from service.settings import encoder_label
 from service.state import AppState, Deps
-from service.store.keys import KeyRecord, Quota
+from service.store.keys import KeyRecord, Quota, earliest
 from service.store.lifts import LiftRecord, TradeoffRecord
 from service.store.owners import Scope
 from service.uploads import LIFT, LiftIntake
@@ -187,17 +187,18 @@ def list_shares(lift: str, deps: Deps) -> models.Shares:
 def create_share(lift: str, asked: models.AskedShare, deps: Deps) -> Response:
     """Make a key that looks at this lift and asks it. It is shown this once, and in a link of the page."""
     found = deps.store.lifts.get(deps.owner, lift)
-    if deps.caller.key is None:
+    maker = deps.caller.record
+    if maker is None:
         raise InvalidRequest(
             "Authorization", expected="a service that wants keys", got="one that is open to its machine",
             hint="the operator makes a first key with splatlift keys create",
         )  # fmt: skip
     if len(deps.store.keys.of_lift(found.id)) >= MOST_SHARES:
         raise OverLimit("share", expected=f"at most {MOST_SHARES} of a lift", got="more", hint="delete some first")
+    expires = earliest(time.time() + asked.expires_s, maker.expires)
     key, secret = deps.store.keys.create(
-        asked.name, frozenset({Scope.SHARED}), Quota(), expires=time.time() + asked.expires_s,
-        lifts=[found.id], maker=deps.caller.key,
-    )  # fmt: skip
+        asked.name, frozenset({Scope.SHARED}), Quota(), expires=expires, lifts=[found.id], maker=maker.id
+    )
     share = shape_share(key, found.id)
     # After the #, which browsers send nobody: neither the log of a proxy nor another site comes to know it.
     links = share.links | {"page": f"/?lift={found.id}#key={secret}"}

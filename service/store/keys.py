@@ -9,7 +9,7 @@ import secrets
 import sqlite3
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, Self
 
@@ -46,6 +46,7 @@ class KeyRecord:
     revoked: float | None = None
     expires: float | None = None
     lifts: tuple[str, ...] = ()  # of the scope `shared`: what it was given
+    maker: str | None = None  # the id of the key that shared them, with which it ends
 
 
 # With what each is given
@@ -89,7 +90,7 @@ class KeyStore:
             scopes, quota: what it may do, and fill.
             expires: when it ends; None = never.
             lifts: what it is given, with the scope `shared`, which it then has alone.
-            maker: the id of a key, with whose end it ends.
+            maker: the id of the key that shares the lifts, with whose end it ends.
 
         Returns:
             The key, and its secret, which nobody can ask for again.
@@ -102,7 +103,7 @@ class KeyStore:
             got = f"{', '.join(sorted(scopes))} and {len(lifts)} lifts"
             raise InvalidRequest("scopes", expected="shared alone, with the lifts that the key is given", got=got)
         secret, given = _new_secret(), tuple(sorted(set(lifts)))
-        key = KeyRecord(secrets.token_hex(6), name, scopes, quota, time.time(), expires=expires, lifts=given)
+        key = KeyRecord(secrets.token_hex(6), name, scopes, quota, time.time(), None, expires, given, maker)
         row = {
             "id": key.id,
             "name": name,
@@ -124,15 +125,19 @@ class KeyStore:
                 connection.execute("INSERT INTO key_lifts VALUES (?, ?)", (key.id, lift))
         return key, secret
 
-    def rotate(self, named: str, *, grace: float = 0.0) -> tuple[KeyRecord, str]:
+    def rotate(
+        self, named: str, *, grace: float = 0.0, keep_shares: bool = False
+    ) -> tuple[KeyRecord, str, list[KeyRecord]]:
         """Give a key a new secret; what it made stays its own.
 
         Args:
             named: its id, or its name where no other valid key has it.
             grace: seconds for which the secret before counts, too. The one before that ends now.
+            keep_shares: let keys that it shared lifts with stay. Otherwise each ends with the secret that made it, as
+                whoever else has that secret may have made it.
 
         Returns:
-            The key, and its new secret.
+            The key, its new secret, and the keys that end so.
 
         Raises:
             NotFound: no valid key is called so.
@@ -140,37 +145,49 @@ class KeyStore:
         """
         secret, now = _new_secret(), time.time()
         with self._database.write(counted=True) as connection:
-            found = connection.execute(
-                f"SELECT id FROM keys WHERE (id = :named OR name = :named) AND id NOT IN ({ENDED_KEYS})",
+            rows = connection.execute(
+                f"{KEYS} WHERE (id = :named OR name = :named) AND id NOT IN ({ENDED_KEYS})",
                 {"named": named, "now": now},
             ).fetchall()
-            if not found:
+            if not rows:
                 raise NotFound("key", expected="the id or name of a valid key", got=named, hint="see keys list")
-            if len(found) > 1:
-                ids = ", ".join(row["id"] for row in found)
+            if len(rows) > 1:
+                ids = ", ".join(row["id"] for row in rows)
                 raise InvalidRequest("key", expected="a name that one key has", got=named, hint=f"name one of {ids}")
+            key, old_until = _record(rows[0]), rows[0]["old_until"]
+            shares = [] if keep_shares else _shares_of(connection, key, now)
+            for share in shares:  # with a secret that counted for a time, those end that were made with it
+                end = now if share.expires == old_until else earliest(share.expires, now + grace)
+                connection.execute("UPDATE keys SET expires = ? WHERE id = ?", (end, share.id))
             connection.execute(
                 "UPDATE keys SET old_digest = digest, old_until = ?, digest = ? WHERE id = ?",
-                (now + grace, digest_of(secret), found[0]["id"]),
+                (now + grace, digest_of(secret), key.id),
             )
-            row = connection.execute(f"{KEYS} WHERE id = ?", (found[0]["id"],)).fetchone()
-        return _record(row), secret
+        return key, secret, shares
 
-    def revoke(self, key: str) -> KeyRecord:
-        """End a key for good; again does no harm. What it made stays, for admins; its jobs in line are canceled.
+    def revoke(self, key: str) -> tuple[KeyRecord, list[KeyRecord]]:
+        """End a key for good, and those that it shared lifts with; again does no harm.
+
+        What it made stays, for admins; its jobs in line are canceled.
+
+        Returns:
+            The key, and the valid keys that end with it.
 
         Raises:
             NotFound: there is none of that id.
         """
+        now = time.time()
         with self._database.write(counted=True) as connection:
-            row = connection.execute(
-                "UPDATE keys SET revoked = coalesce(revoked, ?) WHERE id = ? RETURNING *", (time.time(), key)
-            ).fetchone()
+            row = connection.execute(f"{KEYS} WHERE id = ?", (key,)).fetchone()
             if row is None:
                 raise NotFound("key", expected="the id of a key", got=key, hint="keys list shows them")
+            shares = _shares_of(connection, _record(row), now)
+            connection.execute(
+                "UPDATE keys SET revoked = coalesce(revoked, ?) WHERE id = ? OR maker = ?", (now, key, key)
+            )
             stop_waiting(connection)
             row = connection.execute(f"{KEYS} WHERE id = ?", (key,)).fetchone()
-        return _record(row)
+        return _record(row), shares
 
     def all(self) -> list[KeyRecord]:
         """Every key, oldest first, with those that were revoked."""
@@ -208,18 +225,22 @@ class KeyStore:
             return self._required(connection)
 
     def admit(self, secret: str | None) -> tuple[bool, KeyRecord | None]:
-        """Whether requests need a key, and the valid key of that secret."""
+        """Whether requests need a key, and the valid key of that secret, which ends when the secret does."""
         with self._database.read() as connection:
             if secret is None:
                 return self._required(connection), None
+            digest = digest_of(secret)
             row = connection.execute(
                 f"{KEYS} WHERE (digest = :digest OR (old_digest = :digest AND old_until > :now))"
                 f" AND id NOT IN ({ENDED_KEYS})",
-                {"digest": digest_of(secret), "now": time.time()},
+                {"digest": digest, "now": time.time()},
             ).fetchone()
             if row is None:
                 return self._required(connection), None
-            return self._rule != "none", _record(row)
+            key = _record(row)
+            if row["digest"] != digest:
+                key = replace(key, expires=earliest(key.expires, row["old_until"]))
+            return self._rule != "none", key
 
     def _required(self, connection: sqlite3.Connection) -> bool:
         if self._rule is not None:
@@ -260,6 +281,17 @@ def _any(connection: sqlite3.Connection) -> bool:
     return connection.execute("SELECT EXISTS (SELECT 1 FROM keys)").fetchone()[0] == 1
 
 
+def earliest(*moments: float | None) -> float | None:
+    """The first of moments, of which None is never."""
+    return min((moment for moment in moments if moment is not None), default=None)
+
+
+def _shares_of(connection: sqlite3.Connection, maker: KeyRecord, now: float) -> list[KeyRecord]:
+    """The keys that are valid so far and that a key shared lifts with, oldest first."""
+    asked = f"{KEYS} WHERE maker = :maker AND id NOT IN ({ENDED_KEYS}) ORDER BY created, id"
+    return [_record(row) for row in connection.execute(asked, {"maker": maker.id, "now": now})]
+
+
 def _record(row: sqlite3.Row) -> KeyRecord:
     return KeyRecord(
         id=row["id"],
@@ -270,4 +302,5 @@ def _record(row: sqlite3.Row) -> KeyRecord:
         revoked=row["revoked"],
         expires=row["expires"],
         lifts=tuple(json.loads(row["lifts"])),
+        maker=row["maker"],
     )

@@ -285,6 +285,68 @@ def test_shared_key_ends(end: str, house: Guarded) -> None:
     assert house.client.get("/lifts", headers=guest).status_code == 401
 
 
+def share_of(house: Guarded, secret: str, **more: Any) -> dict[str, str]:
+    """The header of a key that Alice's first lift is shared with, by a key of hers."""
+    body = {"name": "guest", **more}
+    made = house.client.post(f"/lifts/{house.done}/shares", headers=bearer(secret), json=body)
+    assert made.status_code == 201, made.text
+    return bearer(made.json()["key"])
+
+
+def may_read(house: Guarded, guest: dict[str, str]) -> bool:
+    return house.client.get(f"/lifts/{house.done}", headers=guest).status_code == 200
+
+
+@pytest.mark.parametrize("options", [[], ["--grace", "1h"], ["--keep-shares"]])
+def test_shares_end_with_the_secret_that_made_them_unless_they_are_kept(
+    options: list[str], house: Guarded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other, guest = share_of(house, house.secrets["boss"]), share_of(house, house.secrets["alice"])
+    rotate = ["keys", "rotate", house.ids["alice"], *options, "--data", str(tmp_path / "data")]
+    assert main(rotate) == 0
+    said = capsys.readouterr()
+    new = bearer(said.out.strip())
+    assert ("of guest" in said.err) == ("--keep-shares" not in options)
+    assert may_read(house, other) and may_read(house, new) and may_read(house, guest) == bool(options)
+    if options == ["--grace", "1h"]:
+        late = share_of(house, house.secrets["alice"], expires_s=86_400)  # with the secret before, which still counts
+        for ending in (guest, late, bearer(house.secrets["alice"])):
+            expires = house.client.get("/key", headers=ending).json()["expires"]
+            assert expires == pytest.approx(time.time() + 3600, abs=60)
+        mine = share_of(house, said.out.strip())
+        assert main(rotate) == 0  # the first secret ends now
+        assert not may_read(house, late) and may_read(house, mine)
+
+
+def test_revoked_key_names_the_shares_that_end_with_it(
+    house: Guarded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    guest, where = share_of(house, house.secrets["alice"]), ["--data", str(tmp_path / "data")]
+    assert main(["keys", "revoke", house.ids["alice"], *where]) == 0
+    assert "1 that it made" in capsys.readouterr().out and not may_read(house, guest)
+    assert main(["keys", "list", *where]) == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if f"by {house.ids['alice']}" in line]
+    assert "revoked" in line
+
+
+@pytest.mark.parametrize("moment", [1e18, 253_402_300_800.0, float("inf"), -1e18, float("-inf")])
+def test_moments_beyond_the_calendar_are_told_as_its_ends(
+    moment: float, house: Guarded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    share_of(house, house.secrets["alice"])
+    with house.store.database.write() as connection:
+        never_before = moment if moment > 0 else None  # else nobody would be let in
+        connection.execute("UPDATE keys SET created = ?, expires = ?", (moment, never_before))
+        connection.execute("UPDATE jobs SET created = ?1, started = ?1, ended = ?1", (moment,))
+        connection.execute("UPDATE lifts SET created = ?", (moment,))
+    end = "9999-12-31" if moment > 0 else "0001-01-01"
+    for path in ("/jobs", f"/jobs/{house.done}", "/lifts", f"/lifts/{house.done}/shares", "/key"):
+        reply = house.ask("alice", "GET", path)
+        assert reply.status_code == 200 and (f"{end}T00:00:00" in reply.text or path == "/key"), reply.text
+    assert main(["keys", "list", "--data", str(tmp_path / "data")]) == 0
+    assert end in capsys.readouterr().out
+
+
 def test_lifts_are_given_by_the_command_line_with_no_other_scope(
     house: Guarded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -362,13 +424,13 @@ def test_key_is_rotated_by_its_name_where_one_has_it(tmp_path: Path, capsys: pyt
 def test_key_expires_and_stays_revoked_since_the_first_time(house: Guarded) -> None:
     key, secret = house.store.keys.create("guest", frozenset({Scope.READ}), Quota(), expires=time.time() + 3600)
     assert house.client.get("/jobs", headers=bearer(secret)).status_code == 200
-    assert house.store.keys.revoke(house.ids["bob"]).revoked is not None
+    assert house.store.keys.revoke(house.ids["bob"])[0].revoked is not None
     with house.store.database.write() as connection:
         connection.execute("UPDATE keys SET expires = ? WHERE id = ?", (time.time(), key.id))
         connection.execute("UPDATE keys SET revoked = 7 WHERE id = ?", (house.ids["bob"],))
     gone = house.client.get("/jobs", headers=bearer(secret))
     assert gone.status_code == 401 and 'error="invalid_token"' in gone.headers["www-authenticate"]
-    assert house.store.keys.revoke(house.ids["bob"]).revoked == 7
+    assert house.store.keys.revoke(house.ids["bob"])[0].revoked == 7
 
 
 def test_log_names_client_and_key_and_every_use_of_admin_and_no_secret(
@@ -437,6 +499,7 @@ def test_keys_speak_json_and_say_until_when_they_are_valid(
     assert (made["max_bytes"], made["max_queued"], made["max_uploads"]) == (5, None, 2)
     assert told("list") == {"keys": [made]} and secret not in str(made)
     gone = told("revoke", made["id"])
+    assert gone.pop("ended_shares") == []
     assert gone["revoked"] >= made["created"] and told("list") == {"keys": [gone]}
     for text, seconds in (("30d", 30 * 86_400), ("12h", 43_200), ("2999-12-31", None)):
         begun = time.time()
@@ -455,7 +518,22 @@ def test_keys_speak_json_and_say_until_when_they_are_valid(
         ["create", "--name", " ", "--scopes", "read"],
         ["create", "--name", "a\nb", "--scopes", "read"],
         ["create", "--name", "x", "--scopes", "read", "--expires", "soon"],
-        ["create", "--name", "x", "--scopes", "read", "--expires", "1999-12-31"],
+        *(
+            ["create", "--name", "x", "--scopes", "read", "--expires", when]
+            for when in (
+                "1999-12-31",
+                "0001-01-01T00:00:00+14:00",
+                "9999-12-31T23:59:59-23:59",
+                "10000-01-01",
+                "0d",
+                "nan",
+                "inf",
+                "1e400d",
+                "9999999d",
+                "",
+            )
+        ),
+        ["rotate", "nobody", "--grace", "9999999d"],
         ["rotate", "nobody"],
         ["rotate", "nobody", "--grace", "long"],
         ["revoke", "nobody"],
@@ -585,6 +663,22 @@ def test_pages_of_named_origins_read_with_a_key_and_change_nothing(tmp_path: Pat
         assert "access-control-allow-origin" not in other.headers
         asked["headers"] = {"Origin": "https://evil.example"}
         assert assert_problem(house.ask("alice", "POST", "/query", **asked))["type"] == "/problems/foreign-origin"
+
+
+@pytest.mark.parametrize(
+    ("header", "value"),
+    [
+        ("Origin", "https://evil.example"),
+        ("Access-Control-Request-Method", "DELETE"),
+        ("Access-Control-Request-Headers", "authorization, x-other"),
+        ("Access-Control-Request-Private-Network", "true"),
+    ],
+)
+def test_preflight_that_is_refused_is_a_problem(header: str, value: str, tmp_path: Path) -> None:
+    with guarded(tmp_path / "data", cors_origins=LAB) as house:
+        reply = house.ask(None, "OPTIONS", "/jobs", headers=PREFLIGHT | {header: value})
+        problem = assert_problem(reply)
+        assert problem["argument"] == header and value in problem["got"]
 
 
 @pytest.mark.parametrize("origins", ["*", "lab.example", "https://lab.example/", "null", "https://*.example"])
