@@ -27,6 +27,7 @@ import numpy as np
 
 from liftcore.io.splats import write_splats
 from service.commands.demo import serving
+from service.commands.serve import KEEP_ALIVE_SECONDS
 from tests.benchmarks.base import machine
 from tests.benchmarks.load import after, at_once, probe, slow_clients
 from tests.benchmarks.soak import scene_files
@@ -34,6 +35,7 @@ from tests.scenes import random_splats
 
 CADDYFILE = Path(__file__).parents[2] / "docker" / "Caddyfile"
 HEALTH_MS = 50.0  # the most that is promised of an otherwise idle machine
+PAUSE_SECONDS = (60 + KEEP_ALIVE_SECONDS) / 2  # after the proxy closes idle connections, before the service does
 SPLAT_BYTES = 68  # of a .ply with colours of degree 0
 
 
@@ -155,6 +157,23 @@ def bounds(client: httpx.Client) -> dict[str, int]:
     }
 
 
+def kept_connections(client: httpx.Client, url: str, seconds: float) -> dict[str, Any]:
+    """Connections that the proxy keeps to the service: open at once, and after so long a pause; answers to POST.
+
+    A proxy sends no POST a second time: one over a connection that the service just closed would be a 502.
+    """
+
+    def ask() -> int:
+        return client.post("/query", json={"text": ["x"], "lift": "0" * 32}).status_code
+
+    statuses = at_once([ask] * 16)
+    begun = connections_of(url)
+    time.sleep(seconds)
+    left = connections_of(url)
+    statuses += at_once([ask] * 16)
+    return {"begun": begun, "after_s": seconds, "left": left, "statuses": sorted(set(statuses))}
+
+
 def main() -> int:
     """Measure; 1 when a promise was missed."""
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.proxy", description=__doc__)
@@ -175,6 +194,7 @@ def main() -> int:
             figures = {**machine(), "caddy": version.split()[0], "upload": sent}
             figures["ranges"] = ranges(client, sent["id"], folder / "large.ply")
             figures["events"], figures["bounds"] = events(client, direct), bounds(client)
+            figures["kept_connections"] = kept_connections(client, url, PAUSE_SECONDS)
             quiet = {
                 "through": probe(address, after(options.seconds / 4)),
                 "straight": probe(url, after(options.seconds / 4)),
@@ -192,7 +212,9 @@ def main() -> int:
     reached = max(slow[way]["p99"] for way in ("through", "straight")) < HEALTH_MS
     parts = figures["ranges"]
     whole = sent["whole"] and parts["whole"] and all(parts["parts"].values()) and parts["if_none_match"] == 304
-    return 0 if reached and whole and figures["events"]["same"] and not figures["errors"] else 1
+    pool = figures["kept_connections"]
+    ended = pool["left"] <= 1 < pool["begun"] and pool["statuses"] == [404]  # one is kept by the checks of health
+    return 0 if reached and whole and ended and figures["events"]["same"] and not figures["errors"] else 1
 
 
 if __name__ == "__main__":
