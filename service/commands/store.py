@@ -17,7 +17,7 @@ from service.store.store import Store
 
 LOST = (
     "what the database alone held is not made again: keys, owners (what was added is of admins alone), trade-offs,"
-    " jobs without a lift, histories of jobs"
+    " selections, names of things, jobs without a lift, histories of jobs"
 )
 
 
@@ -67,7 +67,7 @@ def _rebuild(given: argparse.Namespace, settings: ServiceSettings) -> int:
     kinds = f" ({', '.join(added)})" if added else ""
     lines = [f"added to {DATABASE}: {sum(found['assets'].values())} assets{kinds}, {found['lifts']} lifts"]
     for left in found["left"]:
-        lines.append(f"left out, and to be moved to quarantine by the server: {left['file']}: {left['why']}")
+        lines.append(f"left out, and moved to quarantine, now or by the server: {left['file']}: {left['why']}")
     return _told(given, {**found, "lost": LOST}, "\n".join([*lines, LOST]))
 
 

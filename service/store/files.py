@@ -28,9 +28,9 @@ MOVED = "%Y%m%dT%H%M%SZ"  # how a folder of the quarantine tells since when it i
 class DataDirectory:
     """One directory, held by one server at a time.
 
-    ``blobs/ab/abcd....ply`` are assets by digest, ``lifts/ID.safetensors`` lifts by job, ``work/ID/`` what a job
-    that was interrupted goes on from, ``tmp/`` drafts, ``quarantine/TIME-RANDOM/`` what nothing reached at that time,
-    under the path that it had.
+    ``blobs/ab/abcd....ply`` are assets by digest, ``lifts/ID.safetensors`` lifts by job, ``lifts/ID.json`` what was
+    changed of one since, ``work/ID/`` what a job that was interrupted goes on from, ``tmp/`` drafts,
+    ``quarantine/TIME-RANDOM/`` what nothing reached at that time, under the path that it had.
 
     Args:
         root: the directory; made when it is not there.
@@ -132,6 +132,10 @@ class DataDirectory:
     def lift(self, job: str) -> Path:
         """Where the lift of a job lies."""
         return self.root / "lifts" / f"{job}.safetensors"
+
+    def lift_changes(self, job: str) -> Path:
+        """Where the changes of a lift lie, if there are any."""
+        return self.lift(job).with_suffix(".json")
 
     def relative(self, path: Path) -> str:
         """The path as the database keeps it."""

@@ -278,7 +278,7 @@ class JobStore:
                     hint=f"say with_{kind}=true if that is meant",
                 )  # fmt: skip
             connection.execute("DELETE FROM jobs WHERE id = ?", (job,))
-            return [self._files.lift(job), self._files.work(job)]
+            return [self._files.lift(job), self._files.lift_changes(job), self._files.work(job)]
 
         self._database.write_freeing(forget)
 

@@ -17,11 +17,11 @@ from typing import Any
 from safetensors import SafetensorError, safe_open
 
 from liftcore.errors import NotFound
-from liftcore.files import with_metadata
+from liftcore.files import whole_file, with_metadata
 from service.errors import InvalidRequest
 from service.store.assets import own
 from service.store.database import Database, Page, insert, page_of, parsed, record_of
-from service.store.files import DataDirectory
+from service.store.files import DataDirectory, sync_directory
 from service.store.jobs import JobOrder, succeed, told
 from service.store.owners import SEEN, SHOWN_JOBS, Owner, require_quota
 
@@ -241,7 +241,17 @@ class LiftStore:
                 connection.execute(f"UPDATE lifts SET {column} = ? WHERE id = ?", (changes[column] or None, lift))
             if "world" in changes:
                 connection.execute(SET_WORLD, (json.dumps(changes["world"] or {}), lift))
+            self._write_changes(connection, lift)
         return self.get(owner, lift)
+
+    def _write_changes(self, connection: sqlite3.Connection, lift: str) -> None:
+        """Within a write transaction: keep what was changed of a lift beside its file, which never changes itself."""
+        row = connection.execute("SELECT name, photos, metadata FROM lifts WHERE id = ?", (lift,)).fetchone()
+        metadata, path = json.loads(row["metadata"]), self._files.lift_changes(lift)
+        world = {"world": metadata["world"]} if metadata.get(WORLD_CHANGED) else {}
+        with whole_file(path) as handle:
+            handle.write(json.dumps({"name": row["name"], "photos": row["photos"], **world}).encode())
+        sync_directory(path.parent)
 
     def _own_photos(self, connection: sqlite3.Connection, owner: Owner, lift: str, photos: str) -> None:
         """Within a write transaction: let the lift's owner have them, whoever of those who see them it is."""

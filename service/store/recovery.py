@@ -26,7 +26,7 @@ from liftcore.errors import InvalidInput, InvalidLift, NotFound, SplatliftError
 from liftcore.files import identify
 from service.errand import ErrandLimits
 from service.errors import Misconfigured
-from service.models import JOB_ID, AssetKind, UploadKind
+from service.models import JOB_ID, AssetKind, LiftChange, UploadKind
 from service.settings import ServiceSettings
 from service.store.assets import CheckedUpload
 from service.store.database import DATABASE, KEYS_REQUIRED, copy_database, open_to_read, remember_generation
@@ -64,6 +64,9 @@ def back_up(data: Path, target: Path) -> int:
         for path in [path for room in ("blobs", "lifts") for path in (folder / room).rglob("*") if path.is_file()]:
             if str(path.relative_to(folder)) not in known:  # deleted while we tried
                 path.unlink()
+        for path in data.glob("lifts/*.json"):
+            if str(path.relative_to(data).with_suffix(".safetensors")) in known:
+                _linked(path, folder / path.relative_to(data))
         if (data / KEYS_REQUIRED).exists():
             shutil.copy(data / KEYS_REQUIRED, folder / KEYS_REQUIRED)
         remember_generation(folder, _generation(folder))
@@ -192,12 +195,18 @@ def rebuild(store: Store, settings: ServiceSettings) -> dict[str, Any]:
     """
     root, left, added = store.files.root, list[dict[str, str]](), Counter[UploadKind]()
     known = {record.path for record in (*store.assets.all(SERVICE), *store.lifts.all(SERVICE))}
+    changes = {path for path in root.glob("lifts/*.json") if store.files.lift(path.stem).exists()}
     for add, pattern in ((_add_asset, "blobs/*/*"), (_add_lift, "lifts/*")):  # lifts are of assets
-        for path in sorted(set(root.glob(pattern)) - known):
+        for path in sorted(set(root.glob(pattern)) - known - changes):
             try:
                 added[add(store, settings, path)] += 1
             except SplatliftError as error:
                 left.append({"file": store.files.relative(path), "why": str(error)})
+    for path in sorted(changes):
+        try:
+            _change_lift(store, path)
+        except SplatliftError as error:
+            left.append({"file": store.files.relative(path), "why": str(error)})
     store.database.catch_up()
     lifts = added.pop(LIFT, 0)
     return {"assets": dict(added), "lifts": lifts, "left": left}
@@ -253,6 +262,19 @@ def _add_lift(store: Store, settings: ServiceSettings, path: Path) -> UploadKind
         store.assets.get(SERVICE, asset, kind)  # a lift without what it was made of can be shown to nobody
     store.lifts.adopt(SERVICE, path.stem, order, FinishedLift(path, sha256_of(path), count, channels, told))
     return LIFT
+
+
+def _change_lift(store: Store, path: Path) -> None:
+    """Give a lift again what was changed of it, but for photos that are gone."""
+    try:
+        changes = LiftChange.model_validate_json(path.read_bytes()).model_dump(exclude_unset=True)
+    except (OSError, ValueError) as error:
+        store.files.quarantine([path])
+        got = " ".join(str(error).split())[:120]
+        raise InvalidLift("lift", expected="the changes of a lift as JSON", got=got) from None
+    if changes.get("photos") is not None and store.assets.find(SERVICE, changes["photos"]) is None:
+        del changes["photos"]
+    store.lifts.change(SERVICE, path.stem, changes)
 
 
 def _cameras_of(store: Store, settings: ServiceSettings, lift: Path) -> str | None:

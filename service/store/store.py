@@ -140,7 +140,8 @@ def collect(store: Store, older_than: float) -> list[Path]:
         known = {row["file"] for row in connection.execute("SELECT file FROM assets")}
         moved += _lost(files, (files.root / "blobs").glob("*/*"), known, older_than)
     with store.database.write() as connection:  # so no lift is between its file and its row
-        known = {row["file"] for row in connection.execute("SELECT file FROM lifts")}
+        rows = connection.execute("SELECT id, file FROM lifts").fetchall()
+        known = {file for row in rows for file in (row["file"], files.relative(files.lift_changes(row["id"])))}
         moved += _lost(files, (files.root / "lifts").iterdir(), known, older_than)
     ended, unknown = _unused_work(store)
     moved += files.quarantine(path for path in unknown if _changed(path) < older_than)

@@ -14,9 +14,11 @@ from liftcore.cli import INTERRUPTED, main
 from service.auth import needed
 from service.commands.serve import require_keys
 from service.errors import Misconfigured, StaleDatabase
+from service.models import JobKind
 from service.settings import ServiceSettings
 from service.store.database import DATABASE
 from service.store.owners import SERVICE
+from service.store.recovery import back_up
 from service.store.store import Store, collect
 
 from .conftest import Uploaded, app_of, serving
@@ -27,7 +29,7 @@ from .tiny_scene import TinyScene, colmap_zip, labels, masks
 
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory: pytest.TempPathFactory, scene: TinyScene, table: Path) -> tuple[Path, dict[str, Any]]:
-    """A data directory with an asset of each kind and a lift, and what the service told of them."""
+    """A data directory with an asset of each kind and a lift that was changed, and what the service told of them."""
     data = tmp_path_factory.mktemp("kept") / "data"
     with serving(data, table) as client:
         contents = {"splats": scene.splats, "cameras": scene.cameras, "features": scene.features}
@@ -37,7 +39,10 @@ def kept(tmp_path_factory: pytest.TempPathFactory, scene: TinyScene, table: Path
             assert client.put(f"/assets/{kind}", content=body).status_code == 201
         job = ended(client, client.post("/lift", json=Uploaded(*ids).order()).headers["location"])
         assert job["state"] == "succeeded", job
+        for change in ({"name": "first"}, {"world": {"up": [0, -1, 0], "metres_per_unit": 0.5}}, {"name": "last"}):
+            assert client.patch(f"/lifts/{job['id']}", json=change).status_code == 200
         told = all_told(client)
+        assert (told["lift"]["name"], told["lift"]["world"]["metres_per_unit"]) == ("last", 0.5)
     return data, told
 
 
@@ -102,6 +107,35 @@ def test_rebuild_brings_an_older_database_up_to_its_files(filled: tuple[Path, di
     store.close()
     with serving(data, table) as client:
         assert all_told(client) == told
+
+
+def test_changes_of_a_lift_that_are_damaged_or_of_photos_that_are_gone_cost_no_lift(
+    filled: tuple[Path, dict[str, Any]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, told = filled
+    (changes,) = data.glob("lifts/*.json")
+    for text, left, name in (('{"name": "x", "photos": "sha256:%s"}' % ("0" * 64), 0, "x"), ('{"name": 7}', 1, None)):
+        (data / DATABASE).unlink()
+        changes.write_text(text)
+        assert main(["store", "rebuild", "--data", str(data), "--json"]) == 0
+        found = json.loads(capsys.readouterr().out)
+        assert (found["lifts"], len(found["left"])) == (1, left) and changes.exists() == (not left)
+        store = Store.open(data)
+        lift = store.lifts.get(SERVICE, told["lift"]["id"])
+        assert (lift.name, lift.photos) == (name, None)
+        store.close()
+
+
+def test_changes_of_a_lift_go_with_it_and_into_backups(filled: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    data, told = filled
+    (changes,) = data.glob("lifts/*.json")
+    back_up(data, tmp_path / "backup")
+    assert (tmp_path / "backup" / "lifts" / changes.name).read_text() == changes.read_text()
+    store = Store.open(data)
+    assert collect(store, 1e12) == [] and changes.exists()
+    store.jobs.delete(SERVICE, told["lift"]["id"], given_up=(JobKind.LIFT,))
+    assert not changes.exists()
+    store.close()
 
 
 def test_rebuild_that_was_cut_off_does_not_let_the_server_start(
