@@ -12,11 +12,12 @@ pair counts as often as it was observed: opposite sides of a wall, which no view
 A rate of two clusters with a third lies between their own, so that neighbour chains find the same tree as a search
 among all pairs does (Murtagh 1983). Compare MaskClustering (Yan et al., CVPR 2024), whose consensus rate this is.
 
-A cluster with regions of LEAST_VIEWS views is a root. Of its regions those that **span** it, with SPANS of the
-cluster's regions that their level sees, are masks of the whole. Without them the rest is clustered again, and a view
-that has but masks of the whole observes nothing there. What is held together then is a part, where LEAST_SHOWN of the
-views that see it show it apart: mistakes cut a thing, too, but each view elsewhere. Parts have parts likewise,
-however many levels there are and whatever they are called. No feature is read.
+A cluster with regions of LEAST_VIEWS views is a root. Regions that **span** it, with SPANS of the cluster's regions
+that their level sees, are masks of the whole. Without them the rest is clustered again, and a view that has but masks
+of the whole observes nothing there. A mask that reaches out of the whole and does not span it says what belongs
+together like any other: a handle that is merged with the wall behind it is still one handle. What is held together
+then is a part, where LEAST_SHOWN of the views that see it show it apart: mistakes cut a thing, too, but each view
+elsewhere. Parts have parts likewise, however many levels there are and whatever they are called. No feature is read.
 """
 
 from collections import deque
@@ -78,18 +79,19 @@ def region_tree(
     view, group, views = node_groups(nodes, groups)
     node = np.full(nodes.size, NO_NODE, np.int32)
     parents, confidence = list[int](), list[float]()
-    waiting = deque([(np.arange(nodes.size), NO_NODE, 0)] if nodes.size else [])
+    waiting = deque([(np.arange(nodes.size), NO_NODE, 0, np.zeros(nodes.size, np.bool_))] if nodes.size else [])
     while waiting:
-        own, parent, depth = waiting.popleft()
-        labels = _clusters(_among(containers, own), groups.levels, threads)
+        own, parent, depth, above = waiting.popleft()
+        labels = _clusters(_without(containers[own], above), groups.levels, threads)
         for part in np.split(own[np.argsort(labels, kind="stable")], np.cumsum(np.bincount(labels))[:-1]):
             shown, seen = np.unique(view[part]).size, _seen_by(containers[part], groups.levels)
             if shown < min(LEAST_VIEWS, views) or (parent != NO_NODE and shown < LEAST_SHOWN * seen):
                 continue
-            whole = _spanning(part, containers, group)
+            spanning = _spanning(part, containers, group)
+            whole = spanning[part]
             node[part] = len(parents)
             if whole.any() and not whole.all() and depth + 1 < MOST_DEPTH:
-                waiting.append((part[~whole], len(parents), depth + 1))
+                waiting.append((part[~whole], len(parents), depth + 1, above | spanning))
             parents.append(parent)
             confidence.append(min(np.unique(view[part[whole]]).size / max(seen, 1), 1.0))
     region = np.full(groups.view.size, NO_NODE, np.int32)
@@ -97,12 +99,9 @@ def region_tree(
     return RegionTree(region, np.array(parents, np.int32), np.array(confidence, np.float32))
 
 
-def _among(containers: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """The containers of some nodes [n] by their places among these; a level sees what others contain not at all."""
-    place = np.full(len(containers), UNSEEN, np.int32)
-    place[own] = np.arange(own.size)
-    there = containers[own]
-    return np.where(there >= 0, place[np.maximum(there, 0)], there)
+def _without(containers: np.ndarray, above: np.ndarray) -> np.ndarray:
+    """Containers [n, views * levels] without masks of wholes [N] bool, whose levels then see nothing of the nodes."""
+    return np.where((containers >= 0) & above[np.maximum(containers, 0)], UNSEEN, containers)
 
 
 def _seen_by(containers: np.ndarray, levels: int) -> int:
@@ -112,17 +111,22 @@ def _seen_by(containers: np.ndarray, levels: int) -> int:
 
 
 def _spanning(part: np.ndarray, containers: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """[n] bool: the nodes of a cluster that contain SPANS of those of its nodes that their level sees."""
+    """[N] bool: the nodes, of all, that contain SPANS of those of a cluster's nodes [n] that their level sees."""
     there = containers[part]
-    held = np.bincount(there[there >= 0], minlength=len(containers))[part]
-    return held >= SPANS * (there != UNSEEN).sum(axis=0)[group[part]]
+    held = np.bincount(there[there >= 0], minlength=len(containers))
+    return (held > 0) & (held >= SPANS * (there != UNSEEN).sum(axis=0)[group])
 
 
 def _clusters(containers: np.ndarray, levels: int, threads: int | None) -> np.ndarray:
-    """[n] i64, the cluster of each node, from 0 in the order of their first nodes."""
+    """[n] i64, the cluster of each node, from 0 in the order of their first nodes.
+
+    Args:
+        containers: [n, views * levels] i32, of these nodes, among all.
+    """
     size = len(containers)
     at, column = np.nonzero(containers >= 0)
-    held = csr_array((np.ones(at.size, np.int8), (at, containers[at, column])), shape=(size, size)).tocsc()
+    shape = size, int(containers.max(initial=0)) + 1
+    held = csr_array((np.ones(at.size, np.int8), (at, containers[at, column])), shape=shape).tocsc()
     held.sort_indices()
     supporting = np.zeros((size, size), np.float32)
     blocks = [(first, min(first + 64, size)) for first in range(0, size, 64)]

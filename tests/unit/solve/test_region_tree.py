@@ -86,6 +86,18 @@ def test_parts_that_half_of_the_views_show_are_found() -> None:
     assert mean_iou(members(found), PART) > 0.8
 
 
+def test_masks_of_a_part_and_of_what_lies_behind_it_hold_it_together() -> None:
+    half = np.arange(SPLATS) < 10  # of the first part, at which three of eight views cut it
+    cut, merged = np.where(half, 12, PART), np.where(PART == 0, 3, PART)  # part 3 is of another thing
+    parts, levels = [], []
+    for shown in (PART, PART, cut, cut, cut, merged, merged, merged):
+        for level, labels in enumerate((THING, shown)):
+            levels += [level] * len(np.unique(labels))
+        parts.append(of_dense(np.concatenate([np.equal.outer(a, np.unique(a)) for a in (THING, shown)], 1) * 1.0))
+    found = region_objects(stacked(parts, SPLATS), np.array(levels, np.int8), np.ones(SPLATS))
+    assert any(np.array_equal(node, PART == 0) for node in members(found))
+
+
 def test_what_holds_the_whole_scene_is_a_group_and_its_parts_are_the_objects() -> None:
     W, levels, codebook = three_levels(1, wrong=0.0, rooms=True)
     found = region_objects(W, levels, np.arange(SPLATS) + 1.0)
