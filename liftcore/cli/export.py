@@ -11,7 +11,7 @@ from liftcore.cli.objects import named_tree
 from liftcore.cli.options import Parser, add_encoder, add_lift, add_world, opened_lift, text_encoder, whole
 from liftcore.cli.query import made_from
 from liftcore.cli.reply import reply, write_files
-from liftcore.cli.segment import read_words
+from liftcore.cli.segment import encoder_and_words
 from liftcore.errors import InvalidInput
 
 if TYPE_CHECKING:
@@ -63,9 +63,9 @@ def run(options: argparse.Namespace) -> int:
         what, source = "splats", None
     if options.prims:
         if what != "labelled" or suffix not in (".usdc", ".usdz"):
-            raise InvalidInput(
-                "--prims", expected="labels as .usdc or .usdz", got=f"{what} as {suffix or 'no suffix'}"
-            )
+            is_usd = suffix in (".usdc", ".usdz")
+            got = "splats without labels" if is_usd else f"an output that ends in {suffix or 'no suffix'}"
+            raise InvalidInput("--prims", expected="an output of labels that ends in .usdc or .usdz", got=got)
         what = "prims"
     files, exports = {"output": options.output}, {"output": partial(scene.export, source=source, what=what)}
     if what == "labelled" and suffix == ".ply":
@@ -95,8 +95,8 @@ def _source(options: argparse.Namespace, scene: Scene) -> Answer | Segmentation 
     if options.text:
         return scene.ask(_query(options.text), encoder=text_encoder(options, scene, stand_in=True), places=False)
     if options.words is not None or options.all_words:
-        encoder = text_encoder(options, scene)
-        return scene.segment(read_words(options.words, scene, encoder), encoder=encoder, progress=True)
+        encoder, words = encoder_and_words(options, scene, options.words)
+        return scene.segment(words, encoder=encoder, progress=True)
     return None if scene.object is None else named_tree(options, scene)
 
 

@@ -8,10 +8,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import Parser, add_encoder, add_splats, add_world, place, sides_of, text_encoder, world_of
+from liftcore.cli.options import Parser, add_encoder, add_splats, add_world, place, sides_of, world_of
 from liftcore.cli.query import made_from
 from liftcore.cli.reply import free_outputs, place_of, reply, write_files
-from liftcore.cli.segment import read_words
+from liftcore.cli.segment import encoder_and_words
 from liftcore.errors import InvalidQuery
 from liftcore.files import check_output, identify
 
@@ -143,10 +143,9 @@ def _vocabulary(options: argparse.Namespace, scene: Scene) -> tuple[TextEncoder 
     if options.vocabulary is None and not options.table and not options.encoder and scene.table is None:
         return None, []
     if options.vocabulary is not None and options.vocabulary.suffix == ".safetensors":
-        encoder, file = scene.encoder(f"table:{options.vocabulary}"), None
-    else:
-        encoder, file = text_encoder(options, scene), options.vocabulary
-    return encoder, read_words(file, scene, encoder)
+        encoder = scene.encoder(f"table:{options.vocabulary}")
+        return encoder, scene.words(encoder)
+    return encoder_and_words(options, scene, options.vocabulary, "--vocabulary")
 
 
 def _lines(document: dict[str, Any]) -> Iterable[str]:

@@ -238,6 +238,8 @@ def world_of(options: argparse.Namespace) -> WorldFrame:
     from liftcore import WorldFrame
 
     given: dict[str, Any] = {"up": options.up, "metres_per_unit": options.metres_per_unit}
+    if options.distance is not None and options.metres_per_unit is not None:
+        raise InvalidInput("--distance", expected="it or --metres-per-unit, not both", got="both")
     if options.distance is not None:
         *points, metres = options.distance
         given["distance"] = {"between": (points[:3], points[3:]), "metres": metres}

@@ -51,8 +51,7 @@ def run(options: argparse.Namespace) -> int:
     scene = opened_lift(options)
     if files:
         free_outputs(files, made_from(scene))
-    encoder = text_encoder(options, scene)
-    words = read_words(options.words, scene, encoder)
+    encoder, words = encoder_and_words(options, scene, options.words)
     document: dict[str, Any] = {"encoder": encoder.name, "words": len(words)}
     if options.what:
         named = [(notation, read_example(notation, "--what")) for notation in options.what]
@@ -72,15 +71,22 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def read_words(path: Path | None, scene: Scene, encoder: TextEncoder) -> list[str]:
-    """The words of a file, one a line, or all that a table has."""
-    if path is None:
-        return scene.words(encoder)
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InvalidQuery("--words", expected="a file of words, one a line", got=str(error)[:120]) from None
-    return list(dict.fromkeys(line.strip() for line in lines if line.strip()))
+def encoder_and_words(
+    options: argparse.Namespace, scene: Scene, path: Path | None, option: str = "--words"
+) -> tuple[TextEncoder, list[str]]:
+    """The text encoder that the options name, and the words of a file, one a line, or all that its table has.
+
+    The file comes first: an encoder takes seconds to open, or is not here.
+    """
+    words = None
+    if path is not None:
+        try:
+            lines = path.read_text(encoding="utf-8").splitlines()
+        except (OSError, UnicodeDecodeError) as error:
+            raise InvalidQuery(option, expected="a file of words, one a line", got=str(error)[:120]) from None
+        words = list(dict.fromkeys(line.strip() for line in lines if line.strip()))
+    encoder = text_encoder(options, scene)
+    return encoder, scene.words(encoder) if words is None else words
 
 
 def _lines(document: dict[str, Any]) -> Iterable[str]:

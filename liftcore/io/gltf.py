@@ -84,6 +84,13 @@ def read_gltf(path: Path, *, colour: bool = True) -> Fields:
     return joined_fields(parts) | {"world": asset.world}
 
 
+def _hint_of(extension: str) -> str:
+    """What to do with a file that needs an extension that is not read."""
+    if "spz" in extension.lower():
+        return "export its splats as .spz, which is read, as .ply, or as .glb without compression"
+    return HINT
+
+
 def read_gltf_document(path: Path) -> dict[str, Any]:
     """What the property tables of a file say of its feature ids: ``instances``, ``classes``, ``nodes``; may be empty.
 
@@ -125,7 +132,8 @@ class _Asset:
             raise self._broken("a JSON object", repr(self.json)[:40])
         others = [name for name in map(str, self._list(self.json, "extensionsRequired")) if name not in UNDERSTOOD]
         if others:
-            raise self._broken("a file without extensions of others", f"one that requires {others[0][:80]}", HINT)
+            got = f"one that requires {others[0][:80]}"
+            raise self._broken("a file without extensions of others", got, _hint_of(others[0]))
         self._buffers: dict[int, np.ndarray] = {}
         asset = self.json.get("asset")
         extras = asset.get("extras") if isinstance(asset, dict) else None
@@ -324,8 +332,9 @@ class _Asset:
             refused = refused or "a primitive that is no list of points"
         if refused:
             raise InvalidSplats(
-                str(self.path), expected="plain splats with the kernel 'ellipse'", got=refused[:100], hint=HINT
-            )
+                str(self.path), expected="plain splats with the kernel 'ellipse'", got=refused[:100],
+                hint=_hint_of(compressed or ""),
+            )  # fmt: skip
         space = kind.get("colorSpace")
         return () if space == SRGB else (f"colours are of {str(space)[:60]!r}, and are taken for sRGB",)
 

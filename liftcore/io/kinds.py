@@ -41,6 +41,7 @@ CAMERA_FILES = re.compile(
     r"(^|/)((cameras|images|frames|rigs)\.(bin|txt)|(dataparser_)?transforms[^/]*\.json|cameras\.json)$"
 )
 MAX_JSON_BYTES = 64 << 20  # that are parsed to tell what a document is
+MAX_LINE_BYTES = 1 << 20  # of a line that is parsed likewise
 HEAD_BYTES = 4096  # of what is told by its first bytes
 DEPTH = 5  # folders down
 MAX_FOLDERS = 2_000
@@ -482,8 +483,18 @@ def _json(path: Path, size: int) -> FileKind:
         with open_regular(path) as handle:
             document = json.loads(handle.read(MAX_JSON_BYTES))
     except (ValueError, RecursionError, MemoryError):
-        return FileKind("cameras", "JSON that does not parse", recognised=False)
+        return _json_lines(path) or FileKind("cameras", "JSON that does not parse", recognised=False)
     return _document(document, path)
+
+
+def _json_lines(path: Path) -> FileKind | None:
+    """The kind of a text of which each line is JSON; None where the first two are not."""
+    with suppress(ValueError, RecursionError, OSError), open_regular(path) as handle:
+        first, _ = (json.loads(handle.readline(MAX_LINE_BYTES)) for _ in range(2))
+        if isinstance(first, dict) and first.keys() >= {"format", "made_by"}:  # `liftcore.io.labels`
+            return FileKind(None, "the objects of a lift, one a line (JSON Lines)", "give the lift that they are of")
+        return FileKind(None, "JSON Lines, a document a line", "give a file of one JSON document")
+    return None
 
 
 def _document(document: Any, path: Path) -> FileKind:

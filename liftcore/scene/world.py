@@ -69,7 +69,7 @@ class WorldFrame(Body):
     @classmethod
     def _in_place_of_the_unit(cls, given: KnownDistance | None, info: ValidationInfo) -> KnownDistance | None:
         if given is not None and info.data.get("metres_per_unit") is not None:
-            raise _wrong("metres_per_unit or a distance, not both")
+            raise _wrong("either a distance or metres per unit, not both")
         return given
 
     @model_validator(mode="after")

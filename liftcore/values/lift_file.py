@@ -262,7 +262,8 @@ def _digest_of_several(files: Sequence[Path], folder: Path) -> str:
 
 
 def found_input(role: str, remembered: InputFile, metadata: LiftMetadata, lift: Path | None) -> Path | None:
-    """Where an input of a lift is: where it was, or beside the lift under its name or another; None if nowhere.
+    """Where an input of a lift is: where it was, beside the lift under its name or another, or in the store that it
+    lies in; None if nowhere.
 
     Cameras will do if those of the lifted views are what they were, whatever others there are.
 
@@ -270,7 +271,7 @@ def found_input(role: str, remembered: InputFile, metadata: LiftMetadata, lift: 
         role: splats, cameras or features. lift: the lift's file; None looks at the remembered path alone.
     """
     path = Path(remembered.path)
-    places = [path] if lift is None else [path, *_beside(lift, path)]
+    places = [path] if lift is None else [path, *_beside(lift, path), *_in_store(lift, remembered.sha256)]
     for place in places:
         if place.exists():
             with suppress(InvalidInput, OSError):
@@ -287,6 +288,11 @@ def _beside(lift: Path, path: Path) -> Iterator[Path]:
         yield from (above.joinpath(*parts[-count:]) for count in range(1, min(len(parts), NEAR) + 1))
     if path.suffix:
         yield from [other for other in visible_files(folder, f"*{path.suffix}") if other != lift][:MOST_BESIDE]
+
+
+def _in_store(lift: Path, sha256: str) -> Iterator[Path]:
+    """Where an input lies in a data directory of a service, ``lifts/ID.safetensors`` and ``blobs/ab/abcd....ply``."""
+    yield from Path(os.path.abspath(lift)).parents[1].glob(f"blobs/{sha256[:2]}/{sha256}.*")
 
 
 def has_poses(place: Path, metadata: LiftMetadata) -> bool:

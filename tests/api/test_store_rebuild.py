@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
+from liftcore import Scene
 from liftcore.cli import INTERRUPTED, main
 from service.auth import needed
 from service.commands.serve import require_keys
@@ -62,6 +63,12 @@ def all_told(client: TestClient) -> dict[str, Any]:
     for each in (*assets.values(), lift):
         del each["created"], each["created_at"]
     return {"assets": assets, "lift": lift, "settings": job["settings"], "state": job["state"], "answer": answer}
+
+
+def test_lift_in_a_data_directory_opens_with_the_splats_that_lie_there(kept: tuple[Path, dict[str, Any]]) -> None:
+    (lift,) = kept[0].glob("lifts/*.safetensors")
+    scene = Scene(lift)
+    assert scene.splats.count == kept[1]["lift"]["count"] and scene.cameras
 
 
 def test_rebuild_makes_the_database_of_the_files(

@@ -215,6 +215,25 @@ def test_a_suffix_that_is_not_written_is_refused_before_the_work(
     assert_one_line(err)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["objects", "--vocabulary", "nowhere.txt", "--encoder", "lvis"], "--vocabulary: expected a file of words"),
+        (["segment", "--words", "nowhere.txt"], "--words: expected a file of words"),
+        (["export", "--words", "nowhere.txt", "-o", "x.ply"], "--words: expected a file of words"),
+        (["export", "--prims", "-o", "x.glb"], "ends in .usdc or .usdz, got an output that ends in .glb"),
+        (["objects", "--distance", *"0001002", "--metres-per-unit", "2"], "it or --metres-per-unit, not both"),
+    ],
+)
+def test_what_does_not_fit_is_said_in_the_words_of_the_options_and_before_an_encoder_opens(
+    arguments: list[str], message: str, scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command, *options = arguments
+    status, _, err = run(capsys, command, scene / "lift.safetensors", *options)
+    assert status == 2 and message in err
+    assert_one_line(err)
+
+
 def test_a_file_of_another_kind_is_never_replaced(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
     names = ("splats.ply", "cameras.json", "pack.safetensors")
     lift = ["lift", *(scene / name for name in names), "-o"]

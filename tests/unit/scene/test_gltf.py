@@ -165,12 +165,18 @@ def test_feature_ids_of_others_count_from_one_with_zero_for_none(tmp_path: Path)
 
 PRIMITIVE = "meshes.0.primitives.0"
 KIND = f"{PRIMITIVE}.extensions.KHR_gaussian_splatting"
+SPZ_INSIDE = "KHR_gaussian_splatting_compression_spz_2"
 MANY = [{"children": list(range(1, 50_000))}, *({"mesh": 0} for _ in range(49_999))]
 WRONG: dict[str, tuple[str, Any, str]] = {  # where, what, and what is said of it; the first accessor is POSITION
     "another file": ("buffers.0.uri", "../../etc/passwd", "buffers within the file"),
     "an address": ("buffers.0.uri", "http://127.0.0.1/s.bin", "buffers within the file"),
     "another kernel": (f"{KIND}.kernel", "box", "the kernel 'box'"),
-    "compressed": (f"{KIND}.extensions", {"KHR_gaussian_splatting_compression_spz_2": {}}, "compression_spz"),
+    "compressed": (f"{KIND}.extensions", {SPZ_INSIDE: {}}, "as .spz, which"),
+    "compressed, as it must say": (
+        "extensionsRequired",
+        [SPZ_INSIDE],
+        "as .spz, which",
+    ),
     "other extensions": ("extensionsRequired", ["EXT_meshopt_compression"], "EXT_meshopt_compression"),
     "a count": ("accessors.0.count", 1 << 30, "as many splats"),
     "other counts": ("accessors.4.count", P - 1, "rows of 1 plain numbers"),

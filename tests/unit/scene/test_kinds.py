@@ -38,6 +38,8 @@ OTHERS = {  # content, a word of its name and of what to do
     "failed.ply": (b"<!DOCTYPE html><h1>404</h1>", "web page", "download"),
     "denied.spz": (b"<?xml version='1.0'?><Error><Code>AccessDenied</Code></Error>", "AccessDenied", "download"),
     "error.ply": (b'{"error": "not found"}', "not found", "download"),
+    "lines.json": (b'{"a": 1}\n[2]\n', "JSON Lines", "one JSON document"),
+    "objects.jsonl": (b'{"format": "f", "made_by": "m"}\n{"format": "f"}\n', "objects of a lift", "give the lift"),
     "pointer.ply": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "Git LFS", "git lfs pull"),
     "model": (b"glTF\x02\0\0\0" + bytes(100), "glTF", "export"),
     "scene.ksplat": (bytes(5000), "ksplat", "splat-transform"),
