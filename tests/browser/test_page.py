@@ -273,6 +273,18 @@ def test_things_are_joined_split_and_taken_apart_again(page: Browser, served: Se
         page.key(key, ctrl=True)
         page.until(f"{SETS}.length === 2 && {counted.format(40)} && splatlift.things.undone" if key == "z" else one)
     assert page.value(names) == before
+    page.press("#join")
+    page.until(f"{one} && splatlift.things.own.length === 1")
+    for _ in range(2):  # deleting it gives back what it was made of, and can be undone
+        for _ in ("Delete", "Really?"):
+            page.press("#catalogue-own .danger")
+        page.until(f"!splatlift.things.own.length && !{SETS}.length && {names}.length === 3 && splatlift.things.last")
+        assert page.value(names) == before
+        page.key("z", ctrl=True)
+        page.until(f"{one} && {names}.length === 2")
+    for _ in ("Delete", "Really?"):
+        page.press("#catalogue-own .danger")
+    page.until(f"!splatlift.things.own.length && !{SETS}.length")
     page.press("#catalogue-list li:last-child .thing")
     page.until(counted.format(20))
     page.press("#by-hand")

@@ -90,7 +90,7 @@ function labels(boxes) {
 
 // After each frame: labels lie at the top of their boxes as these are seen, whole where a part of the box is.
 function placed(place) {
-  if (viewer?.settled && !at("stage").classList.contains("ready")) appear(turn);
+  if ((viewer?.settled || viewer?.steered) && !at("stage").classList.contains("ready")) appear(turn);
   const box = at("query").getBoundingClientRect(); // which labels stay clear of
   const stage = at("labels").getBoundingClientRect();
   const roof = x => (x > box.left - stage.left && x < box.right - stage.left ? Math.max(0, box.bottom - stage.top) : 0) + 26;
@@ -378,7 +378,7 @@ async function warnings(known) {
 // What is said of the scene below it.
 async function about() {
   const said = [`${count(lift.count)} splats`, `${lift.channels} channels`, `${lift.views.length} views lifted`];
-  if (viewer?.rows) said[0] = `${count(viewer.count)} of ${count(lift.count)} splats shown (every ${Math.ceil(lift.count / MOST)}.)`;
+  if (viewer?.mesh && viewer.count < lift.count) said[0] = `${count(viewer.count)} of ${count(lift.count)} splats shown (every ${Math.ceil(lift.count / MOST)}.)`;
   at("about").textContent = said.join(" \u00b7 ");
   try {
     const { counts } = await json(`/assets/${lift.splats}`);
@@ -441,7 +441,7 @@ function keyed(event, built) {
 
 // What is on the screen, with a legend below it: words by their colours, a layer by its name.
 async function shot() {
-  const parts = look.mode !== "view" && viewer ? [viewer.frameNow()] : [at("render"), at("over"), at("mask"), at("outline")].filter(part => !part.hidden);
+  const parts = look.mode !== "view" && viewer ? [await viewer.whole()] : [at("render"), at("over"), at("mask"), at("outline")].filter(part => !part.hidden);
   const [wide, high] = [parts[0].naturalWidth ?? parts[0].width, parts[0].naturalHeight ?? parts[0].height];
   const legend = [...ask.painted().map(({ question }) => [label(question), question.colour]), ...names.entries(), ...(look.what === "rgb" ? [] : [[look.title, null]])];
   const canvas = document.createElement("canvas");

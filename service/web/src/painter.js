@@ -34,18 +34,20 @@ export class Painter {
     this.most = uniform("float", COLOURS.map(() => 1), COLOURS.length); // the highest score
     this.state = uniform("vec4", new THREE.Vector4(0, 0, 0, -1)); // questions, cover of the layer, hide the rest, whose heat
     this.warm = uniform("vec2", new THREE.Vector2(0, 1)); // scores of the ends of the heat
+    this.size = uniform("float", 1); // times a splat's own
     this.modifier = dyno.dynoBlock({ gsplat: dyno.Gsplat }, { gsplat: dyno.Gsplat }, ({ gsplat }) => this.block(gsplat));
   }
 
   block(gsplat) {
-    const { scores, layer, asked, most, state, warm } = this;
+    const { scores, layer, asked, most, state, warm, size } = this;
     const made = new dyno.Dyno({
-      inTypes: { gsplat: dyno.Gsplat, index: "int", scores: "sampler2DArray", layer: "sampler2DArray", asked: "vec4", most: "float", state: "vec4", warm: "vec2" },
+      inTypes: { gsplat: dyno.Gsplat, index: "int", scores: "sampler2DArray", layer: "sampler2DArray", asked: "vec4", most: "float", state: "vec4", warm: "vec2", size: "float" },
       outTypes: { gsplat: dyno.Gsplat },
-      inputs: { gsplat, index: dyno.splitGsplat(gsplat).outputs.index, scores, layer, asked, most, state, warm },
+      inputs: { gsplat, index: dyno.splitGsplat(gsplat).outputs.index, scores, layer, asked, most, state, warm, size },
       globals: () => [dyno.defineGsplat, HEAT_MAP],
       statements: ({ inputs: at, outputs: { gsplat: out } }) => `
         ${out} = ${at.gsplat};
+        ${out}.scales *= ${at.size};
         {
           ivec2 cell = ivec2(${at.index} % ${WIDE}, ${at.index} / ${WIDE});
           vec3 own = ${out}.rgba.rgb;
@@ -94,6 +96,10 @@ export class Painter {
     if (heat) this.warm.value.set(heat.low, heat.high);
   }
 
+  widen(size) {
+    this.size.value = size;
+  }
+
   // Scores go to the GPU once, when they are new.
   lay(all) {
     const { image } = this.scores.value;
@@ -107,7 +113,7 @@ export class Painter {
       if (this.kept[place] === scores) return;
       this.kept[place] = scores;
       const { data } = this.scores.value.image;
-      if (this.rows) this.rows.forEach((row, drawn) => { data[size * place + drawn] = scores[row]; }); else data.set(scores, size * place);
+      if (this.rows) for (let drawn = 0; drawn < this.count; drawn += 1) data[size * place + drawn] = scores[this.rows[drawn]]; else data.set(scores, size * place);
       this.scores.value.addLayerUpdate(place);
       this.scores.value.needsUpdate = true;
     });

@@ -78,7 +78,7 @@ export class Things {
     at("catalogue-own").replaceChildren(...this.own.map(one => el("li", {},
       el("button", { type: "button", className: "thing", "aria-pressed": String(held.includes(`selection:${one.id}`)), on: { click: event => this.pressOwn(one, event.shiftKey) } },
         el("span", {}, one.name, el("small", {}, `${plural(one.count, "splat")}, yours`))),
-      twice("Delete", () => this.forget([one.id]).then(() => this.hold(this.held().filter(term => term !== `selection:${one.id}`)))))));
+      twice("Delete", () => this.drop(one.id)))));
     at("catalogue-hidden").hidden = !hidden;
     at("catalogue-hidden").textContent = this.all ? "Leave out what is hidden" : `Show ${plural(hidden, "hidden thing")}`;
     const focus = document.activeElement?.dataset.unfolds; // which is made anew
@@ -149,7 +149,8 @@ export class Things {
       const made = await how((name, sets) => post(this.route, { name: name.slice(0, 100), edit: { how: "set", query: { sets } } }));
       await this.conceal(hidden, true);
       const after = then ?? `selection:${made[0].id}`;
-      this.last = { change, made: made.map(({ id }) => id), hidden, before, after };
+      const ids = made.map(({ id }) => id);
+      this.last = { held: after, change, back: () => this.forget(ids).then(() => this.conceal(hidden, false)).then(() => this.hold(before)) };
       this.have(this.found, [...made, ...this.own]);
       this.hold([after]);
     } catch (problem) { tell(words(problem), true); }
@@ -164,11 +165,41 @@ export class Things {
       this.make(undone);
       return true;
     }
-    if (!last || String(this.held()) !== last.after) return false;
+    if (!last || String(this.held()) !== last.held) return false;
     this.last = null;
-    this.forget(last.made).then(() => this.conceal(last.hidden, false)).then(() => this.hold(last.before))
-      .then(() => { this.undone = last.change; }).catch(problem => tell(words(problem), true));
+    last.back().then(() => { this.undone = last.change; }).catch(problem => tell(words(problem), true));
     return true;
+  }
+
+  // Delete one of one's own: what it was made of, and nothing else stands for, comes back. This can be undone, too.
+  async drop(id) {
+    const before = [...this.held()];
+    const whole = await this.detail(id);
+    await this.forget([id]);
+    const others = await Promise.all(this.own.map(one => this.detail(one.id)));
+    const hidden = begunFrom(whole.history).filter(set => !others.some(({ history }) => begunFrom(history).includes(set)) && this.found.some(thing => thing.hidden && term(thing) === set));
+    await this.conceal(hidden, false);
+    const left = before.filter(set => set !== `selection:${id}`);
+    this.undone = null;
+    this.last = { held: String(left), change: null, back: () => this.restore(whole, hidden, before) };
+    if (left.length < before.length) this.hold(left); else this.show();
+    tell(`\u201c${whole.name}\u201d is deleted. Ctrl+Z brings it back.`);
+  }
+
+  // A selection that was deleted, begun from what it was begun from, with the splats that it had.
+  async restore({ id, name, history, bits }, hidden, before) {
+    const begun = begunFrom(history);
+    const splats = { how: "set", bits };
+    const made = await post(this.route, { name, edit: begun.length ? { how: "set", query: { sets: begun } } : splats });
+    const whole = begun.length ? await post(`${this.route}/${made.id}/edits`, splats) : made;
+    await this.conceal(hidden, true);
+    this.have(this.found, [whole, ...this.own]);
+    this.hold(before.map(set => (set === `selection:${id}` ? `selection:${made.id}` : set)));
+    this.show();
+  }
+
+  detail(id) {
+    return json(`${this.route}/${id}?bits=true`);
   }
 
   async forget(ids) {
@@ -230,7 +261,7 @@ export class Things {
     const hidden = this.found.filter(thing => thing.hidden).map(term);
     const here = nested.map(({ set }) => set).filter(set => hidden.includes(set));
     if (!here.length) return [];
-    const own = await Promise.all(this.own.map(({ id }) => json(`${this.route}/${id}?bits=true`)));
+    const own = await Promise.all(this.own.map(({ id }) => this.detail(id)));
     const stands = ({ history }) => begunFrom(history).some(set => here.includes(set) || own.some(one => set === `selection:${one.id}` && stands(one)));
     const heirs = own.filter(stands);
     const splat = /^splat:(\d+)$/.exec(example);

@@ -11,6 +11,13 @@ const FLIGHT = 700; // ms
 const LOADING = 60_000; // ms that the unpacking of a scene may take before that is told
 const SAMPLE = 200_000; // splats among which middles are looked for
 const OPAQUE = 40; // of 255: fainter splats are not what somebody points at
+const FEWEST = 10_000; // splats that are drawn while something moves, however slow the machine is
+const SMOOTH = 60; // ms that a frame may take while something moves
+const REST = 250; // ms after the last change, until all splats are drawn
+const FRAMES = 4; // of which the fastest tells how fast the machine is: one may have been held up
+const WIDEST = 2; // times a splat's size, where it stands for others
+const COARSE = 0.5; // pixels a CSS pixel, where fewer splats are drawn
+const SOFTWARE = /swiftshader|llvmpipe|software|basic render/i; // renderers without a GPU
 
 export function webgl() {
   try {
@@ -26,7 +33,7 @@ export class Viewer {
     this.canvas = canvas;
     this.seen = seen;
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, preserveDrawingBuffer: true, powerPreference: "high-performance" });
-    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 1.5));
+    this.renderer.setPixelRatio(fine());
     this.scene = new THREE.Scene();
     this.camera = new THREE.PerspectiveCamera(50, 1, 0.01, 1000);
     this.moved = () => {};
@@ -38,10 +45,13 @@ export class Viewer {
     this.reach = 1;
     this.spark = new SparkRenderer({
       renderer: this.renderer, preBlurAmount: 0.3, blurAmount: 0, sortRadial: false, maxStdDev: 3, minAlpha: 1 / 255,
-      onDirty: () => this.draw(),
+      onDirty: () => this.draw(false),
     });
     this.scene.add(this.spark);
     this.frames = 0;
+    const gl = this.renderer.getContext();
+    const named = gl.getExtension("WEBGL_debug_renderer_info");
+    this.speeds = SOFTWARE.test(gl.getParameter(named ? named.UNMASKED_RENDERER_WEBGL : gl.RENDERER)) ? [FEWEST] : [Infinity];
     new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
     this.resize();
   }
@@ -65,7 +75,7 @@ export class Viewer {
     controls.dampingFactor = 0.12;
     controls.zoomToCursor = true;
     controls.addEventListener("change", () => this.draw());
-    controls.addEventListener("start", () => { this.flight = null; this.lead(); });
+    controls.addEventListener("start", () => { this.flight = null; this.steered = true; this.lead(); });
     controls.addEventListener("end", () => this.moved());
   }
 
@@ -108,24 +118,75 @@ export class Viewer {
     this.draw();
   }
 
-  draw() {
+  // changed: by somebody, not by a sort that ended. A slow machine draws some of the splats then, and all of them at rest.
+  draw(changed = true) {
+    if (changed && this.mesh) {
+      const some = Math.min(this.count, Math.max(FEWEST, Math.round(Math.max(...this.speeds))));
+      this.thin(some);
+      this.rest(some < this.count);
+    }
     if (this.asked) return;
     this.asked = requestAnimationFrame(now => {
       this.asked = 0;
       this.fly(now);
       this.controls.update();
       if (this.leads) this.partner.follow(this);
-      this.renderer.render(this.scene, this.camera);
-      this.frames += 1;
-      this.seen(point => this.place(point));
+      this.render();
       if (this.flight) this.draw();
     });
+  }
+
+  // All splats, a while after the last change is on the screen.
+  rest(some) {
+    clearTimeout(this.resting);
+    this.resting = some && setTimeout(() => {
+      if (this.asked || this.timing || this.spark.sorting || this.spark.sortDirty) return this.rest(true);
+      this.resting = 0;
+      this.thin(this.count);
+      return this.draw(false);
+    }, REST);
+  }
+
+  // The first so many splats, in their order of drawing, wider as they stand for the others.
+  thin(number) {
+    const { packedSplats } = this.mesh;
+    if (packedSplats.numSplats === number) return;
+    packedSplats.numSplats = number;
+    this.painter.widen(Math.min(WIDEST, Math.sqrt(this.count / number)));
+    this.mesh.updateVersion();
+  }
+
+  // Until so many splats as are to be drawn are sorted, what is on the screen stays. Spark sorts the first ones right only
+  // in a frame of its own.
+  render() {
+    const { spark, scene, camera, mesh } = this;
+    if (mesh && spark.display.numSplats && spark.display.numSplats !== mesh.packedSplats.numSplats) {
+      camera.updateMatrixWorld();
+      spark.dirty = false; // or it does not say when they are
+      spark.updateInternal({ scene, camera, autoUpdate: true });
+      return;
+    }
+    const begun = performance.now();
+    const ratio = mesh && spark.display.numSplats < this.count ? COARSE : fine();
+    if (this.renderer.getPixelRatio() !== ratio) this.renderer.setPixelRatio(ratio);
+    this.renderer.render(scene, camera);
+    this.frames += 1;
+    this.seen(point => this.place(point));
+    if (mesh) this.time(spark.display.numSplats, begun);
+  }
+
+  // Splats that are drawn smoothly, by what those of a frame took.
+  async time(number, begun) {
+    if (this.timing) return;
+    this.timing = true;
+    await this.drawn().finally(() => { this.timing = false; });
+    this.speeds = [...this.speeds.slice(1 - FRAMES), number * SMOOTH / (performance.now() - begun)];
   }
 
   // Whether all that was asked for is on the screen.
   get settled() {
     const { activeSplats, sorting, sortDirty, dirty } = this.spark;
-    return Boolean(this.mesh) && !this.asked && !this.flight && activeSplats > 0 && !sorting && !sortDirty && !dirty;
+    return Boolean(this.mesh) && !this.asked && !this.flight && !this.resting && this.spark.display.numSplats === this.count && activeSplats > 0 && !sorting && !sortDirty && !dirty;
   }
 
   // Once the card has drawn all that it was told to.
@@ -133,7 +194,7 @@ export class Viewer {
     const gl = this.renderer.getContext();
     const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
     gl.flush();
-    while (gl.clientWaitSync(fence, 0, 0) === gl.TIMEOUT_EXPIRED) await new Promise(later => setTimeout(later, 30));
+    while (gl.clientWaitSync(fence, 0, 0) === gl.TIMEOUT_EXPIRED) await new Promise(later => setTimeout(later, 8));
     gl.deleteSync(fence);
   }
 
@@ -163,13 +224,13 @@ export class Viewer {
     this.total = content.length / ROW;
     const step = Math.ceil(this.total / MOST);
     this.rows = null;
-    if (step > 1) {
-      this.rows = Uint32Array.from({ length: Math.floor(this.total / step) }, (_, place) => place * step);
+    if (this.total > FEWEST) {
+      this.rows = spread(Math.floor(this.total / step), step);
       const whole = content.byteOffset % 4 ? content.slice() : content;
       const words = new Uint32Array(whole.buffer, whole.byteOffset, whole.length / 4);
-      const thinned = new Uint32Array(this.rows.length * ROW / 4);
-      for (let place = 0; place < thinned.length; place += 1) thinned[place] = words[place % 8 + 8 * step * Math.floor(place / 8)];
-      content = new Uint8Array(thinned.buffer);
+      const drawn = new Uint32Array(this.rows.length * ROW / 4);
+      for (let place = 0; place < drawn.length; place += 1) drawn[place] = words[place % 8 + 8 * this.rows[place >> 3]];
+      content = new Uint8Array(drawn.buffer);
     }
     this.count = content.length / ROW;
     if (content.byteOffset % 4) content = content.slice();
@@ -186,6 +247,7 @@ export class Viewer {
     this.mesh = mesh;
     this.scene.add(mesh);
     this.measure();
+    this.steered = false;
     this.paint([]);
   }
 
@@ -233,6 +295,8 @@ export class Viewer {
       this.cones.geometry.dispose();
       this.draft = null;
     }
+    clearTimeout(this.resting);
+    this.resting = 0;
     if (this.mesh) {
       this.scene.remove(this.mesh);
       this.mesh.dispose();
@@ -347,6 +411,7 @@ export class Viewer {
 
   // By keyboard: turn by angles in radians, zoom by a factor.
   turn(around, over) {
+    this.steered = true;
     this.lead();
     const offset = this.camera.position.clone().sub(this.controls.target);
     const turned = new THREE.Quaternion().setFromUnitVectors(this.camera.up, new THREE.Vector3(0, 1, 0));
@@ -361,6 +426,7 @@ export class Viewer {
   }
 
   zoom(factor) {
+    this.steered = true;
     this.lead();
     this.camera.position.sub(this.controls.target).multiplyScalar(factor).add(this.controls.target);
     this.moved();
@@ -374,6 +440,7 @@ export class Viewer {
   // What lies under a place of the canvas: the splat nearest to where the ray ends, and that point. null: nothing.
   pick(x, y) {
     if (!this.mesh) return null;
+    this.mesh.context.numSplats.value = this.count; // also where fewer are drawn
     const { clientWidth: width, clientHeight: height } = this.canvas;
     const ray = new THREE.Raycaster();
     ray.setFromCamera(new THREE.Vector2(2 * x / width - 1, 1 - 2 * y / height), this.camera);
@@ -433,11 +500,24 @@ export class Viewer {
     this.draw();
   }
 
-  // The canvas as it is now.
-  frameNow() {
+  // The canvas, once all splats are on it.
+  async whole() {
+    while (this.mesh && !this.settled) await new Promise(later => setTimeout(later, 50));
     this.renderer.render(this.scene, this.camera);
     return this.canvas;
   }
+}
+
+const fine = () => Math.min(devicePixelRatio, 1.5);
+
+// Every so many rows, in an order whose first ones, however many, are spread evenly over all: steps of the golden ratio.
+function spread(count, step) {
+  const common = (one, other) => (other ? common(other, one % other) : one);
+  let stride = Math.round(count * (Math.sqrt(5) - 1) / 2);
+  while (common(count, stride) > 1) stride += 1;
+  const rows = new Uint32Array(count);
+  for (let place = 0; place < count; place += 1) rows[place] = place * stride % count * step;
+  return rows;
 }
 
 // OpenCV's axes: x right, y down, z forward.
