@@ -8,6 +8,7 @@ import numpy as np
 from liftcore.errors import InvalidQuery
 from liftcore.query.opened import OpenedLift
 from liftcore.query.question import Answer, Box, FoundObject, Objects, Point
+from liftcore.query.selection import MOST, SOME
 from liftcore.query.terms import SplatSet
 from liftcore.scene.touching import touching
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from liftcore.scene.world import WorldFrame
 
 LEAST_EVIDENCE = 0.05  # of an object, as a share of the largest's
+LEAST_OF_FRAGMENT = 0.25  # the same of a fragment of another thing, where the largest is a thing itself
 MOST_SPLATS = 1 << 20  # that are grouped: a million take seven seconds of two cores and a gigabyte
 _TAIL = 1e-3  # of an object's evidence that its box leaves out at each end of each axis
 
@@ -25,8 +27,10 @@ def objects(scene: OpenedLift, answer: Answer) -> Objects:
 
     Things are splats that touch (`touching`). What has less than a twentieth of the evidence of the largest is no
     thing but strays: single splats and specks whose scores happen to reach the threshold, anywhere in the scene. So
-    are groups of fewer splats than the query's ``min_size``. A query that knows how many instances there are has so
-    many objects at most, those of the highest scores, and one that keeps the largest has one; all else are strays.
+    are groups of fewer splats than the query's ``min_size``. Where the largest is most of a thing of the region
+    graph, a group that is less than a third of another one needs a quarter: features leak from a thing to what stands
+    behind it. A query that knows how many instances there are has so many objects at most, those of the highest
+    scores, and one that keeps the largest has one; all else are strays.
 
     Of a query of sets each set is a thing, and none of its splats is a stray; one of several sets is of the first.
 
@@ -48,8 +52,8 @@ def objects(scene: OpenedLift, answer: Answer) -> Objects:
     sums = np.bincount(groups, weights)
     order = np.argsort(-sums, kind="stable")
     order = order[np.bincount(groups)[order] >= answer.query.min_size]
-    large = len(order) if sets else int((sums[order] >= LEAST_EVIDENCE * sums.max()).sum())
-    kept = order[: min(1, large) if answer.query.keep == "largest" else large]
+    kept = order if sets else _without_leaks(scene, rows, groups, sums, order)
+    kept = kept[:1] if answer.query.keep == "largest" else kept
     if answer.query.instances is not None and len(kept) > answer.query.instances:
         scores = np.bincount(groups, weights * answer.scores[rows])[kept] / sums[kept]
         kept = kept[np.sort(np.argsort(-scores, kind="stable")[: answer.query.instances])]
@@ -73,6 +77,33 @@ def objects(scene: OpenedLift, answer: Answer) -> Objects:
             )
         )
     return Objects.of(found, numbers, int((numbers[rows] < 0).sum()), scene.world)
+
+
+def _without_leaks(
+    scene: OpenedLift, rows: np.ndarray, groups: np.ndarray, sums: np.ndarray, order: np.ndarray
+) -> np.ndarray:
+    """The groups that are objects, of those in order of their evidence.
+
+    Args:
+        rows: [n] i64, selected splats. groups: [n] i64, the group of each. sums: [g] f64, their evidence.
+        order: [k] i64, groups, the largest first.
+    """
+    large = order[sums[order] >= LEAST_EVIDENCE * sums.max()]
+    small = sums[large] < LEAST_OF_FRAGMENT * sums.max()
+    if scene.object is None or not small.any():
+        return large
+    own = scene.object
+    sizes = np.bincount(own + 1)
+
+    def share(group: int) -> float:
+        """Of the thing that a group is of, what the group has; NaN where that is none."""
+        counts = np.bincount(own[rows[groups == group]] + 1)
+        thing = int(counts.argmax())
+        return counts[thing] / sizes[thing] if thing else np.nan
+
+    if not share(large[0]) >= MOST:
+        return large
+    return large[[not (few and share(group) < SOME) for group, few in zip(large, small, strict=True)]]
 
 
 def _set_numbers(scene: OpenedLift, sets: Sequence[SplatSet]) -> np.ndarray:

@@ -74,6 +74,33 @@ def test_single_splats_elsewhere_are_strays_and_stretch_no_box(scene: Scene) -> 
     assert module.trimmed_box(scene.splats.means.numpy()[strayed], np.ones(len(strayed))) != box
 
 
+def test_small_fragment_of_another_thing_is_no_object_beside_a_whole_one(scene: Scene) -> None:
+    count, answer = 2 * SPLATS_A_CLUSTER, of(scene, 0)
+    near = np.linalg.norm(means(scene, 2) - means(scene, 2)[0], axis=1).argsort()
+    fragment = count + near[:4]  # of the last cluster
+    selected = answer.selected | np.isin(np.arange(len(answer.selected)), fragment)
+    things = np.repeat(np.array([0, -1, 1], np.int32), SPLATS_A_CLUSTER)
+    cases = {"of the last": things, "a thing itself": np.where(np.isin(np.arange(len(things)), fragment), 2, things)}
+    cases["of none"] = np.full(len(things), -1, np.int32)
+    found = {}
+    for name, own in cases.items():
+        lift = replace(
+            scene.lift,
+            object=torch.from_numpy(own.astype(np.int32)),
+            object_views=torch.zeros((3, 3), dtype=torch.int32),
+        )
+        found[name] = objects(Scene(lift, scene.splats), answer_with(answer, selected=selected))
+    assert {name: len(one.found) for name, one in found.items()} == {
+        "of the last": 1,
+        "a thing itself": 2,
+        "of none": 2,
+    }
+    assert found["of the last"].strays == len(fragment)
+    large = answer.selected | np.isin(np.arange(len(things)), count + near[:12])
+    lift = replace(scene.lift, object=torch.from_numpy(things), object_views=torch.zeros((2, 3), dtype=torch.int32))
+    assert len(objects(Scene(lift, scene.splats), answer_with(answer, selected=large)).found) == 2
+
+
 def test_who_keeps_the_largest_gets_it_alone_also_as_a_file(scene: Scene) -> None:
     both, largest = objects(scene, of(scene, 0, 2)), objects(scene, of(scene, 0, 2, keep="largest"))
     assert largest.found == both.found[:1]
