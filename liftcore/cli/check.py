@@ -19,6 +19,23 @@ if TYPE_CHECKING:
     from liftcore.evaluate import CheckReport
 
 
+CHECKS = """\
+Twelve views are compared. The exit status is 2, and the fault is named, unless
+- photos have the shape of their cameras, in any size. Others are crops, or lie
+  on their side, and are compared no further;
+- rays meet splats, and the render of a view is more like its own photo than
+  like others. Causes that are recognised: photos that are turned, mirrored,
+  shifted (a wrong principal point) or of another exposure, and camera positions
+  in another scale;
+- masks follow the edges in the photos better than when mirrored, and
+  neighbouring cells of grids are more alike than with the axes in another order;
+- views agree on the splats that they share at least a fifth as much as their
+  most similar regions would allow, and no better with the camera positions at
+  another scale.
+Photos without a camera and cameras without a photo are named, too.
+"""
+
+
 def add_arguments(parser: Parser) -> None:
     """The options of the command."""
     parser.add_argument("splats", type=place, help="trained splats")
@@ -27,6 +44,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--worst", type=Path, metavar="PNG", help="write the worst view: its photo and the render")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="one setting of the lift")
     add_verbose(parser)
+    parser.appendix = lambda: CHECKS
 
 
 def run(options: argparse.Namespace) -> int:

@@ -22,6 +22,25 @@ if TYPE_CHECKING:
     from liftcore.models import SceneTree
 
 
+RELATIONS = """\
+--relations compares the 64 largest objects, and lists each relation of NODE and
+OTHER once, with a gap and an overlap:
+  touching  splats of them touch; the gap of the nearest centres
+  inside    nine tenths of its splats lie in the other's box, which lies in two
+            thirds of the directions from its middle; gap likewise, overlap the
+            share of its splats in that box
+  on        the other lies below a third of its footprint, and they touch or
+            nearly do; the gap of their heights, the share of its footprint
+            above the other
+  under     the other is on it, or begins higher above it; gap likewise, the
+            larger share of either above the other
+  beside    heights overlap by half, and on the ground they are less apart than
+            the smaller is wide; the gap on the ground, the share of the lower
+            one's height
+Gaps are in metres where the length of a unit is known, else in scene units.
+"""
+
+
 def add_arguments(parser: Parser) -> None:
     """The options of the command."""
     parser.add_argument("lift", type=place, help="a lift (.safetensors)")
@@ -38,6 +57,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--csv", type=Path, metavar="CSV", help="write the list as a table")
     parser.add_argument("--into", type=Path, metavar="FOLDER", help="write one PLY an object, object-ID.ply")
     add_splats(parser)
+    parser.appendix = lambda: RELATIONS
 
 
 def run(options: argparse.Namespace) -> int:

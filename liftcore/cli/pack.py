@@ -21,6 +21,30 @@ NAMES = {
     **{name: f"--{name}" for name in ("device", "encoder", "names", "photos", "unlabelled")},
 }  # of arguments
 LARGEST_GREY = 65_535  # of a picture of 16 bits
+PROMPT_LAYOUTS = """\
+layouts of FOLDER, with sub-folders where views have some:
+  PHRASE/VIEW.png       binary pictures, or arrays [h, w] in .npy or .npz; with
+                        --folders views VIEW/PHRASE.png. _ is a space
+  *.json of COCO        images, annotations and categories (CVAT, Label Studio,
+                        Roboflow), LVIS, SA-Co's text_input, YouTube-VIS
+  *.json, one an image  records with a phrase, label or class_name and run
+                        lengths, polygons or pictures: Grounded SAM 2, LabelMe,
+                        ISAT, Supervisely, Darwin. The view is that of its
+                        image_path, else of its own name
+  json_data, mask_data  the tracking of Grounded SAM 2: pictures of ids and
+                        their class names; also DEVA, COCO's panoptic pictures
+  VIEW.png (.npy)       label pictures. Those of 'segment --labels' bring their
+                        names; else --names FILE: JSON from values to names or
+                        back (id2label, COCO's categories), .csv or .tsv of
+                        values and names, a name a line (a first "background"
+                        is 0), "1 name" or "1,name" a line, CVAT's labelmap.txt
+
+Masks of one phrase in a view are merged. Polygons are filled within a pixel of
+pycocotools, on the image's width and height. In a view with a file, pixels
+without a mask count as none of the phrases, but have no label where SA-Co or
+LVIS say that the image was not searched for every phrase. Annotations with
+boxes alone are counted in a warning, and their inside has no label.
+"""
 
 
 def add_arguments(parser: Parser, shared: Parser) -> None:
@@ -59,6 +83,7 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
     prompts.add_argument("--unlabelled", type=_grey, metavar="VALUE", help=by)
     by = "COCO's images without an annotation are left out (skip), or show none of the phrases (negative)"
     prompts.add_argument("--unannotated", choices=("skip", "negative"), default="skip", help=by)
+    prompts.appendix = lambda: PROMPT_LAYOUTS
     retag = formats.add_parser("retag", parents=[shared], help="a pack under other names of its encoder or space")
     space = (
         "the text encoder whose words lie in the space of the features, as query's --encoder names it "
