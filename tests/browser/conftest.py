@@ -60,6 +60,17 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         yield Served(address, job["id"], store)
 
 
+@pytest.fixture
+def other_lift(served: Served) -> Iterator[str]:
+    """Another lift of the same scene."""
+    with httpx.Client(base_url=served.address, timeout=60) as client:
+        known = client.get(f"/lifts/{served.lift}").json()
+        order = {name: known[name] for name in ("splats", "cameras", "features")} | {"settings": {"preset": "mean"}}
+        job = ended(client, client.post("/lift", json=order).headers["location"])["id"]
+        yield job
+        assert client.delete(f"/jobs/{job}?with_lift=true").status_code == 204
+
+
 @contextlib.contextmanager
 def browsing(profile: Path, *options: str) -> Iterator[Browser]:
     """A browser of which nothing is heard but what was asked of it, and which asks this machine alone."""

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import httpx
 import pytest
-
-from tests.api.following import ended
 
 from .browser import Browser
 from .conftest import Served
@@ -27,16 +24,6 @@ def page(browser: Browser, served: Served) -> Iterator[Browser]:
     browser.until(READY)
     yield browser
     browser.open("about:blank#")
-
-
-@pytest.fixture
-def other_lift(served: Served) -> Iterator[str]:
-    with httpx.Client(base_url=served.address, timeout=60) as client:
-        known = client.get(f"/lifts/{served.lift}").json()
-        order = {name: known[name] for name in ("splats", "cameras", "features")} | {"settings": {"preset": "mean"}}
-        job = ended(client, client.post("/lift", json=order).headers["location"])["id"]
-        yield job
-        assert client.delete(f"/jobs/{job}?with_lift=true").status_code == 204
 
 
 def test_two_words_are_seen_beside_each_other_with_one_camera(page: Browser) -> None:

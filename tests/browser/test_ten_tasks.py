@@ -1,4 +1,5 @@
-"""What a stranger does: things are found, corrected, named, taken away and compared, and a link opens it all again.
+"""What a stranger does: the example is opened, things are found, corrected, named and taken away, two lifts are
+compared, and a link opens it all again.
 
 Set SPLATLIFT_PICTURES to a folder to have a picture of each step.
 """
@@ -7,22 +8,38 @@ from __future__ import annotations
 
 import base64
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import httpx
 import pytest
+import zstandard
 
+from service.routes import operations
 from tests.api.tiny_scene import make_scene
 
 from .browser import Browser
-from .conftest import Served
+from .conftest import Served, serving
 from .looking import AMBER, FOUND, READY, ask, columns, splat_at, text_of
 
 pytestmark = pytest.mark.slow
 APPLE = 5  # a splat of it
 ZIP = "splatlift.take.everything(true).then(() => document.querySelector('#toast').textContent)"
 BOTH = "splatlift.beside.scene && splatlift.beside.left.settled && splatlift.viewer.settled"
+
+
+@pytest.fixture
+def empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A service without a lift, which ships a small example."""
+    scene, example = make_scene(), tmp_path / "example"
+    example.mkdir()
+    (example / "point_cloud.spz").write_bytes(scene.splats)
+    (example / "cameras.json").write_bytes(scene.cameras)
+    (example / "features.safetensors.zst").write_bytes(zstandard.compress(scene.features))
+    (tmp_path / "table.safetensors").write_bytes(scene.table)
+    monkeypatch.setattr(operations, "EXAMPLE", example)
+    with serving(tmp_path / "data", encoder=f"table:{tmp_path}/table.safetensors") as (address, _):
+        yield address
 
 
 def pictures(page: Browser, width: int) -> Callable[[str], None]:
@@ -39,13 +56,20 @@ def pictures(page: Browser, width: int) -> Callable[[str], None]:
 
 @pytest.mark.parametrize(("width", "height"), [(1440, 900), (390, 844)])
 def test_ten_tasks_are_done_without_a_manual(
-    browser: Browser, served: Served, tmp_path: Path, width: int, height: int
+    browser: Browser, served: Served, empty: str, other_lift: str, tmp_path: Path, width: int, height: int
 ) -> None:
     page, shown = browser, pictures(browser, width)
     page.window(width, height)
-    page.open(served.address)  # open a scene
+    page.open(empty)  # open the example
+    page.until("!document.querySelector('#empty').hidden")
+    shown("0-empty")
+    page.press("#open-example")
     page.until(READY)
-    shown("1-open")
+    ask(page, "lamp")
+    assert len(columns(page, AMBER)) > 50
+    shown("1-example")
+    page.open(f"{served.address}/?lift={served.lift}")
+    page.until(READY)
     for word in ("book", "apple", "lamp"):  # find three things
         ask(page, word)
         assert len(columns(page, AMBER)) > 50
@@ -65,9 +89,12 @@ def test_ten_tasks_are_done_without_a_manual(
     page.until(f"splatlift.hand.selection.step === 0 && !splatlift.hand.busy && {FOUND}")
     assert page.value("splatlift.ask.now.count") == 20
     own = page.value("splatlift.things.own[0].id")
-    page.press("#panel-ask [data-compare]")  # compare
-    page.until(BOTH)
+    page.press("#tab-bring")  # compare two lifts
+    page.until("document.querySelector('#lifts [aria-label^=Compare]')")
+    page.press("#lifts [aria-label^=Compare]")
+    page.until(f"splatlift.lift?.id === '{other_lift}' && {BOTH}")
     ask(page, "apple")
+    assert page.value("splatlift.beside.scene.id") == served.lift
     shown("4-compared")
     link = page.value("location.href")  # share, and come back by the link
     page.open("about:blank#")

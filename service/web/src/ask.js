@@ -442,7 +442,7 @@ const split = text => text.split(",").map(word => word.trim()).filter(Boolean);
 const lit = question => question.anyway || question.threshold !== "auto" || (question.answer.clear && question.answer.present !== false);
 const shown = term => term.replace(/^splat:/, "splat ").replace(/^region:(.*):(\d+):(\d+)$/, "a mask of $1").replace(/^(.*):(box|stroke):[\d,\s]+$/, "a $2 of $1");
 export const naming = new Map(); // what things and selections are called, by their terms
-export const label = question => question.text.join(", ") || question.sets.map(one => naming.get(one) || one.replace(/^object:(\d+)$/, (_, number) => `thing ${Number(number) + 1}`).replace(/^selection:.*/, "a selection")).join(", ") || (question.like.length > 1 ? `like ${question.like.length} examples` : `like ${shown(question.like[0] || "")}`);
+export const label = question => question.text.join(", ") || question.sets.map(one => (question.titles ?? naming).get(one) || one.replace(/^object:(\d+)$/, (_, number) => `thing ${Number(number) + 1}`).replace(/^selection:.*/, "a selection")).join(", ") || (question.like.length > 1 ? `like ${question.like.length} examples` : `like ${shown(question.like[0] || "")}`);
 const quoted = question => (question.text.length ? `\u201c${question.text.join(", ")}\u201d` : "Such a thing");
 const measures = ({ low, high }) => ` ${low.map((value, axis) => (high[axis] - value).toPrecision(2)).join(" \u00d7 ")}`;
 

@@ -5,6 +5,7 @@ import { at, count, el, tell } from "./dom.js";
 import { title } from "./lifts.js";
 import { inColours, linkedWords, namedSplats } from "./names.js";
 import { bytes, json, npy, words } from "./service.js";
+import { titlesOf } from "./things.js";
 
 const HINT = "Now ask another word, move the slider or choose another scene: the left stays.";
 const SCREEN = ["beside", "camera", "show", "view"]; // of the right alone
@@ -50,6 +51,7 @@ export class Beside {
     const lift = await json(`/lifts/${link.get("lift")}`);
     const questions = linkedQuestions(link);
     const [content, layer] = await Promise.all([this.loaded === lift.id ? null : bytes(`/lifts/${lift.id}/splats`), layerOf(lift, link),
+      ...questions.map(async question => { if (question.sets.length) question.titles = await titlesOf(lift, question.sets); }),
       ...questions.map(async question => Object.assign(question, await answered(lift, question, link.getAll("negatives"))))]);
     return { lift, questions, content, layer, heat: link.has("heat") ? heated(questions[0]) : null, also: layer?.name };
   }

@@ -23,10 +23,7 @@ export class Things {
     if (lift) json(`/lifts/${lift.id}/selections`).then(({ selections }) => { if (lift === this.lift) this.have(this.found, selections); }).then(() => this.show(), () => {});
     if (!lift?.links.objects) return; // of a lift from before there were any
     try {
-      const route = `/lifts/${lift.id}/objects?limit=${MOST}`;
-      const space = `&encoder=${encodeURIComponent(lift.text_space)}`;
-      let named = lift.text_space === "none" ? "" : space;
-      const { objects } = await json(route + named).catch(() => { named = ""; return json(route); }); // that space has no table of words
+      const { objects, named } = await objectsOf(lift);
       if (lift === this.lift) this.have(objects);
       this.show();
       const { nodes } = objects.length && lift.links.tree ? await json(`${lift.links.tree}?limit=${NODES}${named}`) : { nodes: [] };
@@ -36,17 +33,11 @@ export class Things {
     this.show();
   }
 
-  // Things of one name are numbered.
   have(objects, own = this.own) {
     Object.assign(this, { found: objects, own });
     for (const { id, name } of own) this.naming.set(`selection:${id}`, name);
-    const times = new Map();
-    for (const { name } of objects) times.set(name, (times.get(name) || 0) + 1);
-    const seen = new Map();
+    entitle(objects);
     for (const thing of objects) {
-      const number = (seen.get(thing.name) || 0) + 1;
-      seen.set(thing.name, number);
-      thing.title = !thing.name ? `Thing ${thing.id + 1}` : times.get(thing.name) > 1 ? `${thing.name} ${number}` : thing.name;
       this.naming.set(term(thing), thing.title);
       this.entitle(thing);
     }
@@ -299,6 +290,38 @@ export class Things {
     } catch (problem) { tell(words(problem), true); }
     return this.show();
   }
+}
+
+// The things of a lift, and the part of the route that had them named.
+async function objectsOf(lift) {
+  const route = `/lifts/${lift.id}/objects?limit=${MOST}`;
+  let named = lift.text_space === "none" ? "" : `&encoder=${encodeURIComponent(lift.text_space)}`;
+  const { objects } = await json(route + named).catch(() => { named = ""; return json(route); }); // that space has no table of words
+  return { objects, named };
+}
+
+// Things of one name are numbered.
+function entitle(objects) {
+  const times = new Map();
+  for (const { name } of objects) times.set(name, (times.get(name) || 0) + 1);
+  const seen = new Map();
+  for (const thing of objects) {
+    const number = (seen.get(thing.name) || 0) + 1;
+    seen.set(thing.name, number);
+    thing.title = !thing.name ? `Thing ${thing.id + 1}` : times.get(thing.name) > 1 ? `${thing.name} ${number}` : thing.name;
+  }
+}
+
+// The titles of sets of any lift, by their terms.
+export async function titlesOf(lift, sets) {
+  const titles = new Map();
+  const selections = sets.filter(set => set.startsWith("selection:"));
+  await Promise.all(selections.map(async set => titles.set(set, (await json(`/lifts/${lift.id}/selections/${set.slice(10)}`)).name)));
+  if (selections.length === sets.length) return titles;
+  const { objects } = await objectsOf(lift);
+  entitle(objects);
+  for (const thing of objects) titles.set(term(thing), thing.title);
+  return titles;
 }
 
 // The sets that a selection was begun from.
