@@ -147,7 +147,7 @@ class InMemory(Steps[SceneWeights]):
                 weights, W.geometry.codebook, self.settings.robust_steps, self.timings.progress,
                 principal=self.settings.robust_directions, means=self.splats.means, threads=self.threads,
                 reliability=whole_regions(self.settings.reliability, W.geometry.levels), consensus=W.consensus,
-                on_card=on_card,
+                levels=W.geometry.levels, on_card=on_card,
             )  # fmt: skip
             result = replace(W.with_factors(weights, agreement.factors), consensus=None, agreement=agreement)
             return result, agreement.reliability

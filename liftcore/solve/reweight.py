@@ -20,6 +20,11 @@ before, and starts from the first W again. Nothing is tuned; each part has its r
   weights in proportion to the signal give the least noise. There is no bandwidth; a region merged of two things
   keeps part of its weight, and one that points away from the others loses it.
 
+**Each level by itself.** A whole and its part may have a vector each, and both are right: their sum is neither, and
+things that say the same on two levels would outvote those that do not at every border. So p, c, r, s and all sums are
+taken among the regions of one level, and each level keeps its weight at each splat. Levels that say the same lose
+nothing by it that docs/results.md can show. Cells of grids are a level.
+
 A splat of one view does not change. A region without direction (a zero vector, or the mean itself) has c_jm = 0, and
 where nothing in the scene has a direction nothing changes.
 
@@ -120,6 +125,7 @@ def agreement_factors(
     threads: int | None = None,
     reliability: Tensor | None = None,
     consensus: Tensor | None = None,
+    levels: np.ndarray | None = None,
     on_card: bool = False,
 ) -> Agreement:
     """What each entry of W is multiplied with after so many steps, for a scene whose W lies in one place.
@@ -131,25 +137,26 @@ def agreement_factors(
         threads: None takes the cores that this process may use. The number changes no bit.
         reliability: [M] bool, the regions that have factors as a whole; None: none has.
         consensus: [nnz] f32 of each entry (`mask_consensus`).
+        levels: [M] i8, the level of each region in its view, -1 for cells of grids; None: all are of one.
         on_card: work where W lies, by `liftcore.solve.reweight_on_card`.
     """
     if on_card:
         from liftcore.solve.reweight_on_card import ViewConsistencyOnCard
 
-        block: ViewConsistency | ViewConsistencyOnCard = ViewConsistencyOnCard(W)
+        block: ViewConsistency | ViewConsistencyOnCard = ViewConsistencyOnCard(W, levels)
         directions = RegionDirections(codebook, block.totals(), W.region.shape[0], principal)
     else:
-        block = ViewConsistency(W, means, threads)
+        block = ViewConsistency(W, means, threads, levels)
         directions = RegionDirections.of_weights(W, codebook, principal, threads)
     factors, scores, scene = None, torch.zeros(2, 0, dtype=torch.float32), None
     for step in range(steps):
-        table = np.zeros((2, codebook.regions + 1))
+        table = np.zeros((2, codebook.regions + block.levels))
 
         def add(part: PieceSums, table: np.ndarray = table) -> None:
             table[:, part.places] += part.values
 
         cosines = block.cosines(directions, factors, reliability is not None, add)
-        scene = SceneAgreement.of(table, reliability)
+        scene = SceneAgreement.of(table, reliability, block.level)
         scores = block.weigh(cosines, factors, scene, consensus)
         factors = cosines
         progress("robust", step + 1, steps, "steps")
@@ -158,35 +165,43 @@ def agreement_factors(
     return Agreement(factors, directions, scores[0], scores[1], scene.reliability)
 
 
+def level_numbers(levels: np.ndarray) -> np.ndarray:
+    """[M] i32: the levels [M] i8 that there are, numbered from 0 on; cells of grids, which have -1, are one."""
+    return np.unique(levels, return_inverse=True)[1].reshape(-1).astype(np.int32)
+
+
 @dataclass(frozen=True)
 class SceneAgreement:
-    """What a step takes from the whole scene."""
+    """What a step takes from the whole scene, of K levels."""
 
-    usual: float  # c, the mean cosine
+    usual: Tensor  # [K] f64, c, the mean cosine
     regions: Tensor  # [M] f32, r_m / r of each region; one where it has no factor as a whole
-    power: float  # of the consensus, SHARPNESS (1 - r)
-    reliability: float | None  # r, the median over regions; None where it was not asked for
+    power: Tensor  # [K] f64, of the consensus, SHARPNESS (1 - r)
+    reliability: float | None  # r, the median over all regions; None where it was not asked for
 
     @classmethod
-    def of(cls, sums: np.ndarray, whole: Tensor | None) -> "SceneAgreement":
+    def of(cls, sums: np.ndarray, whole: Tensor | None, level: np.ndarray) -> "SceneAgreement":
         """From the sums of `ViewConsistency.cosines` over all splats.
 
         Args:
-            sums: [2, M + 1] f64. whole: [M] bool, the regions that have factors as a whole; None: none has.
+            sums: [2, M + K] f64. whole: [M] bool, the regions that have factors as a whole; None: none has.
+            level: [M] i32, of each region.
         """
-        told, everything = torch.from_numpy(sums)
-        usual, regions = (
-            float(told[-1]) / (float(everything[-1]) or 1.0),
-            torch.ones(sums.shape[1] - 1, dtype=torch.float32),
-        )
+        confirmed, everything = torch.from_numpy(sums)
+        count = level.size
+        usual = torch.where(everything[count:] > 0, confirmed[count:] / everything[count:], 0.0)
+        regions, power = torch.ones(count, dtype=torch.float32), torch.ones(len(usual), dtype=torch.float64)
         if whole is None:
-            return cls(usual, regions, 1.0, None)
-        known = (everything[:-1] > 0) & whole
-        reliable = torch.where(known, told[:-1] / everything[:-1], 0.0)
-        median = float(reliable[known].median()) if known.any() else 0.0
-        if median > 0:
-            regions = torch.where(known, reliable / median, 1.0).float()
-        return cls(usual, regions, SHARPNESS * (1.0 - median), median)
+            return cls(usual, regions, power, None)
+        has_sum = (everything[:count] > 0) & whole
+        reliable = torch.where(has_sum, confirmed[:count] / everything[:count], 0.0)
+        for number in range(len(usual)):
+            own = has_sum & torch.from_numpy(level == number)
+            median = float(reliable[own].median()) if own.any() else 0.0
+            power[number] = SHARPNESS * (1.0 - median)
+            if median > 0:
+                regions = torch.where(own, reliable / median, regions.double()).float()
+        return cls(usual, regions, power, float(reliable[has_sum].median()) if has_sum.any() else 0.0)
 
 
 class ViewConsistency:
@@ -196,12 +211,15 @@ class ViewConsistency:
         W: of all views by rows of codebooks, on the CPU; a row for each splat of the block.
         means: [n, 3] of these splats; neighbours, which read the same directions, are judged together.
         threads: None takes the cores that this process may use. The result is bitwise identical for any value.
+        levels: [M] i8, of each region of the scene, -1 for cells of grids; None: all are of one.
     """
 
-    def __init__(self, W: RegionWeights, means: Tensor | None, threads: int | None) -> None:
+    def __init__(
+        self, W: RegionWeights, means: Tensor | None, threads: int | None, levels: np.ndarray | None = None
+    ) -> None:
         self.W, self.threads = W, threads
-        sums = W.row_sums()
-        self.inverse = torch.where(sums > 0, 1.0 / sums, 0.0)
+        self.level = level_numbers(np.zeros(int(W.offsets[-1]), np.int8) if levels is None else levels)
+        self.levels = int(self.level.max(initial=0)) + 1
         self.view = torch.repeat_interleave(W.offsets.diff())
         self.rows = torch.nonzero(W.indptr.diff())[:, 0]
         if means is not None:
@@ -221,7 +239,7 @@ class ViewConsistency:
             factors: [nnz] f32, of the step before; None before the first one.
             by_region: whether reliability is asked for.
             add: called with the sums of each piece, in their order: ``W (1 - p) c`` and ``W (1 - p)`` of each region
-                and, at place M, ``W c`` and ``W`` of all.
+                and, at the places from M on, ``W c`` and ``W`` of each level.
         """
         found, squares, factors = self._entries(), self._entries(), _or_ones(factors)
         for columns in directions.slices():
@@ -234,7 +252,7 @@ class ViewConsistency:
         def summed(first: int, last: int, table: np.ndarray) -> None:
             tally(*[first, last, *arrays, by_region, table])
 
-        shape = 2, int(self.W.offsets[-1]) + 1
+        shape = 2, int(self.W.offsets[-1]) + self.levels
         for part in piece_sums(summed, self.W.indptr.shape[0] - 1, shape, self.threads):
             add(part)
         return found
@@ -257,8 +275,10 @@ class ViewConsistency:
             scene.regions,
             torch.zeros(0, dtype=torch.float32) if consensus is None else consensus,
             scores,
+            scene.usual,
+            scene.power,
         )
-        arrays = [*self._arrays(_or_ones(factors)), *(part.numpy() for part in parts), scene.usual, scene.power]
+        arrays = [*self._arrays(_or_ones(factors)), *(part.numpy() for part in parts)]
         blocks = [(self.rows[first:last].numpy(), *arrays) for first, last in self.blocks]
         run_each(weigh_rows, blocks, self.threads)
         return scores
@@ -269,9 +289,9 @@ class ViewConsistency:
         return zeros(tuple(self.W.weight.shape), torch.float32, name="weights", in_file=2 * size > MEMORY_LIMIT)
 
     def _arrays(self, factors: Tensor) -> list[np.ndarray]:
-        """W with its factors, the inverse sums of its rows, and the view of each region."""
+        """W with its factors, and the view and the level of each region."""
         W = self.W
-        return [part.numpy() for part in (W.indptr, W.region, W.weight, factors, self.inverse, self.view)]
+        return [*(part.numpy() for part in (W.indptr, W.region, W.weight, factors, self.view)), self.level]
 
 
 def _or_ones(factors: Tensor | None) -> Tensor:
@@ -280,111 +300,141 @@ def _or_ones(factors: Tensor | None) -> Tensor:
 
 
 @vectorised
-def compare_rows(rows, indptr, region, weight, factors, inverse, view, table, products, squares):
+def compare_rows(rows, indptr, region, weight, factors, view, level, table, products, squares):
     """Add ``e_m . r_jv`` and ``|r_jv|^2`` of the entries of some rows, over the channels of the table.
 
     The sum of the others is that of the views before and that of the views behind: a difference of two float32 sums
     would be mostly rounding where a view has most of the weight. Of a view float32 adds up LONG entries one by one.
     """
-    width, most = table.shape[1], 0
+    width, longest, levels = table.shape[1], 0, np.int32(0)
     for row in rows:
-        most = max(most, indptr[row + 1] - indptr[row])
-    most = min(most, view[-1] + 1)
+        longest = max(longest, indptr[row + 1] - indptr[row])
+        for k in range(indptr[row], indptr[row + 1]):
+            levels = max(levels, level[region[k]] + 1)
+    most = min(longest, view[-1] + 1)
     said, before = np.empty((most + 1, width), np.float32), np.empty((most + 1, width), np.float32)
     behind, others = np.empty(width, np.float32), np.empty(width, np.float32)
+    own = np.empty(longest, np.int64)  # of a level in a row
     for row in rows:
-        first, last = indptr[row], indptr[row + 1]
-        before[0] = behind[:] = 0.0
-        k, number = first, 0
-        while k < last:
-            begin, v = k, view[region[k]]
-            while k < last and view[region[k]] == v:
-                target = number if k - begin < LONG else most
-                said[target] = 0.0
-                for n in range(k, min(k + LONG, last)):
-                    m = region[n]
-                    if view[m] != v:
-                        break
-                    factor = factors[n] if factors.size > 0 else np.float32(1.0)
-                    share = np.float32(weight[n] * factor * inverse[row])
-                    for c in range(width):
-                        said[target, c] += share * table[m, c]
-                    k += 1
-                if target != number:
-                    for c in range(width):
-                        said[number, c] += said[target, c]
-            for c in range(width):
-                before[number + 1, c] = before[number, c] + said[number, c]
-            number += 1
-        k = last - 1
-        while k >= first:
-            number -= 1
-            v, square = view[region[k]], np.float32(0.0)
-            for c in range(width):
-                others[c] = before[number, c] + behind[c]
-                square += others[c] * others[c]
-                behind[c] += said[number, c]
-            while k >= first and view[region[k]] == v:
-                m, product = region[k], np.float32(0.0)
+        for number_of_level in range(levels):
+            last, total = 0, 0.0
+            for k in range(indptr[row], indptr[row + 1]):
+                if level[region[k]] == number_of_level:
+                    own[last] = k
+                    total += weight[k]
+                    last += 1
+            if total <= 0.0:
+                continue
+            inverse = 1.0 / total
+            before[0] = behind[:] = 0.0
+            k, number = 0, 0
+            while k < last:
+                begin, v = k, view[region[own[k]]]
+                while k < last and view[region[own[k]]] == v:
+                    target = number if k - begin < LONG else most
+                    said[target] = 0.0
+                    for n in range(k, min(k + LONG, last)):
+                        entry = own[n]
+                        m = region[entry]
+                        if view[m] != v:
+                            break
+                        factor = factors[entry] if factors.size > 0 else np.float32(1.0)
+                        share = np.float32(weight[entry] * factor * inverse)
+                        for c in range(width):
+                            said[target, c] += share * table[m, c]
+                        k += 1
+                    if target != number:
+                        for c in range(width):
+                            said[number, c] += said[target, c]
                 for c in range(width):
-                    product += table[m, c] * others[c]
-                products[k] += product
-                squares[k] += square
-                k -= 1
+                    before[number + 1, c] = before[number, c] + said[number, c]
+                number += 1
+            k = last - 1
+            while k >= 0:
+                number -= 1
+                v, square = view[region[own[k]]], np.float32(0.0)
+                for c in range(width):
+                    others[c] = before[number, c] + behind[c]
+                    square += others[c] * others[c]
+                    behind[c] += said[number, c]
+                while k >= 0 and view[region[own[k]]] == v:
+                    m, product = region[own[k]], np.float32(0.0)
+                    for c in range(width):
+                        product += table[m, c] * others[c]
+                    products[own[k]] += product
+                    squares[own[k]] += square
+                    k -= 1
 
 
 @kernel
 def weigh_rows(
-    rows, indptr, region, weight, factors, inverse, view, cosines, reliable, consensus, scores, usual, power
+    rows, indptr, region, weight, factors, view, level, cosines, reliable, consensus, scores, usual, power
 ):
     """`ViewConsistency.weigh` of some rows."""
-    sharp = np.float32(power)
+    levels = usual.size
+    before, after, gain = np.empty(levels), np.empty(levels), np.empty(levels)
+    confirmed, explained, own = np.empty(levels), np.empty(levels), np.empty(levels)
     for row in rows:
         first, last = indptr[row], indptr[row + 1]
-        before, after, confirmed, explained = 0.0, 0.0, 0.0, 0.0
+        before[:] = after[:] = confirmed[:] = explained[:] = 0.0
+        for k in range(first, last):
+            before[level[region[k]]] += weight[k]
         k = first
         while k < last:
-            begin, v, own = k, view[region[k]], 0.0
+            begin, v = k, view[region[k]]
+            own[:] = 0.0
             while k < last and view[region[k]] == v:
-                factor = factors[k] if factors.size > 0 else np.float32(1.0)
-                own += weight[k] * factor * inverse[row]
+                factor, a = factors[k] if factors.size > 0 else np.float32(1.0), level[region[k]]
+                own[a] += weight[k] * factor * (1.0 / before[a] if before[a] > 0.0 else 0.0)
                 k += 1
-            own = min(own, 1.0)
             for n in range(begin, k):
-                said = (1.0 - own) * cosines[n] + own * usual
+                a = level[region[n]]
+                share = min(own[a], 1.0)
+                said = (1.0 - share) * cosines[n] + share * usual[a]
                 kept = said * reliable[region[n]]
                 if consensus.size > 0:
-                    kept *= consensus[n] ** sharp
-                before += weight[n]
-                after += weight[n] * kept
-                confirmed += weight[n] * kept * cosines[n]
-                explained += weight[n] * kept * said
+                    kept *= consensus[n] ** np.float32(power[a])
+                after[a] += weight[n] * kept
+                confirmed[a] += weight[n] * kept * cosines[n]
+                explained[a] += weight[n] * kept * said
                 cosines[n] = kept
-        gain = before / after if after > 0.0 else 0.0
+        whole = right = like = 0.0
+        for a in range(levels):
+            gain[a] = before[a] / after[a] if after[a] > 0.0 else 0.0
+            whole += before[a]
+            right += gain[a] * confirmed[a]
+            like += gain[a] * explained[a] if after[a] > 0.0 else before[a] * usual[a]
         for n in range(first, last):
-            cosines[n] = cosines[n] * gain if gain > 0.0 else 1.0
-        scores[0, row] = confirmed / after if after > 0.0 else 0.0
-        scores[1, row] = explained / after if after > 0.0 else usual
+            a = level[region[n]]
+            cosines[n] = cosines[n] * gain[a] if gain[a] > 0.0 else 1.0
+        scores[0, row] = right / whole if whole > 0.0 else 0.0
+        scores[1, row] = like / whole if whole > 0.0 else usual[0]
 
 
 @kernel
-def tally(first, last, indptr, region, weight, factors, inverse, view, cosines, squares, by_region, sums):
-    """Products and squares of the entries of some rows become cosines, and their sums [2, M + 1] f64 are taken."""
-    every = sums.shape[1] - 1
+def tally(first, last, indptr, region, weight, factors, view, level, cosines, squares, by_region, sums):
+    """Products and squares of the entries of some rows become cosines, and their sums [2, M + K] f64 are taken."""
+    count = level.size
+    totals, own = np.empty(sums.shape[1] - count), np.empty(sums.shape[1] - count)
     for row in range(first, last):
+        totals[:] = 0.0
+        for k in range(indptr[row], indptr[row + 1]):
+            totals[level[region[k]]] += weight[k]
         k = indptr[row]
         while k < indptr[row + 1]:
-            begin, v, own = k, view[region[k]], 0.0
+            begin, v = k, view[region[k]]
+            own[:] = 0.0
             while k < indptr[row + 1] and view[region[k]] == v:
                 length, factor = np.sqrt(squares[k]), factors[k] if factors.size > 0 else np.float32(1.0)
                 cosine = cosines[k] / length if length > NO_CONSENSUS else np.float32(0.0)
                 cosines[k] = min(max(cosine, np.float32(0.0)), np.float32(1.0))
-                sums[0, every] += weight[k] * np.float64(cosines[k])
-                sums[1, every] += weight[k]
-                own += weight[k] * factor * inverse[row]
+                a = level[region[k]]
+                sums[0, count + a] += weight[k] * np.float64(cosines[k])
+                sums[1, count + a] += weight[k]
+                own[a] += weight[k] * factor * (1.0 / totals[a] if totals[a] > 0.0 else 0.0)
                 k += 1
-            others = max(1.0 - own, 0.0)
             for n in range(begin, k if by_region else begin):
+                others = max(1.0 - own[level[region[n]]], 0.0)
                 factor = factors[n] if factors.size > 0 else np.float32(1.0)
                 sums[0, region[n]] += weight[n] * factor * others * cosines[n]
                 sums[1, region[n]] += weight[n] * factor * others

@@ -1,8 +1,9 @@
 """A step of `liftcore.solve.reweight` by a card, for a W that lies there: the same equations, by blocks of rows.
 
-What `ViewConsistency` adds up entry by entry is a sum over segments here, the entries of one view at one splat. What
-the other views say is the sum of all views less the own one, in float64: its digits are those of float32's sums of
-the views before and behind. All sums have a fixed order, so that the same lift has the same bits on one card.
+What `ViewConsistency` adds up entry by entry is a sum over segments here: the entries of one view and of one level at
+one splat. A **line** is the entries of one level at one splat, and a block has its entries line by line. What the
+other views say is the sum of all views less the own one, in float64: its digits are those of float32's sums of the
+views before and behind. All sums have a fixed order, so that the same lift has the same bits on one card.
 """
 
 from __future__ import annotations
@@ -10,12 +11,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from liftcore.solve.closed_form import bag_sums
 from liftcore.solve.directions import RegionDirections
-from liftcore.solve.reweight import NO_CONSENSUS, SceneAgreement
+from liftcore.solve.reweight import NO_CONSENSUS, SceneAgreement, level_numbers
 from liftcore.solve.sums import PieceSums
 from liftcore.values.region_weights import RegionWeights, from_zero, segment_sums
 
@@ -25,23 +27,23 @@ TABLE_BYTES = 1 << 28  # of a table of entries by channels
 
 @dataclass(frozen=True)
 class _Block:
-    """Rows ``first..last`` of W on the device, and their segments: the entries of one view in one row."""
+    """Rows ``first..last`` of W on the device, and their segments: the entries of one view in one line."""
 
     rows: slice
-    entries: slice
+    entries: Tensor  # [n] i64, where they lie in W, line by line
     region: Tensor  # [n] i32
     weight: Tensor  # [n] f64
-    share: Tensor  # [n] f64, of the row's sum, times the factors of the step before
-    row: Tensor  # [n] i64, counted from the first
+    share: Tensor  # [n] f64, of the line's sum, times the factors of the step before
+    line: Tensor  # [n] i64, counted from the first
     segment: Tensor  # [n] i64
     starts: Tensor  # [S + 1] i64, of segments among the entries
-    row_starts: Tensor  # [rows + 1] i64, of rows among the segments
-    segment_row: Tensor  # [S] i64
+    line_starts: Tensor  # [lines + 1] i64, of lines among the segments
+    segment_line: Tensor  # [S] i64
     own: Tensor  # [n] f64 in 0..1, p: the share of the entry's view
 
-    def row_sums(self, values: Tensor) -> Tensor:
-        """Sums [rows] f64 of values of the entries [n] f64."""
-        return segment_sums(segment_sums(values, self.starts), self.row_starts)
+    def line_sums(self, values: Tensor) -> Tensor:
+        """Sums [lines] f64 of values of the entries [n] f64."""
+        return segment_sums(segment_sums(values, self.starts), self.line_starts)
 
 
 class ViewConsistencyOnCard:
@@ -49,12 +51,14 @@ class ViewConsistencyOnCard:
 
     Args:
         W: of all views by rows of codebooks, on the device; a row for each splat.
+        levels: [M] i8, of each region, -1 for cells of grids; None: all are of one.
     """
 
-    def __init__(self, W: RegionWeights) -> None:
+    def __init__(self, W: RegionWeights, levels: np.ndarray | None = None) -> None:
         self.W, self.place = W, W.device
-        sums = W.row_sums()
-        self.inverse = torch.where(sums > 0, 1.0 / sums, 0.0)
+        self.level = level_numbers(np.zeros(int(W.offsets[-1]), np.int8) if levels is None else levels)
+        self.levels = int(self.level.max(initial=0)) + 1
+        self.region_level = torch.from_numpy(self.level).long().to(self.place)
         self.view = torch.repeat_interleave(W.offsets.diff()).to(self.place)
         self.blocks = W.blocks(BLOCK_ROWS, BLOCK_ENTRIES)
 
@@ -63,7 +67,7 @@ class ViewConsistencyOnCard:
         totals = torch.zeros(len(self.view), dtype=torch.float64, device=self.place)
         for first, last in self.blocks:
             own = slice(*self.W.indptr[[first, last]].tolist())
-            totals += self._by_region(self.W.region[own], self.W.weight[own].double()[None])[0]
+            totals += sums_by_region(self.W.region[own], self.W.weight[own].double()[None], len(self.view))[0]
         return totals.cpu()
 
     def cosines(
@@ -80,19 +84,19 @@ class ViewConsistencyOnCard:
             for first, last in self.blocks:
                 self._compare(self._block(first, last, factors), table, products, squares)
         count = len(self.view)
-        sums = torch.zeros(2, count + 1, dtype=torch.float64, device=self.place)
+        sums = torch.zeros(2, count + self.levels, dtype=torch.float64, device=self.place)
         for first, last in self.blocks:
             block = self._block(first, last, factors)
             lengths = squares[block.entries].sqrt()
             cosines = torch.where(lengths > NO_CONSENSUS, products[block.entries] / lengths, 0.0).clamp(0.0, 1.0)
             products[block.entries] = cosines
             wide = cosines.double()
-            sums[0, count] += (block.weight * wide).sum()
-            sums[1, count] += block.weight.sum()
+            lines = torch.stack([block.line_sums(block.weight * wide), block.line_sums(block.weight)])
+            sums[:, count:] += lines.reshape(2, -1, self.levels).sum(dim=1)
             if by_region:
                 own = factors[block.entries].double() if factors is not None else 1.0
                 others = block.weight * own * (1.0 - block.own)
-                sums[:, :count] += self._by_region(block.region, torch.stack([others * wide, others]))
+                sums[:, :count] += sums_by_region(block.region, torch.stack([others * wide, others]), count)
         add(PieceSums.of(sums.cpu().numpy()))
         return products
 
@@ -100,44 +104,51 @@ class ViewConsistencyOnCard:
         self, cosines: Tensor, factors: Tensor | None, scene: SceneAgreement, consensus: Tensor | None
     ) -> Tensor:
         """Cosines become factors in place; see `ViewConsistency.weigh`. Scores [2, n] f32 are on the CPU."""
-        scores = torch.zeros(2, len(self.inverse), dtype=torch.float64, device=self.place)
-        reliable = scene.regions.to(self.place)
+        scores = torch.zeros(2, self.W.indptr.shape[0] - 1, dtype=torch.float64, device=self.place)
+        reliable, usual, power = (part.to(self.place) for part in (scene.regions, scene.usual, scene.power))
         for first, last in self.blocks:
             block = self._block(first, last, factors)
-            cosine = cosines[block.entries].double()
-            blended = (1.0 - block.own) * cosine + block.own * scene.usual
+            cosine, level = cosines[block.entries].double(), block.line % self.levels
+            blended = (1.0 - block.own) * cosine + block.own * usual[level]
             unscaled = blended * reliable.index_select(0, block.region)
             if consensus is not None:
-                unscaled *= consensus[block.entries].to(self.place).double() ** scene.power
-            before, after = block.row_sums(block.weight), block.row_sums(block.weight * unscaled)
-            gain, has_entries = torch.where(after > 0, before / after, 0.0)[block.row], block.row_starts.diff() > 0
-            cosines[block.entries] = torch.where(gain > 0, unscaled * gain, 1.0).float()
-            for score, values, other in ((scores[0], cosine, 0.0), (scores[1], blended, scene.usual)):
-                sums = block.row_sums(block.weight * unscaled * values)
-                score[block.rows] = torch.where(after > 0, sums / after, other) * has_entries
+                own = slice(*self.W.indptr[[first, last]].tolist())
+                unscaled *= consensus[own].to(self.place)[block.entries - own.start].double() ** power[level]
+            before, after = block.line_sums(block.weight), block.line_sums(block.weight * unscaled)
+            gain = torch.where(after > 0, before / after, 0.0)
+            own_gain, has_entries = gain[block.line], self.W.indptr[first : last + 1].diff() > 0
+            cosines[block.entries] = torch.where(own_gain > 0, unscaled * own_gain, 1.0).float()
+            whole = before.reshape(-1, self.levels).sum(dim=1)
+            for score, values, other in ((scores[0], cosine, torch.zeros_like(usual)), (scores[1], blended, usual)):
+                sums = gain * block.line_sums(block.weight * unscaled * values)
+                sums = torch.where(after > 0, sums, before * other.repeat(len(whole)))
+                mean = torch.where(whole > 0, sums.reshape(-1, self.levels).sum(dim=1) / whole, other[0])
+                score[block.rows] = mean * has_entries
         return scores.float().cpu()
 
     def _block(self, first: int, last: int, factors: Tensor | None) -> _Block:
         """Rows of W with the factors of the step before."""
-        starts = self.W.indptr[first : last + 1]
-        entries = slice(*starts[[0, -1]].tolist())
+        starts, lines = self.W.indptr[first : last + 1], (last - first) * self.levels
+        begin, end = starts[[0, -1]].tolist()
+        row = torch.repeat_interleave(starts.diff(), output_size=end - begin)
+        line = row * self.levels + self.region_level[self.W.region[begin:end].long()]
+        order = torch.argsort(line, stable=True)
+        line, entries = line[order], order + begin
         region, weight = self.W.region[entries], self.W.weight[entries].double()
-        row = torch.repeat_interleave(starts.diff(), output_size=len(region))
         begins = torch.ones(len(region), dtype=torch.bool, device=self.place)
         view = self.view[region]
-        begins[1:] = (view[1:] != view[:-1]) | (row[1:] != row[:-1])
+        begins[1:] = (view[1:] != view[:-1]) | (line[1:] != line[:-1])
         segment = begins.cumsum(0) - 1
         segment_starts = torch.nonzero(begins)[:, 0]
-        segment_row = row[segment_starts]
-        rows = torch.arange(last - first + 1, device=self.place)
-        share = weight * self.inverse[first:last][row]
-        share = share if factors is None else share * factors[entries]
+        segment_line = line[segment_starts]
         bounds = torch.cat([segment_starts, segment_starts.new_full((1,), len(region))])
+        line_starts = torch.searchsorted(segment_line, torch.arange(lines + 1, device=self.place))
+        totals = segment_sums(segment_sums(weight, bounds), line_starts)
+        share = weight * torch.where(totals > 0, 1.0 / totals, 0.0)[line]
+        share = share if factors is None else share * factors[entries]
         own = segment_sums(share, bounds).clamp_max(1.0)[segment]
-        row_starts = torch.searchsorted(segment_row, rows)
-        return _Block(
-            slice(first, last), entries, region, weight, share, row, segment, bounds, row_starts, segment_row, own
-        )
+        rows = slice(first, last)
+        return _Block(rows, entries, region, weight, share, line, segment, bounds, line_starts, segment_line, own)
 
     def _compare(self, block: _Block, table: Tensor, products: Tensor, squares: Tensor) -> None:
         """Add ``e_m . r_jv`` and ``|r_jv|^2`` of a block's entries, over the channels of the table [M, C] f32."""
@@ -145,28 +156,29 @@ class ViewConsistencyOnCard:
         if not len(block.region):
             return
         edges = torch.arange(0, len(block.segment) + step, step, device=self.place).clamp_max(len(block.segment) - 1)
-        rows = torch.unique(block.row[edges]).tolist()  # whole rows, of about so many entries
-        for first, last in zip(rows, [*rows[1:], len(block.row_starts) - 1], strict=True):
-            at, to = block.row_starts[[first, last]].tolist()
+        lines = torch.unique(block.line[edges]).tolist()  # whole lines, of about so many entries
+        for first, last in zip(lines, [*lines[1:], len(block.line_starts) - 1], strict=True):
+            at, to = block.line_starts[[first, last]].tolist()
             begin, end = block.starts[[at, to]].tolist()
             if begin == end:
                 continue
             region, starts = block.region[begin:end], block.starts[at : to + 1] - begin
             view_sums = bag_sums(region, table, starts, block.share[begin:end].float()).double()
             totals = bag_sums(
-                torch.arange(to - at, device=self.place), view_sums, block.row_starts[first : last + 1] - at
+                torch.arange(to - at, device=self.place), view_sums, block.line_starts[first : last + 1] - at
             )
-            others = (totals[block.segment_row[at:to] - first] - view_sums).float()
+            others = (totals[block.segment_line[at:to] - first] - view_sums).float()
             segment = block.segment[begin:end] - at
             lengths = others.square().sum(dim=1)
-            for part in range(0, end - begin, step):  # of a row with more entries than that
+            for part in range(0, end - begin, step):  # of a line with more entries than that
                 few = slice(part, min(part + step, end - begin))
-                place = slice(block.entries.start + begin + few.start, block.entries.start + begin + few.stop)
+                place = block.entries[begin + few.start : begin + few.stop]
                 products[place] += (table[region[few]] * others[segment[few]]).sum(dim=1)
                 squares[place] += lengths[segment[few]]
 
-    def _by_region(self, region: Tensor, values: Tensor) -> Tensor:
-        """Sums [k, M] f64 of values [k, n] f64 of entries by their regions [n] i32, in the entries' order."""
-        starts = from_zero(torch.bincount(region, minlength=len(self.view)))
-        order = torch.argsort(region, stable=True)
-        return torch.stack([segment_sums(part[order], starts) for part in values])
+
+def sums_by_region(region: Tensor, values: Tensor, count: int) -> Tensor:
+    """Sums [k, M] f64 of values [k, n] f64 of entries by their regions [n] i32, in the entries' order."""
+    starts = from_zero(torch.bincount(region, minlength=count))
+    order = torch.argsort(region, stable=True)
+    return torch.stack([segment_sums(part[order], starts) for part in values])

@@ -54,7 +54,7 @@ from liftcore.solve.objects import (
     with_others,
 )
 from liftcore.solve.region_tree import RegionTree, region_tree
-from liftcore.solve.reweight import SceneAgreement, whole_regions
+from liftcore.solve.reweight import SceneAgreement, level_numbers, whole_regions
 from liftcore.solve.sums import added, unpacked
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.pack import NO_ROOM, Views, write_pack
@@ -305,10 +305,11 @@ class InBlocks(Steps[Job]):
         entries = sum(part["region"].size for part in _pieces(W, "rows"))
         principal = W.settings.robust_directions
         RegionDirections(codebook, torch.from_numpy(totals[0]), entries, principal).save(W.folder)
-        scene = None
+        level, scene = level_numbers(levels), None
+        shape = 2, codebook.regions + int(level.max(initial=0)) + 1
         for step in range(W.settings.robust_steps):
             self.run("robust", steps.compare, replace(W, step=step, by_region=whole is not None), W.solutions)
-            scene = SceneAgreement.of(_sums(W, f"cosines-{step}", (2, codebook.regions + 1)), whole)
+            scene = SceneAgreement.of(_sums(W, f"cosines-{step}", shape), whole, level)
             steps.write_agreement(W, step, scene)
         return W, scene.reliability if scene else None
 

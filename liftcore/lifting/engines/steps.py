@@ -72,7 +72,7 @@ NODES = "nodes.safetensors"  # nodes and others, i64
 TREE = "tree-{}.safetensors"  # of regions (`RegionTree`), by the step of `label`
 OBJECTS = "objects.safetensors"  # object [N + 1] i32, the object that each node of the tree is of
 MERGED = "merged.safetensors"  # merged [K, F], the features of the aggregation
-AGREEMENT = "agreement-{}.safetensors"  # regions [M] f32, numbers [3] f64
+AGREEMENT = "agreement-{}.safetensors"  # regions [M] f32, usual and power [K] f64, reliability [1] f64
 
 
 def mapped(path: Path) -> dict[str, Any]:
@@ -354,17 +354,21 @@ def _consensus(job: Job, block: SplatBlock, threads: int | None) -> Tensor | Non
 def scene_agreement(job: Job, step: int) -> SceneAgreement:
     """What the driver found in a step."""
     arrays = map_tensors(job.folder / AGREEMENT.format(step))[0]
-    usual, power, reliability = arrays["numbers"].tolist()
-    return SceneAgreement(
-        usual, torch.from_numpy(arrays["regions"]), power, None if np.isnan(reliability) else reliability
-    )
+    usual, regions, power = (torch.from_numpy(arrays[name]) for name in ("usual", "regions", "power"))
+    reliability = float(arrays["reliability"][0])
+    return SceneAgreement(usual, regions, power, None if np.isnan(reliability) else reliability)
 
 
 def write_agreement(job: Job, step: int, scene: SceneAgreement) -> None:
     """Share what the driver found in a step."""
     reliability = np.nan if scene.reliability is None else scene.reliability
-    numbers = torch.tensor([scene.usual, scene.power, reliability], dtype=torch.float64)
-    write_tensors(job.folder / AGREEMENT.format(step), {"regions": scene.regions, "numbers": numbers}, {})
+    arrays = {"regions": scene.regions, "usual": scene.usual, "power": scene.power}
+    arrays["reliability"] = torch.tensor([reliability], dtype=torch.float64)
+    write_tensors(job.folder / AGREEMENT.format(step), arrays, {})
+
+
+def _judge(job: Job, block: SplatBlock, threads: int | None) -> ViewConsistency:
+    return ViewConsistency(block.W, block.means, threads, mapped(job.folder / REGIONS)["levels"])
 
 
 def _weighed(
@@ -389,7 +393,7 @@ def _before(job: Job, piece: int, step: int) -> Tensor | None:
 def compare(job: Job, piece: int, threads: int | None) -> Piece:
     """Write the cosines of a step, and what the scene is to learn of them; and the factors of the step before."""
     block = _splat_block(job, piece)
-    judge, sums, before = ViewConsistency(block.W, block.means, threads), list[PieceSums](), None
+    judge, sums, before = _judge(job, block, threads), list[PieceSums](), None
     if job.step:
         before, _ = _weighed(job, piece, block, judge, job.step, threads)
         write_piece(job.piece_file(f"factors-{job.step}", piece), {"factors": before})
@@ -401,7 +405,7 @@ def _reweighted(job: Job, piece: int, block: SplatBlock, threads: int | None) ->
     """W of a block after all robust steps, and the scores of splats [2, n]; None without a step."""
     if not job.settings.robust_steps:
         return block.W, None
-    judge = ViewConsistency(block.W, block.means, threads)
+    judge = _judge(job, block, threads)
     factors, scores = _weighed(job, piece, block, judge, job.settings.robust_steps, threads)
     return reweighted(block.W, factors), scores
 

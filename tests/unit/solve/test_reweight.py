@@ -65,9 +65,9 @@ def defined_directions(scene: Scene) -> tuple[np.ndarray, list[np.ndarray]]:
     return mean, e
 
 
-def defined(scene: Scene, steps: int) -> list[np.ndarray]:
+def defined(scene: Scene, steps: int, e: list[np.ndarray] | None = None) -> list[np.ndarray]:
     """The module's equation, line by line."""
-    first, e = [view.astype(np.float64) for view in scene.weights], defined_directions(scene)[1]
+    first, e = [view.astype(np.float64) for view in scene.weights], e or defined_directions(scene)[1]
     D, current = scene.denominators[:, None], first
     for _ in range(steps):
         everything = sum(w @ v for w, v in zip(current, e, strict=True))
@@ -110,6 +110,26 @@ def test_the_steps_equal_their_definition_and_keep_every_splats_sum(scene, steps
         assert np.abs(over(mine - real, D[:, None])).max() < 2e-3
     sums = np.sum([view.sum(axis=1, dtype=np.float64) for view in got], axis=0)
     assert np.allclose(sums, D, rtol=1e-5)
+
+
+def levels_apart(scene: Scene, levels: np.ndarray, steps: int) -> list[np.ndarray]:
+    """The definition for each level by itself: regions [M] of others weigh nothing, and directions stay."""
+    e, ends = defined_directions(scene)[1], np.cumsum([len(book) for book in scene.books])[:-1]
+    parts = []
+    for level in np.unique(levels):
+        own = [view * (part == level) for view, part in zip(scene.weights, np.split(levels, ends), strict=True)]
+        parts.append(defined(Scene(own, scene.books), steps, e))
+    return [np.sum(views, axis=0) for views in zip(*parts, strict=True)]
+
+
+@on_both
+@pytest.mark.parametrize("steps", [1, 2])
+def test_levels_are_judged_apart(steps, on_card):
+    scene = random_scene(3, count=400, channels=20)
+    levels = np.random.default_rng(4).integers(-1, 3, sum(len(book) for book in scene.books)).astype(np.int8)
+    got = scene.after(steps, levels=levels, on_card=on_card)
+    for mine, real in zip(got, levels_apart(scene, levels, steps), strict=True):
+        assert np.abs(over(mine - real, scene.denominators[:, None])).max() < 2e-3
 
 
 def random_scene(seed: int, count: int = 9_000, views: int = 4, rows: int = 7, channels: int = 150) -> Scene:

@@ -91,9 +91,11 @@ def test_robust_steps_in_blocks_are_those_of_the_whole_scene(
 ) -> None:
     masks, steps = torch.from_numpy(LEVELS == 0), 2
     consensus = torch.rand(W.weight.shape, generator=torch.manual_seed(3))
-    whole = agreement_factors(W, codebook, steps, means=means, threads=2, reliability=masks, consensus=consensus)
+    whole = agreement_factors(
+        W, codebook, steps, means=means, threads=2, reliability=masks, consensus=consensus, levels=LEVELS
+    )
     parts = [W.of_splats(*ends) for ends in blocks]
-    judges = [ViewConsistency(part, means[a:b], 1) for part, (a, b) in zip(parts, blocks, strict=True)]
+    judges = [ViewConsistency(part, means[a:b], 1, LEVELS) for part, (a, b) in zip(parts, blocks, strict=True)]
     sums = (sums for part in parts for sums in over_files(list(region_totals(part, 1))))
     totals = torch.from_numpy(added(sums, (1, codebook.regions))[0])
     directions = RegionDirections(codebook, totals, W.region.shape[0])
@@ -105,7 +107,8 @@ def test_robust_steps_in_blocks_are_those_of_the_whole_scene(
             judge.cosines(directions, before, True, found.append)
             for judge, before in zip(judges, factors, strict=True)
         ]
-        scene = SceneAgreement.of(added(over_files(found), (2, codebook.regions + 1)), masks)
+        sums = added(over_files(found), (2, codebook.regions + judges[0].levels))
+        scene = SceneAgreement.of(sums, masks, judges[0].level)
         scores = [
             judge.weigh(cosine, before, scene, consensus[entries])
             for judge, cosine, before, entries in zip(judges, cosines, factors, own, strict=True)
