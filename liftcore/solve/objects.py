@@ -412,8 +412,8 @@ def object_facts(found: RegionObjects, said: NodeVectors) -> dict[str, Any]:
     if said.level_agreement is not None and said.level_agreement < SAY_THE_SAME:
         told.append(
             f"masks of things and of their parts say different things (their vectors' cosine is "
-            f"{said.level_agreement:.2f}), and a splat's feature is the sum of both: ask nodes of the tree, or lift "
-            "one level alone (levels=0, 1, ...)"
+            f"{said.level_agreement:.2f}), and a splat's feature is the sum of both: ask nodes of the tree, which "
+            "hold them apart"
         )
     return facts | ({"warning": "; ".join(told)} if told else {})
 
