@@ -1,7 +1,6 @@
 """The machine that a figure was taken on; the most memory that this process took."""
 
 import platform
-import resource
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -73,8 +72,8 @@ def machine_line(facts: Mapping[str, Any]) -> str:
     return ", ".join(f"{name} {value}" for name, value in facts.items())
 
 
-def peak_memory() -> int:
-    """Bytes of this process at its largest.
+def peak_memory() -> int | None:
+    """Bytes of this process at its largest; None on Windows.
 
     Not ``ru_maxrss`` where Linux says better: that one survives exec, so a child starts from its parent's size.
     """
@@ -83,5 +82,9 @@ def peak_memory() -> int:
         lines = [line for line in status.read_text(encoding="ascii").splitlines() if line.startswith("VmHWM:")]
         if lines:
             return int(lines[0].split()[1]) * 1024
+    if sys.platform == "win32":
+        return None
+    import resource
+
     unit = 1 if sys.platform == "darwin" else 1024  # macOS counts bytes
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit

@@ -10,7 +10,6 @@ import os
 import pickle
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -42,6 +41,7 @@ from liftcore.query.scene import Scene
 from liftcore.raster import open_raster
 from liftcore.runtime.arguments import as_list
 from liftcore.runtime.device import CPU, choose_device
+from liftcore.runtime.folders import scratch_folder
 from liftcore.runtime.progress import Progress, one_step
 from liftcore.scene.cameras import Cameras
 from liftcore.scene.drawing import in_photo
@@ -194,8 +194,8 @@ def compare(
                 warm_up_lift(kernel, device, LiftSettings.of(**{**settings, **candidate.settings}))
     progress("tradeoff", 0, len(candidates), "runs")
     start, runs, judged, skipped = time.monotonic(), [], [], []
-    with tempfile.TemporaryDirectory(prefix="splatlift-tradeoff-") as folder:
-        spec = _plan_runs(scene, settings, threads, Path(folder))
+    with scratch_folder("splatlift-tradeoff-") as folder:
+        spec = _plan_runs(scene, settings, threads, folder)
         lifted = len(spec.lifted)
         spec = _fitting(spec, budget)
         for number, candidate in enumerate(candidates):
@@ -305,7 +305,7 @@ def measured(spec: RunSpec) -> dict[str, Any]:
         "cpu_with_reading_s": seconds["cpu"] + read["cpu"],
         "wall_with_reading_s": seconds["wall"] + read["wall"],
         "peak_memory_bytes": peak_memory(),
-        "load": os.getloadavg()[0],
+        "load": None if sys.platform == "win32" else os.getloadavg()[0],
         "views": len(made.metadata.views),
         "settings": made.metadata.settings.model_dump(mode="json"),
         "seen_share": float(made.seen.float().mean()),

@@ -168,7 +168,7 @@ def _cells(run: Mapping[str, Any], choice: Mapping[str, Any]) -> list[str]:
         f"{run['wall_s']:.2f}",
         f"{run['cpu_s']:.2f}",
         f"{run['cpu_ratio']:.1f}",
-        f"{run['peak_memory_bytes'] / 2**20:.0f}",
+        f"{run['peak_memory_bytes'] / 2**20:.0f}" if run["peak_memory_bytes"] else "-",
         *(_number(run[key]) for key in ("cosine", "cosine_q05")),
         f"{run['lost_share']:.1%}",
         *(_number(run[key]) for key in ("centred_cosine", "mask_iou", "phrase_iou")),

@@ -35,6 +35,7 @@ from liftcore.io.transforms import (
     parse_transforms,
     read_frame,
 )
+from liftcore.runtime.folders import scratch_folder
 from liftcore.scene.cameras import Cameras, cameras_from
 from liftcore.scene.distortion import Fisheye
 from liftcore.scene.views import cameras_of_views
@@ -478,8 +479,7 @@ def _from_zip(path: Path, beside: Path | None, *, choosing: bool, views: Collect
         archive = open_zip(path)
     except BROKEN_ZIP as error:
         raise _broken_zip(path, error) from None
-    with archive, tempfile.TemporaryDirectory(prefix="splatlift-") as folder:
-        root = Path(folder)
+    with archive, scratch_folder("splatlift-") as root:
         names = _unzip(archive, path, root)
         try:
             source = _source_in_zip(names, root, path, beside, views)
@@ -489,7 +489,7 @@ def _from_zip(path: Path, beside: Path | None, *, choosing: bool, views: Collect
             cameras = source.read()
         except InvalidCameras as error:
             argument, got, hint = (
-                text.replace(folder, str(path)) for text in (error.argument, error.got, error.hint)
+                text.replace(str(root), str(path)) for text in (error.argument, error.got, error.hint)
             )
             raise InvalidCameras(argument, expected=error.expected, got=got, hint=hint) from None
         if choosing and source.model is not None and cameras.distorted:

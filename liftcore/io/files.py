@@ -6,6 +6,7 @@ import os
 import secrets
 import stat
 import struct
+import sys
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -14,7 +15,7 @@ from io import BufferedReader
 from pathlib import Path, PurePath
 from typing import IO
 
-from liftcore.errors import InvalidCameras, InvalidInput
+from liftcore.errors import InvalidCameras, InvalidInput, Unavailable
 
 LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 # What zipfile and its decompressors raise of a broken or foreign file.
@@ -67,11 +68,15 @@ def open_regular(path: Path) -> BufferedReader:
     Raises:
         OSError: it does not open, or is none.
     """
-    handle = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | getattr(os, "O_CLOEXEC", 0)), "rb")
+    handle = open(path, "rb", opener=_open_without_waiting)  # noqa: SIM115 - the caller's to close
     if stat.S_ISREG(os.fstat(handle.fileno()).st_mode):
         return handle
     handle.close()
     raise OSError(errno.EINVAL, "no regular file", str(path))
+
+
+def _open_without_waiting(path: str, flags: int) -> int:
+    return os.open(path, flags | (0 if sys.platform == "win32" else os.O_NONBLOCK))
 
 
 def open_zip(path: Path) -> zipfile.ZipFile:
@@ -113,6 +118,7 @@ def whole_file(path: Path | str) -> Iterator[IO[bytes]]:
 
     Raises:
         InvalidInput: a folder lies there.
+        Unavailable: the file is open or mapped, which Windows does not replace.
     """
     path = Path(path)
     if path.is_dir():
@@ -125,6 +131,17 @@ def whole_file(path: Path | str) -> Iterator[IO[bytes]]:
             yield handle
             handle.flush()
             os.fsync(handle.fileno())
-        draft.replace(path)
+        _replace(draft, path)
     finally:
         draft.unlink(missing_ok=True)
+
+
+def _replace(draft: Path, path: Path) -> None:
+    try:
+        draft.replace(path)
+    except PermissionError as error:
+        if sys.platform != "win32":
+            raise
+        expected = "a file that no program has open"
+        hint = "close the lift or the program that reads it, or take another path"
+        raise Unavailable(str(path), expected=expected, got=error.strerror or str(error), hint=hint) from error

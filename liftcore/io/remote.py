@@ -18,7 +18,7 @@ from typing import Any
 
 from liftcore.errors import InvalidInput
 from liftcore.runtime.arguments import as_list
-from liftcore.runtime.folders import cache_folder
+from liftcore.runtime.folders import cache_folder, scratch_folder
 
 REMOTE = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+(::[^:]+)*://")
 OPENED = "a file or folder that fsspec opens, such as s3://bucket/scene.ply (needs s3fs) or file:///scene.ply"
@@ -116,10 +116,10 @@ def landing(path: Path | str) -> Iterator[Path]:
         yield Path(path)
         return
     url = str(path)
-    with tempfile.TemporaryDirectory(prefix="splatlift-") as folder:
+    with scratch_folder("splatlift-") as folder:
         with _told(url):
             storage, place = _opened(url)
-        made = Path(folder, PurePosixPath(place.rstrip("/")).name)
+        made = folder / PurePosixPath(place.rstrip("/")).name
         yield made
         with _told(url):
             if made.is_file():
@@ -127,12 +127,12 @@ def landing(path: Path | str) -> Iterator[Path]:
                 storage.put_file(str(made), place)
                 return
             files = sorted(one for one in made.rglob("*") if one.is_file())
-            last = f"{place.rstrip('/')}/{files[-1].relative_to(made)}"
+            last = f"{place.rstrip('/')}/{files[-1].relative_to(made).as_posix()}"
             if storage.exists(last):
                 storage.rm_file(last)
             storage.makedirs(place, exist_ok=True)
             for one in files:
-                storage.put_file(str(one), f"{place.rstrip('/')}/{one.relative_to(made)}")
+                storage.put_file(str(one), f"{place.rstrip('/')}/{one.relative_to(made).as_posix()}")
 
 
 def _opened(url: str) -> tuple[Any, str]:

@@ -19,6 +19,7 @@ import numpy as np
 
 from liftcore.errors import InvalidInput
 from liftcore.io.files import open_regular, whole_file
+from liftcore.runtime.memory import map_anonymous
 
 DTYPES = {
     "F64": np.float64, "F32": np.float32, "F16": np.float16, "I64": np.int64, "I32": np.int32, "I16": np.int16,
@@ -173,23 +174,24 @@ def map_file(file: IO[bytes]) -> mmap.mmap:
     if sys.platform == "win32":
         return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
     size = os.fstat(file.fileno()).st_size
-    place, address = pages(size)
-    map_over(address, file, 0, size)
+    place = map_anonymous(size, NO_RESERVE)
+    map_over(place, 0, file, 0, size)
     return place
 
 
-def pages(size: int) -> tuple[mmap.mmap, int]:
-    """Addresses for so many bytes, for `map_over` to fill, and the first of them."""
-    place = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | NO_RESERVE)
-    return place, ctypes.addressof(ctypes.c_char.from_buffer(place))
+def map_over(place: mmap.mmap, offset: int, file: IO[bytes], begin: int, size: int) -> None:
+    """Map ``size`` bytes of a file, from the page at ``begin`` on, over ``place`` from ``offset`` on.
 
-
-def map_over(address: int, file: IO[bytes], begin: int, size: int) -> None:
-    """Map bytes of a file, from a page on, over addresses of `pages`; what is written there stays in memory.
+    What is written there stays in memory. Windows maps nothing over addresses that are mapped: there it is a copy.
 
     Raises:
         OSError: they cannot be mapped.
     """
+    if sys.platform == "win32":
+        file.seek(begin)
+        place[offset : offset + size] = file.read(size)
+        return
+    address = ctypes.addressof(ctypes.c_char.from_buffer(place)) + offset
     system = ctypes.CDLL(None, use_errno=True)
     system.mmap.restype = ctypes.c_void_p
     system.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_long]

@@ -19,13 +19,14 @@ import numpy as np
 from liftcore.io.files import open_regular, whole_file
 from liftcore.io.safetensors_file import (
     DTYPES,
+    NO_RESERVE,
     map_over,
     map_tensors,
-    pages,
     safetensors_header,
     tensor_bytes,
     write_tensors,
 )
+from liftcore.runtime.memory import map_anonymous
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -152,10 +153,10 @@ def map_rows(shards: Sequence[Shard]) -> np.ndarray:
         raise ValueError("shards of different channels or types")
     if any(size % PAGE for size in sizes[:-1]):
         raise ValueError("a shard that ends within a page, before the last")
-    place, address = pages(sum(sizes))
+    place, offset = map_anonymous(sum(sizes), NO_RESERVE), 0
     for shard, size in zip(shards, sizes, strict=True):
         with shard.path.open("rb") as handle:
-            map_over(address, handle, shard.begin, size)
-        address += size
+            map_over(place, offset, handle, shard.begin, size)
+        offset += size
     rows = sum(shard.shape[0] for shard in shards)
     return np.frombuffer(place, first.dtype).reshape(rows, first.shape[1])

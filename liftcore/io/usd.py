@@ -16,7 +16,6 @@ Files are opened by ``usd-core`` (the extra ``formats``), which follows referenc
 from __future__ import annotations
 
 import json
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
@@ -29,6 +28,7 @@ from liftcore.errors import InvalidInput, InvalidSplats, Unavailable
 from liftcore.io.labels import COLUMN, IDS, KINDS, id_column, rows_by_id, stored_columns
 from liftcore.io.ply import MODEL
 from liftcore.io.quantised import Fields, gaussian_rows, joined_fields, logits
+from liftcore.runtime.folders import scratch_folder
 from liftcore.scene.harmonics import band_rotation, constant_terms
 from liftcore.scene.quaternions import product_matrix
 from liftcore.scene.similarity import Similarity
@@ -83,8 +83,8 @@ def usd_blocks(
     if prims and IDS[0] not in columns:
         hint = "export labels, such as the objects of a lift"
         raise InvalidSplats("prims", expected=f"a column {IDS[0]}", got="splats without it", hint=hint)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"scene{'.usdc' if suffix == '.usdz' else suffix}"
+    with scratch_folder("splatlift-") as folder:
+        path = folder / f"scene{'.usdc' if suffix == '.usdz' else suffix}"
         stage = pxr.Usd.Stage.CreateNew(str(path))
         pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.y)
         world = splats.world

@@ -357,7 +357,7 @@ class OpenedLift:
         if not self.metadata.splats.path and "splats" in self.__dict__:
             from liftcore.io.splats import write_splats
 
-            self._folder = TemporaryDirectory(prefix="splatlift-")
+            self._folder = TemporaryDirectory(prefix="splatlift-", ignore_cleanup_errors=True)
             path = Path(self._folder.name) / "splats.ply"
             write_splats(path, self.splats)
             return path

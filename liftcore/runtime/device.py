@@ -8,6 +8,7 @@ import os
 import platform
 import re
 import shutil
+import sys
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
@@ -99,7 +100,7 @@ def give_back_memory() -> None:
 
     Views leave hundreds of megabytes of pieces between what is kept, and the solution's large arrays fit in none.
     """
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    trim = None if sys.platform == "win32" else getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)
 
@@ -158,7 +159,7 @@ def _missing() -> tuple[str, str] | None:
 def processor() -> str:
     """The processor's name."""
     with suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
             if line.startswith("model name"):
                 return line.split(":", 1)[1].strip()
     return platform.processor() or platform.machine()
@@ -167,7 +168,7 @@ def processor() -> str:
 def driver_version(told: Path = DRIVER) -> str:
     """The version of NVIDIA's kernel module, ``unknown`` where Linux does not tell."""
     with suppress(OSError):
-        found = re.search(r"Kernel Module.*?\b(\d+(?:\.\d+)+)", told.read_text())
+        found = re.search(r"Kernel Module.*?\b(\d+(?:\.\d+)+)", told.read_text(encoding="utf-8"))
         if found:
             return found[1]
     return "unknown"

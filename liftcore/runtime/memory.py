@@ -1,17 +1,22 @@
 """Large arrays: in memory, or in mapped files that have no name, which the system writes and drops as it needs."""
 
+from __future__ import annotations
+
 import mmap
 import os
 import shutil
+import sys
 import tempfile
 from contextlib import suppress
 from math import prod
 from pathlib import Path
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING
 
 from liftcore.errors import Unavailable
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
 
 MOUNTS = Path("/proc/self/mounts")
 IN_MEMORY = ("tmpfs", "ramfs")
@@ -22,27 +27,41 @@ CONTROL_GROUPS = (  # folder, and the files of limit, use and statistics: versio
 FILE_PAGES = ("inactive_file", "active_file")
 
 
+def map_anonymous(size: int, flags: int = 0) -> mmap.mmap:
+    """Map ``size`` bytes of zeros that are this process's own, of which no page is taken before it is written.
+
+    Args:
+        flags: further flags of mmap, for systems that have them. Windows keeps in its page file what memory has no
+            room for.
+    """
+    if sys.platform == "win32":
+        return mmap.mmap(-1, size)
+    return mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | flags)
+
+
 def zeros(shape: tuple[int, ...], dtype: torch.dtype, *, name: str, in_file: bool = False) -> Tensor:
     """Zeros on the CPU, of which no page is taken before it is written.
 
     Args:
         name: what errors call it. in_file: mapped from a file in the temporary folder that is gone with the tensor.
+            On Windows, which deletes no file that is mapped, the page file is that file.
 
     Raises:
         Unavailable: the disk has no room. It is taken now, for a page without one would end the process later.
     """
+    import torch
+
     size = prod(shape) * dtype.itemsize
     if not size:
         return torch.zeros(shape, dtype=dtype)
-    if not in_file:
+    if not in_file or sys.platform == "win32":
         # Not numpy's, which asks for large pages: to clear those took longer than to solve. Nor torch's, which writes
         # the zeros by one thread, where all threads write soon, or nobody does.
-        pages = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-        return torch.frombuffer(pages, dtype=torch.uint8).view(dtype).view(shape)
+        return torch.frombuffer(map_anonymous(size), dtype=torch.uint8).view(dtype).view(shape)
     check_disk(size, name)
     handle, path = tempfile.mkstemp(prefix="splatlift-")
     try:
-        if hasattr(os, "posix_fallocate"):  # not macOS, where a disk that fills meanwhile ends the process
+        if sys.platform == "linux":  # not macOS, where a disk that fills meanwhile ends the process
             os.posix_fallocate(handle, 0, size)
         return torch.from_file(path, shared=True, size=prod(shape), dtype=dtype).view(shape)
     except OSError as error:

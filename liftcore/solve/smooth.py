@@ -21,7 +21,6 @@ its neighbours by ``a_jk sqrt(w_k)``, and those behind it the mean of these, rin
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -33,6 +32,7 @@ import torch
 from torch import Tensor
 
 from liftcore.raster.cpu.simd import LANES, in_all_lanes, keep_lanes, lanes_at, plus, plus_product, times
+from liftcore.runtime.cores import cores
 from liftcore.runtime.device import CPU, Device
 from liftcore.runtime.jit import kernel
 from liftcore.runtime.one_thread import one_thread
@@ -128,7 +128,7 @@ def smooth(
     squares, steps, residual = np.zeros((2, channels)), list[Step](), 0.0
     card = None if device.kind == "cpu" else system.on_card(device.place)
     block = BLOCK if card is None else min(card.channels, channels)
-    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
+    with ThreadPoolExecutor(threads or cores()) as pool:
         if smoothness and has_evidence.any():
             _, steps, residual = _conjugate_gradients(system, _probe(X, graph.order, has_evidence, pool), pool)
             staged = torch.empty(count, block, dtype=X.dtype)  # a block in the graph's order, in X's dtype

@@ -9,7 +9,6 @@ of text embeddings has them; a lift of it is asked in these without an encoder.
 import errno
 import json
 import math
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -24,6 +23,7 @@ from liftcore.io.files import whole_file
 from liftcore.io.kinds import wrong_kind
 from liftcore.io.remote import local_path
 from liftcore.io.safetensors_file import MAX_HEADER_BYTES, TYPES, check_header, safetensors_header, tensor_bytes
+from liftcore.runtime.folders import scratch_folder
 from liftcore.runtime.progress import Progress, silent
 from liftcore.runtime.torch_modes import callers_modes
 from liftcore.scene.cameras import FEWER_VIEWS, MAX_VIEWS, Camera
@@ -311,7 +311,7 @@ def _check_channels(views: Iterable[tuple[str, ViewFeatures]]) -> None:
 
 
 def _spooled(pairs: Iterable[tuple[str, ViewFeatures]], scratch: Path | None) -> Views:
-    with tempfile.TemporaryDirectory(dir=scratch, prefix="splatlift-views-") as folder:
+    with scratch_folder("splatlift-views-", scratch) as folder:
         files: dict[str, Path] = {}
         for pair in _in_callers_modes(pairs):
             if not (isinstance(pair, tuple | list) and len(pair) == 2):
@@ -321,7 +321,7 @@ def _spooled(pairs: Iterable[tuple[str, ViewFeatures]], scratch: Path | None) ->
             (name,) = _composed_names([name])
             if name in files:
                 raise InvalidFeatures("features", expected="each view once", got=f"{name!r} twice")
-            files[name] = Path(folder, f"{len(files)}.safetensors")
+            files[name] = folder / f"{len(files)}.safetensors"
             view = _Given({name: features}, name).read()
             try:
                 with files[name].open("wb") as handle:

@@ -50,7 +50,7 @@ class StageCosts(Timings):
         Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
         with super().stage(name):
             yield
-        self.peaks[name] = max(self.peaks.get(name, 0), peak_memory())
+        self.peaks[name] = max(self.peaks.get(name, 0), peak_memory() or 0)
 
 
 def blocks(camera: lc.Camera, regions: int, channels: int, seed: int) -> lc.Regions:
@@ -81,7 +81,7 @@ def cost(room: Room, levels: int, regions: int | None) -> dict[str, Any]:
         views = {one.name: blocks(one, regions, room.channels, number) for number, one in enumerate(cameras)}
     give_back_memory()  # of the rows before
     Path("/proc/self/clear_refs").write_text("5")
-    before = peak_memory()
+    before = peak_memory() or 0
     StageCosts.peaks.clear()
     with (
         patch("liftcore.lifting.pipeline.Timings", StageCosts),

@@ -3,7 +3,6 @@
 Photos are read in the orientation of their cameras (`liftcore.io.photos`).
 """
 
-import tempfile
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from liftcore.io.cameras import read_cameras
 from liftcore.io.outputs import check_output, writing
 from liftcore.io.photos import ORIENTATION, UNREAD, UPRIGHT, PhotoHeader, Reading, header_of, orientation_warnings
 from liftcore.io.remote import landing, local_paths
+from liftcore.runtime.folders import scratch_folder
 from liftcore.runtime.progress import Progress, shown_progress, silent
 from liftcore.scene.cameras import Cameras, photo_sizes
 from liftcore.scene.views import IMAGE_SUFFIXES, require_name, without_image_suffix
@@ -93,8 +93,8 @@ def write_encoded(
     readings: dict[str, Reading] = {}
     wide: list[str] = []
     out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as scratch:
-        files = {name: Path(scratch, f"{number}.npy") for number, name in enumerate(images)}
+    with scratch_folder(f".{out.name}.", out.parent) as scratch:
+        files = {name: scratch / f"{number}.npy" for number, name in enumerate(images)}
         done = 0
         for names, batch in _batches(images, encoder, settings, sizes or {}, readings):
             for name, grid in zip(names, encoder.encode(batch), strict=True):

@@ -12,7 +12,6 @@ import json
 import re
 import secrets
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -35,6 +34,7 @@ from liftcore.lifting.inputs import LiftInputs
 from liftcore.lifting.planning.plan import Plan, plan_lift
 from liftcore.query.result import LiftResult, load_lift
 from liftcore.runtime.device import CPU, Device, choose_device
+from liftcore.runtime.folders import scratch_folder
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Timings
 from liftcore.scene.cameras import Camera
@@ -120,8 +120,8 @@ def _folder(folder: Path | None, *, kept: bool) -> Iterator[Path]:
     if folder is not None and kept:
         yield folder.resolve()
         return
-    with tempfile.TemporaryDirectory(dir=folder, prefix="splatlift-blocks-") as own:
-        yield Path(own).resolve()
+    with scratch_folder("splatlift-blocks-", folder) as own:
+        yield own.resolve()
 
 
 def _lack_of_disk(folder: Path, plan: Plan) -> list[str]:
