@@ -11,7 +11,6 @@ import gc
 import sys
 import tempfile
 from argparse import ArgumentParser
-from importlib.abc import MetaPathFinder
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
@@ -19,15 +18,8 @@ from typing import Any
 EXTRAS = (
     *("fastapi", "fastapi_offline", "starlette", "uvicorn", "cachetools", "pydantic_settings", "httpx"),
     *("prometheus_client", "open_clip", "timm", "torchvision", "matplotlib", "ray", "pxr", "sentence_transformers"),
+    *("hdbscan", "sklearn"),
 )
-
-
-class Blocked(MetaPathFinder):
-    """Packages that are not there."""
-
-    def find_spec(self, name: str, path: Any = None, target: Any = None) -> None:
-        if name.partition(".")[0] in EXTRAS:
-            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 
 
 def file_beside(name: str) -> Any:
@@ -47,7 +39,7 @@ def main() -> None:
     parser.add_argument("--as", dest="system", choices=("darwin", "win32"), help="take away what that system lacks")
     options = parser.parse_args()
     if options.block:
-        sys.meta_path.insert(0, Blocked())
+        sys.modules.update(dict.fromkeys(EXTRAS))  # pyright: ignore - None: no package of that name is there
     if options.system:
         file_beside("other_system.py").become(options.system)
     import liftcore as lc
@@ -123,12 +115,14 @@ def check_hints(lc: Any, folder: Path) -> None:
     from liftcore.evaluate import SceneFiles, compare_speeds
 
     scene = SceneFiles(folder / "splats.ply", folder / "cameras.json", (folder / "features.safetensors",))
+    inputs = (lc.read_splats(scene.splats), lc.read_cameras(scene.cameras), lc.read_features(*scene.features))
     for package, extra, call in (
         ("open_clip", "encoders", lambda: lc.open_encoder("open_clip:ViT-B-32/openai").encode(["mug"])),
         ("fastapi", "service", lambda: lc.load_plugin("splatlift.commands", "serve")),
         ("matplotlib", "evaluate", lambda: compare_speeds(scene, budget=1.0)),
+        ("hdbscan", "aggregation", lambda: lc.lift(*inputs, aggregation=True, aggregation_clusters="hdbscan")),
     ):
-        if is_there(package):
+        if find_spec(package) is not None:
             continue
         try:
             call()
@@ -137,14 +131,6 @@ def check_hints(lc: Any, folder: Path) -> None:
             assert ("Linux" if elsewhere else f"splatlift[{extra}]") in str(error), error
         else:
             raise AssertionError(f"{package} is missing, and nobody says so")
-
-
-def is_there(package: str) -> bool:
-    """Whether a package can be imported."""
-    try:
-        return find_spec(package) is not None
-    except ModuleNotFoundError:
-        return False
 
 
 if __name__ == "__main__":

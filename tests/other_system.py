@@ -14,7 +14,6 @@ import os
 import shutil
 import sys
 import tempfile
-from importlib.abc import MetaPathFinder
 from pathlib import Path
 from typing import Any, Literal
 from unittest import mock
@@ -32,7 +31,7 @@ PACKAGES = (
         "scipy.spatial",
         "PIL.Image",
     ),
-    *("hdbscan", "plyfile", "pydantic", "safetensors.numpy", "zstandard", "fsspec.core", "tqdm", "threadpoolctl"),
+    *("plyfile", "pydantic", "safetensors.numpy", "zstandard", "fsspec.core", "tqdm", "threadpoolctl"),
     *("asyncio", "concurrent.futures", "multiprocessing.pool", "platform", "subprocess", "tempfile", "unittest.mock"),
 )
 MODULES: dict[System, tuple[str, ...]] = {
@@ -83,17 +82,6 @@ MAP_FLAGS = ("MAP_PRIVATE", "MAP_SHARED", "MAP_ANONYMOUS", "MAP_ANON", "MAP_NORE
 SYSTEM_FILES = ("/proc", "/sys")
 
 
-class Refused(MetaPathFinder):
-    """Modules that are not there."""
-
-    def __init__(self, names: tuple[str, ...]) -> None:
-        self.names = names
-
-    def find_spec(self, name: str, path: Any = None, target: Any = None) -> None:
-        if name.partition(".")[0] in self.names:
-            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-
-
 class WindowsMap(mmap.mmap):
     """A map that knows no flags and no protections."""
 
@@ -126,9 +114,7 @@ def become(system: System) -> None:
         _keep_used_files()
         vars(mmap)["mmap"] = WindowsMap
         vars(ctypes)["CDLL"] = WindowsLibrary
-    for name in MODULES[system]:
-        sys.modules.pop(name, None)
-    sys.meta_path.insert(0, Refused(MODULES[system]))
+    sys.modules.update(dict.fromkeys(MODULES[system]))  # pyright: ignore - None: none of that name is there
     for name in LINUX_CALLS + (UNIX_CALLS if system == "win32" else ()):
         vars(os).pop(name, None)
     for name in MAP_FLAGS if system == "win32" else ():

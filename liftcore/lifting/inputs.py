@@ -10,6 +10,7 @@ from typing import Any
 from liftcore.raster import check_given
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
+from liftcore.solve.clusters import require_hdbscan
 from liftcore.values.lift_views import Given, LiftViews
 from liftcore.values.pack import Views, as_views
 from liftcore.values.settings import LiftSettings, Preset
@@ -38,4 +39,8 @@ class LiftInputs:
         chosen = LiftSettings.chosen(preset, settings)
         splats = check_given(splats, threads)
         chosen, given = chosen.for_splats(splats), as_views(views)
-        return cls(splats, given, LiftViews.of(given, cameras, chosen), chosen)
+        lifted = LiftViews.of(given, cameras, chosen)
+        masks = any(given.is_regions(name) for name in lifted.names)
+        if chosen.aggregation and not (masks and chosen.clusters_by_masks):
+            require_hdbscan()
+        return cls(splats, given, lifted, chosen)

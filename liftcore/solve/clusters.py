@@ -7,12 +7,14 @@ lie in a narrow cone, and the angle at the cone's axis tells objects apart where
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from liftcore.errors import Unavailable
 from liftcore.runtime.cores import cores
 from liftcore.runtime.one_thread import one_thread
 from liftcore.scene.splats import Splats
@@ -133,6 +135,18 @@ def directions_of(sample: Tensor, channels: int) -> Directions | None:
         return None
     directions = _unit(offsets, RESOLUTION)
     return Directions(centre, principal_axes(directions - directions.mean(axis=0), channels))
+
+
+def require_hdbscan() -> None:
+    """See before the work that features can be clustered.
+
+    Raises:
+        Unavailable: the package hdbscan is not installed.
+    """
+    if find_spec("hdbscan") is None:
+        expected = "the package hdbscan, for clusters of features"
+        hint = "pip install 'splatlift[aggregation]', or take aggregation_clusters=graph where views have masks"
+        raise Unavailable("aggregation", expected=expected, got="none", hint=hint)
 
 
 def hdbscan_labels(points: np.ndarray, smallest: int, neighbours: int, seed: int) -> np.ndarray:
