@@ -40,7 +40,7 @@ class LiftInputs:
         splats = check_given(splats, threads)
         chosen, given = chosen.for_splats(splats), as_views(views)
         lifted = LiftViews.of(given, cameras, chosen)
-        masks = any(given.is_regions(name) for name in lifted.names)
+        masks = chosen.aggregation and any(lifted.features.is_regions(name) for name in lifted.names)
         if chosen.aggregation and not (masks and chosen.clusters_by_masks):
             require_hdbscan()
         return cls(splats, given, lifted, chosen)
