@@ -14,7 +14,7 @@ CUDA_TORCH_PIP ?=
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 export PIP_ROOT_USER_ACTION = ignore
 
-.PHONY: demo test check kernels soak contract load gpu wheel lint format serve web bench docs sbom setup clean
+.PHONY: demo test check coverage kernels soak contract load gpu wheel lint format serve web bench docs sbom setup clean
 
 demo: $(READY)  ## the whole job through the real service; SCENE=DIR takes a scene of your own, ASK=TEXT a question
 	$(BIN)/splatlift demo --out "$(OUT)" $(if $(SCENE),--scene "$(SCENE)") $(if $(ASK),--ask "$(ASK)")
@@ -31,6 +31,13 @@ test: $(READY)  ## everything that must hold
 # Fast tests: one module at a time, nothing of a server, a second process, a real scene or many kernels.
 check: $(READY) lint  ## before a commit: lint, types and the fast tests, in 90 s once set up
 	$(BIN)/python -m pytest -m "not slow" --numprocesses=2 --dist=loadfile --max-worker-restart=0 tests/unit
+
+# coverage is no part of the lock: it comes from PyPI when it is asked for.
+coverage: $(READY) kernels  ## how much of the code the unit tests run, by file; several times as slow as they are
+	$(BIN)/python -m pip install --quiet 'coverage>=7.10,<8'
+	$(BIN)/python -m coverage run -m pytest tests/unit
+	$(BIN)/python -m coverage combine --quiet
+	$(BIN)/python -m coverage report --skip-covered --sort=cover
 
 kernels: $(READY)
 	$(BIN)/python -m tests.kernels
