@@ -19,7 +19,7 @@ import numpy as np
 
 from liftcore.errors import InvalidInput
 from liftcore.io.files import open_regular, whole_file
-from liftcore.runtime.memory import map_anonymous
+from liftcore.runtime.mapping import map_anonymous
 
 DTYPES = {
     "F64": np.float64, "F32": np.float32, "F16": np.float16, "I64": np.int64, "I32": np.int32, "I16": np.int16,

@@ -26,7 +26,7 @@ from liftcore.io.safetensors_file import (
     tensor_bytes,
     write_tensors,
 )
-from liftcore.runtime.memory import map_anonymous
+from liftcore.runtime.mapping import map_anonymous
 
 if TYPE_CHECKING:
     from torch import Tensor

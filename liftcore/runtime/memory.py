@@ -1,8 +1,5 @@
 """Large arrays: in memory, or in mapped files that have no name, which the system writes and drops as it needs."""
 
-from __future__ import annotations
-
-import mmap
 import os
 import shutil
 import sys
@@ -10,13 +7,12 @@ import tempfile
 from contextlib import suppress
 from math import prod
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
 
 from liftcore.errors import Unavailable
-
-if TYPE_CHECKING:
-    import torch
-    from torch import Tensor
+from liftcore.runtime.mapping import map_anonymous
 
 MOUNTS = Path("/proc/self/mounts")
 IN_MEMORY = ("tmpfs", "ramfs")
@@ -25,18 +21,6 @@ CONTROL_GROUPS = (  # folder, and the files of limit, use and statistics: versio
     ("/sys/fs/cgroup/memory", ("memory.limit_in_bytes", "memory.usage_in_bytes", "memory.stat")),
 )
 FILE_PAGES = ("inactive_file", "active_file")
-
-
-def map_anonymous(size: int, flags: int = 0) -> mmap.mmap:
-    """Map ``size`` bytes of zeros that are this process's own, of which no page is taken before it is written.
-
-    Args:
-        flags: further flags of mmap, for systems that have them. Windows keeps in its page file what memory has no
-            room for.
-    """
-    if sys.platform == "win32":
-        return mmap.mmap(-1, size)
-    return mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | flags)
 
 
 def zeros(shape: tuple[int, ...], dtype: torch.dtype, *, name: str, in_file: bool = False) -> Tensor:
@@ -49,8 +33,6 @@ def zeros(shape: tuple[int, ...], dtype: torch.dtype, *, name: str, in_file: boo
     Raises:
         Unavailable: the disk has no room. It is taken now, for a page without one would end the process later.
     """
-    import torch
-
     size = prod(shape) * dtype.itemsize
     if not size:
         return torch.zeros(shape, dtype=dtype)
