@@ -112,13 +112,13 @@ def become(system: System) -> None:
     _refuse_system_files()
     if system == "win32":
         _keep_used_files()
-        vars(mmap)["mmap"] = WindowsMap
-        vars(ctypes)["CDLL"] = WindowsLibrary
+        mock.patch.object(mmap, "mmap", WindowsMap).start()
+        mock.patch.object(ctypes, "CDLL", WindowsLibrary).start()
     sys.modules.update(dict.fromkeys(MODULES[system]))  # pyright: ignore - None: none of that name is there
     for name in LINUX_CALLS + (UNIX_CALLS if system == "win32" else ()):
-        vars(os).pop(name, None)
+        vars(os).pop(name, None)  # pyright: ignore - a module's are a dict
     for name in MAP_FLAGS if system == "win32" else ():
-        vars(mmap).pop(name, None)
+        vars(mmap).pop(name, None)  # pyright: ignore - a module's are a dict
     sys.platform = system
 
 
