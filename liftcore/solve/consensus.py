@@ -225,9 +225,13 @@ def count_splats(piece, first, last, rows, indptr, region, base, sizes):
 
 @kernel
 def number_tuples(rows, indptr, region, own, view, starts):
-    """`SplatTuples` of some rows, whose own begin at ``starts``: tuples, parents and members."""
+    """`SplatTuples` of some rows, whose own begin at ``starts``: tuples, parents and members.
+
+    A splat mostly has the tuples of the one before it, so what last followed a tuple is tried before the hash table.
+    """
     tuples = np.empty(starts[-1], np.int32)
     parents, members = np.empty(1 << 10, np.int32), np.empty(1 << 10, np.int32)
+    followers, begun = np.full(1 << 10, -1, np.int32), np.full(view[-1] + 1 if view.size else 0, -1, np.int32)
     table, count = np.full(1 << 12, -1, np.int32), 0
     for j in range(rows.size):
         at, last, tuple_ = starts[j], -1, -1
@@ -238,19 +242,28 @@ def number_tuples(rows, indptr, region, own, view, starts):
                 tuples[at] = tuple_
                 at, tuple_ = at + 1, -1
             last = view[region[k]]
+            near = followers[tuple_] if tuple_ >= 0 else begun[last]
+            if near >= 0 and members[near] == region[k]:
+                tuple_ = near
+                continue
             place = slot(table, parents, members, tuple_, region[k])
-            if table[place] < 0:
+            near = table[place]
+            if near < 0:
                 if count == parents.size:
                     parents, members = np.concatenate((parents, parents)), np.concatenate((members, members))
-                parents[count], members[count], table[place] = tuple_, region[k], count
+                    followers = np.concatenate((followers, np.full(count, -1, np.int32)))
+                near = count
+                parents[near], members[near], table[place] = tuple_, region[k], near
                 count += 1
                 if 4 * count > table.size:
                     table = np.full(2 * table.size, -1, np.int32)
                     for other in range(count):
                         table[slot(table, parents, members, parents[other], members[other])] = other
-                tuple_ = count - 1
+            if tuple_ >= 0:
+                followers[tuple_] = near
             else:
-                tuple_ = table[place]
+                begun[last] = near
+            tuple_ = near
         if last >= 0:
             tuples[at] = tuple_
     return tuples, parents[:count].copy(), members[:count].copy()
@@ -331,12 +344,16 @@ def agree(
         for place in range(begins[m], begins[m + 1]):
             j = splats[place] if splats[place] >= 0 else ~splats[place]
             begin, end = starts[j], starts[j + 1]
-            every = max((end - begin + MOST_WITNESSES - 1) // MOST_WITNESSES, 1)
-            asked = 0
-            for k in range(begin, end, every):
-                asked += says[tuples[k]]
+            every, asked = np.int64(1), np.int64(0)
+            if end - begin <= MOST_WITNESSES:  # of most splats: a loop of steps of one is the fast one
+                for k in range(begin, end):
+                    asked += says[tuples[k]]
+            else:
+                every = (end - begin + MOST_WITNESSES - 1) // MOST_WITNESSES
+                for k in range(begin, end, every):
+                    asked += says[tuples[k]]
             if asked >= UNKNOWN:
-                asked = 0
+                asked = np.int64(0)
                 for k in range(begin, end, every):
                     t = tuples[k]
                     if says[t] == UNKNOWN:

@@ -106,7 +106,8 @@ def region_objects(
     """
     groups = RegionGroups.of(W.offsets.numpy(), levels)
     members = members or memberships(W, groups, threads)
-    sizes = np.bincount(W.region.numpy()[members.own], minlength=levels.size)
+    sizes = np.zeros(levels.size, np.int64)
+    count_members(W.region.numpy(), members.own, sizes)
     nodes, others = choose_nodes(groups, sizes)
     table = node_splats(W, members, nodes, threads)
     tree = region_tree(nodes, groups, node_containers(table, nodes, groups, threads), threads)
@@ -427,6 +428,13 @@ def _best_views(shown: np.ndarray) -> np.ndarray:
 
 
 @kernel
+def count_members(region, own, sizes):
+    """Add the splats that belong to each region to ``sizes``."""
+    for k in range(region.size):
+        sizes[region[k]] += own[k]
+
+
+@kernel
 def count_nodes(first, last, indptr, region, own, number, counts):
     """The nodes that each of the splats ``first..last`` belongs to, at the splat + 1."""
     for j in range(first, last):
@@ -573,10 +581,7 @@ def sum_by_label(rows, ends, indptr, region, weight, place, size):
         rows: [n] i64, those of the first label before those of the second. ends: [labels] i64, of each label.
         place: [M] i32 below size; -1 for none.
     """
-    most = 0
-    for row in rows:
-        most += indptr[row + 1] - indptr[row]
-    places, values, count = np.empty(most, np.int64), np.empty(most), 0
+    places, values, count = np.empty(1 << 10, np.int64), np.empty(1 << 10), 0
     sums, is_met, met = np.zeros(size), np.zeros(size, np.bool_), np.empty(size, np.int32)
     begin = 0
     for label in range(ends.size):
@@ -590,6 +595,8 @@ def sum_by_label(rows, ends, indptr, region, weight, place, size):
                         met[found] = at
                         found += 1
                     sums[at] += weight[k]
+        while count + found > places.size:
+            places, values = np.concatenate((places, places)), np.concatenate((values, values))
         for at in np.sort(met[:found]):
             places[count], values[count] = label * size + at, sums[at]
             count += 1
