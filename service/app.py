@@ -206,61 +206,61 @@ class Recorder:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        begun, made = time.monotonic(), chosen_id(scope["headers"])
-        status, received, sent, complete = 0, 0, 0, False
+        start, request_id = time.monotonic(), chosen_id(scope["headers"])
+        status, received_bytes, sent_bytes, complete = 0, 0, 0, False
 
         async def counted() -> Message:
-            nonlocal received
+            nonlocal received_bytes
             message = await receive()
-            received += len(message.get("body", b""))
+            received_bytes += len(message.get("body", b""))
             return message
 
         async def marked(message: Message) -> None:
-            nonlocal status, sent, complete
+            nonlocal status, sent_bytes, complete
             if message["type"] == "http.response.start":
                 status = message["status"]
                 message = {**message, "headers": list(message.get("headers", ()))}
                 headers = MutableHeaders(raw=message["headers"])
                 for name, value in SAFE_HEADERS.items():
                     headers.setdefault(name, value)
-                headers.append("X-Request-ID", made)
+                headers.append("X-Request-ID", request_id)
             await send(message)
             if message["type"] == "http.response.body":
-                sent += len(message.get("body", b""))
+                sent_bytes += len(message.get("body", b""))
                 complete = not message.get("more_body", False)
 
-        with working_for(made):
+        with working_for(request_id):
             try:
                 await self._app(scope, counted, marked)
             except asyncio.CancelledError:  # by the server, whose stop has no more time for it
                 if status:
                     raise
-                why = Busy("server", expected="a running server", got="one that stops", hint="send it again")
-                await answer_to(why, CLOSE)(scope, counted, marked)
+                error = Busy("server", expected="a running server", got="one that stops", hint="send it again")
+                await answer_to(error, CLOSE)(scope, counted, marked)
             except Exception:
                 if (
                     not complete
                 ):  # else `service.problems` has answered and logged it, and the framework raises it again
                     raise
             finally:
-                seconds, route = time.monotonic() - begun, getattr(scope.get("route"), "path", None)
-                self._metrics.served(scope["method"], route, status, seconds=seconds, received=received)
+                seconds, route = time.monotonic() - start, getattr(scope.get("route"), "path", None)
+                self._metrics.count_request(scope["method"], route, status, seconds=seconds, received=received_bytes)
                 fields = {
                     "method": scope["method"],
                     "route": route,
                     "path": scope["path"][:PATH_CHARACTERS],  # never the query: people put secrets there
                     "status": status,
                     "seconds": round(seconds, 6),
-                    "received": received,
-                    "sent": sent,
+                    "received": received_bytes,
+                    "sent": sent_bytes,
                     "client": (scope.get("client") or (None,))[0],
-                    **_who(scope),
+                    **_describe_caller(scope),
                     **({} if complete else {"broken_off": True}),
                 }
                 access.info("%s %s %d", scope["method"], route or "(no route)", status, extra={"fields": fields})
 
 
-def _who(scope: Scope) -> dict[str, Any]:
+def _describe_caller(scope: Scope) -> dict[str, Any]:
     """The key that asked, and whether as an admin."""
     caller = scope.get("state", {}).get(CALLER)
     if caller is None or caller.key is None:
@@ -285,12 +285,12 @@ class Turns:
             await self._app(scope, receive, send)
             return
         await self._places.acquire()
-        held = True
+        is_holding = True
 
         def give_up() -> None:
-            nonlocal held
-            if held:
-                held = False
+            nonlocal is_holding
+            if is_holding:
+                is_holding = False
                 self._places.release()
 
         timer = asyncio.get_running_loop().call_later(TURN_SECONDS, give_up)
@@ -316,7 +316,7 @@ class AnswerHead:
             await self._app(scope, receive, send)
             return
         headers = [(name, value) for name, value in scope["headers"] if name != b"range"]  # which is for GET alone
-        asked = {**scope, "method": "GET", "headers": headers}
+        get_scope = {**scope, "method": "GET", "headers": headers}
         with anyio.CancelScope() as rest:
 
             async def told(message: Message) -> None:
@@ -326,7 +326,7 @@ class AnswerHead:
                     rest.cancel()
 
             try:
-                await self._app(asked, receive, told)
+                await self._app(get_scope, receive, told)
             finally:
-                if "route" in asked:
-                    scope["route"] = asked["route"]  # which the recorder reads
+                if "route" in get_scope:
+                    scope["route"] = get_scope["route"]  # which the recorder reads

@@ -21,15 +21,7 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as AsgiScope
 
-from service.errors import (
-    Busy,
-    ForeignOrigin,
-    InvalidRequest,
-    Misdirected,
-    MissingScope,
-    Unauthorized,
-    require_share,
-)
+from service.errors import Busy, ForeignOrigin, InvalidRequest, Misdirected, MissingScope, Unauthorized, require_share
 from service.problems import CLOSE
 from service.requests import is_json
 from service.settings import ServiceSettings
@@ -104,30 +96,30 @@ class Gate:
             return
         method, headers = scope["method"], Headers(scope=scope)
         require_one_length(headers)
-        wanted = needed(method, scope["path"])
-        self._hosts.check(method, headers, only_reads=wanted is Scope.READ)
-        caller = await self._caller(wanted, scope["path"], headers)
+        scope_needed = required_scope(method, scope["path"])
+        self._hosts.check(method, headers, only_reads=scope_needed is Scope.READ)
+        caller = await self._caller(scope_needed, scope["path"], headers)
         if caller.key is not None and caller.owner.sees_all:
-            told = {"key": caller.key, "method": method, "path": scope["path"]}
-            log.info("an admin key is used", extra={"fields": told})
+            fields = {"key": caller.key, "method": method, "path": scope["path"]}
+            log.info("an admin key is used", extra={"fields": fields})
         if self._stopping() and method not in WORKLESS:
             busy = Busy("server", expected="a running server", got="one that stops", hint="ask the next one")
             busy.headers |= CLOSE
             raise busy
         scope.setdefault("state", {})[CALLER] = caller
-        checked = CHECKED.fullmatch(f"{method} {scope['path']}")
-        if checked is None or (scope["path"] == "/lifts" and is_json(headers)):  # an order
+        upload = CHECKED.fullmatch(f"{method} {scope['path']}")
+        if upload is None or (scope["path"] == "/lifts" and is_json(headers)):  # an order
             await self._app(scope, receive, send)
             return
-        own, most = caller.owner.key, caller.max_uploads
-        require_share("plan" if checked["plan"] else "upload", self._uploads[own], most)
-        self._uploads[own] += 1
+        owner, limit = caller.owner.key, caller.max_uploads
+        require_share("plan" if upload["plan"] else "upload", self._uploads[owner], limit)
+        self._uploads[owner] += 1
         try:
             await self._app(scope, receive, send)
         finally:
-            self._uploads[own] -= 1
-            if not self._uploads[own]:
-                del self._uploads[own]
+            self._uploads[owner] -= 1
+            if not self._uploads[owner]:
+                del self._uploads[owner]
 
     async def _caller(self, wanted: Scope | None, path: str, headers: Headers) -> Caller:
         if wanted is None:
@@ -136,23 +128,23 @@ class Gate:
         if not required:
             return EVERYBODY
         if key is None:
-            sent = "authorization" in headers
-            code = ', error="invalid_token"' if sent else ""  # only where a key was sent (RFC 6750, 3.1)
+            has_header = "authorization" in headers
+            code = ', error="invalid_token"' if has_header else ""  # only where a key was sent (RFC 6750, 3.1)
             raise Unauthorized(
                 "Authorization", expected="Bearer and a key of this service",
-                got="one that is not valid" if sent else "none",
+                got="one that is not valid" if has_header else "none",
                 hint="the operator makes keys with splatlift keys create",
                 headers={"WWW-Authenticate": f'Bearer realm="splatlift"{code}'},
             )  # fmt: skip
         if not allows(key.scopes, wanted, path):
-            told = f'Bearer realm="splatlift", error="insufficient_scope", scope="{wanted}"'
+            challenge = f'Bearer realm="splatlift", error="insufficient_scope", scope="{wanted}"'
             raise MissingScope(
                 "Authorization", expected=f"a key with the scope {wanted}",
-                got=f"one with {', '.join(sorted(key.scopes))}", headers={"WWW-Authenticate": told},
+                got=f"one with {', '.join(sorted(key.scopes))}", headers={"WWW-Authenticate": challenge},
             )  # fmt: skip
-        return self._known(key)
+        return self._caller_of(key)
 
-    def _known(self, key: KeyRecord) -> Caller:
+    def _caller_of(self, key: KeyRecord) -> Caller:
         quota, settings = key.quota, self._settings
         owner = Owner(
             key=key.id,
@@ -160,11 +152,11 @@ class Gate:
             max_bytes=settings.key_bytes if quota.max_bytes is None else quota.max_bytes,
             max_queued=settings.key_queued if quota.max_queued is None else quota.max_queued,
         )
-        most = settings.key_uploads if quota.max_uploads is None else quota.max_uploads
-        return Caller(owner, most, key.id, key)
+        max_uploads = settings.key_uploads if quota.max_uploads is None else quota.max_uploads
+        return Caller(owner, max_uploads, key.id, key)
 
 
-def needed(method: str, path: str) -> Scope | None:
+def required_scope(method: str, path: str) -> Scope | None:
     """The scope that a request needs, None when it needs no key. What is not listed as open is not."""
     if method in SAFE and path in OPEN:
         return None
@@ -185,8 +177,8 @@ def allows(scopes: frozenset[Scope], wanted: Scope, path: str) -> bool:
 
 def bearer(headers: Headers) -> str | None:
     """The secret that a request brings, None when it brings none, or not as it should."""
-    given = headers.getlist("authorization")
-    match = BEARER.fullmatch(given[0].strip()) if len(given) == 1 else None
+    values = headers.getlist("authorization")
+    match = BEARER.fullmatch(values[0].strip()) if len(values) == 1 else None
     return None if match is None else match[1]
 
 
@@ -289,5 +281,5 @@ def with_keys(document: dict[str, Any]) -> dict[str, Any]:
 
 
 def _secured(method: str, path: str, operation: dict[str, Any]) -> dict[str, Any]:
-    scope = needed(method.upper(), path)
+    scope = required_scope(method.upper(), path)
     return operation if scope is None else {**operation, "security": [{"key": [scope]}]}

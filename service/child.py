@@ -62,9 +62,9 @@ class Messages:
             while piece := os.read(self._pipe, PIECE):
                 first, *more = piece.split(b"\n")
                 self._rest.append(first)
-                for begun in more:  # joined once, at its end: a message may be of a hundred thousand names
+                for piece_after in more:  # joined once, at its end: a message may be of a hundred thousand names
                     lines.append(b"".join(self._rest))
-                    self._rest = [begun]
+                    self._rest = [piece_after]
             self.open = False  # a half line at the end is what a killed writer leaves
         return [json.loads(line) for line in lines]
 
@@ -93,12 +93,12 @@ def end_with_parent(lifeline: int) -> None:
 
 def children_of(process: int) -> list[int]:
     """The processes that a process started and that have not been waited for, as far as Linux tells."""
-    found = list[int]()
+    children = list[int]()
     with contextlib.suppress(OSError):
         for task in Path(f"/proc/{process}/task").iterdir():  # a process is the child of the thread that began it
             with contextlib.suppress(OSError):
-                found += map(int, (task / "children").read_text().split())
-    return found
+                children += map(int, (task / "children").read_text().split())
+    return children
 
 
 def memory_of(process: int | str, field: str) -> int:
@@ -129,9 +129,9 @@ def fault_of(error: SplatliftError, names: Mapping[str, str] | None = None) -> d
         names: server path -> the name that the client knows; paths of this machine are nobody's business.
     """
     fault = {name: str(getattr(error, name)) for name in FIELDS}
-    told: dict[str, Any] = {"kind": error.kind}
-    told |= {field: renamed(text, names or {}) for field, text in fault.items()}
-    return told if error.nearest is None else told | {"nearest": error.nearest}
+    document: dict[str, Any] = {"kind": error.kind}
+    document |= {field: renamed(text, names or {}) for field, text in fault.items()}
+    return document if error.nearest is None else document | {"nearest": error.nearest}
 
 
 def renamed(text: str, names: Mapping[str, str]) -> str:
@@ -151,4 +151,4 @@ def error_of(fault: Mapping[str, Any]) -> SplatliftError:
 
 
 def _tree(cls: type[SplatliftError]) -> list[type[SplatliftError]]:
-    return [cls, *(found for child in cls.__subclasses__() for found in _tree(child))]
+    return [cls, *(descendant for child in cls.__subclasses__() for descendant in _tree(child))]

@@ -59,11 +59,11 @@ def unchanged(request: Request, etag: str, *, found: bool = True) -> Response | 
     if header is None:
         return None
     tags = {tag.strip().removeprefix("W/") for tag in header.split(",")}
-    same = etag in tags or (found and "*" in tags)
-    return Response(status_code=304, headers={"ETag": etag}) if same else None
+    is_same = etag in tags or (found and "*" in tags)
+    return Response(status_code=304, headers={"ETag": etag}) if is_same else None
 
 
-def kept(etag: str) -> dict[str, str]:
+def cache_headers(etag: str) -> dict[str, str]:
     """Headers of what a client may keep and must ask about."""
     return {"ETag": etag, "Cache-Control": "private, no-cache"}
 
@@ -88,13 +88,13 @@ def file_answer(
         size += len(header) - offset
         sha256 = hashlib.sha256(header + sha256.encode()).hexdigest()
     etag = f'"{sha256}"'
-    if (same := unchanged(request, etag)) is not None:
-        return same
-    asked, condition = request.headers.get("range"), request.headers.get("if-range", etag)
-    part = _range_of(asked, size) if asked is not None and condition == etag else None
+    if (not_modified := unchanged(request, etag)) is not None:
+        return not_modified
+    range_header, condition = request.headers.get("range"), request.headers.get("if-range", etag)
+    part = _range_of(range_header, size) if range_header is not None and condition == etag else None
     if header is not None:
-        return _ChangedFile(path, header, offset, part, size, kept(etag) | _saved_as(name))
-    return _FileAnswer(part, path, headers=kept(etag), filename=name, stat_result=status)
+        return _ChangedFile(path, header, offset, part, size, cache_headers(etag) | _saved_as(name))
+    return _FileAnswer(part, path, headers=cache_headers(etag), filename=name, stat_result=status)
 
 
 def _range_of(header: str, size: int) -> tuple[int, int] | None:
@@ -110,8 +110,8 @@ def _range_of(header: str, size: int) -> tuple[int, int] | None:
     first, last = match[1].lstrip("0") or match[1][:1], int(match[2] or size)
     begin = max(0, size - last) if not first else int(first) if len(first) < FAR_DIGITS else size
     if begin >= size:
-        expected, told = f"a range within {size} bytes", {"Content-Range": f"bytes */{size}"}
-        raise RangeNotSatisfiable("Range", expected=expected, got=header[:80], headers=told)
+        expected, headers = f"a range within {size} bytes", {"Content-Range": f"bytes */{size}"}
+        raise RangeNotSatisfiable("Range", expected=expected, got=header[:80], headers=headers)
     last = min(last, size - 1) if first else size - 1
     return (begin, last) if begin <= last else None
 
@@ -150,11 +150,11 @@ class _ChangedFile(_OpenFile):
         self, path: Path, header: bytes, offset: int, part: tuple[int, int] | None, size: int, headers: dict[str, str]
     ) -> None:
         first, last = part or (0, size - 1)
-        told = {"Content-Length": str(last + 1 - first), "Accept-Ranges": "bytes"}
-        told |= {"Content-Range": f"bytes {first}-{last}/{size}"} if part else {}
+        own_headers = {"Content-Length": str(last + 1 - first), "Accept-Ranges": "bytes"}
+        own_headers |= {"Content-Range": f"bytes {first}-{last}/{size}"} if part else {}
         self.file = path.open("rb")
         blocks = self._blocks(header, offset, first, last + 1)
-        super().__init__(blocks, 206 if part else 200, told | headers, BINARY)
+        super().__init__(blocks, 206 if part else 200, own_headers | headers, BINARY)
 
     def _blocks(self, header: bytes, offset: int, first: int, end: int) -> Iterator[bytes]:
         yield header[first:end]
@@ -173,19 +173,19 @@ class Draft(_OpenFile):
 
     def __init__(self, draft: Path, media_type: str, *, filename: str | None, headers: Mapping[str, str]) -> None:
         self.file = draft.open("rb")
-        told = {
+        own_headers = {
             "Content-Length": str(os.fstat(self.file.fileno()).st_size),
             "Cache-Control": "private, no-cache",
         }
-        told |= {} if filename is None else _saved_as(filename)
-        super().__init__(iter(lambda: self.file.read(BLOCK_BYTES), b""), 200, told | dict(headers), media_type)
+        own_headers |= {} if filename is None else _saved_as(filename)
+        super().__init__(iter(lambda: self.file.read(BLOCK_BYTES), b""), 200, own_headers | dict(headers), media_type)
 
 
 def _saved_as(name: str) -> dict[str, str]:
     return {"Content-Disposition": f'attachment; filename="{name}"'}
 
 
-def listed(
+def page_response(
     name: str,
     page: Callable[[int, str | None], Page[Any]],
     shape: Callable[[Any], BaseModel],
@@ -205,16 +205,16 @@ def listed(
     first = page(min(limit, STREAMED), cursor)  # before the answer begins: the cursor may be none
 
     def pieces() -> Iterator[str]:
-        found, left = first, limit
+        page_records, remaining = first, limit
         yield f'{{"{name}":['
         while True:
-            yield ",".join(shape(record).model_dump_json() for record in found.records)
-            left -= len(found.records)
-            if found.cursor is None or left == 0:
+            yield ",".join(shape(record).model_dump_json() for record in page_records.records)
+            remaining -= len(page_records.records)
+            if page_records.cursor is None or remaining == 0:
                 break
-            found = page(min(left, STREAMED), found.cursor)
-            yield "," if found.records else ""
-        yield f'],"next":{json.dumps(found.cursor)}}}'
+            page_records = page(min(remaining, STREAMED), page_records.cursor)
+            yield "," if page_records.records else ""
+        yield f'],"next":{json.dumps(page_records.cursor)}}}'
 
     return StreamingResponse(pieces(), media_type="application/json")
 

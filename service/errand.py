@@ -76,11 +76,11 @@ def get_ready() -> None:
     except FileNotFoundError:
         os.chdir("/")  # somebody removed the directory, which multiprocessing asks for, and tasks begin in
     if len(tempfile.gettempdir()) > LONGEST_FOLDER:
-        own, tempfile.tempdir = tempfile.tempdir, "/tmp"
+        folder, tempfile.tempdir = tempfile.tempdir, "/tmp"
         try:
             util.get_temp_dir()  # multiprocessing keeps the first that it made
         finally:
-            tempfile.tempdir = own
+            tempfile.tempdir = folder
     forkserver.ensure_running()
 
 
@@ -159,12 +159,12 @@ def _require_running(ending: threading.Event) -> None:
         raise Busy("server", expected="a running server", got="one that stops", hint="send it again")
 
 
-def _end_of(printed: Path) -> str:
+def _end_of(file_path: Path) -> str:
     """The last of what a task printed, which may be without end."""
-    if not printed.exists():
+    if not file_path.exists():
         return ""
-    with printed.open("rb") as file:
-        file.seek(max(0, printed.stat().st_size - TRACE_BYTES))
+    with file_path.open("rb") as file:
+        file.seek(max(0, file_path.stat().st_size - TRACE_BYTES))
         return file.read(TRACE_BYTES).decode(errors="replace")
 
 
@@ -177,20 +177,20 @@ def _start(ending: threading.Event, *given: Any) -> tuple[ForkServerProcess, Con
     reason = ""
     for pause in (0.0, DYING_SECONDS):  # the template may die over it
         time.sleep(pause)
-        with ExitStack() as opened:
+        with ExitStack() as resources:
             try:
-                read, write = os.pipe()
-                ours = opened.enter_context(Connection(read, writable=False))
-                theirs = Connection(write, readable=False)
-                task = CONTEXT.Process(target=_child_main, args=(theirs, *given), daemon=True)
-                with theirs, _TURN:
+                read_end, write = os.pipe()
+                near_end = resources.enter_context(Connection(read_end, writable=False))
+                far_end = Connection(write, readable=False)
+                task = CONTEXT.Process(target=_child_main, args=(far_end, *given), daemon=True)
+                with far_end, _TURN:
                     _require_running(ending)
                     get_ready()
                     with _bounded(ending):
                         task.start()
                     _FORKED.update(filter(None, [_template()]))
-                opened.pop_all()
-                return task, ours
+                resources.pop_all()
+                return task, near_end
             except (OSError, EOFError, RuntimeError) as error:  # the last: no room for a thread
                 log.warning("a process for %s does not start", given[0], exc_info=True)
                 reason = getattr(error, "strerror", None) or "one that ended"
@@ -200,11 +200,11 @@ def _start(ending: threading.Event, *given: Any) -> tuple[ForkServerProcess, Con
 @contextmanager
 def _bounded(ending: threading.Event) -> Iterator[None]:
     """Kill the template where it takes too long over a fork, or the server ends meanwhile."""
-    done = threading.Event()
+    finished = threading.Event()
     deadline = time.monotonic() + (FORK_SECONDS if _template() in _FORKED else IMPORT_SECONDS)
 
     def watch() -> None:
-        while not done.wait(TICK_SECONDS):
+        while not finished.wait(TICK_SECONDS):
             if ending.is_set() or time.monotonic() > deadline:
                 _kill_template()
 
@@ -212,15 +212,15 @@ def _bounded(ending: threading.Event) -> Iterator[None]:
     try:
         yield
     finally:
-        done.set()
+        finished.set()
 
 
 def _read_last_message(pipe: Connection, limits: ErrandLimits) -> dict[str, Any] | None:
     """The last that a task says until it ends; None when it must be ended."""
     messages, last = Messages(pipe.fileno()), {"event": "nothing"}
     deadline = time.monotonic() + limits.seconds
-    while not limits.ending.is_set() and (left := deadline - time.monotonic()) > 0:
-        last = [last, *messages.read(min(left, TICK_SECONDS))][-1]
+    while not limits.ending.is_set() and (remaining := deadline - time.monotonic()) > 0:
+        last = [last, *messages.read(min(remaining, TICK_SECONDS))][-1]
         if not messages.open:
             return last
     return None
@@ -232,14 +232,14 @@ def _child_main(pipe: Connection, task: str, arguments: list[str], scratch: str,
     parent = multiprocessing.parent_process()
     assert parent is not None
     end_with_parent(parent.sentinel)
-    printed = os.open(Path(scratch) / PRINTED, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+    output = os.open(Path(scratch) / PRINTED, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
     for stream in (1, 2):
-        os.dup2(printed, stream)
+        os.dup2(output, stream)
     os.environ["TMPDIR"] = tempfile.tempdir = scratch
     module, _, name = task.rpartition(".")
     run = getattr(importlib.import_module(module), name)
-    most = memory_of("self", "VmData") + memory_bytes  # imports hold half a gigabyte with CUDA's torch
-    resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+    limit = memory_of("self", "VmData") + memory_bytes  # imports hold half a gigabyte with CUDA's torch
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
     with os.fdopen(pipe.fileno(), "wb", closefd=False) as out:
         out.write(line_of({"event": "ready"}))
         out.flush()

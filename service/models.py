@@ -74,21 +74,21 @@ class Published:
     without: Sequence[str] = ()
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        shown = deepcopy(handler.resolve_ref_schema(handler(self.model.__pydantic_core_schema__)))
+        copy = deepcopy(handler.resolve_ref_schema(handler(self.model.__pydantic_core_schema__)))
         for name in self.without:
-            shown["properties"].pop(name)
-        del shown["title"]
-        return shown
+            copy["properties"].pop(name)
+        del copy["title"]
+        return copy
 
 
-def _bounded(given: Any) -> Any:
+def _bounded(value: Any) -> Any:
     """What is too much to be settings is refused before any of it is looked at."""
-    if isinstance(given, dict):
-        texts = (text for pair in given.items() for text in pair if isinstance(text, str))
-        if len(given) > SETTINGS or any(len(text) > SETTING_CHARACTERS for text in texts):
-            told = {"expected": f"at most {SETTINGS} settings of at most {SETTING_CHARACTERS} characters"}
-            raise PydanticCustomError("too_many_settings", "{expected}", told)
-    return given
+    if isinstance(value, dict):
+        texts = (text for pair in value.items() for text in pair if isinstance(text, str))
+        if len(value) > SETTINGS or any(len(text) > SETTING_CHARACTERS for text in texts):
+            context = {"expected": f"at most {SETTINGS} settings of at most {SETTING_CHARACTERS} characters"}
+            raise PydanticCustomError("too_many_settings", "{expected}", context)
+    return value
 
 
 Bounded = BeforeValidator(_bounded)
@@ -480,8 +480,8 @@ def at_most(characters: int) -> AfterValidator:
 
     def check(texts: list[str]) -> list[str]:
         if (got := sum(map(len, texts))) > characters:
-            told = {"expected": f"texts of at most {characters} characters together, which are {got}"}
-            raise PydanticCustomError("too_long_together", "{expected}", told)
+            context = {"expected": f"texts of at most {characters} characters together, which are {got}"}
+            raise PydanticCustomError("too_long_together", "{expected}", context)
         return texts
 
     return AfterValidator(check)
@@ -493,10 +493,7 @@ Numbers = Annotated[
     tuple[Annotated[float, Field(allow_inf_nan=False, strict=True)], ...],
     Field(min_length=1, max_length=VECTOR, fail_fast=True),
 ]
-AnExample = Annotated[
-    Notation | Numbers,
-    takes(f"{NOTATIONS}, or a vector of 1 to {VECTOR} finite numbers"),
-]
+AnExample = Annotated[Notation | Numbers, takes(f"{NOTATIONS}, or a vector of 1 to {VECTOR} finite numbers")]
 Examples = Annotated[list[AnExample], Field(max_length=ASKED, fail_fast=True)]
 
 

@@ -51,9 +51,9 @@ _CURRENT: ContextVar[str | None] = ContextVar("request_id", default=None)
 
 def chosen_id(headers: Iterable[tuple[bytes, bytes]]) -> str:
     """The id for a request with these headers (names in lower case): the client's own when it is a sane one."""
-    sent = [value for name, value in headers if name == REQUEST_ID]
-    if len(sent) == 1 and SANE.fullmatch(sent[0]):
-        return sent[0].decode("ascii")
+    values = [value for name, value in headers if name == REQUEST_ID]
+    if len(values) == 1 and SANE.fullmatch(values[0]):
+        return values[0].decode("ascii")
     return secrets.token_hex(16)
 
 
@@ -133,13 +133,13 @@ class Sparing(logging.Filter):
         if record.name == access.name:
             return True
         place, now = (record.pathname, record.lineno), self._clock()
-        begun, count = self._said.get(place, (now, 0))
-        if now - begun >= 60:
+        start, count = self._said.get(place, (now, 0))
+        if now - start >= 60:
             left_out = count - SAME_A_MINUTE
             if left_out > 0:
                 record.fields = getattr(record, "fields", {}) | {"left_out": left_out}
-            begun, count = now, 0
-        self._said[place] = begun, count + 1
+            start, count = now, 0
+        self._said[place] = start, count + 1
         return count < SAME_A_MINUTE
 
 
@@ -152,7 +152,7 @@ class JsonLines(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """One line."""
-        return json.dumps(_told(self, record), ensure_ascii=True, default=str)
+        return json.dumps(_fields_of(self, record), ensure_ascii=True, default=str)
 
 
 class TextLines(logging.Formatter):
@@ -160,18 +160,18 @@ class TextLines(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """One line, and those of the trace."""
-        told = _told(self, record)
-        trace = told.pop("error", None)
-        time, level, logger, message = (told.pop(name) for name in ("time", "level", "logger", "message"))
+        fields = _fields_of(self, record)
+        trace = fields.pop("error", None)
+        time, level, logger, message = (fields.pop(name) for name in ("time", "level", "logger", "message"))
         message = message if message.isprintable() else message.encode("unicode_escape").decode()
-        rest = "".join(f" {name}={json.dumps(value, default=str)}" for name, value in told.items())
+        rest = "".join(f" {name}={json.dumps(value, default=str)}" for name, value in fields.items())
         line = f"{time} {level.upper()} {logger}: {message}{rest}"
         return line if trace is None else f"{line}\n{trace}"
 
 
-def _told(formatter: logging.Formatter, record: logging.LogRecord) -> dict[str, Any]:
+def _fields_of(formatter: logging.Formatter, record: logging.LogRecord) -> dict[str, Any]:
     moment = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
-    told: dict[str, Any] = {
+    fields: dict[str, Any] = {
         "time": moment.replace("+00:00", "Z"),
         "level": record.levelname.lower(),
         "logger": record.name,
@@ -179,11 +179,11 @@ def _told(formatter: logging.Formatter, record: logging.LogRecord) -> dict[str, 
     }
     request = getattr(record, "request_id", None) or current_id()
     if request is not None:
-        told["request_id"] = request
-    told |= getattr(record, "fields", {})
+        fields["request_id"] = request
+    fields |= getattr(record, "fields", {})
     if record.exc_info:
-        told["error"] = _without_secrets(formatter.formatException(record.exc_info))
-    return told
+        fields["error"] = _without_secrets(formatter.formatException(record.exc_info))
+    return fields
 
 
 def _without_secrets(text: str) -> str:
@@ -205,14 +205,14 @@ PACKAGES = ("torch", "numpy", "numba", "fastapi", "uvicorn")
 
 def versions(commit: str | None) -> models.Version:
     """What runs here, found without importing it; the commit is told by whoever built this, in the settings."""
-    found = {name: _installed(name) for name in PACKAGES}
+    packages = {name: _installed(name) for name in PACKAGES}
     return models.Version(
         version=__version__,
         api=API,
         database=VERSION,
         commit=commit,
         python=platform.python_version(),
-        packages={name: known for name, known in found.items() if known is not None},
+        packages={name: number for name, number in packages.items() if number is not None},
     )
 
 
@@ -258,12 +258,12 @@ class Metrics:
             "splatlift_query_seconds", "Time that the query worker took, waiting included, by what came of it.",
             ("operation", "outcome"), buckets=REQUEST_BUCKETS, registry=registry,
         )  # fmt: skip
-        told = {"version": build.version, "commit": build.commit or "", "python": build.python, **build.packages}
-        Info("splatlift_build", "What runs here.", registry=registry).info(told)
+        labels = {"version": build.version, "commit": build.commit or "", "python": build.python, **build.packages}
+        Info("splatlift_build", "What runs here.", registry=registry).info(labels)
         ProcessCollector(registry=registry)
         registry.register(_Gauges(store, queries, streams))
 
-    def served(self, method: str, route: str | None, status: int, *, seconds: float, received: int) -> None:
+    def count_request(self, method: str, route: str | None, status: int, *, seconds: float, received: int) -> None:
         """Count a request; its route is the template, None when no route takes the path."""
         method, route = method if method in METHODS else OTHER, route or OTHER
         self._requests.labels(method, route, str(status)).inc()

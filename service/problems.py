@@ -101,14 +101,14 @@ def by_status(status: int, detail: str, **told: Any) -> Problem:
 def answer(problem: Problem, headers: Mapping[str, str] | None = None) -> JSONResponse:
     """The problem as a response to the request that is worked for."""
     problem = problem.model_copy(update={"request_id": current_id()})
-    told = {name: _plain(value) for name, value in problem.model_dump(exclude_none=True).items()}
-    return JSONResponse(told, problem.status, headers=headers, media_type=MEDIA_TYPE)
+    fields = {name: _plain(value) for name, value in problem.model_dump(exclude_none=True).items()}
+    return JSONResponse(fields, problem.status, headers=headers, media_type=MEDIA_TYPE)
 
 
 def answer_to(error: SplatliftError, more: Mapping[str, str] | None = None) -> JSONResponse:
     """The error as a response, with the headers that belong to it, and more."""
-    own = error.headers if isinstance(error, errors.ServiceError) else {}
-    return answer(problem_of(error), {**own, **(more or {})})
+    headers = error.headers if isinstance(error, errors.ServiceError) else {}
+    return answer(problem_of(error), {**headers, **(more or {})})
 
 
 def install(app: FastAPI) -> None:
@@ -160,43 +160,47 @@ def _of_system(what: str, error: Exception) -> JSONResponse:
 
 def _of_framework(request: Request, error: HTTPException) -> JSONResponse:
     method = request.method[:PATH_CHARACTERS]
-    headers, told, detail = dict(error.headers or {}), {}, error.detail
+    headers, fields, detail = dict(error.headers or {}), {}, error.detail
     if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
         headers["Allow"] = ", ".join(_methods_of(request))
-        told = {"argument": "method", "expected": f"one of {headers['Allow']}", "got": method}
-        detail = f"expected {told['expected']}, got {method}"
+        fields = {"argument": "method", "expected": f"one of {headers['Allow']}", "got": method}
+        detail = f"expected {fields['expected']}, got {method}"
     if error.status_code == HTTPStatus.NOT_FOUND:
-        told = {"argument": "path", "expected": "a route of this service", "got": request.url.path[:PATH_CHARACTERS]}
-        told["hint"] = "GET /docs shows them all"
-        detail = f"expected {told['expected']}; {told['hint']}"
-    asked = f"{method} {request.url.path[:PATH_CHARACTERS]}"
-    return answer(by_status(error.status_code, f"{asked}: {detail}", **told), headers)
+        fields = {
+            "argument": "path",
+            "expected": "a route of this service",
+            "got": request.url.path[:PATH_CHARACTERS],
+        }
+        fields["hint"] = "GET /docs shows them all"
+        detail = f"expected {fields['expected']}; {fields['hint']}"
+    request_line = f"{method} {request.url.path[:PATH_CHARACTERS]}"
+    return answer(by_status(error.status_code, f"{request_line}: {detail}", **fields), headers)
 
 
 def _methods_of(request: Request) -> list[str]:
     """What the path takes, by all of its routes: the framework tells of the first one only."""
     scopes = {method: {**request.scope, "method": method} for method in METHODS}
     routes = request.app.routes
-    taken = [
+    methods = [
         method
         for method, scope in scopes.items()
         if any(route.matches(dict(scope))[0] is Match.FULL for route in routes)
     ]
-    return [*taken, "HEAD"] if "GET" in taken else taken
+    return [*methods, "HEAD"] if "GET" in methods else methods
 
 
 def refusal(request: Request, error: RequestValidationError) -> errors.ServiceError:
     """The first thing that is wrong with the form of a request: where, what was expected, what came."""
     first = error.errors()[0]
-    place, kind, told = [str(part) for part in first["loc"]], first["type"], first.get("ctx", {})
+    place, kind, context = [str(part) for part in first["loc"]], first["type"], first.get("ctx", {})
     if kind == "json_invalid":
-        return _no_json(error.body, int(place[1]), told["error"])
+        return _no_json(error.body, int(place[1]), context["error"])
     if place == ["body"] and isinstance(first.get("input"), bytes):
         return _unread(request.headers.get("content-type"))
     got = "nothing" if kind == "missing" else _short(first.get("input"))
     if kind == "unknown_field":  # told of what holds it, `service.models.Body`
-        place.append(told["field"])
-        got = repr(told["field"])
+        place.append(context["field"])
+        got = repr(context["field"])
     return errors.InvalidRequest(
         ".".join(place[1:]) or place[0],
         expected="a JSON object" if place == ["body"] else _expected(first),
@@ -205,18 +209,18 @@ def refusal(request: Request, error: RequestValidationError) -> errors.ServiceEr
     )
 
 
-def _expected(told: dict[str, Any]) -> str:
-    if told["type"] == "missing":
+def _expected(error: dict[str, Any]) -> str:
+    if error["type"] == "missing":
         return "a value"
-    if told["type"] == "int_parsing_size":
+    if error["type"] == "int_parsing_size":
         return "an integer of fewer digits"
-    words = PYDANTIC.sub("", told["msg"]).replace("String should match pattern", "text that matches pattern")
-    return told.get("ctx", {}).get("expected") or words[:1].lower() + words[1:]
+    words = PYDANTIC.sub("", error["msg"]).replace("String should match pattern", "text that matches pattern")
+    return error.get("ctx", {}).get("expected") or words[:1].lower() + words[1:]
 
 
-def _no_json(body: str, place: int, why: str) -> errors.UnreadableBody:
-    shown = repr(body[place : place + SHOWN_OF_JSON]) if place < len(body) else "its end"
-    got = f"{shown} at character {place + 1} ({why[:1].lower()}{why[1:]})"
+def _no_json(body: str, place: int, reason: str) -> errors.UnreadableBody:
+    excerpt = repr(body[place : place + SHOWN_OF_JSON]) if place < len(body) else "its end"
+    got = f"{excerpt} at character {place + 1} ({reason[:1].lower()}{reason[1:]})"
     return errors.UnreadableBody("body", expected="JSON", got=got, hint="in the body of the request")
 
 

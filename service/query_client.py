@@ -168,8 +168,8 @@ class QueryClient:
             ClientLeft: nobody waits for it.
             Crashed: the worker died twice over this call, or failed with an error that is ours.
         """
-        begun, outcome = time.monotonic(), "crashed"
-        call = _Call(json.dumps(request, allow_nan=False).encode(), waiter or Waiter(), begun + self._limits.seconds)
+        start, outcome = time.monotonic(), "crashed"
+        call = _Call(json.dumps(request, allow_nan=False).encode(), waiter or Waiter(), start + self._limits.seconds)
         try:
             ahead = self._wait_for_turn(call)
             try:
@@ -186,7 +186,7 @@ class QueryClient:
             raise
         finally:
             if self._callback is not None:
-                self._callback(request["operation"], outcome, time.monotonic() - begun)
+                self._callback(request["operation"], outcome, time.monotonic() - start)
         return reply
 
     def require_device(self, device: str) -> None:
@@ -245,13 +245,13 @@ class QueryClient:
 
     def _require_place(self, key: str) -> None:
         speaking = self._busy_with if isinstance(self._busy_with, _Call) else None
-        taken = [*self._line, *([] if speaking is None else [speaking])]
-        if self._stopped or len(taken) >= self._limits.waiting:
+        calls = [*self._line, *([] if speaking is None else [speaking])]
+        if self._stopped or len(calls) >= self._limits.waiting:
             raise self._busy()
-        most = self._limits.of_a_key
-        if key and most is not None:  # with one place in all there are no shares
-            most = max(1, min(most, self._limits.waiting - 1))
-            require_share("query", sum(call.waiter.key == key for call in taken), most)
+        limit = self._limits.of_a_key
+        if key and limit is not None:  # with one place in all there are no shares
+            limit = max(1, min(limit, self._limits.waiting - 1))
+            require_share("query", sum(call.waiter.key == key for call in calls), limit)
 
     def _busy(self) -> Busy:
         line = f"at most {self._limits.waiting} waiting queries"
@@ -280,12 +280,12 @@ class QueryClient:
         """
         process, worker = self._process, self._worker
         assert process is not None and worker is not None
-        room = itertools.accumulate(map(len, ahead))
-        sent = [call.line, *(line for line, size in zip(ahead, room, strict=True) if size <= AHEAD_BYTES)]
+        sizes = itertools.accumulate(map(len, ahead))
+        lines = [call.line, *(line for line, size in zip(ahead, sizes, strict=True) if size <= AHEAD_BYTES)]
         deadline = threading.Timer(_left(call), process.kill)  # it may be stopped, and neither read nor write
         deadline.start()
         try:
-            worker.send_bytes(b"[" + b", ".join(sent) + b"]")
+            worker.send_bytes(b"[" + b", ".join(lines) + b"]")
             return Frame(json.loads(worker.recv_bytes()), worker.recv_bytes())
         except (EOFError, OSError):
             if _left(call):
@@ -298,16 +298,16 @@ class QueryClient:
 
     def _spawn(self) -> None:
         self._reap()
-        ours, theirs = socket.socketpair()
-        command = [sys.executable, "-m", "service.query_worker", str(theirs.fileno())]
+        near_end, far_end = socket.socketpair()
+        command = [sys.executable, "-m", "service.query_worker", str(far_end.fileno())]
         command += [str(self._limits.scenes), str(self._limits.cache_bytes), self._limits.encoder]
         self._spawned += 1
-        with ours, theirs:
+        with near_end, far_end:
             self._process = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=STDERR, pass_fds=[theirs.fileno()], start_new_session=True,
+                command, stdin=subprocess.PIPE, stdout=STDERR, pass_fds=[far_end.fileno()], start_new_session=True,
                 env=ENVIRONMENT | os.environ,
             )  # fmt: skip
-            self._worker = Connection(ours.detach())
+            self._worker = Connection(near_end.detach())
         if self._stopped:  # whoever stopped us may have looked before there was a process
             self._process.kill()
 

@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from cachetools import LRUCache
 
@@ -65,7 +65,8 @@ RELATION_BYTES = 512  # of two objects: a pydantic model with its dictionary
 NUMBER_BYTES = 32  # of a number of a question: a Python float and the place in its tuple
 
 
-Kept = Answer | Objects | ViewMask | Segmentation | Catalogue | SceneTree
+Cached = Answer | Objects | ViewMask | Segmentation | Catalogue | SceneTree
+K = TypeVar("K", bound=Cached)
 
 
 class Answers:
@@ -78,8 +79,8 @@ class Answers:
 
     def __init__(self, *, scenes: int, cache_bytes: int) -> None:
         self._scenes = LRUCache[str, Scene](scenes)
-        most = max(1, cache_bytes)
-        self._cache = LRUCache[object, Kept](most, lambda made: min(bytes_of(made), most))
+        limit = max(1, cache_bytes)
+        self._cache = LRUCache[object, Cached](limit, lambda value: min(bytes_of(value), limit))
         self._encoders: dict[str, tuple[object, TextEncoder]] = {}  # spec -> version of its file, encoder
         self._opening = threading.RLock()  # of encoders, which the warm-up opens too
         self._warm: set[Kernel] = set()  # kernels of splats whose compiled code is loaded, or being loaded
@@ -135,28 +136,30 @@ class Answers:
         """Answer the first question, and more to its lift as far as one pass goes; errors wait for their turn."""
         scene = self._scene(requests[0])
         splats = len(scene.features)
-        room = min(
+        capacity = min(
             PRODUCT_BYTES // (COSINE_BYTES * splats), self._cache.maxsize // (ANSWER_BYTES * splats + ENTRY_BYTES)
         )
-        asked: dict[str, Any] = {}
+        questions: dict[str, Any] = {}
         for request in requests:
-            same = all(request.get(name) == requests[0].get(name) for name in ("lift", "selections"))
-            if not same or "query" not in request or _key(request) in self._cache:
+            is_alike = all(request.get(name) == requests[0].get(name) for name in ("lift", "selections"))
+            if not is_alike or "query" not in request or _key(request) in self._cache:
                 continue
             with contextlib.suppress(SplatliftError):
-                found = self._question(request)
-                if not asked or len(found.rows) <= room:
-                    asked[_key(request)] = found
-                    room -= len(found.rows)
-        if asked:
-            for key, answer in zip(asked, scene.answer(list(asked.values())), strict=True):
+                question = self._question(request)
+                if not questions or len(question.rows) <= capacity:
+                    questions[_key(request)] = question
+                    capacity -= len(question.rows)
+        if questions:
+            for key, answer in zip(questions, scene.answer(list(questions.values())), strict=True):
                 self._cache[key] = answer
 
-    def _kept(self, key: object, make: Callable[[], Kept]) -> Kept:
-        """What the cache has of a key, made where it has nothing."""
+    def _cached(self, kind: type[K], key: object, make: Callable[[], K]) -> K:
+        """The value that the cache has of a key, made where it has none."""
         if key not in self._cache:
             self._cache[key] = make()
-        return self._cache[key]
+        value = self._cache[key]
+        assert isinstance(value, kind)
+        return value
 
     def _scene(self, request: dict[str, Any]) -> Scene:
         if request["lift"] not in self._scenes:
@@ -184,10 +187,10 @@ class Answers:
 
     def _encoder(self, spec: str, version: object) -> TextEncoder:
         with self._opening:
-            known = self._encoders.get(spec)
-            if known is None or known[0] != version:  # a table that the operator replaced is another table
-                known = self._encoders[spec] = (version, open_encoder(spec, remembers=True))
-            return known[1]
+            entry = self._encoders.get(spec)
+            if entry is None or entry[0] != version:  # a table that the operator replaced is another table
+                entry = self._encoders[spec] = (version, open_encoder(spec, remembers=True))
+            return entry[1]
 
     def _question(self, request: dict[str, Any]) -> Any:
         spec = request["encoder"]
@@ -196,9 +199,7 @@ class Answers:
         return self._scene(request).prepare(query, encoder)
 
     def _answer(self, request: dict[str, Any]) -> Answer:
-        made = self._kept(_key(request), lambda: self._scene(request).answer([self._question(request)])[0])
-        assert isinstance(made, Answer)
-        return made
+        return self._cached(Answer, _key(request), lambda: self._scene(request).answer([self._question(request)])[0])
 
     def _look(self, request: dict[str, Any]) -> ViewMask:
         answer = self._answer(request)
@@ -208,16 +209,12 @@ class Answers:
             return scene.look(answer, view, find_objects=lambda: self._grouped(request))
 
         seen_from = json.dumps(request.get("camera", request.get("view")))
-        made = self._kept((_key(request), "view", seen_from), make)
-        assert isinstance(made, ViewMask)
-        return made
+        return self._cached(ViewMask, (_key(request), "view", seen_from), make)
 
     def _grouped(self, request: dict[str, Any]) -> Objects:
         answer = self._answer(request)
         key = (_key(request), "objects", json.dumps(request.get("world")))
-        made = self._kept(key, lambda: self._scene(request).objects(answer))
-        assert isinstance(made, Objects)
-        return made
+        return self._cached(Objects, key, lambda: self._scene(request).objects(answer))
 
     def _query(self, request: dict[str, Any]) -> Frame:
         scene, answer = self._scene(request), self._answer(request)
@@ -226,27 +223,27 @@ class Answers:
         return Frame(scene.locate(answer, request["top"]).model_dump(mode="json"))
 
     def _objects(self, request: dict[str, Any]) -> Frame:
-        found = self._answer(request).model_dump(mode="json", include=set(Found.model_fields))
-        return Frame(found | self._grouped(request).model_dump(mode="json"))
+        document = self._answer(request).model_dump(mode="json", include=set(Found.model_fields))
+        return Frame(document | self._grouped(request).model_dump(mode="json"))
 
     def _file(self, request: dict[str, Any]) -> Frame:
         """A file of an answer, of named splats, of an object or of the scene."""
-        scene, operation, what = self._scene(request), request["operation"], request.get("what", "")
+        scene, operation, kind_asked = self._scene(request), request["operation"], request.get("what", "")
         view = view_of(request) if "view" in request or "camera" in request else None
         if operation == "layer":
-            blocks = scene.blocks_of(scene.colours(what))
+            blocks = scene.blocks_of(scene.colours(kind_asked))
         elif operation == "region_mask":
             mask = scene.region_mask(request["view"], request["level"], request["region"])
             blocks = scene.blocks_of(mask, "mask")
         elif operation in WORD_FILES:
             blocks = scene.blocks_of(self._named(request), WORD_FILES[operation], view=view)
         elif "query" in request:
-            seen = self._look(request) if operation in ("mask", "attention") else None
-            kind = SPLATS_FILES[what] if operation == "splats" else operation
-            blocks = scene.blocks_of(self._answer(request), kind, view=view, seen=seen)
+            view_mask = self._look(request) if operation in ("mask", "attention") else None
+            kind = SPLATS_FILES[kind_asked] if operation == "splats" else operation
+            blocks = scene.blocks_of(self._answer(request), kind, view=view, seen=view_mask)
         else:  # one of its objects, its splats or a picture of it
             blocks = scene.blocks_of(
-                request.get("object"), "" if operation == "splats" else what or "splats", view=view
+                request.get("object"), "" if operation == "splats" else kind_asked or "splats", view=view
             )
         if operation not in ("splats", "scene"):
             return _small_file(b"".join(blocks), request)
@@ -256,35 +253,36 @@ class Answers:
     def _views(self, request: dict[str, Any]) -> Frame:
         cameras = self._scene(request).cameras
         if "view" in request:
-            found = cameras_of_views([request["view"]], cameras).values()
-            return Frame({"views": [_camera(cameras[name], name) for name in found], "more": False})
+            names_found = cameras_of_views([request["view"]], cameras).values()
+            return Frame({"views": [_camera(cameras[name], name) for name in names_found], "more": False})
         first, count = request["first"], request["count"]
         names = list(itertools.islice(cameras, first, first + count))
-        more = first + count < len(cameras)
-        return Frame({"views": [_camera(cameras[name], name) for name in names], "more": more})
+        has_more = first + count < len(cameras)
+        return Frame({"views": [_camera(cameras[name], name) for name in names], "more": has_more})
+
+    def _text_encoder(self, request: dict[str, Any]) -> TextEncoder:
+        lift_table = self._scene(request).table if request["encoder"] == OWN_WORDS else None
+        return lift_table or self._encoder(request["encoder"], request["encoder_version"])
 
     def _words(self, request: dict[str, Any]) -> tuple[list[str], TextEncoder]:
         """The words of a request, all of its table where it names none."""
-        own = self._scene(request).table if request["encoder"] == OWN_WORDS else None
-        encoder = own or self._encoder(request["encoder"], request["encoder_version"])
+        encoder = self._text_encoder(request)
         return self._scene(request).words(encoder) if request["words"] is None else request["words"], encoder
 
     def _named(self, request: dict[str, Any]) -> Segmentation:
         def make() -> Segmentation:
             words, encoder = self._words(request)
-            most = max(1, WORD_COSINES // len(self._scene(request).features))
-            if len(words) > most:
-                expected, got = f"at most {most} words for the splats of this lift", f"{len(words)} of them"
+            limit = max(1, WORD_COSINES // len(self._scene(request).features))
+            if len(words) > limit:
+                expected, got = f"at most {limit} words for the splats of this lift", f"{len(words)} of them"
                 raise InvalidQuery("words", expected=expected, got=got, hint="ask for some of them at a time")
             return self._scene(request).segment(words, encoder=encoder)
 
-        made = self._kept((_key(request), "words"), make)
-        assert isinstance(made, Segmentation)
-        return made
+        return self._cached(Segmentation, (_key(request), "words"), make)
 
     def _segment(self, request: dict[str, Any]) -> Frame:
-        told = self._named(request).summary.model_dump(mode="json")
-        return _json(request, told, "found", told.pop("found"))
+        document = self._named(request).summary.model_dump(mode="json")
+        return _json(request, document, "found", document.pop("found"))
 
     def _what(self, request: dict[str, Any]) -> Frame:
         words, encoder = self._words(request)
@@ -293,30 +291,28 @@ class Answers:
 
     def _askable(self, request: dict[str, Any]) -> Frame:
         scene = self._scene(request)
-        own = scene.table if request["encoder"] == OWN_WORDS else None
-        encoder = own or self._encoder(request["encoder"], request["encoder_version"])
+        encoder = self._text_encoder(request)
         return Frame(scene.askable(request["text"], request["count"], encoder=encoder).model_dump(mode="json"))
 
     def _catalogue(self, request: dict[str, Any]) -> Frame:
         decides = (request.get(name) for name in ("lift", "encoder", "encoder_version", "world"))
         key = ("catalogue", json.dumps([*decides]))
-        found = self._kept(key, lambda: self._named_objects(request))
-        assert isinstance(found, Catalogue)
+        catalogue = self._cached(Catalogue, key, lambda: self._named_objects(request))
         first, last = request["first"], request["first"] + request["count"]
         if request["splat"] is not None:
             first, last = self._object_of(request)
-        given = {thing: {"name": name, "hidden": hidden} for thing, (name, hidden) in request["things"]}
-        things = (
-            one.model_dump(mode="json") | {"hidden": False} | _given(given.get(one.id))
-            for one in found.listed(first, last, features=request["means"])
+        labels = {number: {"name": name, "hidden": is_hidden} for number, (name, is_hidden) in request["things"]}
+        objects = (
+            item.model_dump(mode="json") | {"hidden": False} | _given(labels.get(item.id))
+            for item in catalogue.listed(first, last, features=request["means"])
         )
-        after = last if last < len(found.objects) else None
-        told = {"explanation": found.explanation, "count": len(found.objects), "next": after}
+        after = last if last < len(catalogue.objects) else None
+        document = {"explanation": catalogue.explanation, "count": len(catalogue.objects), "next": after}
         return _json(
             request,
-            told | {"world": found.world.model_dump(mode="json"), "unit": found.world.unit},
+            document | {"world": catalogue.world.model_dump(mode="json"), "unit": catalogue.world.unit},
             "objects",
-            things,
+            objects,
         )
 
     def _object_of(self, request: dict[str, Any]) -> tuple[int, int]:
@@ -331,19 +327,18 @@ class Answers:
             return self._named_tree(request, relations=request["relations"], up=_direction(request["up"]))
 
         decides = (request.get(name) for name in ("lift", "encoder", "encoder_version", "relations", "up", "world"))
-        found = self._kept(("tree", json.dumps([*decides])), make)
-        assert isinstance(found, SceneTree)
+        tree = self._cached(SceneTree, ("tree", json.dumps([*decides])), make)
         first, last = request["first"], request["first"] + request["count"]
-        nodes = found.nodes[first:last]
-        listed = {one.id for one in nodes}
-        relations = tuple(one for one in found.relations if one.node in listed)
-        page = found.model_copy(update={"nodes": nodes, "relations": relations})
-        told = page.model_dump(mode="json", exclude={"nodes"}) | {"next": last if last < found.count else None}
-        return _json(request, told, "nodes", (one.model_dump(mode="json") for one in page.nodes))
+        nodes = tree.nodes[first:last]
+        ids = {item.id for item in nodes}
+        relations = tuple(item for item in tree.relations if item.node in ids)
+        page = tree.model_copy(update={"nodes": nodes, "relations": relations})
+        document = page.model_dump(mode="json", exclude={"nodes"}) | {"next": last if last < tree.count else None}
+        return _json(request, document, "nodes", (item.model_dump(mode="json") for item in page.nodes))
 
     def _regions(self, request: dict[str, Any]) -> Frame:
-        found = self._scene(request).regions(request["view"], request["x"], request["y"])
-        return Frame({"regions": [one.model_dump(mode="json") for one in found]})
+        regions = self._scene(request).regions(request["view"], request["x"], request["y"])
+        return Frame({"regions": [region.model_dump(mode="json") for region in regions]})
 
     def _device(self, request: dict[str, Any]) -> Frame:
         try:
@@ -359,8 +354,8 @@ class Answers:
         edit = Edit.model_validate(request["edit"])
         selection = _selected(scene, EDITED, request["before"]).edit(edit, answer)
         count, box = int(selection.splats.sum()), selection.box
-        told = None if box is None else {"low": box.low, "high": box.high}
-        return Frame({"edit": edit.described(), "count": count, "box": told}, zlib.compress(selection.bits))
+        corners = None if box is None else {"low": box.low, "high": box.high}
+        return Frame({"edit": edit.described(), "count": count, "box": corners}, zlib.compress(selection.bits))
 
     def _export(self, request: dict[str, Any]) -> Frame:
         """A ZIP of answers, of words or of things, in the draft."""
@@ -385,13 +380,15 @@ class Answers:
 
     def _named_things(self, request: dict[str, Any]) -> Catalogue | SceneTree:
         """The objects of a lift by the names that they were given, with their parts where it has any."""
-        given = {thing: {"name": name} for thing, (name, _) in request["things"] if name is not None}
+        labels = {number: {"name": name} for number, (name, _) in request["things"] if name is not None}
         if self._scene(request).node is None:
-            found = self._named_objects(request)
-            return replace(found, objects=tuple(one.model_copy(update=given.get(one.id)) for one in found.objects))
+            catalogue = self._named_objects(request)
+            return replace(
+                catalogue, objects=tuple(item.model_copy(update=labels.get(item.id)) for item in catalogue.objects)
+            )
         tree = self._named_tree(request)
         return tree.model_copy(
-            update={"nodes": tuple(one.model_copy(update=given.get(one.id)) for one in tree.nodes)}
+            update={"nodes": tuple(item.model_copy(update=labels.get(item.id)) for item in tree.nodes)}
         )
 
     def _count_objects(self, request: dict[str, Any]) -> Frame:
@@ -421,11 +418,11 @@ def _direction(up: str | None) -> tuple[float, float, float] | Literal["cameras"
     return x, y, z
 
 
-def _given(thing: dict[str, Any] | None) -> dict[str, Any]:
+def _given(label: dict[str, Any] | None) -> dict[str, Any]:
     """What somebody gave an object: whether it is hidden, and a name, which no score belongs to."""
-    if thing is None or thing["name"] is None:
-        return {} if thing is None else {"hidden": thing["hidden"]}
-    return thing | {"score": None}
+    if label is None or label["name"] is None:
+        return {} if label is None else {"hidden": label["hidden"]}
+    return label | {"score": None}
 
 
 def _small_file(content: bytes, request: dict[str, Any]) -> Frame:
@@ -436,10 +433,10 @@ def _small_file(content: bytes, request: dict[str, Any]) -> Frame:
     return Frame({})
 
 
-def _json(request: dict[str, Any], told: dict[str, Any], name: str, items: Iterable[dict[str, Any]]) -> Frame:
+def _json(request: dict[str, Any], document: dict[str, Any], name: str, items: Iterable[dict[str, Any]]) -> Frame:
     """A JSON object with a list of many, whole: the HTTP process passes it on, through the pipe or in the draft."""
     dumps = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode
-    head = dumps(request["head"] | told).removesuffix("}")
+    head = dumps(request["head"] | document).removesuffix("}")
     return _small_file(f"{head},{dumps(name)}:[{','.join(map(dumps, items))}]}}".encode(), request)
 
 
@@ -462,24 +459,26 @@ def write_draft(blocks: Iterable[bytes], draft: Path) -> None:
 def _key(request: dict[str, Any]) -> str:
     """What an answer is kept by: a digest, as a question may be as long as a body."""
     names = ("lift", "encoder", "encoder_version", "query" if "query" in request else "words")
-    told = [*(request[name] for name in names), request.get("selections")]
-    return hashlib.sha256(json.dumps(told).encode()).hexdigest()
+    values = [*(request[name] for name in names), request.get("selections")]
+    return hashlib.sha256(json.dumps(values).encode()).hexdigest()
 
 
-def bytes_of(made: Kept) -> int:
+def bytes_of(value: Cached) -> int:
     """The memory that an answer, with its question, the objects of one, a view of one or named splats take."""
-    if isinstance(made, Answer):
-        tensors = made.scores.nbytes + made.seen.nbytes + made.selected.nbytes
-        return ENTRY_BYTES + tensors + sum(map(_term_bytes, made.query.terms))
-    if isinstance(made, Objects):
-        return ENTRY_BYTES + made.numbers.nbytes
-    if isinstance(made, Segmentation):
-        return ENTRY_BYTES + made.labels.nbytes + made.margin.nbytes + sum(len(word.encode()) for word in made.words)
-    if isinstance(made, Catalogue):
-        return ENTRY_BYTES * (1 + len(made.objects)) + made.features.nbytes
-    if isinstance(made, SceneTree):
-        return ENTRY_BYTES * (1 + len(made.nodes)) + RELATION_BYTES * len(made.relations)
-    return ENTRY_BYTES + made.attention.nbytes + made.row_sums.nbytes + made.mask.nbytes
+    if isinstance(value, Answer):
+        tensors = value.scores.nbytes + value.seen.nbytes + value.selected.nbytes
+        return ENTRY_BYTES + tensors + sum(map(_term_bytes, value.query.terms))
+    if isinstance(value, Objects):
+        return ENTRY_BYTES + value.numbers.nbytes
+    if isinstance(value, Segmentation):
+        return (
+            ENTRY_BYTES + value.labels.nbytes + value.margin.nbytes + sum(len(word.encode()) for word in value.words)
+        )
+    if isinstance(value, Catalogue):
+        return ENTRY_BYTES * (1 + len(value.objects)) + value.features.nbytes
+    if isinstance(value, SceneTree):
+        return ENTRY_BYTES * (1 + len(value.nodes)) + RELATION_BYTES * len(value.relations)
+    return ENTRY_BYTES + value.attention.nbytes + value.row_sums.nbytes + value.mask.nbytes
 
 
 def _term_bytes(term: Any) -> int:

@@ -43,21 +43,21 @@ LET_GO = 16  # times the limit of a body: an upload sent to the wrong route ends
 # Async: a sync dependency waits for a thread of the pool, and every route with it.
 async def _known_only(request: Request) -> None:
     """Refuse query parameters that the route does not know: passed over, they would seem to have been heard."""
-    given = request.query_params
-    if not given:
+    parameters = request.query_params
+    if not parameters:
         return
     route: APIRoute = request.scope["route"]
-    more = (route.openapi_extra or {}).get("parameters", ())
-    described = {parameter["name"]: parameter for parameter in more if parameter["in"] == "query"}
-    known = [*_names(route), *described]
-    lists = {name for name, parameter in described.items() if parameter["schema"].get("type") == "array"}
-    for name in given:
-        if name not in known:
+    documented = (route.openapi_extra or {}).get("parameters", ())
+    by_name = {parameter["name"]: parameter for parameter in documented if parameter["in"] == "query"}
+    names = [*_names(route), *by_name]
+    lists = {name for name, parameter in by_name.items() if parameter["schema"].get("type") == "array"}
+    for name in parameters:
+        if name not in names:
             raise InvalidRequest(
-                name[:NAME_CHARACTERS], expected=f"one of {', '.join(known)}" if known else "no parameters",
+                name[:NAME_CHARACTERS], expected=f"one of {', '.join(names)}" if names else "no parameters",
                 got=repr(name[:NAME_CHARACTERS]), hint="in the query of the request",
             )  # fmt: skip
-        if len(values := given.getlist(name)) > 1 and name not in lists:  # the last would win
+        if len(values := parameters.getlist(name)) > 1 and name not in lists:  # the last would win
             raise InvalidRequest(
                 name, expected="one value", got=f"{len(values)} of them", hint="in the query of the request"
             )
@@ -69,9 +69,9 @@ KnownParameters = Depends(_known_only)
 def _names(route: APIRoute) -> Iterator[str]:
     """The query parameters that a route declares, one by one or as the fields of a model."""
     for field in route.dependant.query_params:
-        declared = field.field_info.annotation
-        if isinstance(declared, type) and issubclass(declared, BaseModel):
-            yield from declared.model_fields
+        annotation = field.field_info.annotation
+        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+            yield from annotation.model_fields
         else:
             yield field.alias
 
@@ -139,15 +139,15 @@ class _BoundedRequest(Request):
             UnreadableBody: it cannot be parsed as JSON.
         """
         require_plain(self.headers.getlist("content-encoding"))
-        deps, content, received = self.app.state.deps, bytearray(), 0
+        deps, content, count = self.app.state.deps, bytearray(), 0
         limit = deps.settings.max_body_bytes
         async for chunk in self.stream():
-            received += len(chunk)
-            if received <= limit:
+            count += len(chunk)
+            if count <= limit:
                 content += chunk
-            elif received > LET_GO * limit:
+            elif count > LET_GO * limit:
                 raise _too_large(limit, CLOSE)
-        if received > limit:
+        if count > limit:
             raise _too_large(limit)
         self._begin, self._value = bytes(content[:NAME_CHARACTERS]), None
         if content and is_json(self.headers):  # else the framework refuses it unread
@@ -250,7 +250,7 @@ class Parameters(Generic[M]):
         return {"parameters": parameters}
 
 
-def both(router: APIRouter, path: str, parameters: Parameters[Any], **route: Any) -> Callable[[F], F]:
+def get_and_post(router: APIRouter, path: str, parameters: Parameters[Any], **route: Any) -> Callable[[F], F]:
     """Register an endpoint for a GET by parameters, and for a POST of the same as JSON: its argument ``asked``."""
 
     def register(endpoint: F) -> F:
@@ -272,8 +272,9 @@ def _reading(endpoint: F, source: Any) -> F:
         return endpoint(**arguments)
 
     signature = inspect.signature(endpoint, eval_str=True)
-    declared = [
-        one.replace(annotation=source) if one.name == "asked" else one for one in signature.parameters.values()
+    parameters = [
+        parameter.replace(annotation=source) if parameter.name == "asked" else parameter
+        for parameter in signature.parameters.values()
     ]
-    reading.__signature__ = signature.replace(parameters=declared)  # pyright: ignore[reportAttributeAccessIssue]
+    reading.__signature__ = signature.replace(parameters=parameters)  # pyright: ignore[reportAttributeAccessIssue]
     return reading  # pyright: ignore[reportReturnType]

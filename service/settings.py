@@ -177,10 +177,10 @@ def variables() -> Iterator[tuple[str, str, str]]:
     for name, field in ServiceSettings.model_fields.items():
         default = field.get_default(call_default_factory=True)
         unit, size = ("GiB", GiB) if name.endswith("bytes") and default and default % GiB == 0 else ("MiB", MiB)
-        shown = "not set" if default in (None, ()) else str(default)
+        text = "not set" if default in (None, ()) else str(default)
         if name.endswith("bytes") and default and default % size == 0:
-            shown = f"{default} ({default // size} {unit})"
-        yield f"SPLATLIFT_{name.upper()}", shown, field.description or ""
+            text = f"{default} ({default // size} {unit})"
+        yield f"SPLATLIFT_{name.upper()}", text, field.description or ""
 
 
 def read_settings(**values: Any) -> ServiceSettings:
@@ -234,10 +234,10 @@ def encoder_spec(settings: ServiceSettings, text_space: str, asked: str | None) 
         return OWN_WORDS
     if asked not in (None, text_space):
         if asked not in settings.text_spaces:
-            known = ", ".join(["default", *sorted(settings.text_spaces)])
+            names = ", ".join(["default", *sorted(settings.text_spaces)])
             raise InvalidRequest(
                 "encoder", expected="the name of a text space that the operator set up", got=repr(asked),
-                hint=f"known here: {known}",
+                hint=f"known here: {names}",
             )  # fmt: skip
         return settings.text_spaces[asked]
     if text_space in settings.text_spaces:
@@ -289,9 +289,9 @@ def require_encoder_files(settings: ServiceSettings) -> None:
         Misconfigured: there is no such encoder, a file is missing or does not open, or a table is none. The setting
             is named.
     """
-    named = {"encoder": settings.encoder}
-    named |= {f"text_spaces, {space!r}": spec for space, spec in settings.text_spaces.items()}
-    for argument, spec in named.items():
+    specs = {"encoder": settings.encoder}
+    specs |= {f"text_spaces, {space!r}": spec for space, spec in settings.text_spaces.items()}
+    for argument, spec in specs.items():
         try:
             check_encoder(spec)
         except InvalidInput as error:

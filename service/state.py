@@ -56,13 +56,13 @@ class Stopping:
         Args:
             hurried: whether the notice is to end now; asked a few times a second.
         """
-        begun = time.monotonic()
+        start = time.monotonic()
         self.begun = True
         log.info("stopping: no new work, running jobs go back in line")
         self._streams.close()
         await anyio.to_thread.run_sync(self._runner.stop)
-        while not hurried() and (left := self._notice - (time.monotonic() - begun)) > 0:
-            await anyio.sleep(min(left, HURRY_SECONDS))
+        while not hurried() and (remaining := self._notice - (time.monotonic() - start)) > 0:
+            await anyio.sleep(min(remaining, HURRY_SECONDS))
 
 
 class Readiness:
@@ -95,9 +95,9 @@ class Readiness:
         """
         if self._stopping.begun:
             raise NotReady("stopping", expected="a service that goes on", got="one that stops")
-        found = self._found if self._fresh() else await self._look_in_time()
-        if found:  # why, is for the log: it may name files of the server
-            failed = ", ".join(found)
+        failures = self._found if self._fresh() else await self._look_in_time()
+        if failures:  # why, is for the log: it may name files of the server
+            failed = ", ".join(failures)
             raise NotReady(failed, expected="checks that pass", got=f"{failed} failed", hint="the log says why")
 
     async def _look_in_time(self) -> dict[str, str]:
@@ -108,13 +108,13 @@ class Readiness:
 
     def _look(self) -> dict[str, str]:
         if not self._fresh():  # the one before us may just have looked
-            found = {}
+            results = {}
             for name, check in self._checks.items():
                 self._looking_at = name
-                found[name] = check()
-            self._found = {name: why for name, why in found.items() if why is not None}
-            for name, why in self._found.items():
-                log.warning("the check of the %s failed: %s", name, why)
+                results[name] = check()
+            self._found = {name: reason for name, reason in results.items() if reason is not None}
+            for name, reason in self._found.items():
+                log.warning("the check of the %s failed: %s", name, reason)
             self._looked = time.monotonic()
         return self._found
 

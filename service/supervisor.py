@@ -44,10 +44,7 @@ DRAFTS = {JobKind.LIFT: ".safetensors", JobKind.TRADEOFF: ".png"}  # what a chil
 GONE_SECONDS = 3.0  # the kernel takes a moment to end a group
 LONGEST = 8192  # bytes of a record of the log; what is longer without an end of line comes in pieces
 MARK = "SPLATLIFT_JOB_PROCESS"  # a job's processes carry its id under this name, for who looks at a machine
-TRANSIENT_ERRORS = (
-    OSError,
-    sqlite3.OperationalError,
-)  # of the server: a full disk, a locked database
+TRANSIENT_ERRORS = (OSError, sqlite3.OperationalError)  # of the server: a full disk, a locked database
 
 log = logging.getLogger(__name__)
 printed = logging.getLogger("service.jobs.process")  # what their processes print
@@ -154,21 +151,21 @@ class Supervisor:
 
     def _run(self, job: JobRecord) -> bool:
         """Run a job; whether its attempt came to an end of its own."""
-        begun, attempts, kept_up = time.monotonic(), self._store.jobs, True
+        start, attempts, kept_up = time.monotonic(), self._store.jobs, True
         with working_for(job.request_id):
             log.info("job %s, attempt %d begins", job.id, job.attempt)
             try:
                 Attempt(job, self._store, self._limits, self._command, self._clock).run(self._stopping)
             except TRANSIENT_ERRORS as error:
                 log.exception("job %s could not be kept up", job.id)
-                kept_up, why = False, f"the server could not keep it up: {error}"
-                retry_until_committed(lambda: attempts.release(job.id, job.attempt, why), self._stopping)
+                kept_up, reason = False, f"the server could not keep it up: {error}"
+                retry_until_committed(lambda: attempts.release(job.id, job.attempt, reason), self._stopping)
             except Exception as error:
                 log.exception("job %s could not be run", job.id)
                 unforeseen = Crashed("job", expected="a process that runs", got="an error of the server")
                 fault = fault_of(error if isinstance(error, SplatliftError) else unforeseen)
                 retry_until_committed(lambda: attempts.fail(job.id, job.attempt, fault), self._stopping)
-            outcome, seconds = attempts.state(SERVICE, job.id) or "deleted", time.monotonic() - begun
+            outcome, seconds = attempts.state(SERVICE, job.id) or "deleted", time.monotonic() - start
             log.info("job %s, attempt %d: %s after %.3f s", job.id, job.attempt, outcome, seconds)
         if self._callback is not None:
             self._callback(outcome, seconds)
@@ -206,10 +203,10 @@ class Lease:
             self.renew()  # it was the server that slept: the child has a lease from now on
         self._looked = now
         if now - self._alive > self._seconds / LOOKS:
-            spent = processor_seconds()
-            if self._spent is None or spent < self._spent:  # less when one that it had started has ended
-                self._spent = spent
-            elif spent - self._spent > BUSY_SECONDS:
+            seconds = processor_seconds()
+            if self._spent is None or seconds < self._spent:  # less when one that it had started has ended
+                self._spent = seconds
+            elif seconds - self._spent > BUSY_SECONDS:
                 self.renew()
         return now - self._alive > self._seconds
 
@@ -292,10 +289,10 @@ class Attempt:
             self._log(f"attempt {self._job.attempt} begins{self._request()}{self._earlier_work()}")
             command, environment = [*self._command, str(order)], {"TMPDIR": str(scratch)}
             with JobProcess(command, environment, self._job.id) as process:
-                why = self._follow(process, stopping)
+                reason = self._follow(process, stopping)
                 status = process.end()
             retry_until_committed(
-                lambda: self._settle(draft, why or _describe_exit(status), stopping.is_set()), stopping
+                lambda: self._settle(draft, reason or _describe_exit(status), stopping.is_set()), stopping
             )
         if self._store.jobs.state(SERVICE, self._job.id) in ENDED:
             files.forget_work(self._job.id)
@@ -303,15 +300,15 @@ class Attempt:
     def _follow(self, process: JobProcess, stopping: threading.Event) -> str | SplatliftError | None:
         """Listen until the child has ended or must end; why it must, None when it ended by itself."""
         while True:
-            ended = process.ended()  # before listening, so that its last words are heard
-            for message in process.listen(0 if ended else TICK_SECONDS):
+            has_ended = process.ended()  # before listening, so that its last words are heard
+            for message in process.listen(0 if has_ended else TICK_SECONDS):
                 self._take(message)
-            if ended:
+            if has_ended:
                 return None
             self._notes.write()
-            why = self._why_end(process)
-            if why is not None or stopping.is_set():
-                return why or "the server stops"
+            reason = self._why_end(process)
+            if reason is not None or stopping.is_set():
+                return reason or "the server stops"
 
     def _take(self, message: dict[str, Any]) -> None:
         self._lease.renew()
@@ -349,7 +346,7 @@ class Attempt:
         except TRANSIENT_ERRORS:  # nobody can have canceled it in a database that cannot be read
             return True
 
-    def _settle(self, draft: Path, why: str | SplatliftError, stopping: bool) -> None:
+    def _settle(self, draft: Path, reason: str | SplatliftError, stopping: bool) -> None:
         """No process of this attempt is left; what becomes true now stays true."""
         self._notes.flush()
         job, attempts, answer = self._job, self._store.jobs, self._answer or {"event": "none"}
@@ -360,22 +357,22 @@ class Attempt:
             attempts.lose(job.id, job.attempt, answer["fault"]["got"], answer["fault"])
         elif answer["event"] == "fault":
             attempts.fail(job.id, job.attempt, answer["fault"])
-        elif isinstance(why, SplatliftError):
-            attempts.fail(job.id, job.attempt, fault_of(why))
+        elif isinstance(reason, SplatliftError):
+            attempts.fail(job.id, job.attempt, fault_of(reason))
         elif stopping:
             attempts.release(job.id, job.attempt, "the server stops")
         else:
-            log.warning("job %s, attempt %d: %s", job.id, job.attempt, why)
-            attempts.lose(job.id, job.attempt, why)
+            log.warning("job %s, attempt %d: %s", job.id, job.attempt, reason)
+            attempts.lose(job.id, job.attempt, reason)
 
     def _keep(self, draft: Path, answer: dict[str, Any]) -> bool:
         """Make the result true, and the job succeeded with it; False when the attempt may not."""
-        job, kept = self._job, self._store
+        job, store = self._job, self._store
         if job.kind is JobKind.TRADEOFF:
-            found = FinishedTradeoff(answer["document"], answer["page"], draft.read_bytes())
-            return kept.tradeoffs.finish(job.id, job.attempt, found)
-        made = FinishedLift(draft, answer["sha256"], answer["count"], answer["channels"], answer["metadata"])
-        return kept.lifts.finish(job.id, job.attempt, made)
+            tradeoff = FinishedTradeoff(answer["document"], answer["page"], draft.read_bytes())
+            return store.tradeoffs.finish(job.id, job.attempt, tradeoff)
+        lift = FinishedLift(draft, answer["sha256"], answer["count"], answer["channels"], answer["metadata"])
+        return store.lifts.finish(job.id, job.attempt, lift)
 
     def _log(self, text: str) -> None:
         self._notes.add(EventKind.LOG, text)
@@ -384,13 +381,13 @@ class Attempt:
         return f", asked for by request {self._job.request_id}" if self._job.request_id else ""
 
     def _earlier_work(self) -> str:
-        kept = sum(1 for _ in self._store.files.work(self._job.id).rglob("*.safetensors"))
-        return f", {kept} files of earlier work are kept" if kept else ""
+        count = sum(1 for _ in self._store.files.work(self._job.id).rglob("*.safetensors"))
+        return f", {count} files of earlier work are kept" if count else ""
 
     def _order(self, draft: Path) -> dict[str, Any]:
-        job, files, kept = self._job, self._store.files, self._store.assets
-        assets = [kept.get(SERVICE, name) for name in (job.splats, job.cameras, *job.features)]
-        labels = [kept.get(SERVICE, *named) for named in labels_of(job.parameters)]
+        job, files, store = self._job, self._store.files, self._store.assets
+        assets = [store.get(SERVICE, name) for name in (job.splats, job.cameras, *job.features)]
+        labels = [store.get(SERVICE, *label) for label in labels_of(job.parameters)]
         return {
             "kind": job.kind,
             "parameters": job.parameters,
@@ -426,14 +423,14 @@ class StagePace:
     def progress(self, message: dict[str, Any]) -> dict[str, Any]:
         """The message as `service.models.Progress` has it."""
         now = time.monotonic()
-        done, total = message["done"], message["total"]
+        completed, total = message["done"], message["total"]
         if self.begins(message):
-            self._stage, self._begin, self._done_at_begin = message["stage"], now, done
-        advanced = done - self._done_at_begin
-        eta = (now - self._begin) / advanced * (total - done) if advanced > 0 else None
+            self._stage, self._begin, self._done_at_begin = message["stage"], now, completed
+        advanced = completed - self._done_at_begin
+        eta = (now - self._begin) / advanced * (total - completed) if advanced > 0 else None
         return {
             "stage": self._stage,
-            "done": done,
+            "done": completed,
             "total": total,
             "unit": message["unit"],
             "eta_s": None if eta is None else round(eta, 2),

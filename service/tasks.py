@@ -48,8 +48,8 @@ log = logging.getLogger(__name__)
 
 def _described(path: Path, kind: AssetKind) -> dict[str, Any]:
     """What a file of that kind holds, read whole; of none that may run code as it is read."""
-    found = inspect_file(path, kind, trusted=False)
-    return {name: value for name, value in found.items() if name not in ("kind", "bytes")}
+    description = inspect_file(path, kind, trusted=False)
+    return {name: value for name, value in description.items() if name not in ("kind", "bytes")}
 
 
 def check_splats(path: Path) -> dict[str, Any]:
@@ -59,8 +59,8 @@ def check_splats(path: Path) -> dict[str, Any]:
 
 def check_cameras(path: Path) -> dict[str, Any]:
     """Read and describe every camera."""
-    found = _described(path, AssetKind.CAMERAS)
-    return {"suffix": ".zip" if zipfile.is_zipfile(path) else ".json", "found": found}
+    description = _described(path, AssetKind.CAMERAS)
+    return {"suffix": ".zip" if zipfile.is_zipfile(path) else ".json", "found": description}
 
 
 def require_texts(argument: str, texts: Sequence[str], longest: int, error: type[InvalidInput]) -> None:
@@ -72,9 +72,9 @@ def require_texts(argument: str, texts: Sequence[str], longest: int, error: type
                 got=f"{len(text)}: {text[:40]!r}..." if text else "an empty one",
                 hint="name each image, without folders where that is enough" if argument == "view name" else "",
             )  # fmt: skip
-    if (together := sum(map(len, texts))) > models.FILE_CHARACTERS:
-        most = f"at most {models.FILE_CHARACTERS} characters of all together"
-        raise error(argument, expected=most, got=f"{together} in {len(texts)}", hint="several files hold more")
+    if (total := sum(map(len, texts))) > models.FILE_CHARACTERS:
+        limit = f"at most {models.FILE_CHARACTERS} characters of all together"
+        raise error(argument, expected=limit, got=f"{total} in {len(texts)}", hint="several files hold more")
 
 
 def check_features(path: Path) -> dict[str, Any]:
@@ -82,9 +82,9 @@ def check_features(path: Path) -> dict[str, Any]:
     packs = read_features(path)
     require_texts("word", packs.table.words if packs.table else (), models.WORD_CHARACTERS, InvalidFeatures)
     for name in ("encoder", "text_space"):
-        if len(told := getattr(packs, name)) > models.WORD_CHARACTERS:
+        if len(text := getattr(packs, name)) > models.WORD_CHARACTERS:
             expected = f"at most {models.WORD_CHARACTERS} characters"
-            raise InvalidFeatures(name, expected=expected, got=f"{len(told)}: {told[:40]!r}...")
+            raise InvalidFeatures(name, expected=expected, got=f"{len(text)}: {text[:40]!r}...")
     return {"suffix": ".safetensors", "found": _described(path, AssetKind.FEATURES)}
 
 
@@ -133,8 +133,8 @@ def check_lift(path: Path, cameras: Path | None = None) -> dict[str, Any]:
         expected = f"at most {SHOWN_BYTES} bytes of metadata beside the names of views and the words"
         raise InvalidLift("lift", expected=expected, got=f"{brief}")
     count, channels = arrays["features"].shape
-    found = {"count": count, "channels": channels, "metadata": metadata, "warnings": []}
-    return {"suffix": ".safetensors", "found": found}
+    description = {"count": count, "channels": channels, "metadata": metadata, "warnings": []}
+    return {"suffix": ".safetensors", "found": description}
 
 
 CHECKS: dict[UploadKind, Callable[..., dict[str, Any]]] = {
@@ -157,17 +157,17 @@ def check(named: str, file: str, *more: str) -> dict[str, Any]:
     kind: UploadKind = LIFT if named == LIFT else AssetKind(named)
     path = Path(file)
     try:
-        checked = CHECKS[kind](path, *map(Path, more))
-        require_texts("view name", checked["found"].get("names", ()), models.VIEW_CHARACTERS, INVALID[kind])
-        require_texts("word", checked["found"].get("words", ()), models.WORD_CHARACTERS, INVALID[kind])
+        result = CHECKS[kind](path, *map(Path, more))
+        require_texts("view name", result["found"].get("names", ()), models.VIEW_CHARACTERS, INVALID[kind])
+        require_texts("word", result["found"].get("words", ()), models.WORD_CHARACTERS, INVALID[kind])
     except SplatliftError as error:
         return _invalid(_of_another_kind(kind, path) or error, kind, path)
     except MemoryError:
         return _invalid(_out_of_memory(kind), kind, path)
-    counts = finite(checked["found"])  # norms of float32 rows may be infinite
+    counts = finite(result["found"])  # norms of float32 rows may be infinite
     return {
         "event": "valid",
-        "suffix": checked["suffix"],
+        "suffix": result["suffix"],
         "warnings": [str(warning) for warning in counts.pop("warnings")],
         "counts": counts,
     }
@@ -180,16 +180,18 @@ def _invalid(error: SplatliftError, kind: UploadKind, path: Path) -> dict[str, A
 
 def _of_another_kind(kind: UploadKind, path: Path) -> InvalidInput | None:
     """What to say of a file that belongs elsewhere; None where it looks like what it was sent as, or like nothing."""
-    looks = identify(path)
-    found = looks.kind
-    if looks.suffix in (".sog", ".zip") and not zipfile.is_zipfile(path):
+    identity = identify(path)
+    actual = identity.kind
+    if identity.suffix in (".sog", ".zip") and not zipfile.is_zipfile(path):
         got, hint = "the document of a SOG without its pictures", "zip it with them, and send that"
         return INVALID[kind](kind, expected=f"a file of {kind}", got=got, hint=hint)
-    if found is None:
+    if actual is None:
         return wrong_kind(path, kind, INVALID[kind], argument=kind, expected=f"a file of {kind}")
-    hint = "POST it to /lifts" if found == LIFT else f"PUT it to /assets/{found}"
+    hint = "POST it to /lifts" if actual == LIFT else f"PUT it to /assets/{actual}"
     return (
-        None if found == kind else INVALID[kind](kind, expected=f"a file of {kind}", got=f"one of {found}", hint=hint)
+        None
+        if actual == kind
+        else INVALID[kind](kind, expected=f"a file of {kind}", got=f"one of {actual}", hint=hint)
     )
 
 
@@ -219,8 +221,8 @@ def plan(file: str) -> dict[str, Any]:
     try:
         settings = LiftSettings.of(**order["settings"])
         files = order["splats"], order["cameras"], order["features"]
-        found = plan_files(*files, settings, in_blocks=order["engine"] is not None)
-        return {"event": "valid", "plan": plan_document(found, order["names"])}
+        lift_plan = plan_files(*files, settings, in_blocks=order["engine"] is not None)
+        return {"event": "valid", "plan": plan_document(lift_plan, order["names"])}
     except SplatliftError as error:
         return {"event": "invalid", "fault": fault_of(error, order["names"])}
 
@@ -246,7 +248,7 @@ def lift_as_ordered(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
     settings = LiftSettings.of(**order["settings"])
     address = order["ray_address"] if order["engine"] == "ray" else None
     engine = open_engine(order["engine"], address, order["threads"])
-    made = lift_files(
+    lift = lift_files(
         Path(order["splats"]),
         Path(order["cameras"]),
         [Path(path) for path in order["features"]],
@@ -257,15 +259,15 @@ def lift_as_ordered(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
         checkpoint=Checkpoint(Path(order["work"]), order["checkpoint_seconds"]),
         engine=engine,
     )
-    made = _as_clients_know(made, order["file_names"])
+    lift = _as_clients_know(lift, order["file_names"])
     output = Path(order["output"])
-    made.save(output, progress=report)
+    lift.save(output, progress=report)
     return {
         "sha256": sha256_of(output),
-        "count": made.features.shape[0],
-        "channels": made.features.shape[1],
+        "count": lift.features.shape[0],
+        "channels": lift.features.shape[1],
         # Through JSON and not model_dump: what is not finite must become null before it reaches a client.
-        "metadata": json.loads(made.metadata.model_dump_json()),
+        "metadata": json.loads(lift.metadata.model_dump_json()),
     }
 
 
@@ -275,18 +277,18 @@ def plan_document(plan: Plan, names: Mapping[str, str]) -> dict[str, Any]:
     return finite({"summary": list(plan.summary()), "warnings": warnings, **plan.facts()})
 
 
-def _as_clients_know(made: LiftResult, names: Mapping[str, str]) -> LiftResult:
+def _as_clients_know(lift: LiftResult, names: Mapping[str, str]) -> LiftResult:
     """The inputs by the names under which clients download them: whoever has the lift may have them beside it, and
     paths of this machine are nobody's business.
     """
-    metadata = made.metadata
+    metadata = lift.metadata
     resolved = {str(Path(path).resolve()): name for path, name in names.items()}  # data may lie behind a link
     inputs = metadata.splats, metadata.cameras, *metadata.features
     splats, cameras, *features = (
         file.model_copy(update={"path": resolved[str(Path(file.path).resolve())]}) for file in inputs
     )
     update = {"splats": splats, "cameras": cameras, "features": tuple(features)}
-    return replace(made, metadata=metadata.model_copy(update=update))
+    return replace(lift, metadata=metadata.model_copy(update=update))
 
 
 def compare_as_ordered(order: dict[str, Any], progress: Reporter) -> dict[str, Any]:
@@ -306,7 +308,7 @@ def compare_as_ordered(order: dict[str, Any], progress: Reporter) -> dict[str, A
     if labels:
         classes = tuple(parameters["labels"]["classes"])
         scene = SceneFiles(*files, Path(labels["masks"]), Path(labels["table"]), classes)
-    found = compare_speeds(
+    tradeoff = compare_speeds(
         scene,
         budget=parameters["budget_s"],
         settings=settings,
@@ -317,6 +319,6 @@ def compare_as_ordered(order: dict[str, Any], progress: Reporter) -> dict[str, A
         command=f"POST /tradeoff {json.dumps(parameters | {'settings': settings})}",
     )
     with tempfile.TemporaryDirectory(prefix="splatlift-chart-") as folder:
-        chart = next(file for file in found.save(Path(folder)) if file.suffix == ".png")
+        chart = next(file for file in tradeoff.save(Path(folder)) if file.suffix == ".png")
         Path(order["output"]).write_bytes(chart.read_bytes())
-    return {"document": found.document, "page": "\n".join(found.lines()) + "\n"}
+    return {"document": tradeoff.document, "page": "\n".join(tradeoff.lines()) + "\n"}

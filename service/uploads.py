@@ -119,7 +119,7 @@ class Intake(ABC, Generic[Taken]):
         digest = self._digest.hexdigest()
         if promised is not None and digest != promised.lower():
             raise DigestMismatch("sha256", expected=promised, got=digest, hint="upload the file again")
-        return self._known(digest)
+        return self._find_same(digest)
 
     def check(self, limits: ErrandLimits) -> CheckedUpload:
         """Read the whole draft in a process of its own.
@@ -139,7 +139,7 @@ class Intake(ABC, Generic[Taken]):
         return ()
 
     @abstractmethod
-    def _known(self, digest: str) -> Taken | None: ...
+    def _find_same(self, digest: str) -> Taken | None: ...
 
     @abstractmethod
     def keep(self, upload: CheckedUpload) -> tuple[Taken, bool]:
@@ -154,9 +154,9 @@ class Intake(ABC, Generic[Taken]):
 class AssetIntake(Intake[AssetRecord]):
     """The upload of an asset."""
 
-    def _known(self, digest: str) -> AssetRecord | None:
-        known = self._store.assets.find(self._owner, f"sha256:{digest}", most=SHOWN_CHARACTERS)
-        return known if known is not None and known.kind == self._kind and known.whole else None
+    def _find_same(self, digest: str) -> AssetRecord | None:
+        record = self._store.assets.find(self._owner, f"sha256:{digest}", most=SHOWN_CHARACTERS)
+        return record if record is not None and record.kind == self._kind and record.whole else None
 
     def keep(self, upload: CheckedUpload) -> tuple[AssetRecord, bool]:
         """Make an asset of it."""
@@ -179,28 +179,28 @@ class LiftIntake(Intake[LiftRecord]):
             return ()
         return (self._store.assets.get(self._owner, self._cameras, AssetKind.CAMERAS).path,)
 
-    def _known(self, digest: str) -> LiftRecord | None:
-        known = self._store.lifts.of_file(self._owner, digest)
-        return known if known is not None and is_whole(known.path, known.bytes) else None
+    def _find_same(self, digest: str) -> LiftRecord | None:
+        record = self._store.lifts.of_file(self._owner, digest)
+        return record if record is not None and is_whole(record.path, record.bytes) else None
 
     def keep(self, upload: CheckedUpload) -> tuple[LiftRecord, bool]:
         """Make a lift of it."""
-        told, assets = upload.counts, self._store.assets
-        order = order_of(told["metadata"])
+        counts, assets = upload.counts, self._store.assets
+        order = order_of(counts["metadata"])
         order = order if self._cameras is None else replace(order, cameras=self._cameras)
         splats = assets.get(self._owner, order.splats, AssetKind.SPLATS)
-        if splats.counts["splats"] != told["count"]:
-            got = f"{told['count']} for {splats.counts['splats']} splats"
+        if splats.counts["splats"] != counts["count"]:
+            got = f"{counts['count']} for {splats.counts['splats']} splats"
             raise InvalidLift("lift", expected="a row for each splat", got=got)
         try:
             cameras = assets.get(self._owner, order.cameras, AssetKind.CAMERAS, most=ALL)
         except NotFound as error:
             hint = "PUT its file of cameras first; in place of a folder a zip of it, named here as ?cameras=ID"
             raise NotFound(error.argument, expected=error.expected, got=error.got, hint=hint) from None
-        require_pairs(told["metadata"]["views"], cameras.counts["names"])
+        require_pairs(counts["metadata"]["views"], cameras.counts["names"])
         packs = tuple(pack for pack in order.features if assets.find(self._owner, pack) is not None)
-        made = FinishedLift(upload.draft, upload.sha256, told["count"], told["channels"], told["metadata"])
-        return self._store.lifts.take(self._owner, replace(order, features=packs), made), True
+        lift = FinishedLift(upload.draft, upload.sha256, counts["count"], counts["channels"], counts["metadata"])
+        return self._store.lifts.take(self._owner, replace(order, features=packs), lift), True
 
 
 @dataclass(frozen=True)
@@ -224,22 +224,22 @@ def check(kind: UploadKind, path: Path, scratch: Path, limits: ErrandLimits, *be
         Busy: as `run_errand` has it.
     """
     memory = min(limits.memory_bytes, CHECK_BASE_BYTES + CHECK_FACTOR * sum(map(_size, (path, *beside))))
-    given = [kind, str(path), *map(str, beside)]
-    heard = run_errand("service.tasks.check", given, scratch, replace(limits, memory_bytes=memory))
-    if heard is None:
+    arguments = [kind, str(path), *map(str, beside)]
+    result = run_errand("service.tasks.check", arguments, scratch, replace(limits, memory_bytes=memory))
+    if result is None:
         raise too_slow(kind, limits)
-    if heard.last["event"] == "valid":
-        return Report(suffix=heard.last["suffix"], counts=heard.last["counts"], warnings=heard.last["warnings"])
-    if heard.last["event"] == "invalid":
-        raise error_of(heard.last["fault"])
-    log.error("the check of %s ended with %s: %s", kind, heard.returncode, heard.trace)
-    if heard.last["event"] == "ready":
+    if result.last["event"] == "valid":
+        return Report(suffix=result.last["suffix"], counts=result.last["counts"], warnings=result.last["warnings"])
+    if result.last["event"] == "invalid":
+        raise error_of(result.last["fault"])
+    log.error("the check of %s ended with %s: %s", kind, result.returncode, result.trace)
+    if result.last["event"] == "ready":
         # It had started to read: whatever ended it, this file did.
         raise INVALID[kind](
-            kind, expected="a file that its reader can take", got=f"one that ended it with {heard.returncode}",
+            kind, expected="a file that its reader can take", got=f"one that ended it with {result.returncode}",
             hint="it may be broken, or need more memory than an upload may take",
         )  # fmt: skip
-    raise Crashed("check", expected="a process that starts", got=f"one that ended with {heard.returncode}")
+    raise Crashed("check", expected="a process that starts", got=f"one that ended with {result.returncode}")
 
 
 def too_slow(kind: UploadKind, limits: ErrandLimits) -> InvalidInput:

@@ -63,8 +63,8 @@ def run(options: argparse.Namespace) -> int:
     folder = options.scene or unpack_tabletop(out / "scene")
     subject = find_scene(folder, options.ask, out / "scene", options.pack)
     if subject.other_packs:
-        others = ", ".join(subject.other_packs)
-        say(f"Features are those of {subject.features.name}; --pack takes others that are here: {others}.")
+        other_packs = ", ".join(subject.other_packs)
+        say(f"Features are those of {subject.features.name}; --pack takes others that are here: {other_packs}.")
     with serving(data, subject.encoder, out / "service.log") as url:
         say(f"The service listens on {url}.")
         report = show(subject, url, out, say)
@@ -90,13 +90,15 @@ def serving(data: Path, encoder: str, log: Path) -> Iterator[str]:
     options = ["--port", "0", "--data", str(data), "--encoder", encoder]
     command = [sys.executable, "-m", "liftcore.cli", "serve", *options]
     with (
-        log.open("wb") as told,
-        subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=told, text=True) as server,
+        log.open("wb") as stderr,
+        subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=stderr, text=True
+        ) as server,
     ):
         try:
-            said = server.stdout.readline() if server.stdout else ""
-            if said.startswith(LISTENING):
-                yield said.removeprefix(LISTENING).strip()
+            first_line = server.stdout.readline() if server.stdout else ""
+            if first_line.startswith(LISTENING):
+                yield first_line.removeprefix(LISTENING).strip()
         except BaseException:
             print(f"--- the service's last words ---\n{_last_words(log)}", file=sys.stderr)
             raise
@@ -106,7 +108,7 @@ def serving(data: Path, encoder: str, log: Path) -> Iterator[str]:
                 server.wait(STOP_SECONDS)
             except subprocess.TimeoutExpired:
                 server.kill()
-    if not said.startswith(LISTENING):
+    if not first_line.startswith(LISTENING):
         got = f"an early end; its last words: {_last_words(log)}"
         raise Unavailable("service", expected="a service that starts", got=got)
 
@@ -219,17 +221,17 @@ def show(subject: DemoScene, url: str, out: Path, say: Callable[[str], None]) ->
         took = (job["ended"] or 0) - (job["started"] or 0)
         say(f"Lifted {lift['channels']} channels onto {lift['count']:,} splats in {took:.1f} s.")
         pictures = {"rgb": f"render-{subject.views[0]}.png", "pca": f"features-{subject.views[0]}.png"}
-        for what, name in pictures.items():
-            (out / name).write_bytes(client.picture("/render", lift=lift["id"], view=subject.views[0], what=what))
-        kind, asked = "text", subject.phrases
-        if not asked:
-            kind, asked = "like", (_middle(out / pictures["rgb"], subject.views[0]),)
-            for line in _why_no_words(subject, asked[0]):
+        for picture, name in pictures.items():
+            (out / name).write_bytes(client.picture("/render", lift=lift["id"], view=subject.views[0], what=picture))
+        kind, phrases = "text", subject.phrases
+        if not phrases:
+            kind, phrases = "like", (_middle(out / pictures["rgb"], subject.views[0]),)
+            for line in _why_no_words(subject, phrases[0]):
                 say(line)
         # The first question opens the lift; it is asked once apart, so that times are of warm queries.
-        client.get("/query", lift=lift["id"], **{kind: asked[0]}, threshold="0")
+        client.get("/query", lift=lift["id"], **{kind: phrases[0]}, threshold="0")
         findings = []
-        for phrase in asked:
+        for phrase in phrases:
             findings.append(_find(client, lift["id"], kind, phrase, subject, out))
             for line in _lines(findings[-1]):
                 say(line)
@@ -251,8 +253,8 @@ def show(subject: DemoScene, url: str, out: Path, say: Callable[[str], None]) ->
 
 
 def _counts(kind: str, asset: dict[str, Any]) -> str:
-    told = ("splats", "views", "channels")  # counts that people care about
-    numbers = ", ".join(f"{value} {name}" for name, value in asset["counts"].items() if name in told)
+    names = ("splats", "views", "channels")  # counts that people care about
+    numbers = ", ".join(f"{value} {name}" for name, value in asset["counts"].items() if name in names)
     return f"{kind} ({numbers})" if numbers else kind
 
 
@@ -273,30 +275,30 @@ def _middle(render: Path, view: str) -> str:
 
 def _why_no_words(subject: DemoScene, example: str) -> list[str]:
     if subject.text_space == NO_WORDS:
-        why = "Its features share a space with no text encoder: they have no words"
+        reason = "Its features share a space with no text encoder: they have no words"
     elif not subject.text_space:
-        why = "Its pack does not name its text space (`splatlift pack retag` does)"
+        reason = "Its pack does not name its text space (`splatlift pack retag` does)"
     else:
-        why = "Nothing says what this scene shows (`--ask TEXT` asks in words)"
-    return [f"  {why}, so it is asked for more of what the middle of the view shows, {example}."]
+        reason = "Nothing says what this scene shows (`--ask TEXT` asks in words)"
+    return [f"  {reason}, so it is asked for more of what the middle of the view shows, {example}."]
 
 
 def _find(client: Client, lift: str, kind: str, phrase: str, subject: DemoScene, out: Path) -> Finding:
-    asked = {"lift": lift, kind: phrase}
+    parameters = {"lift": lift, kind: phrase}
     begin = time.perf_counter()
-    answer = client.get("/query", **asked)
-    answered = time.perf_counter()
-    masks = {view: _pixels(client.picture("/query/mask", view=view, **asked)) > 0 for view in subject.views}
-    mask_seconds = (time.perf_counter() - answered) / len(masks)
+    answer = client.get("/query", **parameters)
+    answer_time = time.perf_counter()
+    masks = {view: _pixels(client.picture("/query/mask", view=view, **parameters)) > 0 for view in subject.views}
+    mask_seconds = (time.perf_counter() - answer_time) / len(masks)
     from liftcore import ViewMask
 
     view, best, truth = subject.views[0], answer["top"], subject.truth
     slug = "-".join("".join(c if c.isalnum() else " " for c in phrase.casefold()).split())
-    names = {what: f"{slug}-{what}-{view}.png" for what in ("mask", "heat", "found")}
+    names = {picture: f"{slug}-{picture}-{view}.png" for picture in ("mask", "heat", "found")}
     Image.fromarray(masks[view].astype(np.uint8) * 255).save(out / names["mask"])
-    (out / names["heat"]).write_bytes(client.picture("/query/attention", view=view, **asked))
-    seen = ViewMask.overlay(_pixels((out / f"render-{view}.png").read_bytes()), masks[view])
-    Image.fromarray(seen).save(out / names["found"])
+    (out / names["heat"]).write_bytes(client.picture("/query/attention", view=view, **parameters))
+    overlay = ViewMask.overlay(_pixels((out / f"render-{view}.png").read_bytes()), masks[view])
+    Image.fromarray(overlay).save(out / names["found"])
     return Finding(
         phrase=phrase,
         there=answer["present"],
@@ -306,8 +308,8 @@ def _find(client: Client, lift: str, kind: str, phrase: str, subject: DemoScene,
         score=best[0]["score"] if best else float("nan"),
         threshold=answer["threshold"]["value"],
         explanation=answer["threshold"]["explanation"],
-        objects=client.get("/query/objects", **asked)["objects"],
-        query_ms=1e3 * (answered - begin),
+        objects=client.get("/query/objects", **parameters)["objects"],
+        query_ms=1e3 * (answer_time - begin),
         mask_ms=1e3 * mask_seconds,
         iou=truth.mean_iou(phrase, masks) if truth else None,
         pictures=names,
@@ -319,23 +321,23 @@ def _pixels(png: bytes) -> np.ndarray:
         return np.asarray(image)
 
 
-def _lines(found: Finding) -> list[str]:
-    what = f"the {found.object}" if found.object else "something"
-    if found.there is False:
-        return [f'  "{found.phrase}" finds nothing', f"      {found.why}"]
-    bar = "no threshold" if found.threshold is None else f"threshold {found.threshold:.2f}"
-    iou = "" if found.iou is None else f", IoU {found.iou:.2f} against the truth of views that were not lifted"
+def _lines(finding: Finding) -> list[str]:
+    noun = f"the {finding.object}" if finding.object else "something"
+    if finding.there is False:
+        return [f'  "{finding.phrase}" finds nothing', f"      {finding.why}"]
+    bar = "no threshold" if finding.threshold is None else f"threshold {finding.threshold:.2f}"
+    iou = "" if finding.iou is None else f", IoU {finding.iou:.2f} against the truth of views that were not lifted"
     lines = [
-        f'  "{found.phrase}": {what}',
-        f"      {found.splats:,} splats, best score {found.score:.2f}, {bar}, "
-        f"{found.query_ms:.0f} ms (mask {found.mask_ms:.0f} ms){iou}",
+        f'  "{finding.phrase}": {noun}',
+        f"      {finding.splats:,} splats, best score {finding.score:.2f}, {bar}, "
+        f"{finding.query_ms:.0f} ms (mask {finding.mask_ms:.0f} ms){iou}",
     ]
-    if found.there is None:
-        lines.append(f"      {found.why}")
-    for number, thing in enumerate(found.objects, 1):
-        place = ", ".join(f"{value:.2f}" for value in thing["centre"])
-        lines.append(f"      object {number}: {thing['splats']:,} splats around ({place})")
-    return [*lines, f"      {found.pictures['found']}"]
+    if finding.there is None:
+        lines.append(f"      {finding.why}")
+    for number, item in enumerate(finding.objects, 1):
+        place = ", ".join(f"{value:.2f}" for value in item["centre"])
+        lines.append(f"      object {number}: {item['splats']:,} splats around ({place})")
+    return [*lines, f"      {finding.pictures['found']}"]
 
 
 # What a scene folder holds: splats, cameras, a feature pack, words, and the truth where somebody knows it
@@ -358,23 +360,23 @@ class Truth:
 
     def mask_of(self, phrase: str, view: str) -> np.ndarray | None:
         """[H, W] bool, where the phrase's objects are; None when the phrase or the view has no truth."""
-        meant = self.meant.get(_bare(phrase))
-        if meant is None or view not in self.masks:
+        names = self.meant.get(_bare(phrase))
+        if names is None or view not in self.masks:
             return None
-        rows = [self.names.index(name) for name in meant]
+        rows = [self.names.index(name) for name in names]
         return np.isin(self.masks[view], rows)
 
     def name_of(self, masks: Mapping[str, np.ndarray]) -> str | None:
         """The object that most pixels of these masks [H, W] bool show; None where they show none."""
-        shown = np.concatenate([self.masks[view][mask] for view, mask in masks.items() if view in self.masks])
-        known = shown[shown >= 0]
-        return self.names[int(np.bincount(known).argmax())] if len(known) else None
+        labels = np.concatenate([self.masks[view][mask] for view, mask in masks.items() if view in self.masks])
+        objects = labels[labels >= 0]
+        return self.names[int(np.bincount(objects).argmax())] if len(objects) else None
 
     def mean_iou(self, phrase: str, masks: Mapping[str, np.ndarray]) -> float | None:
         """Mean intersection over union of masks [H, W] bool, over the views that show what the phrase means."""
         pairs = [(mask, self.mask_of(phrase, view)) for view, mask in masks.items()]
-        shown = [(mask, meant) for mask, meant in pairs if meant is not None and meant.any()]
-        values = [(mask & meant).sum() / (mask | meant).sum() for mask, meant in shown]
+        visible = [(mask, target) for mask, target in pairs if target is not None and target.any()]
+        values = [(mask & target).sum() / (mask | target).sum() for mask, target in visible]
         return float(np.mean(values)) if values else None
 
 
@@ -448,7 +450,7 @@ def find_scene(folder: Path, phrases: Sequence[str], scratch: Path, pack: Path |
         splats=_splats(folder),
         cameras=cameras,
         features=features,
-        other_packs=tuple(one.name for one in packs if not one.exists() or one.resolve() != features.resolve()),
+        other_packs=tuple(path.name for path in packs if not path.exists() or path.resolve() != features.resolve()),
         encoder=f"table:{table}" if table.is_file() else _ENCODERS.get(text_space, next(iter(BUILT_IN))),
         text_space=text_space,
         phrases=tuple(phrases) or (truth.asked if truth and askable and text_space != NO_WORDS else ()),
@@ -459,22 +461,22 @@ def find_scene(folder: Path, phrases: Sequence[str], scratch: Path, pack: Path |
 
 def _splats(folder: Path) -> Path:
     """The splats of a folder, or of the last iteration that a 3DGS trainer kept in it."""
-    found = identify(folder)
-    if not found.sent:
-        got = f"{found.splats[0]} alone" if found.splats else "none"
+    kind = identify(folder)
+    if not kind.sent:
+        got = f"{kind.splats[0]} alone" if kind.splats else "none"
         raise InvalidInput(f"splats of {folder.name}", expected="splats that the service takes", got=got)
-    return folder / found.sent[0]
+    return folder / kind.sent[0]
 
 
 def _cameras(folder: Path, scratch: Path) -> Path:
     """The one file of the cameras; of several, such as a COLMAP model's, a zip in ``scratch``."""
     from liftcore.files import camera_files
 
-    named = [folder / name for name in _CAMERA_FILES if (folder / name).is_file()]
-    files = [file for file in camera_files(named[0] if named else folder) if file.is_file()]
+    candidates = [folder / name for name in _CAMERA_FILES if (folder / name).is_file()]
+    files = [file for file in camera_files(candidates[0] if candidates else folder) if file.is_file()]
     if not files:
-        wanted = ", ".join([*_CAMERA_FILES, "sparse/0"])
-        raise InvalidInput(f"cameras of {folder.name}", expected=f"one of {wanted}", got="none")
+        names = ", ".join([*_CAMERA_FILES, "sparse/0"])
+        raise InvalidInput(f"cameras of {folder.name}", expected=f"one of {names}", got="none")
     if len(files) == 1:
         return files[0]
     scratch.mkdir(parents=True, exist_ok=True)
@@ -487,10 +489,10 @@ def _cameras(folder: Path, scratch: Path) -> Path:
 
 def _packs(folder: Path) -> list[Path]:
     """The feature packs of a folder, ``features.safetensors`` first."""
-    found = [path for path in visible_files(folder, "*.safetensors") if identify(path).kind == "features"]
-    if not found:
+    packs = [path for path in visible_files(folder, "*.safetensors") if identify(path).kind == "features"]
+    if not packs:
         raise InvalidInput(f"features of {folder.name}", expected="a feature pack (.safetensors)", got="none")
-    return sorted(found, key=lambda path: path.name != "features.safetensors")
+    return sorted(packs, key=lambda path: path.name != "features.safetensors")
 
 
 def _read_truth(folder: Path) -> Truth | None:
@@ -502,13 +504,14 @@ def _read_truth(folder: Path) -> Truth | None:
         return None
     document = json.loads(names_file.read_text())
     arrays = load_file(arrays_file)
-    names = tuple(str(thing["class"]) for thing in document["objects"])
-    meant = {_bare(name): (name,) for name in names}
+    names = tuple(str(item["class"]) for item in document["objects"])
+    synonyms = {_bare(name): (name,) for name in names}
     masks = {key.removesuffix("/mask"): mask for key, mask in arrays.items() if key.endswith("/mask")}
     return Truth(
         names=names,
         masks={view: masks[view] for view in document.get("held_out_views", masks)},
-        meant=meant | {_bare(phrase): tuple(things) for phrase, things in document.get("phrases", {}).items()},
+        meant=synonyms
+        | {_bare(phrase): tuple(item_names) for phrase, item_names in document.get("phrases", {}).items()},
         asked=tuple(document.get("ask", [f"the {name}" for name in _in_view(names, masks, document)])),
     )
 
@@ -520,8 +523,8 @@ def _bare(phrase: str) -> str:
 
 def _in_view(names: Sequence[str], masks: Mapping[str, np.ndarray], document: Mapping) -> list[str]:
     """The objects that fill most of the pictured view."""
-    shown = next((masks[view] for view in document.get("held_out_views", masks) if view in masks), np.empty(0, int))
-    counts = np.bincount(shown[(shown >= 0) & (shown < len(names))], minlength=len(names))
+    labels = next((masks[view] for view in document.get("held_out_views", masks) if view in masks), np.empty(0, int))
+    counts = np.bincount(labels[(labels >= 0) & (labels < len(names))], minlength=len(names))
     return [names[int(row)] for row in np.argsort(-counts, kind="stable")[:_PHRASES] if counts[row]]
 
 

@@ -90,28 +90,28 @@ def opened(data: Path, *, make: bool) -> Iterator[KeyStore]:
         database.close()
 
 
-def _create(keys: KeyStore, given: argparse.Namespace) -> None:
-    name = given.name.strip()
+def _create(keys: KeyStore, options: argparse.Namespace) -> None:
+    name = options.name.strip()
     if not name or len(name) > MAX_NAME or not name.isprintable():
-        raise InvalidRequest("name", expected=f"1 to {MAX_NAME} printable characters", got=repr(given.name)[:120])
-    quota = Quota(given.max_bytes, given.max_queued, given.max_uploads)
-    expires = None if given.expires is None else _moment(given.expires)
-    lifts = [lift.strip() for lift in (given.lifts or "").split(",") if lift.strip()]
-    scopes = parse_scopes((given.scopes or (Scope.SHARED if lifts else "")).split(","))
+        raise InvalidRequest("name", expected=f"1 to {MAX_NAME} printable characters", got=repr(options.name)[:120])
+    quota = Quota(options.max_bytes, options.max_queued, options.max_uploads)
+    expires = None if options.expires is None else _moment(options.expires)
+    lifts = [lift.strip() for lift in (options.lifts or "").split(",") if lift.strip()]
+    scopes = parse_scopes((options.scopes or (Scope.SHARED if lifts else "")).split(","))
     key, secret = keys.create(name, scopes, quota, expires=expires, lifts=lifts)
-    _show(key, secret, given)
+    _show(key, secret, options)
 
 
-def _rotate(keys: KeyStore, given: argparse.Namespace) -> None:
-    grace = 0.0 if given.grace is None else _seconds("grace", given.grace)
-    key, secret, shares = keys.rotate(given.key, grace=grace, keep_shares=given.keep_shares)
-    _show(key, secret, given, ended_shares=[share.id for share in shares])
-    if shares and not given.json:
+def _rotate(keys: KeyStore, options: argparse.Namespace) -> None:
+    grace = 0.0 if options.grace is None else _seconds("grace", options.grace)
+    key, secret, shares = keys.rotate(options.key, grace=grace, keep_shares=options.keep_shares)
+    _show(key, secret, options, ended_shares=[share.id for share in shares])
+    if shares and not options.json:
         print(f"The secret before ends{_with(shares)}. With --keep-shares they would stay.", file=sys.stderr)
 
 
-def _show(key: KeyRecord, secret: str, given: argparse.Namespace, **more: Any) -> None:
-    if given.json:
+def _show(key: KeyRecord, secret: str, options: argparse.Namespace, **more: Any) -> None:
+    if options.json:
         print(json.dumps({**_document(key), **more, "key": secret}))
         return
     print(secret)
@@ -121,11 +121,11 @@ def _show(key: KeyRecord, secret: str, given: argparse.Namespace, **more: Any) -
     )
 
 
-def _seconds(argument: str, text: str, more: str = "") -> float:
+def _seconds(argument: str, text: str, alternative: str = "") -> float:
     """A time such as 30d."""
     match = re.fullmatch(r"(\d{1,6})([smhd])", text.strip(), re.ASCII)
     if match is None:
-        expected = f"a number of at most 6 digits with d, h, m or s, such as 30d or 12h{more}"
+        expected = f"a number of at most 6 digits with d, h, m or s, such as 30d or 12h{alternative}"
         raise InvalidRequest(argument, expected=expected, got=repr(text)[:80])
     return int(match[1]) * UNITS[match[2]]
 
@@ -143,23 +143,23 @@ def _moment(text: str) -> float:
     return moment
 
 
-def _list(keys: KeyStore, given: argparse.Namespace) -> None:
-    found = keys.all()
-    if given.json:
-        print(json.dumps({"keys": [_document(key) for key in found]}))
+def _list(keys: KeyStore, options: argparse.Namespace) -> None:
+    records = keys.all()
+    if options.json:
+        print(json.dumps({"keys": [_document(key) for key in records]}))
         return
-    for key in found:
+    for key in records:
         scopes = ",".join(sorted(key.scopes)) + ("" if key.maker is None else f" by {key.maker}")
         print("  ".join([key.id, _when(key.created), _state(key), scopes, _limits(key), key.name]))
-    if not found:
-        lost = "no keys, but there were some: nobody is let in until one is made"
+    if not records:
+        closed = "no keys, but there were some: nobody is let in until one is made"
         none = "no keys: the service is open to this machine, and to no other"
-        print(lost if keys.required() else none, file=sys.stderr)
+        print(closed if keys.required() else none, file=sys.stderr)
 
 
-def _revoke(keys: KeyStore, given: argparse.Namespace) -> None:
-    key, shares = keys.revoke(given.key)
-    if given.json:
+def _revoke(keys: KeyStore, options: argparse.Namespace) -> None:
+    key, shares = keys.revoke(options.key)
+    if options.json:
         print(json.dumps({**_document(key), "ended_shares": [share.id for share in shares]}))
     else:
         print(f"key {key.id} of {key.name} is revoked{_with(shares)}")

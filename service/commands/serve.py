@@ -97,8 +97,8 @@ class AnnouncingServer(uvicorn.Server):
         await super().startup(sockets)
         if self.started and sockets:
             host, port = sockets[0].getsockname()[:2]
-            shown = f"[{host}]" if ":" in host else host
-            self._announce(f"http://{shown}:{port}")
+            name = f"[{host}]" if ":" in host else host
+            self._announce(f"http://{name}:{port}")
 
 
 def say(address: str) -> None:
@@ -120,8 +120,8 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument("--encoder", metavar="SPEC", help="the default text encoder: lvis, table:FILE, ...")
     of_space = "the text encoder of a text space; may be given several times"
     parser.add_argument("--text-space", action="append", dest="text_spaces", metavar="NAME=SPEC", help=of_space)
-    anew = "where the database is gone or older than the files, begin an empty one; the files go to quarantine"
-    parser.add_argument("--new", action="store_true", help=anew)
+    new_help = "where the database is gone or older than the files, begin an empty one; the files go to quarantine"
+    parser.add_argument("--new", action="store_true", help=new_help)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -186,8 +186,8 @@ def data_directory_errors() -> Iterator[None]:
 def told_variables() -> str:
     """All settings, as ``--help`` tells them."""
     rows = (
-        f"  {name}, default {default}\n{fill(said, 78, initial_indent=MARGIN, subsequent_indent=MARGIN)}"
-        for name, default, said in variables()
+        f"  {name}, default {default}\n{fill(meaning, 78, initial_indent=MARGIN, subsequent_indent=MARGIN)}"
+        for name, default, meaning in variables()
     )
     return "\n".join(("environment variables; options win, and an empty variable is not set:", *rows))
 
@@ -217,9 +217,9 @@ def require_files(settings: ServiceSettings) -> None:
     Raises:
         Misconfigured: there would be too few of them.
     """
-    needed = FILES_A_CONNECTION * settings.max_connections + FILES_BESIDE
+    required = FILES_A_CONNECTION * settings.max_connections + FILES_BESIDE
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if 0 <= hard < needed:
+    if 0 <= hard < required:
         raise Misconfigured(
             "max_connections", expected=f"at most {max(0, (hard - FILES_BESIDE) // FILES_A_CONNECTION)}, as a"
             f" process may open {hard} files here", got=f"{settings.max_connections}", hint="or raise ulimit -n",
@@ -227,7 +227,7 @@ def require_files(settings: ServiceSettings) -> None:
     try:
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     except (ValueError, OSError):  # a kernel that has a limit of its own below the one it tells
-        resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, needed) if soft >= 0 else soft, hard))
+        resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, required) if soft >= 0 else soft, hard))
 
 
 def bind(host: str, port: int) -> socket.socket:

@@ -39,15 +39,15 @@ def run(options: argparse.Namespace) -> int:
     with data_directory_errors():
         settings = read_settings(data=options.data)
         if options.action == "restore":
-            found = {"files": restore(options.directory, settings.data)}
-            return _told(options, found, f"restored to {settings.data}")
+            document = {"files": restore(options.directory, settings.data)}
+            return _reply(options, document, f"restored to {settings.data}")
         _require_directory(settings.data)
         if options.action == "backup":
-            found = {"files": back_up(settings.data, options.directory)}
-            return _told(options, found, f"{DATABASE} and {found['files']} files are in {options.directory}")
+            document = {"files": back_up(settings.data, options.directory)}
+            return _reply(options, document, f"{DATABASE} and {document['files']} files are in {options.directory}")
         if options.action == "verify":
             damage = verify(settings.data)
-            _told(options, {"damage": damage}, "\n".join(damage) or "every file is as it was stored")
+            _reply(options, {"damage": damage}, "\n".join(damage) or "every file is as it was stored")
             return 1 if damage else 0
         return _rebuild(options, settings)
 
@@ -57,20 +57,20 @@ def _require_directory(data: Path) -> None:
         raise NotFound("data", expected="the data directory of a service", got=str(data), hint="name it with --data")
 
 
-def _rebuild(given: argparse.Namespace, settings: ServiceSettings) -> int:
+def _rebuild(options: argparse.Namespace, settings: ServiceSettings) -> int:
     store = Store.open(settings.data, rebuilding=True)
     try:
-        found = rebuild(store, settings)
+        document = rebuild(store, settings)
     finally:
         store.close()
-    added = [f"{count} of kind {kind}" for kind, count in sorted(found["assets"].items())]
-    kinds = f" ({', '.join(added)})" if added else ""
-    lines = [f"added to {DATABASE}: {sum(found['assets'].values())} assets{kinds}, {found['lifts']} lifts"]
-    for left in found["left"]:
-        lines.append(f"left out, and moved to quarantine, now or by the server: {left['file']}: {left['why']}")
-    return _told(given, {**found, "lost": LOST}, "\n".join([*lines, LOST]))
+    kind_counts = [f"{count} of kind {kind}" for kind, count in sorted(document["assets"].items())]
+    kinds = f" ({', '.join(kind_counts)})" if kind_counts else ""
+    lines = [f"added to {DATABASE}: {sum(document['assets'].values())} assets{kinds}, {document['lifts']} lifts"]
+    for file in document["left"]:
+        lines.append(f"left out, and moved to quarantine, now or by the server: {file['file']}: {file['why']}")
+    return _reply(options, {**document, "lost": LOST}, "\n".join([*lines, LOST]))
 
 
-def _told(given: argparse.Namespace, found: dict[str, Any], text: str) -> int:
-    print(json.dumps(found) if given.json else text)
+def _reply(options: argparse.Namespace, document: dict[str, Any], text: str) -> int:
+    print(json.dumps(document) if options.json else text)
     return 0

@@ -92,8 +92,10 @@ def show(
         path = lift.save_scene(Path(folder), splats, cameras)
         command = [sys.executable, "-m", "liftcore.cli", "view", str(path), "--port", str(port)]
         command += ["--no-browser"] * (not browser)
-        lent = os.environ | {FOLDER_VARIABLE: folder}  # to the server: a notebook's kernel may be killed
-        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=lent) as server:
+        environment = os.environ | {FOLDER_VARIABLE: folder}  # to the server: a notebook's kernel may be killed
+        with subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+        ) as server:
             assert server.stdout is not None
             try:
                 for line in server.stdout:
@@ -118,18 +120,18 @@ def adopt(store: Store, settings: ServiceSettings, path: Path) -> str:
         InvalidLift: it is no lift, or its splats or cameras are not where it remembers them.
         InvalidInput: one of its files is malformed, or of a format that may hold code.
     """
-    told, shape = metadata_of(path)
-    order = order_of(told)
-    packs = list(zip(told["features"], order.features, strict=True))
-    kept = [(pack, asset) for pack, asset in packs if Path(pack["path"]).is_file()]
-    _link(store, settings, AssetKind.SPLATS, told["splats"], path)
-    _link(store, settings, AssetKind.CAMERAS, told["cameras"], path)
-    for pack, _ in kept:
+    metadata, shape = metadata_of(path)
+    order = order_of(metadata)
+    packs = list(zip(metadata["features"], order.features, strict=True))
+    present = [(pack, asset) for pack, asset in packs if Path(pack["path"]).is_file()]
+    _link(store, settings, AssetKind.SPLATS, metadata["splats"], path)
+    _link(store, settings, AssetKind.CAMERAS, metadata["cameras"], path)
+    for pack, _ in present:
         _link(store, settings, AssetKind.FEATURES, pack, path)
     lift = secrets.token_hex(16)
     store.files.lift(lift).symlink_to(path.resolve())
-    made = FinishedLift(store.files.lift(lift), sha256_of(path), shape[0], shape[1], told)
-    store.lifts.adopt(SERVICE, lift, replace(order, features=tuple(asset for _, asset in kept)), made)
+    record = FinishedLift(store.files.lift(lift), sha256_of(path), shape[0], shape[1], metadata)
+    store.lifts.adopt(SERVICE, lift, replace(order, features=tuple(asset for _, asset in present)), record)
     return lift
 
 
@@ -166,16 +168,16 @@ def settings_of(folder: Path, port: int, text_space: str) -> ServiceSettings:
 
     Spaces of encoders that ship, and those that the environment names, are answered as by any server.
     """
-    own: dict[str, Any] = {"data": folder, "host": "127.0.0.1", "port": port}
-    settings = read_settings(**own)
+    values: dict[str, Any] = {"data": folder, "host": "127.0.0.1", "port": port}
+    settings = read_settings(**values)
     if text_space in ("", NO_WORDS, OWN_WORDS, *BUILT_IN.values(), *settings.text_spaces):
         return settings
-    known = settings.model_copy(update={"text_spaces": {**settings.text_spaces, text_space: text_space}})
+    extended = settings.model_copy(update={"text_spaces": {**settings.text_spaces, text_space: text_space}})
     try:
-        require_encoder_files(known)
+        require_encoder_files(extended)
     except Misconfigured:
         return settings
-    return known
+    return extended
 
 
 def _serve(path: Path, port: int, *, browser: bool) -> None:
@@ -185,9 +187,9 @@ def _serve(path: Path, port: int, *, browser: bool) -> None:
         listener = bind(settings.host, settings.port)
         store = Store.open(settings.data, floor_bytes=0)
         try:
-            announced = partial(announce, lift=adopt(store, settings, path), browser=browser)
+            announce_lift = partial(announce, lift=adopt(store, settings, path), browser=browser)
             with logging_to_stderr(settings.log_format):
-                server_of(assemble(settings, store), settings, announced).run(sockets=[listener])
+                server_of(assemble(settings, store), settings, announce_lift).run(sockets=[listener])
         finally:
             store.close()
             listener.close()

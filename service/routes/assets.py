@@ -12,7 +12,7 @@ from fastapi import APIRouter, Path, Query, Request, Response
 
 from service import models
 from service.child import error_of
-from service.content import FILE, Cursor, Limit, file_answer, listed
+from service.content import FILE, Cursor, Limit, file_answer, page_response
 from service.errand import run_errand
 from service.errors import Crashed
 from service.requests import JsonRoute, require_file
@@ -31,10 +31,7 @@ router = APIRouter(prefix="/assets", tags=["assets"], route_class=JsonRoute)
 AssetKind = Annotated[models.AssetKind, Path(alias="asset", description="what it is")]
 KindParameter = Annotated[models.AssetKind, Query(description="what it is")]
 AssetId = Annotated[str, Path(description="sha256: and the digest of the bytes, in hex")]
-Sha256 = Annotated[
-    str | None,
-    Query(pattern="^[0-9a-fA-F]{64}$", description="of the content; checked if given"),
-]
+Sha256 = Annotated[str | None, Query(pattern="^[0-9a-fA-F]{64}$", description="of the content; checked if given")]
 NamesCursor = Annotated[int, Query(ge=0, le=10**9, description="the `next` of the page before")]
 KNOWN_ALREADY: dict[int | str, dict[str, Any]] = {200: {"model": models.Asset, "description": "It was here already"}}
 RAW_BODY: dict[str, Any] = {
@@ -53,7 +50,7 @@ async def put_asset(kind: AssetKind, request: Request, deps: Deps, sha256: Sha25
     It is splats (any format but checkpoints), cameras (JSON, or a zip of a COLMAP model or of several files), a
     feature pack, masks, a text table, or photos (a zip of JPEG and PNG files that are named like the views).
     """
-    asset, new = await taken(AssetIntake, kind, request, deps, sha256)
+    asset, new = await receive_upload(AssetIntake, kind, request, deps, sha256)
     return _reply(asset, 201 if new else 200)
 
 
@@ -63,7 +60,7 @@ async def create_asset(kind: KindParameter, request: Request, deps: Deps, sha256
     return await put_asset(kind, request, deps, sha256)
 
 
-async def taken(
+async def receive_upload(
     into: Callable[..., Intake[Taken]], kind: models.UploadKind, request: Request, deps: AppState, sha256: str | None
 ) -> tuple[Taken, bool]:
     """Take the body of an upload in, check it whole and keep it; whether its owner did not have it before."""
@@ -78,11 +75,11 @@ async def taken(
     try:
         await write(intake.open)
         await _receive(request, partial(write, intake.feed))
-        known = await write(intake.finish, sha256)
-        if known is not None:
-            return known, False
-        checked = await anyio.to_thread.run_sync(intake.check, deps.check_limits, limiter=deps.checks)
-        return await write(intake.keep, checked)
+        existing = await write(intake.finish, sha256)
+        if existing is not None:
+            return existing, False
+        upload = await anyio.to_thread.run_sync(intake.check, deps.check_limits, limiter=deps.checks)
+        return await write(intake.keep, upload)
     finally:
         with anyio.CancelScope(shield=True):  # removing gigabytes takes its time
             await write(intake.close)
@@ -107,7 +104,7 @@ async def _receive(request: Request, feed: Callable[[bytes], Any]) -> None:
 @router.get("", response_model=models.Assets)
 def list_assets(deps: Deps, limit: Limit = models.PAGE, cursor: Cursor = None) -> Response:
     """The assets, newest first, in pages. Lists of names and words are told with each asset alone."""
-    return listed("assets", partial(deps.store.assets.page, deps.owner), shape, limit=limit, cursor=cursor)
+    return page_response("assets", partial(deps.store.assets.page, deps.owner), shape, limit=limit, cursor=cursor)
 
 
 @router.get("/{asset}", response_model=models.Asset)
@@ -120,41 +117,41 @@ def get_asset(asset: AssetId, deps: Deps) -> Response:
 def get_asset_names(asset: AssetId, deps: Deps, limit: Limit = models.PAGE, cursor: NamesCursor = 0) -> models.Names:
     """The names of views, or the words, that an asset holds, in pages: of long ones a page may have fewer."""
     names = deps.store.assets.names(deps.owner, asset, cursor, limit + 1)
-    most = max(1, sum(total <= models.PAGE_CHARACTERS for total in accumulate(map(len, names[:limit]))))
-    return models.Names(names=names[:most], next=cursor + most if len(names) > most else None)
+    count = max(1, sum(total <= models.PAGE_CHARACTERS for total in accumulate(map(len, names[:limit]))))
+    return models.Names(names=names[:count], next=cursor + count if len(names) > count else None)
 
 
 @router.get("/{asset}/content", response_class=Response, responses=FILE)
 def get_asset_content(asset: AssetId, request: Request, deps: Deps) -> Response:
     """The bytes of an asset, or a range of them."""
-    found = deps.store.assets.get(deps.owner, asset)
-    digest = found.id.removeprefix("sha256:")
-    return file_answer(request, found.path, found.bytes, digest, found.file_name)
+    record = deps.store.assets.get(deps.owner, asset)
+    digest = record.id.removeprefix("sha256:")
+    return file_answer(request, record.path, record.bytes, digest, record.file_name)
 
 
 @router.patch("/{asset}", response_model=models.Asset, status_code=201, responses=KNOWN_ALREADY)
 async def change_pack(asset: AssetId, change: models.PackChange, deps: Deps) -> Response:
     """Name the encoder or the text space of a feature pack: the same features under these names, as another asset."""
-    made, new = await anyio.to_thread.run_sync(_retagged, asset, change, deps, limiter=deps.checks)
-    return _reply(made, 201 if new else 200)
+    record, new = await anyio.to_thread.run_sync(_retagged, asset, change, deps, limiter=deps.checks)
+    return _reply(record, 201 if new else 200)
 
 
 def _retagged(asset: str, change: models.PackChange, deps: AppState) -> tuple[AssetRecord, bool]:
-    found = deps.store.assets.get(deps.owner, asset, models.AssetKind.FEATURES)
-    require_whole(found.path, found.bytes)
+    source = deps.store.assets.get(deps.owner, asset, models.AssetKind.FEATURES)
+    require_whole(source.path, source.bytes)
     limit = deps.settings.max_upload_bytes(models.AssetKind.FEATURES)
     intake = AssetIntake(deps.store, deps.owner, models.AssetKind.FEATURES, limit)
     try:
         intake.open()
-        with deps.store.files.scratch() as scratch, found.path.open("rb") as pack:
+        with deps.store.files.scratch() as scratch, source.path.open("rb") as pack:
             header = scratch / "header"
-            given = [str(found.path), change.model_dump_json(exclude_none=True), str(header)]
-            heard = run_errand("service.tasks.rename", given, scratch, deps.check_limits)
-            if heard is None:
+            arguments = [str(source.path), change.model_dump_json(exclude_none=True), str(header)]
+            result = run_errand("service.tasks.rename", arguments, scratch, deps.check_limits)
+            if result is None:
                 raise too_slow(models.AssetKind.FEATURES, deps.check_limits)
-            if heard.last["event"] == "invalid":
-                raise error_of(heard.last["fault"])
-            if heard.last["event"] != "valid":
+            if result.last["event"] == "invalid":
+                raise error_of(result.last["fault"])
+            if result.last["event"] != "valid":
                 raise Crashed(
                     "asset", expected="a pack whose header is read", got="one that is not", hint="try again"
                 )
@@ -162,8 +159,8 @@ def _retagged(asset: str, change: models.PackChange, deps: AppState) -> tuple[As
             pack.seek(HEADER_LENGTH_BYTES + int.from_bytes(pack.read(HEADER_LENGTH_BYTES), "little"))
             while block := pack.read(BATCH):
                 intake.feed(block)
-        known = intake.finish(None)
-        return (known, False) if known is not None else intake.keep(intake.check(deps.check_limits))
+        existing = intake.finish(None)
+        return (existing, False) if existing is not None else intake.keep(intake.check(deps.check_limits))
     finally:
         intake.close()
 
@@ -176,9 +173,9 @@ def delete_asset(asset: AssetId, deps: Deps) -> None:
 
 def shape(asset: AssetRecord) -> models.Asset:
     """An asset as clients get it."""
-    own = f"/assets/{asset.id}"
-    links = {"self": own, "content": f"{own}/content"}
-    links |= {} if asset.kind is models.AssetKind.SPLATS else {"names": f"{own}/names"}
+    path = f"/assets/{asset.id}"
+    links = {"self": path, "content": f"{path}/content"}
+    links |= {} if asset.kind is models.AssetKind.SPLATS else {"names": f"{path}/names"}
     return models.Asset.model_validate({**vars(asset), "links": links})
 
 

@@ -17,7 +17,7 @@ from liftcore.files import cameras_of_views, require_pairs, with_panoramas
 from liftcore.text.table import Vocabulary
 from service import models
 from service.child import error_of
-from service.content import Cursor, Limit, listed
+from service.content import Cursor, Limit, page_response
 from service.errand import run_errand
 from service.errors import InvalidRequest, OverLimit
 from service.observe import current_id
@@ -98,30 +98,30 @@ async def order_tradeoff(order: models.TradeoffRequest, deps: Deps, key: Key = N
 def _lift(order: models.LiftRequest, deps: AppState, key: str | None) -> Response:
     settings = LiftSettings.of_json(order.settings).model_dump(mode="json")
     # An order without words reads as before there were any.
-    sent = order.model_dump(mode="json", exclude=None if order.table else {"table"})
+    document = order.model_dump(mode="json", exclude=None if order.table else {"table"})
     parameters = {} if order.table is None else {"table": order.table}
-    return _take(order, deps, key, sent=sent, settings=settings, parameters=parameters)
+    return _take(order, deps, key, sent=document, settings=settings, parameters=parameters)
 
 
 def _planned(order: models.LiftRequest, deps: AppState) -> models.Plan:
     settings = LiftSettings.of_json(order.settings).model_dump(mode="json")
-    wanted = JobOrder(order.splats, order.cameras, tuple(order.features), settings)
-    _require_fit(wanted, deps)
-    deps.queries.require_device(wanted.settings.get("device", "auto"))
-    splats, cameras, *packs = [deps.store.assets.get(deps.owner, *named) for named in wanted.assets()]
+    job_order = JobOrder(order.splats, order.cameras, tuple(order.features), settings)
+    _require_fit(job_order, deps)
+    deps.queries.require_device(job_order.settings.get("device", "auto"))
+    splats, cameras, *packs = [deps.store.assets.get(deps.owner, *asset) for asset in job_order.assets()]
     document = {
         "splats": str(splats.path), "cameras": str(cameras.path), "features": [str(pack.path) for pack in packs],
         "settings": settings, "engine": deps.settings.engine,
-        "names": {str(one.path): f"{one.kind} {one.id}" for one in (splats, cameras, *packs)},
+        "names": {str(record.path): f"{record.kind} {record.id}" for record in (splats, cameras, *packs)},
     }  # fmt: skip
     with deps.store.files.scratch() as scratch:
         file = scratch / "order.json"
         file.write_text(json.dumps(document))
-        heard = run_errand("service.tasks.plan", [str(file)], scratch, deps.check_limits)
-    if heard is not None and heard.last["event"] == "valid":
-        return models.Plan.model_validate(heard.last["plan"])
-    if heard is not None and heard.last["event"] == "invalid":
-        raise error_of(heard.last["fault"])
+        result = run_errand("service.tasks.plan", [str(file)], scratch, deps.check_limits)
+    if result is not None and result.last["event"] == "valid":
+        return models.Plan.model_validate(result.last["plan"])
+    if result is not None and result.last["event"] == "invalid":
+        raise error_of(result.last["fault"])
     raise OverLimit(
         "plan", expected="a lift that is planned within the limits of an upload's check", got="one that needs more",
         hint="order it without: its job plans too",
@@ -134,26 +134,28 @@ def _compare(order: models.TradeoffRequest, deps: AppState, key: str | None) -> 
         raise InvalidSettings(models.COMPARED, expected=expected, got=got)
     LiftSettings.of_json(order.settings)
     if order.budget_s > deps.settings.tradeoff_seconds:
-        most = f"at most {deps.settings.tradeoff_seconds:g} s, as the operator allows"
-        raise InvalidRequest("budget_s", expected=most, got=f"{order.budget_s:g}")
-    sent = order.model_dump(mode="json", exclude_none=True)  # an order without labels reads as before there were any
-    parameters = {name: sent[name] for name in ("budget_s", "labels") if name in sent}
+        limit = f"at most {deps.settings.tradeoff_seconds:g} s, as the operator allows"
+        raise InvalidRequest("budget_s", expected=limit, got=f"{order.budget_s:g}")
+    document = order.model_dump(
+        mode="json", exclude_none=True
+    )  # an order without labels reads as before there were any
+    parameters = {name: document[name] for name in ("budget_s", "labels") if name in document}
     return _take(
-        order, deps, key, sent=sent, settings=order.settings, kind=models.JobKind.TRADEOFF, parameters=parameters
+        order, deps, key, sent=document, settings=order.settings, kind=models.JobKind.TRADEOFF, parameters=parameters
     )
 
 
 def _take(order: models.LiftInputs, deps: AppState, key: str | None, *, sent: dict[str, Any], **of: Any) -> Response:
     """The answer to an order: the job that it makes, or made before. By what was ``sent`` it is known again."""
-    wanted = JobOrder(
+    job_order = JobOrder(
         splats=order.splats, cameras=order.cameras, features=tuple(order.features),
         key=key, fingerprint=None if key is None else fingerprint(sent), request_id=current_id(), **of,
     )  # fmt: skip
-    job, new = deps.store.jobs.repeated(deps.owner, wanted), False
+    job, new = deps.store.jobs.repeated(deps.owner, job_order), False
     if job is None:
-        _require_fit(wanted, deps)
-        deps.queries.require_device(wanted.settings.get("device", "auto"))
-        job, new = deps.store.jobs.submit(deps.owner, wanted, max_queued=deps.settings.max_queued)
+        _require_fit(job_order, deps)
+        deps.queries.require_device(job_order.settings.get("device", "auto"))
+        job, new = deps.store.jobs.submit(deps.owner, job_order, max_queued=deps.settings.max_queued)
         deps.runner.wake()
     return _reply(deps.store.jobs.get(deps.owner, job), 202 if new else 200)
 
@@ -168,18 +170,18 @@ def _require_fit(order: JobOrder, deps: AppState) -> None:
     check_fit(cameras, packs)
     in_blocks = order.kind is models.JobKind.LIFT and deps.settings.engine is not None
     check_settings(LiftSettings.of(**order.settings), packs, in_blocks=in_blocks)
-    named = [get(*asset) for asset in labels_of(order.parameters)]
-    if order.kind is models.JobKind.TRADEOFF and named:
-        check_labels(order, cameras, packs, *named)
-    elif named:
-        check_channels("table", named[0], packs)
+    label_assets = [get(*asset) for asset in labels_of(order.parameters)]
+    if order.kind is models.JobKind.TRADEOFF and label_assets:
+        check_labels(order, cameras, packs, *label_assets)
+    elif label_assets:
+        check_channels("table", label_assets[0], packs)
     deps.store.files.require_room(scratch_bytes(order.kind, splats, packs))
 
 
 @router.get("/jobs", response_model=models.Jobs, tags=["jobs"])
 def list_jobs(deps: Deps, limit: Limit = models.PAGE, cursor: Cursor = None) -> Response:
     """The jobs, newest first, in pages."""
-    return listed("jobs", partial(deps.store.jobs.page, deps.owner), shape, limit=limit, cursor=cursor)
+    return page_response("jobs", partial(deps.store.jobs.page, deps.owner), shape, limit=limit, cursor=cursor)
 
 
 @router.get("/jobs/{job}", response_model=models.Job, tags=["jobs"])
@@ -191,11 +193,11 @@ def get_job(job: str, deps: Deps) -> models.Job:
 @router.get("/jobs/{job}/events", response_class=Response, responses=EVENTS, tags=["jobs"])
 async def follow_job(job: str, deps: Deps, last_event: LastEvent = 0) -> Response:
     """What happens to a job, as it happens: its states, plan, latest progress and log. Ends after the last state."""
-    look = partial(deps.store.jobs.events, deps.owner, job)
+    read_events = partial(deps.store.jobs.events, deps.owner, job)
     state = await anyio.to_thread.run_sync(deps.store.jobs.state, deps.owner, job)
-    if not await anyio.to_thread.run_sync(look, last_event) and state in models.ENDED:
+    if not await anyio.to_thread.run_sync(read_events, last_event) and state in models.ENDED:
         return Response(status_code=204)
-    return deps.streams.answer(look, event_data, last_event, deps.caller.key)
+    return deps.streams.answer(read_events, event_data, last_event, deps.caller.key)
 
 
 @router.post(
@@ -210,8 +212,8 @@ def cancel_job(job: str, deps: Deps) -> Response:
     no harm. A job that has succeeded or failed is refused (409).
     """
     deps.store.jobs.cancel(deps.owner, job)
-    found = deps.store.jobs.get(deps.owner, job)
-    return _reply(found, 200 if found.state is models.JobState.CANCELED else 202)
+    record = deps.store.jobs.get(deps.owner, job)
+    return _reply(record, 200 if record.state is models.JobState.CANCELED else 202)
 
 
 @router.delete("/jobs/{job}", status_code=204, tags=["jobs"])
@@ -222,8 +224,8 @@ def delete_job(
     with_tradeoff: Annotated[bool, Query(description="its trade-off goes too, likewise")] = False,
 ) -> None:
     """Forget a job. It is refused (409) before it has ended."""
-    said = {models.JobKind.LIFT: with_lift, models.JobKind.TRADEOFF: with_tradeoff}
-    deps.store.jobs.delete(deps.owner, job, given_up=[kind for kind, gone in said.items() if gone])
+    choices = {models.JobKind.LIFT: with_lift, models.JobKind.TRADEOFF: with_tradeoff}
+    deps.store.jobs.delete(deps.owner, job, given_up=[kind for kind, is_given_up in choices.items() if is_given_up])
 
 
 def event_data(event: Event) -> str:
@@ -294,15 +296,18 @@ def check_kernel(splats: AssetRecord, settings: Mapping[str, Any]) -> None:
     Raises:
         InvalidSettings: ``kernel`` or ``antialiased`` does not fit the file, of which the header is read.
     """
-    own, kernel = kernel_of(splats, {}), kernel_of(splats, settings)
-    chosen = LiftSettings.of(**settings)
-    chosen.check_kernel(Kernel(kernel))
-    if kernel == own:
+    file_kernel, kernel = kernel_of(splats, {}), kernel_of(splats, settings)
+    lift_settings = LiftSettings.of(**settings)
+    lift_settings.check_kernel(Kernel(kernel))
+    if kernel == file_kernel:
         return
     try:
-        chosen.check_kernel(Kernel(kernel), splats.path, splats.id)
+        lift_settings.check_kernel(Kernel(kernel), splats.path, splats.id)
     except InvalidSplats as error:
-        got, hint = f"{kernel} for {splats.id}, which has {error.got}", f"leave it out: the file speaks of {own}"
+        got, hint = (
+            f"{kernel} for {splats.id}, which has {error.got}",
+            f"leave it out: the file speaks of {file_kernel}",
+        )
         raise InvalidSettings("kernel", expected=f"a kernel with {error.expected}", got=got, hint=hint) from None
 
 
@@ -331,16 +336,16 @@ def check_labels(
         expected = f"{masks.counts['classes']} words, as the masks name classes 0..{masks.counts['classes'] - 1}"
         raise InvalidRequest("labels.classes", expected=expected, got=f"{len(classes)}")
     check_channels("labels.table", table, features)
-    known = cameras.counts["names"]
-    masked = set(cameras_of_views(masks.counts["names"], known).values())
+    camera_names = cameras.counts["names"]
+    masked = set(cameras_of_views(masks.counts["names"], camera_names).values())
     if not masked:
         raise InvalidRequest(
             "labels.masks",
             expected="masks of views named like the cameras",
-            got=f"masks of {_some(masks.counts['names'])} and cameras {_some(known)}, none in common",
+            got=f"masks of {_some(masks.counts['names'])} and cameras {_some(camera_names)}, none in common",
         )
-    named = [view for pack in features for view in pack.counts["names"]]
-    views = sorted(cameras_of_views(named, known).values())
+    view_names = [view for pack in features for view in pack.counts["names"]]
+    views = sorted(cameras_of_views(view_names, camera_names).values())
     if masked.issuperset(views[:: LiftSettings.of(**order.settings).view_stride]):
         expected = "features of views besides those with masks, which are not lifted"
         raise InvalidRequest("labels.masks", expected=expected, got="masks of all of them")

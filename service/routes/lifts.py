@@ -13,10 +13,10 @@ from fastapi.responses import JSONResponse, StreamingResponse
 from liftcore.errors import NotFound
 from liftcore.files import in_camera_orientation
 from service import models
-from service.content import FILE, TAGGED, Cursor, Limit, file_answer, kept, listed, unchanged
+from service.content import FILE, TAGGED, Cursor, Limit, cache_headers, file_answer, page_response, unchanged
 from service.errors import InvalidRequest, OverLimit
 from service.requests import JsonRoute
-from service.routes.assets import RAW_BODY, Sha256, taken
+from service.routes.assets import RAW_BODY, Sha256, receive_upload
 from service.routes.jobs import Key
 from service.routes.queries import (
     NO_ENCODER,
@@ -24,7 +24,7 @@ from service.routes.queries import (
     PLY,
     PNG,
     Ask,
-    made,
+    binary_response,
     scene_request,
     tagged_answer,
     with_encoder,
@@ -78,7 +78,7 @@ router = APIRouter(route_class=JsonRoute)
 @router.get("/lifts", response_model=models.Lifts, tags=["lifts"])
 def list_lifts(deps: Deps, limit: Limit = models.PAGE, cursor: Cursor = None) -> Response:
     """The lifts, newest first, in pages."""
-    return listed("lifts", partial(deps.store.lifts.page, deps.owner), shape_lift, limit=limit, cursor=cursor)
+    return page_response("lifts", partial(deps.store.lifts.page, deps.owner), shape_lift, limit=limit, cursor=cursor)
 
 
 @router.post(
@@ -107,16 +107,12 @@ async def create_lift(
     feature packs only for examples by region. ``cameras`` names other cameras with the same poses, such as a zip of
     the folder that was lifted with.
     """
-    lift, new = await taken(partial(LiftIntake, cameras=cameras), LIFT, request, deps, sha256)
+    lift, new = await receive_upload(partial(LiftIntake, cameras=cameras), LIFT, request, deps, sha256)
     location = {"Location": f"/lifts/{lift.id}"}
     return JSONResponse(shape_lift(lift).model_dump(mode="json"), 201 if new else 200, headers=location)
 
 
-@router.patch(
-    "/lifts/{lift}",
-    response_model=models.LiftResult,
-    tags=["lifts"],
-)
+@router.patch("/lifts/{lift}", response_model=models.LiftResult, tags=["lifts"])
 def change_lift(lift: str, change: models.LiftChange, deps: Deps) -> models.LiftResult:
     """Give a lift a name, photos of its views, or what is known of its frame; what is left out stays."""
     return shape_lift(deps.store.lifts.change(deps.owner, lift, change.model_dump(exclude_unset=True)))
@@ -125,8 +121,8 @@ def change_lift(lift: str, change: models.LiftChange, deps: Deps) -> models.Lift
 @router.delete("/lifts/{lift}", status_code=204, tags=["lifts"])
 def delete_lift(lift: str, deps: Deps) -> Response:
     """Forget a lift, its selections and its job; what it was made of stays."""
-    found = deps.store.lifts.get(deps.owner, lift)
-    deps.store.jobs.delete(deps.owner, found.id, given_up=(models.JobKind.LIFT,))
+    record = deps.store.lifts.get(deps.owner, lift)
+    deps.store.jobs.delete(deps.owner, record.id, given_up=(models.JobKind.LIFT,))
     return Response(status_code=204)
 
 
@@ -139,9 +135,9 @@ def get_lift(lift: str, deps: Deps) -> models.LiftResult:
 @router.get("/lifts/{lift}/features", response_class=Response, responses=FILE, tags=["lifts"])
 def get_lift_features(lift: str, request: Request, deps: Deps) -> Response:
     """The lift file (safetensors), or a range of it; it has the ``world`` that a PATCH gave the lift."""
-    found = deps.store.lifts.get(deps.owner, lift)
-    name, header = f"lift-{found.id}.safetensors", found.changed_header()
-    return file_answer(request, found.path, found.bytes, found.sha256, name, header)
+    record = deps.store.lifts.get(deps.owner, lift)
+    name, header = f"lift-{record.id}.safetensors", record.changed_header()
+    return file_answer(request, record.path, record.bytes, record.sha256, name, header)
 
 
 @router.get("/tradeoffs/{tradeoff}", response_model=models.Tradeoff, tags=["trade-offs"])
@@ -153,9 +149,9 @@ def get_tradeoff(tradeoff: str, deps: Deps) -> models.Tradeoff:
 @router.get("/tradeoffs/{tradeoff}/chart", response_class=Response, responses=PNG | TAGGED, tags=["trade-offs"])
 def get_tradeoff_chart(tradeoff: str, request: Request, deps: Deps) -> Response:
     """Accuracy over time, and how near the dial stays to the exact lift, as a picture."""
-    found = deps.store.tradeoffs.get(deps.owner, tradeoff)
-    etag = f'"{found.sha256}"'
-    return unchanged(request, etag) or Response(found.chart, media_type="image/png", headers=kept(etag))
+    record = deps.store.tradeoffs.get(deps.owner, tradeoff)
+    etag = f'"{record.sha256}"'
+    return unchanged(request, etag) or Response(record.chart, media_type="image/png", headers=cache_headers(etag))
 
 
 @router.get("/tradeoffs/{tradeoff}/table", response_class=Response, responses=MARKDOWN, tags=["trade-offs"])
@@ -179,32 +175,32 @@ def get_key(deps: Deps) -> models.OwnKey:
 @router.get("/lifts/{lift}/shares", response_model=models.Shares, tags=["keys"])
 def list_shares(lift: str, deps: Deps) -> models.Shares:
     """The keys that the lift was given to and that are valid, newest first, without their secrets."""
-    found = deps.store.lifts.get(deps.owner, lift)
-    return models.Shares(shares=[shape_share(key, found.id) for key in deps.store.keys.of_lift(found.id)])
+    record = deps.store.lifts.get(deps.owner, lift)
+    return models.Shares(shares=[shape_share(key, record.id) for key in deps.store.keys.of_lift(record.id)])
 
 
 @router.post("/lifts/{lift}/shares", response_model=models.NewShare, status_code=201, tags=["keys"])
 def create_share(lift: str, asked: models.AskedShare, deps: Deps) -> Response:
     """Make a key that looks at this lift and asks it. It is shown this once, and in a link of the page."""
-    found = deps.store.lifts.get(deps.owner, lift)
+    record = deps.store.lifts.get(deps.owner, lift)
     maker = deps.caller.record
     if maker is None:
         raise InvalidRequest(
             "Authorization", expected="a service that wants keys", got="one that is open to its machine",
             hint="the operator makes a first key with splatlift keys create",
         )  # fmt: skip
-    if len(deps.store.keys.of_lift(found.id)) >= MOST_SHARES:
+    if len(deps.store.keys.of_lift(record.id)) >= MOST_SHARES:
         raise OverLimit("share", expected=f"at most {MOST_SHARES} of a lift", got="more", hint="delete some first")
     expires = earliest(time.time() + asked.expires_s, maker.expires)
     key, secret = deps.store.keys.create(
-        asked.name, frozenset({Scope.SHARED}), Quota(), expires=expires, lifts=[found.id], maker=maker.id
+        asked.name, frozenset({Scope.SHARED}), Quota(), expires=expires, lifts=[record.id], maker=maker.id
     )
-    share = shape_share(key, found.id)
+    share = shape_share(key, record.id)
     # After the #, which browsers send nobody: neither the log of a proxy nor another site comes to know it.
-    links = share.links | {"page": f"/?lift={found.id}#key={secret}"}
-    made = models.NewShare(**share.model_dump(exclude={"links"}), links=links, key=secret)
+    links = share.links | {"page": f"/?lift={record.id}#key={secret}"}
+    reply = models.NewShare(**share.model_dump(exclude={"links"}), links=links, key=secret)
     headers = {"Location": share.links["self"], "Cache-Control": "no-store"}
-    return JSONResponse(made.model_dump(mode="json"), 201, headers=headers)
+    return JSONResponse(reply.model_dump(mode="json"), 201, headers=headers)
 
 
 @router.delete("/lifts/{lift}/shares/{share}", status_code=204, tags=["keys"])
@@ -229,15 +225,15 @@ def get_lift_splats(lift: str, request: Request, deps: Deps, ask: Ask) -> Respon
 
     2DGS discs are thin Gaussians there, and DBS kernels the Gaussians of nearest size.
     """
-    found = deps.store.lifts.get(deps.owner, lift)
-    return tagged_answer(request, deps, scene_request("scene", found, deps), found, ask)
+    record = deps.store.lifts.get(deps.owner, lift)
+    return tagged_answer(request, deps, scene_request("scene", record, deps), record, ask)
 
 
 @router.get("/lifts/{lift}/colours", responses=NPY | TAGGED, response_class=Response, tags=["lifts"])
 def get_lift_colours(lift: str, request: Request, deps: Deps, ask: Ask, what: Layer = "pca") -> Response:
     """A colour for every splat: .npy, uint8 [P, 3], sRGB. Splats without a feature are grey."""
-    found = deps.store.lifts.get(deps.owner, lift)
-    return tagged_answer(request, deps, scene_request("layer", found, deps) | {"what": what}, found, ask)
+    record = deps.store.lifts.get(deps.owner, lift)
+    return tagged_answer(request, deps, scene_request("layer", record, deps) | {"what": what}, record, ask)
 
 
 @router.get("/lifts/{lift}/photo", responses=PHOTO | TAGGED, response_class=Response, tags=["lifts"])
@@ -248,19 +244,19 @@ def get_photo(lift: str, view: View, request: Request, deps: Deps, ask: Ask) -> 
     """
 
     def camera_size() -> tuple[int, int] | None:
-        cameras = ask(scene_request("views", found, deps) | {"view": view}).header["views"]
+        cameras = ask(scene_request("views", record, deps) | {"view": view}).header["views"]
         return (cameras[0]["width"], cameras[0]["height"]) if cameras else None
 
-    found = deps.store.lifts.get(deps.owner, lift)
-    zipped = None if found.photos is None else deps.store.assets.get(deps.owner, found.photos)
-    opened = None if zipped is None else deps.photos.of(zipped.path).open(view)
-    if zipped is None or opened is None:
+    record = deps.store.lifts.get(deps.owner, lift)
+    zipped = None if record.photos is None else deps.store.assets.get(deps.owner, record.photos)
+    photo = None if zipped is None else deps.photos.of(zipped.path).open(view)
+    if zipped is None or photo is None:
         got, hint = f"none of {view!r}"[:200], "PUT /assets/photos, then PATCH /lifts/{lift} with its id"
         raise NotFound("view", expected="a view of which the lift has a photo", got=got, hint=hint)
-    media_type, size, blocks = opened
+    media_type, size, blocks = photo
     blocks, is_changed = in_camera_orientation(blocks, camera_size)
     etag = f'"{hashlib.sha256(f"{zipped.id} {view} {is_changed}".encode()).hexdigest()}"'
-    headers = kept(etag) | {"Content-Length": str(size)}
+    headers = cache_headers(etag) | {"Content-Length": str(size)}
     return unchanged(request, etag) or StreamingResponse(blocks, media_type=media_type, headers=headers)
 
 
@@ -273,22 +269,26 @@ def _with_photo(deps: AppState, lift: LiftRecord, views: list[str]) -> set[str]:
 @router.get("/lifts/{lift}/views", response_model=models.Views, tags=["lifts"])
 def list_views(lift: str, deps: Deps, ask: Ask, limit: Limit = models.PAGE, cursor: ViewsCursor = 0) -> models.Views:
     """The cameras of the scene with their poses, in pages; also those that were not lifted."""
-    found = deps.store.lifts.get(deps.owner, lift)
-    answer = ask(scene_request("views", found, deps) | {"first": cursor, "count": limit}).header
+    record = deps.store.lifts.get(deps.owner, lift)
+    answer = ask(scene_request("views", record, deps) | {"first": cursor, "count": limit}).header
     names = [view["name"] for view in answer["views"]]
-    lifted, photos = deps.store.lifts.lifted(deps.owner, lift, names), _with_photo(deps, found, names)
-    told = [
+    lifted, photos = deps.store.lifts.lifted(deps.owner, lift, names), _with_photo(deps, record, names)
+    views = [
         models.View(lifted=view["name"] in lifted, photo=view["name"] in photos, **view) for view in answer["views"]
     ]
-    return models.Views(views=told, next=cursor + limit if answer["more"] else None)
+    return models.Views(views=views, next=cursor + limit if answer["more"] else None)
 
 
 @router.get("/lifts/{lift}/regions", response_model=models.CoveringRegions, tags=["lifts"])
 def list_regions(lift: str, view: View, x: Pixel, y: Pixel, deps: Deps, ask: Ask) -> models.CoveringRegions:
     """The regions of the lift's feature packs that cover a pixel of a view's photo: each is an example to ask by."""
-    found = deps.store.lifts.get(deps.owner, lift)
-    wanted = with_packs(scene_request("regions", found, deps), found, deps, "lift") | {"view": view, "x": x, "y": y}
-    return models.CoveringRegions(lift=found.id, view=view, **ask(wanted).header)
+    record = deps.store.lifts.get(deps.owner, lift)
+    request = with_packs(scene_request("regions", record, deps), record, deps, "lift") | {
+        "view": view,
+        "x": x,
+        "y": y,
+    }
+    return models.CoveringRegions(lift=record.id, view=view, **ask(request).header)
 
 
 @router.get("/lifts/{lift}/regions/mask", responses=PNG | TAGGED, response_class=Response, tags=["lifts"])
@@ -296,18 +296,18 @@ def get_region_mask(
     lift: str, view: View, level: Level, region: Level, request: Request, deps: Deps, ask: Ask
 ) -> Response:
     """The pixels of a view's photo that one region covers: a PNG, white where it is."""
-    found = deps.store.lifts.get(deps.owner, lift)
-    wanted = with_packs(scene_request("region_mask", found, deps), found, deps, "lift")
-    wanted |= {"view": view, "level": level, "region": region}
-    return tagged_answer(request, deps, wanted, found, ask)
+    record = deps.store.lifts.get(deps.owner, lift)
+    worker_request = with_packs(scene_request("region_mask", record, deps), record, deps, "lift")
+    worker_request |= {"view": view, "level": level, "region": region}
+    return tagged_answer(request, deps, worker_request, record, ask)
 
 
 @router.get("/lifts/{lift}/objects", response_model=models.SceneObjects, tags=["lifts"])
 def list_objects(lift: str, deps: Deps, ask: Ask, asked: Annotated[models.AskedForSceneObjects, Query()]) -> Response:
     """The things in the scene, found by masks alone when it was lifted; a vocabulary names them."""
-    things = list(deps.store.selections.things(deps.owner, deps.store.lifts.get(deps.owner, lift).id).items())
-    more = {"means": asked.features, "things": things, "splat": asked.splat}
-    return _nodes("catalogue", lift, deps, ask, asked, **more)
+    labels = list(deps.store.selections.things(deps.owner, deps.store.lifts.get(deps.owner, lift).id).items())
+    fields = {"means": asked.features, "things": labels, "splat": asked.splat}
+    return _nodes("catalogue", lift, deps, ask, asked, **fields)
 
 
 @router.get("/lifts/{lift}/tree", response_model=models.LiftTree, tags=["lifts"])
@@ -320,30 +320,30 @@ def get_tree(lift: str, deps: Deps, ask: Ask, asked: Annotated[models.AskedForTr
 
 
 def _nodes(operation: str, lift: str, deps: Deps, ask: Ask, asked: models.AskedForNodes, **more: Any) -> Response:
-    found = deps.store.lifts.get(deps.owner, lift)
-    wanted: dict[str, Any] = scene_request(operation, found, deps) | NO_ENCODER | {"words": None}
+    record = deps.store.lifts.get(deps.owner, lift)
+    request: dict[str, Any] = scene_request(operation, record, deps) | NO_ENCODER | {"words": None}
     if asked.table is not None or asked.encoder is not None:
-        wanted = with_encoder(wanted, asked, found, deps)
-    named = None if wanted["encoder"] is None else encoder_label(wanted["encoder"])
-    wanted |= {"first": asked.cursor, "count": asked.limit, **more}
-    return made(deps, wanted | {"head": {"lift": found.id, "encoder": named}}, found, ask, {})
+        request = with_encoder(request, asked, record, deps)
+    encoder = None if request["encoder"] is None else encoder_label(request["encoder"])
+    request |= {"first": asked.cursor, "count": asked.limit, **more}
+    return binary_response(deps, request | {"head": {"lift": record.id, "encoder": encoder}}, record, ask, {})
 
 
 @router.get("/lifts/{lift}/objects/{thing}/splats", responses=PLY | TAGGED, response_class=Response, tags=["lifts"])
 def get_object_splats(lift: str, thing: ObjectId, request: Request, deps: Deps, ask: Ask) -> Response:
     """The splats of one object and no others: a PLY of the dialect that was lifted."""
-    found = deps.store.lifts.get(deps.owner, lift)
-    wanted = scene_request("splats", found, deps) | {"what": f"object-{thing}", "object": thing}
-    return tagged_answer(request, deps, wanted, found, ask)
+    record = deps.store.lifts.get(deps.owner, lift)
+    worker_request = scene_request("splats", record, deps) | {"what": f"object-{thing}", "object": thing}
+    return tagged_answer(request, deps, worker_request, record, ask)
 
 
 def shape_lift(lift: LiftRecord) -> models.LiftResult:
     """A lift as clients get it; paths of this machine stay here."""
-    own = f"/lifts/{lift.id}"
-    links = {"self": own, "job": f"/jobs/{lift.id}", "features": f"{own}/features"}
-    links |= {"views": f"{own}/views", "objects": f"{own}/objects", "tree": f"{own}/tree"}
+    path = f"/lifts/{lift.id}"
+    links = {"self": path, "job": f"/jobs/{lift.id}", "features": f"{path}/features"}
+    links |= {"views": f"{path}/views", "objects": f"{path}/objects", "tree": f"{path}/tree"}
     links |= {"query": f"/query?lift={lift.id}&text="}
-    told = {
+    fields = {
         "views": [],
         "words": [],
         "origin": (0.0, 0.0, 0.0),
@@ -352,13 +352,13 @@ def shape_lift(lift: LiftRecord) -> models.LiftResult:
         **vars(lift),
         "links": links,
     }
-    return models.LiftResult(**{name: told[name] for name in models.LiftResult.model_fields})
+    return models.LiftResult(**{name: fields[name] for name in models.LiftResult.model_fields})
 
 
 def shape_tradeoff(tradeoff: TradeoffRecord) -> models.Tradeoff:
     """A trade-off as clients get it."""
-    own = f"/tradeoffs/{tradeoff.id}"
-    links = {"self": own, "job": f"/jobs/{tradeoff.id}", "chart": f"{own}/chart", "table": f"{own}/table"}
-    ours = ("id", "splats", "cameras", "features", "labels", "created")
-    told = {name: getattr(tradeoff, name) for name in ours}
-    return models.Tradeoff.model_validate({**tradeoff.document, **told, "links": links})
+    path = f"/tradeoffs/{tradeoff.id}"
+    links = {"self": path, "job": f"/jobs/{tradeoff.id}", "chart": f"{path}/chart", "table": f"{path}/table"}
+    names = ("id", "splats", "cameras", "features", "labels", "created")
+    fields = {name: getattr(tradeoff, name) for name in names}
+    return models.Tradeoff.model_validate({**tradeoff.document, **fields, "links": links})

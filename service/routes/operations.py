@@ -26,10 +26,7 @@ SWAGGER = Path(str(files("fastapi_offline"))) / "static"  # shipped, as a robot'
 NO_PICTURE = "data:,"  # the page asks another host for one unless it is told
 METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 METRICS: dict[int | str, dict[str, Any]] = {
-    200: {
-        "description": "The Prometheus text format",
-        "content": {METRICS_TYPE: {"schema": {"type": "string"}}},
-    }
+    200: {"description": "The Prometheus text format", "content": {METRICS_TYPE: {"schema": {"type": "string"}}}}
 }
 
 
@@ -112,8 +109,8 @@ class Documents:
         """The one of the two, as JSON."""
         with self._turn:
             if not self._made:
-                found = with_summaries(self._app.openapi())
-                self._made = tuple(bytes(JSONResponse(made).body) for made in (found, with_keys(found)))
+                document = with_summaries(self._app.openapi())
+                self._made = tuple(bytes(JSONResponse(variant).body) for variant in (document, with_keys(document)))
         return self._made[keys]
 
 
@@ -153,13 +150,13 @@ def _serve(path: str, file: Path, media_type: str, headers: dict[str, str] | Non
 EXAMPLE = Path(__file__).parents[1] / "commands" / "tabletop"
 
 
-def _serve_example(name: str, kept: str) -> None:
+def _serve_example(name: str, file_name: str) -> None:
     """Register a file of the scene that ships: the page orders a lift of it, as of files that were brought."""
 
     @router.get(f"/web/example/{name}", include_in_schema=False)
     def content() -> Response:
-        stored = (EXAMPLE / kept).read_bytes()
-        if kept.endswith(".zst"):
+        stored = (EXAMPLE / file_name).read_bytes()
+        if file_name.endswith(".zst"):
             stored = zstandard.ZstdDecompressor().decompress(stored)
         return Response(stored, media_type="application/octet-stream")
 

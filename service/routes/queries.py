@@ -18,7 +18,7 @@ from fastapi import Query as Parameter
 from liftcore import Query, __version__
 from liftcore.text import encoder_file
 from service import models
-from service.content import BINARY, Draft, kept, unchanged
+from service.content import BINARY, Draft, cache_headers, unchanged
 from service.errors import InvalidRequest
 from service.models import (
     AskedForWords,
@@ -36,7 +36,7 @@ from service.models import (
     WordsAnswer,
 )
 from service.query_client import PIPE_BYTES, Frame, Waiter
-from service.requests import JsonRoute, Parameters, both
+from service.requests import JsonRoute, Parameters, get_and_post
 from service.settings import encoder_label, encoder_spec, encoder_version
 from service.state import AppState, Deps
 from service.store.assets import kernel_of
@@ -79,45 +79,52 @@ async def _asking(request: Request, deps: Deps) -> AsyncIterator[Callable[[dict[
 Ask = Annotated[Callable[[dict[str, Any]], Frame], Depends(_asking, scope="function")]
 
 
-def tagged_answer(request: Request, deps: AppState, wanted: dict[str, Any], lift: LiftRecord, ask: Ask) -> Response:
+def tagged_answer(
+    request: Request, deps: AppState, worker_request: dict[str, Any], lift: LiftRecord, ask: Ask
+) -> Response:
     """304 when the client has it already, and nothing is asked; else it. The tag is made of all that decides it.
 
     What a POST asks for has no address, and so no tag.
     """
     if request.method == "POST":
-        return made(deps, wanted, lift, ask, {})
-    decides = {name: value for name, value in wanted.items() if name != "names"}
+        return binary_response(deps, worker_request, lift, ask, {})
+    decides = {name: value for name, value in worker_request.items() if name != "names"}
     decides |= {"lift": lift.sha256, "version": __version__}
     etag = f'"{hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()}"'
-    same = unchanged(request, etag, found=False)  # nobody has looked whether the view is there
-    if same is not None:
-        return same
-    answer = made(deps, wanted, lift, ask, kept(etag))
+    not_modified = unchanged(request, etag, found=False)  # nobody has looked whether the view is there
+    if not_modified is not None:
+        return not_modified
+    answer = binary_response(deps, worker_request, lift, ask, cache_headers(etag))
     return (None if isinstance(answer, Draft) else unchanged(request, etag)) or answer
 
 
-def made(deps: AppState, wanted: dict[str, Any], lift: LiftRecord, ask: Ask, headers: dict[str, str]) -> Response:
+def binary_response(
+    deps: AppState, worker_request: dict[str, Any], lift: LiftRecord, ask: Ask, headers: dict[str, str]
+) -> Response:
     """The answer itself. What is large the query process writes to a draft, so that no client, however slowly it
     reads, keeps it in memory.
     """
     files, name, size = deps.store.files, None, 0
-    match wanted["operation"]:
+    match worker_request["operation"]:
         case "splats":
-            name, size = f"{wanted['what']}-{lift.id}.ply", deps.store.assets.get(deps.owner, lift.splats).bytes
+            name, size = (
+                f"{worker_request['what']}-{lift.id}.ply",
+                deps.store.assets.get(deps.owner, lift.splats).bytes,
+            )
         case "export":
-            name = f"{wanted['name'] or 'splats'}-{lift.id}.zip"
+            name = f"{worker_request['name'] or 'splats'}-{lift.id}.zip"
             size = deps.store.assets.get(deps.owner, lift.splats).bytes + EXPORT_BYTES * lift.count
         case "scene":
             name, size = f"scene-{lift.id}.splat", ROW_BYTES * lift.count
         case "scores" | "selection" | "layer" | "word_labels" if SCORE_BYTES * lift.count > PIPE_BYTES:
             size = SCORE_BYTES * lift.count
-        case "catalogue" if wanted["means"]:
-            size = NUMBER_BYTES * lift.channels * wanted["count"]
+        case "catalogue" if worker_request["means"]:
+            size = NUMBER_BYTES * lift.channels * worker_request["count"]
     if size:
         files.require_room(size)
-    media_type = MEDIA_TYPES[wanted["operation"]]
+    media_type = MEDIA_TYPES[worker_request["operation"]]
     with files.draft("" if name is None else Path(name).suffix) as draft:
-        body = ask(wanted | {"draft": str(draft)}).body
+        body = ask(worker_request | {"draft": str(draft)}).body
         if draft.exists():
             return Draft(draft, media_type, filename=name, headers=headers)
     return Response(body, media_type=media_type, headers=headers)
@@ -150,10 +157,14 @@ def scene_request(operation: str, lift: LiftRecord, deps: AppState) -> dict[str,
 def query_request(operation: str, asked: models.Question, lift: LiftRecord, deps: AppState) -> dict[str, Any]:
     """The same with a query; texts bring their encoder, and examples of regions the lift's feature packs."""
     request: dict[str, Any] = scene_request(operation, lift, deps)
-    named = [str(one).removeprefix(SELECTION) for one in (*asked.sets, *asked.like, *asked.unlike) if _selects(one)]
-    if named:
-        found = {name: deps.store.selections.get(deps.owner, lift.id, name) for name in dict.fromkeys(named)}
-        request["selections"] = {name: bits_of(deps.store.selections.bits(one)) for name, one in found.items()}
+    selection_ids = [
+        str(item).removeprefix(SELECTION) for item in (*asked.sets, *asked.like, *asked.unlike) if _selects(item)
+    ]
+    if selection_ids:
+        selections = {
+            name: deps.store.selections.get(deps.owner, lift.id, name) for name in dict.fromkeys(selection_ids)
+        }
+        request["selections"] = {name: bits_of(deps.store.selections.bits(item)) for name, item in selections.items()}
     request = with_encoder(request, asked, lift, deps) if asked.texts else {**request, **NO_ENCODER}
     if any(isinstance(example, str) and example.startswith(REGION) for example in (*asked.like, *asked.unlike)):
         request = with_packs(request, lift, deps, "like")
@@ -191,16 +202,17 @@ def with_packs(request: dict[str, Any], lift: LiftRecord, deps: AppState, argume
         hint = "PUT /assets/features each of its packs before POST /lifts, or ask by splat:J or VIEW:x,y"
         got = "one that was brought without some of them"
         raise InvalidRequest(argument, expected="a lift whose feature packs are here", got=got, hint=hint)
+    return _with_packs_here(request, lift, deps)
+
+
+def _with_packs_here(request: dict[str, Any], lift: LiftRecord, deps: AppState) -> dict[str, Any]:
     packs = [deps.store.assets.get(deps.owner, asset) for asset in lift.features]
     names = request["names"] | {str(pack.path): f"features {pack.id}" for pack in packs}
     return request | {"features": [str(pack.path) for pack in packs], "names": names}
 
 
 def with_encoder(
-    request: dict[str, Any],
-    asked: models.LiftQuestion | models.AskedForNodes,
-    lift: LiftRecord,
-    deps: AppState,
+    request: dict[str, Any], asked: models.LiftQuestion | models.AskedForNodes, lift: LiftRecord, deps: AppState
 ) -> dict[str, Any]:
     """The request with the encoder of its words: an uploaded table, the lift's, or one of the operator.
 
@@ -208,10 +220,10 @@ def with_encoder(
         InvalidRequest: there is none of the lift's space, or of two names.
         NotFound: there is no such table.
     """
-    names, chosen = dict(request["names"]), asked.table
-    if chosen is None and asked.encoder in (None, lift.metadata["text_space"]):  # the words that came with the lift
-        chosen = deps.store.jobs.get(deps.owner, lift.id).parameters.get("table")
-    if chosen is None:
+    names, table_id = dict(request["names"]), asked.table
+    if table_id is None and asked.encoder in (None, lift.metadata["text_space"]):  # the words that came with the lift
+        table_id = deps.store.jobs.get(deps.owner, lift.id).parameters.get("table")
+    if table_id is None:
         spec = encoder_spec(deps.settings, lift.metadata["text_space"], asked.encoder)
         file = encoder_file(spec)
         if file is not None:
@@ -219,7 +231,7 @@ def with_encoder(
     elif asked.table is not None and asked.encoder is not None:
         raise InvalidRequest("table", expected="table or encoder", got="both", hint="leave one of them out")
     else:
-        table = deps.store.assets.get(deps.owner, chosen)
+        table = deps.store.assets.get(deps.owner, table_id)
         if table.kind is not models.AssetKind.TABLE:
             raise InvalidRequest("table", expected="an uploaded text table", got=f"{table.kind} {table.id}")
         spec = f"table:{table.path}"
@@ -244,7 +256,7 @@ IN_VIEW = Parameters(Question, (*TERMS, "view"), needs=("view",))
 PICTURE = Parameters(AskedToRender, ("lift", "view", "what"), needs=("view",))
 
 
-@both(router, "/query", WHERE, response_model=QueryAnswer)
+@get_and_post(router, "/query", WHERE, response_model=QueryAnswer)
 def query(asked: Question, deps: Deps, ask: Ask) -> dict[str, Any]:
     """Where it is: scores in numbers, the best splats, a box, and links to objects, splats and pictures.
 
@@ -252,15 +264,15 @@ def query(asked: Question, deps: Deps, ask: Ask) -> dict[str, Any]:
     """
     lift = find_lift(asked.lift, deps)
     request = query_request("query", asked, lift, deps) | {"view": asked.view, "top": asked.top}
-    found = ask(request).header
+    answer = ask(request).header
     view = asked.view or lift.first_view
     return {
         "lift": lift.id,
         "view": view,
         "text_space": lift.metadata["text_space"],
         "encoder": None if request["encoder"] is None else encoder_label(request["encoder"]),
-        "links": _answer_links(asked, lift, view, found=found["count"] > 0),
-        **found,
+        "links": _answer_links(asked, lift, view, found=answer["count"] > 0),
+        **answer,
     }
 
 
@@ -268,36 +280,36 @@ def query(asked: Question, deps: Deps, ask: Ask) -> dict[str, Any]:
 def query_words(asked: Annotated[AskedForWords, Parameter()], deps: Deps, ask: Ask) -> WordsAnswer:
     """What can be asked: words that a text which is being typed may become, and words for what is here."""
     lift = find_lift(asked.lift, deps)
-    wanted = with_encoder(scene_request("askable", lift, deps), asked, lift, deps)
-    return WordsAnswer(lift=lift.id, **ask(wanted | {"text": asked.text, "count": asked.limit}).header)
+    request = with_encoder(scene_request("askable", lift, deps), asked, lift, deps)
+    return WordsAnswer(lift=lift.id, **ask(request | {"text": asked.text, "count": asked.limit}).header)
 
 
-@both(router, "/query/objects", ASKED, response_model=ObjectsAnswer)
+@get_and_post(router, "/query/objects", ASKED, response_model=ObjectsAnswer)
 def query_objects(asked: Question, deps: Deps, ask: Ask) -> dict[str, Any]:
     """The things that were found, splats that touch one another: where each lies, and how large it is."""
     lift = find_lift(asked.lift, deps)
     return {"lift": lift.id, **ask(query_request("objects", asked, lift, deps)).header}
 
 
-@both(router, "/query/scores", ASKED, responses=NPY, response_class=Response)
+@get_and_post(router, "/query/scores", ASKED, responses=NPY, response_class=Response)
 def query_scores(asked: Question, request: Request, deps: Deps, ask: Ask) -> Response:
     """The score of every splat: .npy, float32 [P]."""
     return _entity("scores", asked, request, deps, ask)
 
 
-@both(router, "/query/selection", ASKED, responses=NPY, response_class=Response)
+@get_and_post(router, "/query/selection", ASKED, responses=NPY, response_class=Response)
 def query_selection(asked: Question, request: Request, deps: Deps, ask: Ask) -> Response:
     """Which splats were selected: .npy, bool [P]. By `auto` they are not just those at or above the threshold."""
     return _entity("selection", asked, request, deps, ask)
 
 
-@both(router, "/query/mask", IN_VIEW, responses=PNG, response_class=Response)
+@get_and_post(router, "/query/mask", IN_VIEW, responses=PNG, response_class=Response)
 def query_mask(asked: Question, request: Request, deps: Deps, ask: Ask) -> Response:
     """Where it is in a view, or from a camera of your own in a body: a PNG, white where it is."""
     return _entity("mask", asked, request, deps, ask, seen_from(asked))
 
 
-@both(router, "/query/attention", IN_VIEW, responses=PNG, response_class=Response)
+@get_and_post(router, "/query/attention", IN_VIEW, responses=PNG, response_class=Response)
 def query_attention(asked: Question, request: Request, deps: Deps, ask: Ask) -> Response:
     """How well each pixel of a view, or of a camera of your own in a body, answers to it: a PNG."""
     return _entity("attention", asked, request, deps, ask, seen_from(asked))
@@ -307,13 +319,13 @@ SPLATS_OF = "the splats that were found and no others, or all splats in the colo
 SplatsOf = Annotated[Literal["object", "scores"], Parameter(description=SPLATS_OF)]
 
 
-@both(router, "/query/splats", ASKED, responses=PLY, response_class=Response)
+@get_and_post(router, "/query/splats", ASKED, responses=PLY, response_class=Response)
 def query_splats(asked: Question, request: Request, deps: Deps, ask: Ask, what: SplatsOf = "object") -> Response:
     """What was found, or the scene in the colours of its scores, as splats: a PLY of the dialect that was lifted."""
     return _entity("splats", asked, request, deps, ask, {"what": what})
 
 
-@both(router, "/render", PICTURE, responses=PNG, response_class=Response)
+@get_and_post(router, "/render", PICTURE, responses=PNG, response_class=Response)
 def render(asked: AskedToRender, request: Request, deps: Deps, ask: Ask) -> Response:
     """The splats from a view, in their colours or in those of their features or clusters, or their depth: a PNG.
 
@@ -323,17 +335,12 @@ def render(asked: AskedToRender, request: Request, deps: Deps, ask: Ask) -> Resp
     is. In a body a camera of your own may stand in place of the view.
     """
     lift = find_lift(asked.lift, deps)
-    wanted = scene_request("render", lift, deps) | seen_from(asked) | {"what": asked.what}
-    return tagged_answer(request, deps, wanted, lift, ask)
+    worker_request = scene_request("render", lift, deps) | seen_from(asked) | {"what": asked.what}
+    return tagged_answer(request, deps, worker_request, lift, ask)
 
 
 def _entity(
-    operation: str,
-    asked: Question,
-    request: Request,
-    deps: AppState,
-    ask: Ask,
-    more: dict[str, Any] | None = None,
+    operation: str, asked: Question, request: Request, deps: AppState, ask: Ask, more: dict[str, Any] | None = None
 ) -> Response:
     """What a GET names, with its tag, or what a POST asks for."""
     lift = find_lift(asked.lift, deps)
@@ -370,7 +377,7 @@ def _link(path: str, asked: Question, **more: str) -> str:
     for name in (*Query.deciding(), "encoder", "table"):
         value = getattr(asked, name)
         if name == "threshold" or value != Question.model_fields[name].default:
-            pairs += [(name, str(one)) for one in (value if isinstance(value, list) else [value])]
+            pairs += [(name, str(item)) for item in (value if isinstance(value, list) else [value])]
     return f"{path}{'&' if '?' in path else '?'}{urlencode(pairs + list(more.items()))}"
 
 
@@ -378,30 +385,30 @@ def _link(path: str, asked: Question, **more: str) -> str:
 def segment(asked: AskedToSegment, deps: Deps, ask: Ask) -> Response:
     """Which of many words are there, and where: to every splat the word that it is most like, or none."""
     lift = find_lift(asked.lift, deps)
-    wanted = _word_request("segment", asked, lift, deps)
-    head = {"lift": lift.id, "encoder": encoder_label(wanted["encoder"])}
-    return made(deps, wanted | {"head": head}, lift, ask, {})
+    request = _word_request("segment", asked, lift, deps)
+    head = {"lift": lift.id, "encoder": encoder_label(request["encoder"])}
+    return binary_response(deps, request | {"head": head}, lift, ask, {})
 
 
 @router.post("/query/segment/labels", responses=NPY, response_class=Response)
 def segment_labels(asked: AskedToSegment, deps: Deps, ask: Ask) -> Response:
     """The value of every splat's word, 0 for none: .npy, int32 [P]."""
     lift = find_lift(asked.lift, deps)
-    return made(deps, _word_request("word_labels", asked, lift, deps), lift, ask, {})
+    return binary_response(deps, _word_request("word_labels", asked, lift, deps), lift, ask, {})
 
 
 @router.post("/query/segment/map", responses=PNG, response_class=Response)
 def segment_map(asked: AskedToSegment, deps: Deps, ask: Ask) -> Response:
     """The values of a view's pixels in colours, with a palette: a PNG whose text `legend` has the words by value."""
     lift = find_lift(asked.lift, deps)
-    return made(deps, _word_request("word_map", asked, lift, deps) | seen_from(asked), lift, ask, {})
+    return binary_response(deps, _word_request("word_map", asked, lift, deps) | seen_from(asked), lift, ask, {})
 
 
 @router.post("/query/segment/picture", responses=PNG, response_class=Response)
 def segment_picture(asked: AskedToSegment, deps: Deps, ask: Ask) -> Response:
     """A view tinted with the colours of its words, beside a drawn legend: a PNG."""
     lift = find_lift(asked.lift, deps)
-    return made(deps, _word_request("word_picture", asked, lift, deps) | seen_from(asked), lift, ask, {})
+    return binary_response(deps, _word_request("word_picture", asked, lift, deps) | seen_from(asked), lift, ask, {})
 
 
 @router.post("/query/export", responses=bytes_of("application/zip"), response_class=Response)
@@ -412,47 +419,48 @@ def export(asked: AskedToExport, deps: Deps, ask: Ask) -> Response:
     `truth.safetensors` (masks for a trade-off).
     """
     lift = find_lift(asked.lift, deps)
-    wanted: dict[str, Any] = scene_request("export", lift, deps) | NO_ENCODER | {"words": None}
+    request: dict[str, Any] = scene_request("export", lift, deps) | NO_ENCODER | {"words": None}
     title = [asked.of]
     if asked.of == "questions":
-        if not asked.questions or any(one.lift not in (None, lift.id) for one in asked.questions):
+        if not asked.questions or any(question.lift not in (None, lift.id) for question in asked.questions):
             raise InvalidRequest("questions", expected="a question or more, to the same lift", got="none, or others")
-        named = _by_name(asked.questions)
-        parts = [{"name": name, "request": query_request("query", one, lift, deps)} for name, one in named.items()]
-        wanted, title = wanted | {"parts": parts}, list(named)
+        by_name = _by_name(asked.questions)
+        parts = [
+            {"name": name, "request": query_request("query", question, lift, deps)}
+            for name, question in by_name.items()
+        ]
+        request, title = request | {"parts": parts}, list(by_name)
     elif asked.of == "words" or asked.encoder is not None or asked.table is not None:
-        wanted = _word_request("export", asked, lift, deps)
+        request = _word_request("export", asked, lift, deps)
     name = "-".join(re.findall(r"[A-Za-z0-9]+", " ".join(title)))[:80]
-    things = list(deps.store.selections.things(deps.owner, lift.id).items())
-    wanted |= {"of": asked.of, "of_view": asked.view, "name": name, "things": things}
-    return made(deps, wanted, lift, ask, {})
+    labels = list(deps.store.selections.things(deps.owner, lift.id).items())
+    request |= {"of": asked.of, "of_view": asked.view, "name": name, "things": labels}
+    return binary_response(deps, request, lift, ask, {})
 
 
 def _by_name(questions: list[models.NamedQuestion]) -> dict[str, models.NamedQuestion]:
     """Questions by what files call them; one whose name another has gets a number."""
-    named = dict[str, models.NamedQuestion]()
-    for one in questions:
-        name = first = one.name or ", ".join(map(shown, (*one.text, *one.like, *one.sets)))
+    by_name = dict[str, models.NamedQuestion]()
+    for question in questions:
+        name = first = question.name or ", ".join(map(shown, (*question.text, *question.like, *question.sets)))
         number = 1
-        while name in named:
+        while name in by_name:
             number += 1
             name = f"{first} {number}"
-        named[name] = one
-    return named
+        by_name[name] = question
+    return by_name
 
 
 @router.post("/query/what", response_model=WhatAnswer)
 def name_example(asked: AskedWhat, deps: Deps, ask: Ask) -> WhatAnswer:
     """What is this? The words that a pixel, a splat, a region or a vector is most like."""
     lift = find_lift(asked.lift, deps)
-    wanted = _word_request("what", asked, lift, deps) | {"example": asked.example, "top": asked.top}
+    request = _word_request("what", asked, lift, deps) | {"example": asked.example, "top": asked.top}
     return WhatAnswer(
-        lift=lift.id, encoder=encoder_label(wanted["encoder"]), example=shown(asked.example), **ask(wanted).header
+        lift=lift.id, encoder=encoder_label(request["encoder"]), example=shown(asked.example), **ask(request).header
     )
 
 
 def _word_request(operation: str, asked: Words, lift: LiftRecord, deps: AppState) -> dict[str, Any]:
     request = with_encoder(scene_request(operation, lift, deps), asked, lift, deps)
-    packs = [deps.store.assets.get(deps.owner, asset) for asset in lift.features]
-    names = request["names"] | {str(pack.path): f"features {pack.id}" for pack in packs}
-    return request | {"words": asked.words, "features": [str(pack.path) for pack in packs], "names": names}
+    return _with_packs_here(request, lift, deps) | {"words": asked.words}

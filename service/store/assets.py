@@ -90,16 +90,16 @@ class AssetStore:
         """
         asset = f"sha256:{upload.sha256}"
         with self._files.blobs_changing, self._database.write(counted=True) as connection:
-            owned = connection.execute(
+            row = connection.execute(
                 "SELECT 1 FROM asset_owners WHERE asset = ? AND owner = ?", (asset, owner.key)
             ).fetchone()
-            if owned is None:
+            if row is None:
                 require_quota(connection, owner, upload.draft.stat().st_size)
                 self._publish(connection, asset, upload)
                 own(connection, asset, owner.key)
             elif not self.get(owner, asset).whole:
                 self._publish(connection, asset, upload)
-        return self.get(owner, asset, most=SHOWN_CHARACTERS), owned is None
+        return self.get(owner, asset, most=SHOWN_CHARACTERS), row is None
 
     def _publish(self, connection: sqlite3.Connection, asset: str, upload: CheckedUpload) -> None:
         """The bytes and the row; both may be there, and then the bytes are replaced by equal ones."""
@@ -138,10 +138,10 @@ class AssetStore:
             row = connection.execute(ONE, owner.terms(asset=asset)).fetchone()
             if row is None:
                 return None
-            found = self._record(row)
-            if found.kind is not AssetKind.SPLATS and row["counts_bytes"] <= most:
-                found.counts[_long(found.kind)] = _names(connection, asset, 0, -1)
-            return found
+            record = self._record(row)
+            if record.kind is not AssetKind.SPLATS and row["counts_bytes"] <= most:
+                record.counts[_long(record.kind)] = _names(connection, asset, 0, -1)
+            return record
 
     def names(self, owner: Owner, asset: str, first: int, limit: int) -> list[str]:
         """So many of the names, or words, that an asset holds, from the one of that number on."""
@@ -155,13 +155,13 @@ class AssetStore:
         Raises:
             NotFound: there is none, or it is of another kind.
         """
-        found = self.find(owner, asset, most=most)
+        record = self.find(owner, asset, most=most)
         name = f"{kind or 'asset'}"
-        if found is None:
+        if record is None:
             raise NotFound(name, expected="the id of an asset that is here", got=asset, hint="PUT /assets/... first")
-        if kind is not None and found.kind is not kind:
-            raise NotFound(name, expected=f"an asset of kind {kind}", got=f"{asset}, which is of kind {found.kind}")
-        return found
+        if kind is not None and record.kind is not kind:
+            raise NotFound(name, expected=f"an asset of kind {kind}", got=f"{asset}, which is of kind {record.kind}")
+        return record
 
     def page(self, owner: Owner, limit: int, cursor: str | None = None) -> Page[AssetRecord]:
         """So many assets after a cursor, newest first, without the names and words that they hold."""
@@ -180,7 +180,7 @@ class AssetStore:
             InUse: a job or a lift of theirs refers to it.
         """
         with self._files.blobs_changing:
-            found, terms = self.get(owner, asset), owner.terms(asset=asset)
+            record, terms = self.get(owner, asset), owner.terms(asset=asset)
 
             def forget(connection: sqlite3.Connection) -> list[Path]:
                 users = connection.execute(
@@ -201,7 +201,7 @@ class AssetStore:
                     " AND NOT EXISTS (SELECT 1 FROM asset_owners WHERE asset = :asset) RETURNING id",
                     terms,
                 ).fetchall()
-                return [found.path] if last else []
+                return [record.path] if last else []
 
             self._database.write_freeing(forget)
 
@@ -218,8 +218,8 @@ class AssetStore:
 
 def kernel_of(splats: AssetRecord, settings: Mapping[str, Any]) -> str:
     """The kernel that a lift of those settings takes the splats for."""
-    asked = settings.get("kernel", "auto")
-    return splats.counts.get("kernel", "3dgs") if asked == "auto" else asked
+    kernel = settings.get("kernel", "auto")
+    return splats.counts.get("kernel", "3dgs") if kernel == "auto" else kernel
 
 
 def _names(connection: sqlite3.Connection, asset: str, first: int, limit: int) -> list[str]:

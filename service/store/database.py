@@ -149,14 +149,14 @@ class Database:
         """
         try:
             with self.write(counted=True) as connection:
-                freed = list(work(connection))
+                paths = list(work(connection))
         except sqlite3.OperationalError as error:
             if getattr(error, "sqlite_errorcode", 0) & 0xFF not in (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR):
                 raise
             (self._path.parent / RESERVE).unlink(missing_ok=True)
             with self.write(counted=True) as connection:
-                freed = list(work(connection))
-        for path in freed:
+                paths = list(work(connection))
+        for path in paths:
             remove(path)
         self.keep_reserve()
 
@@ -178,10 +178,10 @@ class Database:
             sqlite3.OperationalError: it is gone, or another.
         """
         try:
-            same = _identity(self._path) == self._identity
+            is_same = _identity(self._path) == self._identity
         except OSError as error:  # a disk that tells nothing tells of no other file
-            same = not isinstance(error, FileNotFoundError)
-        if not same:
+            is_same = not isinstance(error, FileNotFoundError)
+        if not is_same:
             raise _error("another file, or none, is in the place of the database", "SQLITE_READONLY_DBMOVED")
 
     def _require_readable(self, seconds: float = 0.0) -> None:
@@ -199,11 +199,11 @@ class Database:
                 deadline = time.monotonic() + seconds
                 connection.set_progress_handler(lambda: time.monotonic() > deadline, LOOK_STEPS)
                 try:
-                    found = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
+                    result = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
                 except sqlite3.OperationalError as error:
-                    found = "ok" if error.sqlite_errorcode == sqlite3.SQLITE_INTERRUPT else str(error)
-                if found != "ok":
-                    raise _error(f"the database is damaged: {found}", "SQLITE_CORRUPT")
+                    result = "ok" if error.sqlite_errorcode == sqlite3.SQLITE_INTERRUPT else str(error)
+                if result != "ok":
+                    raise _error(f"the database is damaged: {result}", "SQLITE_CORRUPT")
 
     def _next_generation(self) -> int:
         return self._writer.execute("UPDATE generation SET number = number + 1 RETURNING number").fetchone()[0]
@@ -270,10 +270,10 @@ def expected_generation(data: Path) -> int | None:
     Raises:
         Misconfigured: the marker is there and holds no number.
     """
-    marked = _marked(data)
-    if marked is None and (any(data.glob("blobs/*/*")) or any(data.glob("lifts/*"))):
+    marker = _marked(data)
+    if marker is None and (any(data.glob("blobs/*/*")) or any(data.glob("lifts/*"))):
         return 0  # files of a release without the marker
-    return marked
+    return marker
 
 
 def remember_generation(data: Path, number: int) -> None:
@@ -317,12 +317,9 @@ def copy_database(source: Path, target: Path) -> None:
     draft = target.with_name(f".{target.name}.part")
     draft.unlink(missing_ok=True)
     try:
-        with (
-            closing(open_to_read(source)) as read,
-            closing(sqlite3.connect(draft)) as written,
-        ):
-            read.backup(written)
-            written.execute("PRAGMA journal_mode = DELETE")  # so that it is one file
+        with closing(open_to_read(source)) as original, closing(sqlite3.connect(draft)) as copy:
+            original.backup(copy)
+            copy.execute("PRAGMA journal_mode = DELETE")  # so that it is one file
         with draft.open("rb") as handle:
             os.fsync(handle.fileno())
         draft.replace(target)

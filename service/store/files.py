@@ -71,8 +71,8 @@ class DataDirectory:
             yield path
         finally:
             self._live.discard(path.name)
-            for left in path.parent.glob(f"*{path.name}*"):  # with the drafts that writers keep beside it
-                left.unlink(missing_ok=True)
+            for remnant in path.parent.glob(f"*{path.name}*"):  # with the drafts that writers keep beside it
+                remnant.unlink(missing_ok=True)
 
     @contextmanager
     def scratch(self) -> Iterator[Path]:
@@ -150,7 +150,7 @@ class DataDirectory:
         # A folder for each time that something is moved, so that nothing replaces what is there.
         now = datetime.now(UTC).strftime(MOVED)
         folder = self.root / "quarantine" / f"{now}-{secrets.token_hex(4)}"
-        moved = []
+        sources = []
         for path in paths:
             target = folder / path.relative_to(self.root)
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -158,19 +158,19 @@ class DataDirectory:
                 path.rename(target)
             except FileNotFoundError:  # its owner was quicker
                 continue
-            moved.append(path)
-        return moved
+            sources.append(path)
+        return sources
 
     def quarantined(self) -> list[tuple[Path, float]]:
         """The folders of the quarantine, and since when each is there; those with other names are nobody's."""
-        found = []
+        folders = []
         for folder in (self.root / "quarantine").glob("*-*"):
             try:
                 since = datetime.strptime(folder.name.partition("-")[0], MOVED).replace(tzinfo=UTC)
             except ValueError:
                 continue
-            found.append((folder, since.timestamp()))
-        return found
+            folders.append((folder, since.timestamp()))
+        return folders
 
     def begin_anew(self, database: str, marker: str) -> None:
         """Move all that is here to quarantine, with the database and what is remembered of its generation."""

@@ -25,15 +25,7 @@ from service.models import ENDED, AssetKind, JobKind, JobState
 from service.store.assets import own
 from service.store.database import Database, Page, insert, page_of, parsed, record_of
 from service.store.files import DataDirectory
-from service.store.owners import (
-    ENDED_KEYS,
-    QUEUE_RETRY_SECONDS,
-    SEEN,
-    SHOWN_JOBS,
-    Owner,
-    require_quota,
-    require_turn,
-)
+from service.store.owners import ENDED_KEYS, QUEUE_RETRY_SECONDS, SEEN, SHOWN_JOBS, Owner, require_quota, require_turn
 
 LOG_LINES = 200  # a job; older ones go
 LINE_CHARACTERS = 500
@@ -60,8 +52,8 @@ class JobOrder:
 
     def assets(self) -> list[tuple[str, AssetKind]]:
         """What it needs: ids, and the kind that each must be."""
-        wanted = [(self.splats, AssetKind.SPLATS), (self.cameras, AssetKind.CAMERAS)]
-        return [*wanted, *((asset, AssetKind.FEATURES) for asset in self.features), *labels_of(self.parameters)]
+        inputs = [(self.splats, AssetKind.SPLATS), (self.cameras, AssetKind.CAMERAS)]
+        return [*inputs, *((asset, AssetKind.FEATURES) for asset in self.features), *labels_of(self.parameters)]
 
 
 @dataclass(frozen=True)
@@ -106,9 +98,9 @@ class Event:
 
 def labels_of(parameters: Mapping[str, Any]) -> list[tuple[str, AssetKind]]:
     """The assets that a job's parameters name, with their kinds: what a trade-off is judged by, or a lift's words."""
-    named = parameters.get("labels")
-    if named is not None:
-        return [(named[str(kind)], kind) for kind in (AssetKind.MASKS, AssetKind.TABLE)]
+    labels = parameters.get("labels")
+    if labels is not None:
+        return [(labels[str(kind)], kind) for kind in (AssetKind.MASKS, AssetKind.TABLE)]
     return [(parameters["table"], AssetKind.TABLE)] if "table" in parameters else []
 
 
@@ -139,9 +131,9 @@ class JobStore:
         """
         job = secrets.token_hex(16)
         with self._database.write(counted=True) as connection:
-            known = _of_key(connection, order, owner)
-            if known is not None:
-                return known, False
+            earlier = _of_key(connection, order, owner)
+            if earlier is not None:
+                return earlier, False
             _require_place(connection, order.kind, max_queued)
             require_turn(connection, order.kind, owner)
             _take_assets(connection, order, owner)
@@ -199,8 +191,8 @@ class JobStore:
     def page(self, owner: Owner, limit: int, cursor: str | None = None) -> Page[JobRecord]:
         """So many jobs after a cursor, newest first."""
         with self._database.read() as connection:
-            listed = f"SELECT * FROM jobs WHERE {SEEN}"
-            return page_of(connection, listed, owner.terms(), limit, cursor, lambda row: record(connection, row))
+            select = f"SELECT * FROM jobs WHERE {SEEN}"
+            return page_of(connection, select, owner.terms(), limit, cursor, lambda row: record(connection, row))
 
     def all(self, owner: Owner) -> list[JobRecord]:
         """Every job, newest first."""
@@ -239,11 +231,11 @@ class JobStore:
             NotFound: there is no such job, or the key that follows it is no longer valid.
         """
         with self._database.read() as connection:
-            seen = connection.execute(
+            visible = connection.execute(
                 f"SELECT 1 FROM jobs WHERE id = :job AND {SEEN} AND :owner NOT IN ({ENDED_KEYS})",
                 owner.terms(job=job, now=time.time()),
             )
-            if seen.fetchone() is None:
+            if visible.fetchone() is None:
                 raise NotFound("job", expected="the id of a job", got=job)
             rows = connection.execute(
                 "SELECT number, kind, data FROM job_events WHERE job = ? AND number > ? ORDER BY number",
@@ -292,11 +284,11 @@ class JobStore:
         Returns:
             How many went.
         """
-        forgotten = 0
+        count = 0
         while True:
-            gone: list[str] = []
+            batch: list[str] = []
 
-            def forget(connection: sqlite3.Connection, gone: list[str] = gone) -> list[Path]:
+            def forget(connection: sqlite3.Connection, batch: list[str] = batch) -> list[Path]:
                 rows = connection.execute(
                     "DELETE FROM jobs WHERE id IN (SELECT id FROM (SELECT id, coalesce(ended, created) AS since,"
                     " row_number() OVER (PARTITION BY owner ORDER BY coalesce(ended, created) DESC, id) AS place"
@@ -305,13 +297,13 @@ class JobStore:
                     " WHERE since < :before OR place > :most LIMIT :at_once) RETURNING id",
                     {"before": before, "most": most, "at_once": FORGOTTEN_AT_ONCE},
                 ).fetchall()
-                gone[:] = [row["id"] for row in rows]
-                return [self._files.work(job) for job in gone]
+                batch[:] = [row["id"] for row in rows]
+                return [self._files.work(job) for job in batch]
 
             self._database.write_freeing(forget)
-            forgotten += len(gone)
-            if len(gone) < FORGOTTEN_AT_ONCE:
-                return forgotten
+            count += len(batch)
+            if len(batch) < FORGOTTEN_AT_ONCE:
+                return count
 
     def claim(self) -> JobRecord | None:
         """Take a queued job and make it running, as a new attempt.
@@ -336,10 +328,10 @@ class JobStore:
                 " RETURNING *",
                 (time.time(), owner),
             ).fetchone()
-            told(connection, row)
-            claimed = record(connection, row)
+            record_state(connection, row)
+            job = record(connection, row)
         self._claims = [*(other for other in self._claims if other != owner), owner]
-        return claimed
+        return job
 
     def advance(self, job: str, attempt: int, progress: Mapping[str, Any]) -> None:
         """Note how far an attempt is."""
@@ -352,11 +344,11 @@ class JobStore:
     def _note_latest(self, job: str, attempt: int, kind: EventKind, data: Mapping[str, Any]) -> None:
         """Keep what there is one of: in the job's column of that name, and as an event."""
         with self._database.write() as connection:
-            changed = connection.execute(
+            update = connection.execute(
                 f"UPDATE jobs SET {kind} = :data WHERE {OWNS}",
                 {"data": json.dumps(data), "job": job, "attempt": attempt},
             )
-            if changed.rowcount == 1:
+            if update.rowcount == 1:
                 note(connection, job, kind, data)
 
     def log(self, job: str, attempt: int, text: str) -> None:
@@ -409,8 +401,8 @@ class JobStore:
 
 def find(connection: sqlite3.Connection, job: str, owner: Owner) -> sqlite3.Row | None:
     """The row of a job that an owner sees."""
-    asked = f"SELECT * FROM jobs WHERE id = :job AND {SHOWN_JOBS}"
-    return connection.execute(asked, owner.terms(job=job)).fetchone()
+    select = f"SELECT * FROM jobs WHERE id = :job AND {SHOWN_JOBS}"
+    return connection.execute(select, owner.terms(job=job)).fetchone()
 
 
 def row_of(connection: sqlite3.Connection, job: str, owner: Owner) -> sqlite3.Row:
@@ -433,7 +425,7 @@ def record(connection: sqlite3.Connection, row: sqlite3.Row) -> JobRecord:
         row,
         state=JobState(row["state"]),
         kind=JobKind(row["kind"]),
-        features=tuple(found["asset"] for found in features),
+        features=tuple(feature["asset"] for feature in features),
         **{name: parsed(row[name]) for name in ("settings", "parameters", "progress", "plan", "problem")},
     )
 
@@ -464,11 +456,11 @@ def _require_place(connection: sqlite3.Connection, kind: JobKind, max_queued: in
 def _take_assets(connection: sqlite3.Connection, order: JobOrder, owner: Owner) -> None:
     """See that the assets are there; what the job of an admin needs of others, the admin has from now on."""
     for asset, kind in order.assets():
-        seen = connection.execute(
+        visible = connection.execute(
             f"SELECT 1 FROM assets JOIN asset_owners ON asset = id WHERE id = :asset AND kind = :kind AND {SEEN}",
             owner.terms(asset=asset, kind=kind),
         )
-        if seen.fetchone() is None:
+        if visible.fetchone() is None:
             raise NotFound(kind, expected=f"the id of an asset of kind {kind}", got=asset)
         own(connection, asset, owner.key)
 
@@ -480,12 +472,12 @@ def note(connection: sqlite3.Connection, job: str, kind: EventKind, data: Mappin
         " SELECT ?, coalesce(max(number), 0) + 1, ?, ?, ? FROM job_events WHERE job = ?",
         (job, kind, json.dumps(data), time.time(), job),
     )
-    kept = {EventKind.PLAN: 1, EventKind.PROGRESS: 1, EventKind.LOG: LOG_LINES}.get(kind)
-    if kept is not None:
+    limit = {EventKind.PLAN: 1, EventKind.PROGRESS: 1, EventKind.LOG: LOG_LINES}.get(kind)
+    if limit is not None:
         connection.execute(
             "DELETE FROM job_events WHERE job = :job AND kind = :kind AND number NOT IN"
             " (SELECT number FROM job_events WHERE job = :job AND kind = :kind ORDER BY number DESC LIMIT :kept)",
-            {"job": job, "kind": kind, "kept": kept},
+            {"job": job, "kind": kind, "kept": limit},
         )
 
 
@@ -494,7 +486,7 @@ def log_line(text: str) -> dict[str, Any]:
     return {"line": text[:LINE_CHARACTERS], "time": round(time.time(), 3)}
 
 
-def told(connection: sqlite3.Connection, row: sqlite3.Row) -> None:
+def record_state(connection: sqlite3.Connection, row: sqlite3.Row) -> None:
     """Note the state of a row that was just changed."""
     data = {"state": row["state"], "attempt": row["attempt"], "problem": parsed(row["problem"])}
     note(connection, row["id"], EventKind.STATE, data)
@@ -504,7 +496,7 @@ def move(
     connection: sqlite3.Connection, row: sqlite3.Row, state: JobState, problem: Mapping[str, str] | None = None
 ) -> None:
     """Within a write transaction: bring a job to a state, and note it."""
-    changed = connection.execute(
+    after = connection.execute(
         "UPDATE jobs SET state = :state, problem = :problem,"
         " ended = CASE WHEN :ended THEN :now ELSE NULL END,"
         " progress = CASE WHEN :state = 'queued' THEN NULL ELSE progress END"
@@ -517,7 +509,7 @@ def move(
             "job": row["id"],
         },
     ).fetchone()
-    told(connection, changed)
+    record_state(connection, after)
 
 
 def succeed(connection: sqlite3.Connection, job: str, attempt: int) -> bool:
@@ -538,8 +530,8 @@ def stop_waiting(connection: sqlite3.Connection) -> None:
     now = time.time()
     rows = connection.execute(f"SELECT * FROM jobs WHERE state = 'queued' AND owner IN ({ENDED_KEYS})", {"now": now})
     for row in rows.fetchall():
-        ended = Unauthorized("key", expected="a key that is valid when its job begins", got="one that no longer is")
-        move(connection, row, JobState.CANCELED, fault_of(ended))
+        error = Unauthorized("key", expected="a key that is valid when its job begins", got="one that no longer is")
+        move(connection, row, JobState.CANCELED, fault_of(error))
 
 
 def _owned(connection: sqlite3.Connection, job: str, attempt: int) -> sqlite3.Row | None:

@@ -69,9 +69,9 @@ class KeyStore:
 
     def under(self, rule: Rule | None) -> Self:
         """The same keys under the operator's word on whether requests need one."""
-        ruled = copy.copy(self)
-        ruled._rule = rule
-        return ruled
+        store = copy.copy(self)
+        store._rule = rule
+        return store
 
     def create(
         self,
@@ -102,8 +102,8 @@ class KeyStore:
         if (Scope.SHARED in scopes or lifts) and not (scopes == {Scope.SHARED} and lifts):
             got = f"{', '.join(sorted(scopes))} and {len(lifts)} lifts"
             raise InvalidRequest("scopes", expected="shared alone, with the lifts that the key is given", got=got)
-        secret, given = _new_secret(), tuple(sorted(set(lifts)))
-        key = KeyRecord(secrets.token_hex(6), name, scopes, quota, time.time(), None, expires, given, maker)
+        secret, lift_ids = _new_secret(), tuple(sorted(set(lifts)))
+        key = KeyRecord(secrets.token_hex(6), name, scopes, quota, time.time(), None, expires, lift_ids, maker)
         row = {
             "id": key.id,
             "name": name,
@@ -197,10 +197,10 @@ class KeyStore:
 
     def of_lift(self, lift: str) -> list[KeyRecord]:
         """The keys that a lift was given to and that are valid, newest first."""
-        given, terms = "SELECT key FROM key_lifts WHERE lift = :lift", {"lift": lift, "now": time.time()}
-        asked = f"{KEYS} WHERE id IN ({given}) AND id NOT IN ({ENDED_KEYS}) ORDER BY created DESC, id"
+        holders, terms = "SELECT key FROM key_lifts WHERE lift = :lift", {"lift": lift, "now": time.time()}
+        select = f"{KEYS} WHERE id IN ({holders}) AND id NOT IN ({ENDED_KEYS}) ORDER BY created DESC, id"
         with self._database.read() as connection:
-            rows = connection.execute(asked, terms).fetchall()
+            rows = connection.execute(select, terms).fetchall()
         return [_record(row) for row in rows]
 
     def take_away(self, key: str, lift: str) -> None:
@@ -269,8 +269,8 @@ def any_key(database: Path) -> bool:
         return False
     connection = open_to_read(database)
     try:
-        known = connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'keys'").fetchone()
-        return known is not None and _any(connection)
+        table = connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'keys'").fetchone()
+        return table is not None and _any(connection)
     except sqlite3.DatabaseError as error:
         raise unusable(database, error) from None
     finally:
@@ -288,8 +288,8 @@ def earliest(*moments: float | None) -> float | None:
 
 def _shares_of(connection: sqlite3.Connection, maker: KeyRecord, now: float) -> list[KeyRecord]:
     """The keys that are valid so far and that a key shared lifts with, oldest first."""
-    asked = f"{KEYS} WHERE maker = :maker AND id NOT IN ({ENDED_KEYS}) ORDER BY created, id"
-    return [_record(row) for row in connection.execute(asked, {"maker": maker.id, "now": now})]
+    select = f"{KEYS} WHERE maker = :maker AND id NOT IN ({ENDED_KEYS}) ORDER BY created, id"
+    return [_record(row) for row in connection.execute(select, {"maker": maker.id, "now": now})]
 
 
 def _record(row: sqlite3.Row) -> KeyRecord:

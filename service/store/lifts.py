@@ -22,7 +22,7 @@ from service.errors import InvalidRequest
 from service.store.assets import own
 from service.store.database import Database, Page, insert, page_of, parsed, record_of
 from service.store.files import DataDirectory, sync_directory
-from service.store.jobs import JobOrder, succeed, told
+from service.store.jobs import JobOrder, record_state, succeed
 from service.store.owners import SEEN, SHOWN_JOBS, Owner, require_quota
 
 BY_HAND = "set by hand"  # of the rendering that a lift's plan tells: the setting was not auto
@@ -74,16 +74,18 @@ class LiftRecord:
         try:
             handle: Any
             with safe_open(str(self.path), framework="np") as handle:
-                told = json.loads(handle.metadata()["splatlift"])
-            own, now = (
+                metadata = json.loads(handle.metadata()["splatlift"])
+            in_file, now = (
                 {name: value for name, value in (world or {}).items() if value is not None}
-                for world in (told.get("world"), self.metadata["world"])
+                for world in (metadata.get("world"), self.metadata["world"])
             )
-            if own == now:
+            if in_file == now:
                 return None
-            told |= {"world": self.metadata["world"]}
+            metadata |= {"world": self.metadata["world"]}
             return next(
-                with_metadata(self.path, {"splatlift": json.dumps(told, ensure_ascii=False, separators=(",", ":"))})
+                with_metadata(
+                    self.path, {"splatlift": json.dumps(metadata, ensure_ascii=False, separators=(",", ":"))}
+                )
             )
         except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
             got = f"one that does not open: {error}"[:200]
@@ -221,7 +223,7 @@ class LiftStore:
                 connection.execute("INSERT OR IGNORE INTO job_features VALUES (?, ?, ?)", (job, place, asset))
             for asset, _ in order.assets():
                 own(connection, asset, row["owner"])
-            told(connection, row)
+            record_state(connection, row)
             self._insert(connection, job, made, status.st_size, status.st_mtime)
             if made.draft != path:
                 self._files.publish(made.draft, path)
@@ -307,18 +309,18 @@ class LiftStore:
         Raises:
             NotFound: there is none.
         """
-        found = self.find(owner, lift)
-        if found is None:
+        record = self.find(owner, lift)
+        if record is None:
             raise NotFound(
                 "lift", expected="the id of a lift", got=lift, hint="GET /lifts lists them; a lift has its job's id"
             )
-        return found
+        return record
 
     def lifted(self, owner: Owner, lift: str, names: list[str]) -> set[str]:
         """Which of these views were lifted."""
-        asked, known = "SELECT 1 FROM lifted_views WHERE lift = ? AND name = ?", self.get(owner, lift).id
+        select, ident = "SELECT 1 FROM lifted_views WHERE lift = ? AND name = ?", self.get(owner, lift).id
         with self._database.read() as connection:
-            return {name for name in names if connection.execute(asked, (known, name)).fetchone()}
+            return {name for name in names if connection.execute(select, (ident, name)).fetchone()}
 
     def only(self, owner: Owner) -> LiftRecord:
         """The one lift that is here.

@@ -92,10 +92,11 @@ def require_quota(connection: sqlite3.Connection, owner: Owner, coming: int) -> 
     """
     if owner.max_bytes is None:
         return
-    used = stored_bytes(connection, owner)
-    if used + coming > owner.max_bytes:
+    stored = stored_bytes(connection, owner)
+    if stored + coming > owner.max_bytes:
         raise OverQuota(
-            "key", expected=f"at most {owner.max_bytes} bytes of assets and results", got=f"{used} and {coming} more",
+            "key", expected=f"at most {owner.max_bytes} bytes of assets and results",
+            got=f"{stored} and {coming} more",
             hint="delete assets, or jobs with their results, or ask the operator for more",
         )  # fmt: skip
 

@@ -48,29 +48,30 @@ def back_up(data: Path, target: Path) -> int:
         Misconfigured: the target is there already, or files that the database knows are lost.
     """
     _require_database(data)
-    known, lost = set[str](), list[str]()
+    files, missing = set[str](), list[str]()
     with _made_whole(target) as folder:
         for _ in range(TRIES):  # the database first: what is deleted after it is missed, and looked for anew
             copy_database(data / DATABASE, folder / DATABASE)
-            known = {file for file, _, _ in _files(folder)}
-            lost = [file for file in sorted(known) if not _linked(data / file, folder / file)]
-            if not lost:
+            files = {file for file, _, _ in _files(folder)}
+            missing = [file for file in sorted(files) if not _linked(data / file, folder / file)]
+            if not missing:
                 break
-        if lost:
+        if missing:
             raise Misconfigured(
-                "data", expected="all files that the database knows", got=f"{len(lost)} lost, such as {lost[0]}",
+                "data", expected="all files that the database knows",
+                got=f"{len(missing)} lost, such as {missing[0]}",
                 hint="splatlift store verify tells which; delete what they belong to, then back up again",
             )  # fmt: skip
-        for path in [path for room in ("blobs", "lifts") for path in (folder / room).rglob("*") if path.is_file()]:
-            if str(path.relative_to(folder)) not in known:  # deleted while we tried
+        for path in [path for name in ("blobs", "lifts") for path in (folder / name).rglob("*") if path.is_file()]:
+            if str(path.relative_to(folder)) not in files:  # deleted while we tried
                 path.unlink()
         for path in data.glob("lifts/*.json"):
-            if str(path.relative_to(data).with_suffix(".safetensors")) in known:
+            if str(path.relative_to(data).with_suffix(".safetensors")) in files:
                 _linked(path, folder / path.relative_to(data))
         if (data / KEYS_REQUIRED).exists():
             shutil.copy(data / KEYS_REQUIRED, folder / KEYS_REQUIRED)
         remember_generation(folder, _generation(folder))
-    return len(known)
+    return len(files)
 
 
 def restore(backup: Path, data: Path) -> int:
@@ -100,12 +101,12 @@ def verify(data: Path) -> list[str]:
             f"{DATABASE}: {row[0]}" for row in connection.execute("PRAGMA integrity_check(10)") if row[0] != "ok"
         ]
         charts = connection.execute("SELECT id, sha256, chart FROM tradeoffs")
-        changed = [job for job, digest, chart in charts if hashlib.sha256(chart).hexdigest() != digest]
-    damage += [f"trade-off {job}: another chart" for job in changed]
+        damaged = [job for job, digest, chart in charts if hashlib.sha256(chart).hexdigest() != digest]
+    damage += [f"trade-off {job}: another chart" for job in damaged]
     for file, size, digest in _files(data):
-        why = _damage_of(data / file, size, digest)
-        if why is not None and (file, size, digest) in _files(data):  # else it was deleted while we looked
-            damage.append(f"{file}: {why}")
+        reason = _damage_of(data / file, size, digest)
+        if reason is not None and (file, size, digest) in _files(data):  # else it was deleted while we looked
+            damage.append(f"{file}: {reason}")
     return damage
 
 
@@ -114,13 +115,13 @@ def _damage_of(path: Path, size: int, digest: str) -> str | None:
         return "no regular file"
     try:
         with path.open("rb") as handle:
-            found = hashlib.file_digest(handle, "sha256").hexdigest()
-            read = handle.tell()
+            actual = hashlib.file_digest(handle, "sha256").hexdigest()
+            count = handle.tell()
     except OSError as error:
         return error.strerror
-    if read != size:
-        return f"{read} bytes in place of {size}"
-    return None if found == digest else f"other bytes: their sha256 is {found}, not {digest}"
+    if count != size:
+        return f"{count} bytes in place of {size}"
+    return None if actual == digest else f"other bytes: their sha256 is {actual}, not {digest}"
 
 
 def _files(data: Path) -> list[tuple[str, int, str]]:
@@ -149,10 +150,10 @@ def _linked(source: Path, target: Path) -> bool:
         return False
     except OSError:  # another file system, or one without links
         try:
-            with source.open("rb") as read, target.open("wb") as written:
-                shutil.copyfileobj(read, written, CHUNK)
-                written.flush()
-                os.fsync(written.fileno())
+            with source.open("rb") as original, target.open("wb") as copy:
+                shutil.copyfileobj(original, copy, CHUNK)
+                copy.flush()
+                os.fsync(copy.fileno())
         except FileNotFoundError:
             return False
     return True
@@ -170,8 +171,8 @@ def _made_whole(target: Path) -> Iterator[Path]:
     keep_private(folder)
     try:
         yield folder
-        for found in [path for path in folder.rglob("*") if path.is_dir()]:
-            sync_directory(found)
+        for subfolder in [path for path in folder.rglob("*") if path.is_dir()]:
+            sync_directory(subfolder)
         sync_directory(folder)
         folder.replace(target)
         sync_directory(target.absolute().parent)
@@ -193,23 +194,23 @@ def rebuild(store: Store, settings: ServiceSettings) -> dict[str, Any]:
     Returns:
         ``assets`` by kind and ``lifts``: how many were added; ``left``: files that could not be, and why.
     """
-    root, left, added = store.files.root, list[dict[str, str]](), Counter[UploadKind]()
-    known = {record.path for record in (*store.assets.all(SERVICE), *store.lifts.all(SERVICE))}
+    root, refused, counts = store.files.root, list[dict[str, str]](), Counter[UploadKind]()
+    recorded = {record.path for record in (*store.assets.all(SERVICE), *store.lifts.all(SERVICE))}
     changes = {path for path in root.glob("lifts/*.json") if store.files.lift(path.stem).exists()}
     for add, pattern in ((_add_asset, "blobs/*/*"), (_add_lift, "lifts/*")):  # lifts are of assets
-        for path in sorted(set(root.glob(pattern)) - known - changes):
+        for path in sorted(set(root.glob(pattern)) - recorded - changes):
             try:
-                added[add(store, settings, path)] += 1
+                counts[add(store, settings, path)] += 1
             except SplatliftError as error:
-                left.append({"file": store.files.relative(path), "why": str(error)})
+                refused.append({"file": store.files.relative(path), "why": str(error)})
     for path in sorted(changes):
         try:
             _change_lift(store, path)
         except SplatliftError as error:
-            left.append({"file": store.files.relative(path), "why": str(error)})
+            refused.append({"file": store.files.relative(path), "why": str(error)})
     store.database.catch_up()
-    lifts = added.pop(LIFT, 0)
-    return {"assets": dict(added), "lifts": lifts, "left": left}
+    lifts = counts.pop(LIFT, 0)
+    return {"assets": dict(counts), "lifts": lifts, "left": refused}
 
 
 def _add_asset(store: Store, settings: ServiceSettings, path: Path) -> AssetKind:
@@ -234,10 +235,10 @@ def checked(store: Store, settings: ServiceSettings, kind: UploadKind, *paths: P
 
 
 def _kind_of(path: Path) -> AssetKind:
-    found = identify(path)
-    if found.kind not in set(AssetKind):
-        raise NotFound("asset", expected="a file of an asset", got=found.name)
-    return AssetKind(found.kind)
+    kind = identify(path)
+    if kind.kind not in set(AssetKind):
+        raise NotFound("asset", expected="a file of an asset", got=kind.name)
+    return AssetKind(kind.kind)
 
 
 def _add_lift(store: Store, settings: ServiceSettings, path: Path) -> UploadKind:
@@ -249,18 +250,18 @@ def _add_lift(store: Store, settings: ServiceSettings, path: Path) -> UploadKind
         raise InvalidLift("lift", expected="a file named after its job", got=path.name)
     _, metadata, shape = header_of(path)
     try:
-        told = json.loads(metadata["splatlift"])
-        order = order_of(told)
+        document = json.loads(metadata["splatlift"])
+        order = order_of(document)
         count, channels = shape
     except (KeyError, TypeError, ValueError) as error:
         raise InvalidLift("lift", expected="the metadata of a lift", got=f"none that tell of it: {error!r}") from None
-    if told.get("poses") and store.assets.find(SERVICE, order.cameras) is None:
+    if document.get("poses") and store.assets.find(SERVICE, order.cameras) is None:
         order = replace(order, cameras=_cameras_of(store, settings, path) or order.cameras)
-    here = tuple(pack for pack in order.features if store.assets.find(SERVICE, pack) is not None)
-    order = replace(order, features=here)  # lifts may be brought without their packs
+    packs = tuple(pack for pack in order.features if store.assets.find(SERVICE, pack) is not None)
+    order = replace(order, features=packs)  # lifts may be brought without their packs
     for asset, kind in order.assets():
         store.assets.get(SERVICE, asset, kind)  # a lift without what it was made of can be shown to nobody
-    store.lifts.adopt(SERVICE, path.stem, order, FinishedLift(path, sha256_of(path), count, channels, told))
+    store.lifts.adopt(SERVICE, path.stem, order, FinishedLift(path, sha256_of(path), count, channels, document))
     return LIFT
 
 

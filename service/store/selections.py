@@ -98,9 +98,9 @@ class SelectionStore:
             OverQuota, NoSpace: there is no room for it.
         """
         with self._database.write(counted=True) as connection:
-            found = _expected(connection, owner, lift, selection, versions)
-            step = found.step + 1
-            terms = (selection, found.step, step - HISTORY)
+            record = _expected(connection, owner, lift, selection, versions)
+            step = record.step + 1
+            terms = (selection, record.step, step - HISTORY)
             connection.execute(
                 "DELETE FROM selection_steps WHERE selection = ? AND (number > ? OR number < ?)", terms
             )
@@ -119,10 +119,10 @@ class SelectionStore:
             InvalidRequest: there is no such step.
         """
         with self._database.write(counted=True) as connection:
-            found = _expected(connection, owner, lift, selection, versions)
-            step = changes.get("step", found.step)
-            if not found.first <= step <= found.last:
-                expected = f"a step from {found.first} to {found.last}"
+            record = _expected(connection, owner, lift, selection, versions)
+            step = changes.get("step", record.step)
+            if not record.first <= step <= record.last:
+                expected = f"a step from {record.first} to {record.last}"
                 raise InvalidRequest("step", expected=expected, got=str(step))
             if changes:
                 self._update(connection, selection, **changes)
@@ -178,11 +178,11 @@ class SelectionStore:
 
     def things(self, owner: Owner, lift: str) -> dict[int, tuple[str | None, bool]]:
         """Of the lift's objects that somebody named or hid: their names, and whether they are hidden."""
-        asked = (
+        select = (
             f"SELECT thing, name, hidden FROM things JOIN jobs ON jobs.id = lift WHERE lift = :lift AND {SHOWN_JOBS}"
         )
         with self._database.read() as connection:
-            rows = connection.execute(asked, owner.terms(lift=lift)).fetchall()
+            rows = connection.execute(select, owner.terms(lift=lift)).fetchall()
         return {row["thing"]: (row["name"], bool(row["hidden"])) for row in rows}
 
     def change_thing(self, lift: str, thing: int, changes: dict[str, Any]) -> None:
@@ -193,8 +193,8 @@ class SelectionStore:
             OverLimit: too many others of the lift have been changed.
         """
         with _lift_there(lift), self._database.write(counted=True) as connection:
-            others = "SELECT count(*) FROM things WHERE lift = ? AND thing != ?"
-            number = connection.execute(others, (lift, thing)).fetchone()[0]
+            select = "SELECT count(*) FROM things WHERE lift = ? AND thing != ?"
+            number = connection.execute(select, (lift, thing)).fetchone()[0]
             if number >= MOST_THINGS:
                 raise OverLimit("thing", expected=f"at most {MOST_THINGS} changed objects of a lift", got="more")
             insert(connection, "things", {"lift": lift, "thing": thing, "hidden": 0}, known="IGNORE")
@@ -209,12 +209,12 @@ class SelectionStore:
         packed = zlib.compress(splats.bits)
         edit, box = json.dumps(splats.edit), None if splats.box is None else json.dumps(splats.box)
         coming = len(packed) + len(edit)
-        taken = "SELECT total(length(splats) + length(edit)) FROM selection_steps JOIN selections ON id = selection"
+        select = "SELECT total(length(splats) + length(edit)) FROM selection_steps JOIN selections ON id = selection"
         lift = "(SELECT lift FROM selections WHERE id = ?)"
-        (held,) = connection.execute(f"{taken} WHERE lift = {lift}", (selection,)).fetchone()
-        most = MOST_BYTES + BYTES_A_SPLAT * 8 * len(splats.bits)
-        if held + coming > most:
-            expected = f"at most {most} bytes of all selections of a lift"
+        (stored,) = connection.execute(f"{select} WHERE lift = {lift}", (selection,)).fetchone()
+        limit = MOST_BYTES + BYTES_A_SPLAT * 8 * len(splats.bits)
+        if stored + coming > limit:
+            expected = f"at most {limit} bytes of all selections of a lift"
             raise OverLimit("selection", expected=expected, got="more", hint=NO_USE)
         self._files.require_room(coming)
         require_quota(connection, owner, coming)
@@ -249,10 +249,10 @@ def _expected(
     row = connection.execute(f"{VISIBLE} AND selections.id = :selection", terms).fetchone()
     if row is None:
         raise _none(selection)
-    found = _record(row)
-    if versions is not None and found.version not in versions:
+    record = _record(row)
+    if versions is not None and record.version not in versions:
         raise Changed("selection", expected="the version that was seen", got="a newer one", hint="GET it again")
-    return found
+    return record
 
 
 def _record(row: sqlite3.Row) -> SelectionRecord:

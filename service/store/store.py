@@ -95,10 +95,10 @@ def _database(files: DataDirectory, *, new: bool, rebuilding: bool) -> Database:
     path = files.root / DATABASE
     if rebuilding:  # until `Database.catch_up` it is not the one that belongs here
         remember_generation(files.root, (expected_generation(files.root) or 0) + 1)
-    known = path.exists()
+    existed = path.exists()
     try:
         database = Database(path, rebuilding=rebuilding)
-        if new and known:
+        if new and existed:
             database.close()
             raise Misconfigured(
                 "--new", expected="a database that is gone or older than its files", got="the right one",
@@ -134,27 +134,27 @@ def collect(store: Store, older_than: float) -> list[Path]:
     Returns:
         What was moved or removed.
     """
-    files, moved = store.files, []
+    files, quarantined = store.files, []
     files.make_folders()
     with files.blobs_changing, store.database.read() as connection:  # so no upload is between its blob and its row
-        known = {row["file"] for row in connection.execute("SELECT file FROM assets")}
-        moved += _lost(files, (files.root / "blobs").glob("*/*"), known, older_than)
+        recorded = {row["file"] for row in connection.execute("SELECT file FROM assets")}
+        quarantined += _lost(files, (files.root / "blobs").glob("*/*"), recorded, older_than)
     with store.database.write() as connection:  # so no lift is between its file and its row
         rows = connection.execute("SELECT id, file FROM lifts").fetchall()
-        known = {file for row in rows for file in (row["file"], files.relative(files.lift_changes(row["id"])))}
-        moved += _lost(files, (files.root / "lifts").iterdir(), known, older_than)
-    ended, unknown = _unused_work(store)
-    moved += files.quarantine(path for path in unknown if _changed(path) < older_than)
-    removed = [path for path in ended + files.left_over() if _changed(path) < older_than]
-    for path in removed:
+        recorded = {file for row in rows for file in (row["file"], files.relative(files.lift_changes(row["id"])))}
+        quarantined += _lost(files, (files.root / "lifts").iterdir(), recorded, older_than)
+    finished, unknown = _unused_work(store)
+    quarantined += files.quarantine(path for path in unknown if _changed(path) < older_than)
+    garbage = [path for path in finished + files.left_over() if _changed(path) < older_than]
+    for path in garbage:
         shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
-    return moved + removed
+    return quarantined + garbage
 
 
-def _lost(files: DataDirectory, found: Iterable[Path], known: Container[str], older_than: float) -> list[Path]:
+def _lost(files: DataDirectory, paths: Iterable[Path], recorded: Container[str], older_than: float) -> list[Path]:
     """Move files that have no row to quarantine."""
-    lost = [path for path in found if files.relative(path) not in known and _changed(path) < older_than]
-    return files.quarantine(lost)
+    garbage = [path for path in paths if files.relative(path) not in recorded and _changed(path) < older_than]
+    return files.quarantine(garbage)
 
 
 def empty_quarantine(files: DataDirectory, since_before: float) -> list[Path]:
@@ -167,17 +167,17 @@ def empty_quarantine(files: DataDirectory, since_before: float) -> list[Path]:
     Returns:
         The folders that were removed.
     """
-    removed = [folder for folder, since in files.quarantined() if since < since_before]
-    for folder in removed:
+    folders = [folder for folder, since in files.quarantined() if since < since_before]
+    for folder in folders:
         shutil.rmtree(folder)
-    return removed
+    return folders
 
 
 def _unused_work(store: Store) -> tuple[list[Path], list[Path]]:
     """Folders of jobs that have ended, which never run again, and of jobs that the database does not know."""
     states = {folder: store.jobs.state(SERVICE, folder.name) for folder in (store.files.root / "work").iterdir()}
-    ended = [folder for folder, state in states.items() if state in ENDED]
-    return ended, [folder for folder, state in states.items() if state is None]
+    finished = [folder for folder, state in states.items() if state in ENDED]
+    return finished, [folder for folder, state in states.items() if state is None]
 
 
 def _changed(path: Path) -> float:
@@ -219,9 +219,9 @@ class Collector:
         for path in empty_quarantine(store.files, now - settings.quarantine_seconds):
             log.info("removed %s, whose time in quarantine is over", path)
         before = -math.inf if settings.keep_jobs_seconds is None else now - settings.keep_jobs_seconds
-        most = sys.maxsize if settings.keep_jobs is None else settings.keep_jobs
-        if forgotten := store.jobs.forget_ended(before, most):
-            log.info("forgot %d jobs that ended long ago, without a result", forgotten)
+        limit = sys.maxsize if settings.keep_jobs is None else settings.keep_jobs
+        if count := store.jobs.forget_ended(before, limit):
+            log.info("forgot %d jobs that ended long ago, without a result", count)
         store.database.keep_reserve()
         for path in collect(store, now - settings.garbage_grace_seconds):
             log.info("moved %s away, which nothing refers to", path)

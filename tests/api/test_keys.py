@@ -22,7 +22,7 @@ from starlette.datastructures import Headers
 
 from liftcore.cli import main
 from liftcore.errors import SplatliftError
-from service.auth import CALLER, OPEN, Gate, Hosts, host_name, is_loopback, needed
+from service.auth import CALLER, OPEN, Gate, Hosts, host_name, is_loopback, required_scope
 from service.commands.serve import require_keys
 from service.content import EventStreams, is_last
 from service.errors import Busy, ForeignOrigin, Misconfigured, Misdirected, TooMany
@@ -79,7 +79,7 @@ def test_every_route_but_the_open_ones_wants_a_key(house: Guarded) -> None:
 
 def test_every_route_wants_its_scope(house: Guarded) -> None:
     for method, path in closed_routes(house):
-        wanted = needed(method, path)
+        wanted = required_scope(method, path)
         assert wanted is not None
         others = " ".join(scope for scope in Scope if scope not in (wanted, Scope.ADMIN, Scope.SHARED))
         secret = make_key(house.store, others)[1]
@@ -99,7 +99,7 @@ def test_scopes_are_as_documented() -> None:
         "metrics": "GET /metrics",
     }
     for scope, requests in asked.items():
-        assert {needed(*request.split()) for request in requests.split(", ")} == {scope}
+        assert {required_scope(*request.split()) for request in requests.split(", ")} == {scope}
 
 
 def naming(method: str, path: str, job: str, asset: str, house: Guarded) -> list[dict[str, Any]]:
@@ -206,7 +206,7 @@ def test_key_to_a_lift_reads_and_asks_that_one_and_is_let_in_nowhere_else(house:
     read = refused = 0
     for method, path in closed_routes(house):
         lifts = path.startswith(("/lifts", "/query", "/render")) and not path.endswith(("/shares", "/shares/{share}"))
-        may = needed(method, path) is Scope.READ and (lifts or path == "/key")
+        may = required_scope(method, path) is Scope.READ and (lifts or path == "/key")
         nameless = (method, path) in NAMELESS
         for lift in (house.done, other):
             for how in [{}] if nameless else naming(method, path, lift, asset, house):
@@ -609,7 +609,7 @@ def test_no_header_breaks_the_gate_and_only_names_pass(text: str) -> None:
 @given(st.sampled_from(["GET", "HEAD", "POST", "PUT", "DELETE", "OPTIONS", "BREW"]), st.text(max_size=20))
 def test_what_is_not_listed_as_open_wants_a_scope(method: str, rest: str) -> None:
     for path in ("/" + rest, *(f"{path}{rest}" for path in OPEN)):
-        assert (needed(method, path) is None) == (method in ("GET", "HEAD") and path in OPEN)
+        assert (required_scope(method, path) is None) == (method in ("GET", "HEAD") and path in OPEN)
 
 
 def test_own_page_may_change_things_and_foreign_ones_only_look() -> None:

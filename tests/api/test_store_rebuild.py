@@ -12,7 +12,7 @@ from fastapi.testclient import TestClient
 
 from liftcore import Scene
 from liftcore.cli import INTERRUPTED, main
-from service.auth import needed
+from service.auth import required_scope
 from service.commands.serve import require_keys
 from service.errors import Misconfigured, StaleDatabase
 from service.models import JobKind
@@ -199,7 +199,7 @@ def statuses(house: Guarded, secret: str | None = None) -> dict[str, int]:
     headers = {} if secret is None else bearer(secret)
     found = {}
     for method, path in every_route(app_of(house.client)):
-        if needed(method, path) is not None:
+        if required_scope(method, path) is not None:
             asked = address(path, "0" * 32, "sha256:" + "0" * 64)
             found[f"{method} {path}"] = house.client.request(method, asked, headers=headers).status_code
     return found
