@@ -23,7 +23,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from liftcore import __version__
 from liftcore.files import PhotoIndexes
 from service import problems
-from service.auth import CALLER, STRANGER, Gate
+from service.auth import CALLER, STRANGER, AuthMiddleware
 from service.content import EventStreams
 from service.errand import revive
 from service.errors import Busy, ForeignOrigin
@@ -104,8 +104,8 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
     app.state.readers = settings.cors_origins
     app.state.stopping, app.state.metrics, app.state.documents = stopping, metrics, operations.Documents(app)
     app.add_middleware(AnswerHead)
-    app.add_middleware(Gate, keys=store.keys, settings=settings, stopping=lambda: stopping.begun)
-    app.add_middleware(Turns)
+    app.add_middleware(AuthMiddleware, keys=store.keys, settings=settings, stopping=lambda: stopping.begun)
+    app.add_middleware(ConcurrencyLimit)
     problems.install(app)
     app.include_router(operations.router)  # probes and links to the page may carry what they like
     for module in (assets, jobs, lifts, queries, selections):
@@ -268,7 +268,7 @@ def _describe_caller(scope: Scope) -> dict[str, Any]:
     return {"key": caller.key} | ({"admin": True} if caller.owner.sees_all else {})
 
 
-class Turns:
+class ConcurrencyLimit:
     """Few requests are begun at a time, and the others wait for nothing but a place: so however many come at once,
     the event loop is soon done with what it has begun, and probes, which pass the line, are answered at once.
 

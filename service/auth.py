@@ -73,7 +73,7 @@ EVERYBODY = Caller(SERVICE)  # while there are no keys
 STRANGER = Caller(NOBODY)  # on an open route
 
 
-class Gate:
+class AuthMiddleware:
     """ASGI middleware: lets a request pass with its `Caller` in the scope's state, or raises why not."""
 
     def __init__(self, app: ASGIApp, keys: KeyStore, settings: ServiceSettings, stopping: Callable[[], bool]) -> None:

@@ -92,7 +92,7 @@ def logging_to_stderr(log_format: str) -> Iterator[None]:
     handler.setFormatter(JsonLines() if log_format == "json" else TextLines())
     waiting: queue.Queue[logging.LogRecord] = queue.Queue(WAITING_RECORDS)
     line = _Line(waiting)
-    line.addFilter(Sparing())
+    line.addFilter(LogRateLimit())
     listener = logging.handlers.QueueListener(waiting, handler)
     logging.basicConfig(level=logging.INFO, handlers=[line])
     logging.captureWarnings(True)
@@ -116,7 +116,7 @@ class _Line(logging.handlers.QueueHandler):
         """Nothing: the line is full, and complaints would go to where nobody reads."""
 
 
-class Sparing(logging.Filter):
+class LogRateLimit(logging.Filter):
     """Lets one line of code say SAME_A_MINUTE things a minute; the access log tells of every request.
 
     Args:

@@ -64,7 +64,7 @@ class Waiter:
     """Who asks, and whether they still wait for the answer."""
 
     key: str = ""  # the id of a key; empty while there are none: then all share one line
-    left: bool = False
+    disconnected: bool = False
 
 
 @dataclass(eq=False)
@@ -149,7 +149,7 @@ class QueryClient:
 
     def cancel(self, waiter: Waiter) -> None:
         """Say that nobody waits for the answers of this one any more. Never waits."""
-        waiter.left = True
+        waiter.disconnected = True
         with self._condition:
             self._condition.notify_all()
 
@@ -215,7 +215,8 @@ class QueryClient:
             self._line.append(call)
             try:
                 self._condition.wait_for(
-                    lambda: self._stopped or call.waiter.left or self._next() is call, _left(call)
+                    lambda: self._stopped or call.waiter.disconnected or self._next() is call,
+                    _remaining_seconds(call),
                 )
                 came = not self._stopped and self._next() is call
             finally:
@@ -223,13 +224,13 @@ class QueryClient:
                 self._condition.notify_all()
             if self._stopped:
                 raise Busy("query", expected="a running server", got="one that stops", hint="ask the next one")
-            if call.waiter.left:
+            if call.waiter.disconnected:
                 raise ClientLeft("query", expected="a client that waits for its turn", got="one that left")
             if not came:
                 raise self._busy()
             self._busy_with = call
             self._turns[call.waiter.key] = 1 + max(self._turns.values(), default=0)
-            return [other.line for other in self._line if not other.waiter.left]
+            return [other.line for other in self._line if not other.waiter.disconnected]
 
     def _end_turn(self) -> None:
         with self._condition:
@@ -240,7 +241,7 @@ class QueryClient:
         """Whose turn it is: the oldest call of the key that had its last turn before all others."""
         if self._busy_with is not None:
             return None
-        waiting = (call for call in self._line if not call.waiter.left)
+        waiting = (call for call in self._line if not call.waiter.disconnected)
         return min(waiting, key=lambda call: self._turns.get(call.waiter.key, 0), default=None)
 
     def _require_place(self, key: str) -> None:
@@ -282,13 +283,15 @@ class QueryClient:
         assert process is not None and worker is not None
         sizes = itertools.accumulate(map(len, ahead))
         lines = [call.line, *(line for line, size in zip(ahead, sizes, strict=True) if size <= AHEAD_BYTES)]
-        deadline = threading.Timer(_left(call), process.kill)  # it may be stopped, and neither read nor write
+        deadline = threading.Timer(
+            _remaining_seconds(call), process.kill
+        )  # it may be stopped, and neither read nor write
         deadline.start()
         try:
             worker.send_bytes(b"[" + b", ".join(lines) + b"]")
             return Frame(json.loads(worker.recv_bytes()), worker.recv_bytes())
         except (EOFError, OSError):
-            if _left(call):
+            if _remaining_seconds(call):
                 return None
         finally:
             deadline.cancel()
@@ -321,5 +324,5 @@ class QueryClient:
             self._worker = None
 
 
-def _left(call: _Call) -> float:
+def _remaining_seconds(call: _Call) -> float:
     return max(0.0, call.deadline - time.monotonic())

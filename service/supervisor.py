@@ -211,7 +211,7 @@ class Lease:
         return now - self._alive > self._seconds
 
 
-class Notes:
+class AttemptLog:
     """What an attempt tells of itself. What cannot be noted now is noted later, and stops nobody."""
 
     def __init__(self, job: JobRecord, store: Store) -> None:
@@ -272,7 +272,7 @@ class Attempt:
         self._command = command
         self._lease = Lease(limits.lease_seconds, clock)
         self._begun = time.monotonic()
-        self._notes = Notes(job, store)
+        self._notes = AttemptLog(job, store)
         self._pace = StagePace()
         self._answer: dict[str, Any] | None = None  # the child's last word
 

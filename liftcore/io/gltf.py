@@ -85,7 +85,7 @@ def read_gltf(path: Path, *, colour: bool = True) -> Fields:
 
 
 def _hint_of(extension: str) -> str:
-    """What to do with a file that needs an extension that is not read."""
+    """The advice for a file that needs an extension that is not read."""
     if "spz" in extension.lower():
         return "export its splats as .spz, which is read, as .ply, or as .glb without compression"
     return HINT

@@ -291,7 +291,7 @@ def _beside(lift: Path, path: Path) -> Iterator[Path]:
 
 
 def _in_store(lift: Path, sha256: str) -> Iterator[Path]:
-    """Where an input lies in a data directory of a service, ``lifts/ID.safetensors`` and ``blobs/ab/abcd....ply``."""
+    """The places of an input beside ``lifts/ID.safetensors`` of a service: ``blobs/ab/abcd....ply``."""
     yield from Path(os.path.abspath(lift)).parents[1].glob(f"blobs/{sha256[:2]}/{sha256}.*")
 
 

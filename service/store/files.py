@@ -134,7 +134,7 @@ class DataDirectory:
         return self.root / "lifts" / f"{job}.safetensors"
 
     def lift_changes(self, job: str) -> Path:
-        """Where the changes of a lift lie, if there are any."""
+        """The path of a lift's changes, if there are any."""
         return self.lift(job).with_suffix(".json")
 
     def relative(self, path: Path) -> str:

@@ -22,7 +22,7 @@ from starlette.datastructures import Headers
 
 from liftcore.cli import main
 from liftcore.errors import SplatliftError
-from service.auth import CALLER, OPEN, Gate, Hosts, host_name, is_loopback, required_scope
+from service.auth import CALLER, OPEN, AuthMiddleware, Hosts, host_name, is_loopback, required_scope
 from service.commands.serve import require_keys
 from service.content import EventStreams, is_last
 from service.errors import Busy, ForeignOrigin, Misconfigured, Misdirected, TooMany
@@ -52,21 +52,21 @@ TIMES = {"created": 0, "created_at": ""}
 
 
 @pytest.fixture
-def house(tmp_path: Path) -> Iterator[Guarded]:
+def server(tmp_path: Path) -> Iterator[Guarded]:
     with guarded(tmp_path / "data", allowed_hosts="Lift.example.org, other.example.org") as made:
         yield made
 
 
-def closed_routes(house: Guarded) -> list[tuple[str, str]]:
-    routes = [(method, path) for method, path in every_route(app_of(house.client)) if path not in OPEN]
+def closed_routes(server: Guarded) -> list[tuple[str, str]]:
+    routes = [(method, path) for method, path in every_route(app_of(server.client)) if path not in OPEN]
     assert len(routes) >= 20
     return routes
 
 
-def test_every_route_but_the_open_ones_wants_a_key(house: Guarded) -> None:
+def test_every_route_but_the_open_ones_wants_a_key(server: Guarded) -> None:
     seen = set()
-    for method, path in every_route(app_of(house.client)):
-        reply = house.ask(None, method, address(path, house.done, house.order.splats), content=b"{")
+    for method, path in every_route(app_of(server.client)):
+        reply = server.ask(None, method, address(path, server.done, server.order.splats), content=b"{")
         if path in OPEN_ROUTES:
             assert reply.status_code == 200, path
             seen.add(path)
@@ -74,22 +74,22 @@ def test_every_route_but_the_open_ones_wants_a_key(house: Guarded) -> None:
             assert (reply.status_code, reply.headers["www-authenticate"]) == (401, 'Bearer realm="splatlift"'), path
             assert assert_problem(reply)["type"] == "/problems/unauthorized"
     assert seen == OPEN_ROUTES
-    assert house.ask(None, "GET", "/nowhere").status_code == 401
+    assert server.ask(None, "GET", "/nowhere").status_code == 401
 
 
-def test_every_route_wants_its_scope(house: Guarded) -> None:
-    for method, path in closed_routes(house):
+def test_every_route_wants_its_scope(server: Guarded) -> None:
+    for method, path in closed_routes(server):
         wanted = required_scope(method, path)
         assert wanted is not None
         others = " ".join(scope for scope in Scope if scope not in (wanted, Scope.ADMIN, Scope.SHARED))
-        secret = make_key(house.store, others)[1]
-        reply = house.client.request(
-            method, address(path, house.done, house.order.splats), headers=bearer(secret), content=b"{"
+        secret = make_key(server.store, others)[1]
+        reply = server.client.request(
+            method, address(path, server.done, server.order.splats), headers=bearer(secret), content=b"{"
         )
         assert reply.status_code == 403, path
         assert f'error="insufficient_scope", scope="{wanted}"' in reply.headers["www-authenticate"]
         assert assert_problem(reply)["expected"] == f"a key with the scope {wanted}"
-    assert house.store.jobs.get(SERVICE, house.queued).state is JobState.QUEUED
+    assert server.store.jobs.get(SERVICE, server.queued).state is JobState.QUEUED
 
 
 def test_scopes_are_as_documented() -> None:
@@ -102,7 +102,7 @@ def test_scopes_are_as_documented() -> None:
         assert {required_scope(*request.split()) for request in requests.split(", ")} == {scope}
 
 
-def naming(method: str, path: str, job: str, asset: str, house: Guarded) -> list[dict[str, Any]]:
+def naming(method: str, path: str, job: str, asset: str, server: Guarded) -> list[dict[str, Any]]:
     """Requests to a route that name a job, a lift or an asset, once for each place that takes a name."""
     if method == "PATCH" or "/selections" in path or "/shares" in path:
         name = {"encoder" if path.startswith("/assets") else "name": "a name"}
@@ -116,7 +116,7 @@ def naming(method: str, path: str, job: str, asset: str, house: Guarded) -> list
         wrong = [{place: name} for place, name in absent.items()]
         if path == "/tradeoff":
             wrong.append({"labels": {"masks": asset, "table": asset, "classes": ["apple"]}})
-        return [{"json": house.body() | place} for place in wrong]
+        return [{"json": server.body() | place} for place in wrong]
     if method == "POST" and (
         path in ("/render", "/query/what", "/query/export") or path.startswith("/query/segment")
     ):
@@ -137,81 +137,83 @@ def naming(method: str, path: str, job: str, asset: str, house: Guarded) -> list
     return [{}]
 
 
-def test_what_is_anothers_is_absent_on_every_route(house: Guarded) -> None:
-    asset = house.order.splats
+def test_what_is_anothers_is_absent_on_every_route(server: Guarded) -> None:
+    asset = server.order.splats
     ids = re.compile("sha256:[0-9a-f]{64}|[0-9a-f]{32}")
-    for method, path in closed_routes(house):
+    for method, path in closed_routes(server):
         if (method, path) in NAMELESS:
             continue
-        job = house.compared if "{tradeoff}" in path else house.done
-        real = naming(method, path, job, asset, house)
-        absent = naming(method, path, NOBODY, NO_ASSET, house)
+        job = server.compared if "{tradeoff}" in path else server.done
+        real = naming(method, path, job, asset, server)
+        absent = naming(method, path, NOBODY, NO_ASSET, server)
         for how, nothing in zip(real, absent, strict=True):
             tag = {"headers": {"If-None-Match": "*"}}  # which does not tell that it is there
-            reply = house.ask("bob", method, address(path, job, asset), **tag, **how)
-            other = house.ask("bob", method, address(path, NOBODY, NO_ASSET), **nothing)
+            reply = server.ask("bob", method, address(path, job, asset), **tag, **how)
+            other = server.ask("bob", method, address(path, NOBODY, NO_ASSET), **nothing)
             assert assert_problem(reply)["type"] == "/problems/not-found", f"{method} {path}"
             assert reply.status_code == other.status_code == 404
             texts = [ids.sub("ID", answer.text) for answer in (reply, other)]
             assert texts[0] == texts[1], f"{method} {path}"
     for path in ("/assets", "/jobs", "/lifts"):
-        assert list(house.ask("bob", "GET", path).json().values()) == [[], None]
-    assert "at least one lift" in house.ask("bob", "GET", "/query", params=ASKING).json()["detail"]
-    assert house.ask("alice", "GET", f"/lifts/{house.done}/features").content == b"a lift"
-    assert house.ask("alice", "GET", f"/tradeoffs/{house.compared}/chart").content == b"a chart"
-    assert house.store.jobs.get(SERVICE, house.queued).state is JobState.QUEUED
+        assert list(server.ask("bob", "GET", path).json().values()) == [[], None]
+    assert "at least one lift" in server.ask("bob", "GET", "/query", params=ASKING).json()["detail"]
+    assert server.ask("alice", "GET", f"/lifts/{server.done}/features").content == b"a lift"
+    assert server.ask("alice", "GET", f"/tradeoffs/{server.compared}/chart").content == b"a chart"
+    assert server.store.jobs.get(SERVICE, server.queued).state is JobState.QUEUED
 
 
-def test_admins_see_and_touch_everything(house: Guarded) -> None:
-    assert [len(house.ask("boss", "GET", path).json()[path[1:]]) for path in ("/assets", "/jobs", "/lifts")] == [
+def test_admins_see_and_touch_everything(server: Guarded) -> None:
+    assert [len(server.ask("boss", "GET", path).json()[path[1:]]) for path in ("/assets", "/jobs", "/lifts")] == [
         3,
         3,
         1,
     ]
-    assert house.ask("boss", "GET", f"/assets/{house.order.splats}/content").status_code == 200
-    assert house.ask("boss", "POST", f"/jobs/{house.queued}/cancel").status_code == 200
-    assert house.ask("boss", "DELETE", f"/jobs/{house.done}?with_lift=true").status_code == 204
-    assert house.ask("alice", "GET", f"/jobs/{house.done}").status_code == 404
+    assert server.ask("boss", "GET", f"/assets/{server.order.splats}/content").status_code == 200
+    assert server.ask("boss", "POST", f"/jobs/{server.queued}/cancel").status_code == 200
+    assert server.ask("boss", "DELETE", f"/jobs/{server.done}?with_lift=true").status_code == 204
+    assert server.ask("alice", "GET", f"/jobs/{server.done}").status_code == 404
 
 
-def test_same_bytes_are_of_each_who_uploaded_them(tmp_path: Path, house: Guarded) -> None:
+def test_same_bytes_are_of_each_who_uploaded_them(tmp_path: Path, server: Guarded) -> None:
     content = b'{"w": 4, "h": 4, "fl_x": 3, "fl_y": 3, "frames": [{"file_path": "a", "transform_matrix":' \
         b' [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]}'  # fmt: skip
-    first = house.ask("alice", "PUT", "/assets/cameras", content=content)
+    first = server.ask("alice", "PUT", "/assets/cameras", content=content)
     asset = first.json()["id"]
     assert first.status_code == 201, first.text
-    assert house.ask("bob", "GET", f"/assets/{asset}").status_code == 404  # a digest is no proof
-    second = house.ask("bob", "PUT", "/assets/cameras", content=content)
+    assert server.ask("bob", "GET", f"/assets/{asset}").status_code == 404  # a digest is no proof
+    second = server.ask("bob", "PUT", "/assets/cameras", content=content)
     assert second.status_code == 201  # new to him: that she has it, he does not learn
     assert first.json() | TIMES == second.json() | TIMES
-    assert house.ask("bob", "PUT", "/assets/cameras", content=content).status_code == 200
-    assert house.ask("bob", "DELETE", f"/assets/{asset}").status_code == 204
-    assert house.ask("bob", "GET", f"/assets/{asset}/content").status_code == 404
-    assert house.ask("alice", "GET", f"/assets/{asset}/content").content == content
-    assert house.ask("alice", "DELETE", f"/assets/{asset}").status_code == 204
+    assert server.ask("bob", "PUT", "/assets/cameras", content=content).status_code == 200
+    assert server.ask("bob", "DELETE", f"/assets/{asset}").status_code == 204
+    assert server.ask("bob", "GET", f"/assets/{asset}/content").status_code == 404
+    assert server.ask("alice", "GET", f"/assets/{asset}/content").content == content
+    assert server.ask("alice", "DELETE", f"/assets/{asset}").status_code == 204
     assert not list((tmp_path / "data" / "blobs").rglob("*.json"))
 
 
 # What is given
 
 
-def shared_key(house: Guarded, **more: Any) -> dict[str, str]:
+def shared_key(server: Guarded, **more: Any) -> dict[str, str]:
     """The header of a key that was given Alice's first lift."""
-    return bearer(house.store.keys.create("guest", frozenset({Scope.SHARED}), Quota(), lifts=[house.done], **more)[1])
+    return bearer(
+        server.store.keys.create("guest", frozenset({Scope.SHARED}), Quota(), lifts=[server.done], **more)[1]
+    )
 
 
-def test_key_to_a_lift_reads_and_asks_that_one_and_is_let_in_nowhere_else(house: Guarded) -> None:
-    finish(house.store, b"another lift")  # of Alice, by the job that was in line
-    other, asset, guest = house.queued, house.order.splats, shared_key(house)
+def test_key_to_a_lift_reads_and_asks_that_one_and_is_let_in_nowhere_else(server: Guarded) -> None:
+    finish(server.store, b"another lift")  # of Alice, by the job that was in line
+    other, asset, guest = server.queued, server.order.splats, shared_key(server)
     read = refused = 0
-    for method, path in closed_routes(house):
+    for method, path in closed_routes(server):
         lifts = path.startswith(("/lifts", "/query", "/render")) and not path.endswith(("/shares", "/shares/{share}"))
         may = required_scope(method, path) is Scope.READ and (lifts or path == "/key")
         nameless = (method, path) in NAMELESS
-        for lift in (house.done, other):
-            for how in [{}] if nameless else naming(method, path, lift, asset, house):
+        for lift in (server.done, other):
+            for how in [{}] if nameless else naming(method, path, lift, asset, server):
                 at = address(path, lift, asset)
-                reply = house.client.request(method, at, headers=guest, **how)
+                reply = server.client.request(method, at, headers=guest, **how)
                 if not may:
                     assert assert_problem(reply)["type"] == "/problems/missing-scope", f"{method} {path}"
                     refused += 1
@@ -220,141 +222,143 @@ def test_key_to_a_lift_reads_and_asks_that_one_and_is_let_in_nowhere_else(house:
                 elif lift == other:
                     assert assert_problem(reply)["type"] == "/problems/not-found", f"{method} {path}"
                 else:
-                    mine = house.ask("alice", method, at, **how)
+                    mine = server.ask("alice", method, at, **how)
                     assert reply.status_code == mine.status_code, f"{method} {path}"
                     read += 1
     assert read >= 20 and refused >= 20
-    assert [one["id"] for one in house.client.get("/lifts", headers=guest).json()["lifts"]] == [house.done]
-    assert house.client.get(f"/lifts/{house.done}/features", headers=guest).content == b"a lift"
-    assert house.client.get("/key", headers=guest).json()["lifts"] == [house.done]
+    assert [one["id"] for one in server.client.get("/lifts", headers=guest).json()["lifts"]] == [server.done]
+    assert server.client.get(f"/lifts/{server.done}/features", headers=guest).content == b"a lift"
+    assert server.client.get("/key", headers=guest).json()["lifts"] == [server.done]
 
 
-def test_key_to_a_lift_asks_with_no_other_asset_of_its_owner(house: Guarded, tmp_path: Path) -> None:
-    alice = Owner(house.ids["alice"], sees_all=False)
-    with house.store.files.draft(".safetensors") as draft:
+def test_key_to_a_lift_asks_with_no_other_asset_of_its_owner(server: Guarded, tmp_path: Path) -> None:
+    alice = Owner(server.ids["alice"], sees_all=False)
+    with server.store.files.draft(".safetensors") as draft:
         draft.write_bytes(b"a table")
         upload = CheckedUpload(draft, AssetKind.TABLE, "f" * 64, ".safetensors", {"words": ["apple"]}, [])
-        table = house.store.assets.add(alice, upload)[0].id
-    guest, texts = shared_key(house), set()
+        table = server.store.assets.add(alice, upload)[0].id
+    guest, texts = shared_key(server), set()
     for one in (table, NO_ASSET):
-        asked = {"text": "apple", "lift": house.done, "table": one}
-        reply = house.client.get("/query", params=asked, headers=guest)
+        asked = {"text": "apple", "lift": server.done, "table": one}
+        reply = server.client.get("/query", params=asked, headers=guest)
         assert assert_problem(reply)["type"] == "/problems/not-found"
         texts.add(reply.text.replace(one, "ID").partition('"request_id"')[0])
     assert len(texts) == 1
 
 
-def test_owner_gives_a_lift_to_a_key_and_takes_it_away(house: Guarded) -> None:
-    at = f"/lifts/{house.done}/shares"
-    made = house.ask("alice", "POST", at, json={"name": "Bob from the lab", "expires_s": 3600})
+def test_owner_gives_a_lift_to_a_key_and_takes_it_away(server: Guarded) -> None:
+    at = f"/lifts/{server.done}/shares"
+    made = server.ask("alice", "POST", at, json={"name": "Bob from the lab", "expires_s": 3600})
     assert made.status_code == 201 and made.headers["cache-control"] == "no-store"
     share = made.json()
-    assert share["links"]["page"] == f"/?lift={house.done}#key={share['key']}"
+    assert share["links"]["page"] == f"/?lift={server.done}#key={share['key']}"
     assert share["expires"] == pytest.approx(time.time() + 3600, abs=60) and share["expires_at"].endswith("Z")
     guest = bearer(share["key"])
-    assert house.client.get("/key", headers=guest).json()["name"] == "Bob from the lab"
-    assert house.client.get(f"/lifts/{house.done}", headers=guest).status_code == 200
-    (listed,) = house.ask("alice", "GET", at).json()["shares"]
+    assert server.client.get("/key", headers=guest).json()["name"] == "Bob from the lab"
+    assert server.client.get(f"/lifts/{server.done}", headers=guest).status_code == 200
+    (listed,) = server.ask("alice", "GET", at).json()["shares"]
     assert listed["id"] == share["id"] and share["key"] not in str(listed)
-    assert [house.ask(name, "GET", at).status_code for name in ("bob", "boss")] == [404, 200]
-    assert house.ask("bob", "DELETE", share["links"]["self"]).status_code == 404
-    assert house.ask("alice", "DELETE", share["links"]["self"]).status_code == 204
-    assert house.client.get(f"/lifts/{house.done}", headers=guest).status_code == 401
-    assert house.ask("alice", "DELETE", share["links"]["self"]).status_code == 404
+    assert [server.ask(name, "GET", at).status_code for name in ("bob", "boss")] == [404, 200]
+    assert server.ask("bob", "DELETE", share["links"]["self"]).status_code == 404
+    assert server.ask("alice", "DELETE", share["links"]["self"]).status_code == 204
+    assert server.client.get(f"/lifts/{server.done}", headers=guest).status_code == 401
+    assert server.ask("alice", "DELETE", share["links"]["self"]).status_code == 404
     for wrong in ({}, {"name": ""}, {"name": "x", "expires_s": 1}, {"name": "x", "scopes": ["admin"]}):
-        assert assert_problem(house.ask("alice", "POST", at, json=wrong))["status"] == 422
+        assert assert_problem(server.ask("alice", "POST", at, json=wrong))["status"] == 422
 
 
 @pytest.mark.parametrize("end", ["expired", "revoked", "maker revoked", "lift deleted"])
-def test_shared_key_ends(end: str, house: Guarded) -> None:
-    guest, key = shared_key(house, maker=house.ids["alice"]), house.store.keys.of_lift(house.done)[0].id
-    assert house.client.get("/lifts", headers=guest).status_code == 200
+def test_shared_key_ends(end: str, server: Guarded) -> None:
+    guest, key = shared_key(server, maker=server.ids["alice"]), server.store.keys.of_lift(server.done)[0].id
+    assert server.client.get("/lifts", headers=guest).status_code == 200
     match end:
         case "expired":
-            with house.store.database.write() as connection:
+            with server.store.database.write() as connection:
                 connection.execute("UPDATE keys SET expires = ? WHERE id = ?", (time.time(), key))
         case "revoked":
-            house.store.keys.revoke(key)
+            server.store.keys.revoke(key)
         case "maker revoked":
-            house.store.keys.revoke(house.ids["alice"])
+            server.store.keys.revoke(server.ids["alice"])
         case _:
-            assert house.ask("alice", "DELETE", f"/lifts/{house.done}").status_code == 204
-            assert house.client.get("/lifts", headers=guest).json()["lifts"] == []
-            assert house.client.get(f"/lifts/{house.done}", headers=guest).status_code == 404
+            assert server.ask("alice", "DELETE", f"/lifts/{server.done}").status_code == 204
+            assert server.client.get("/lifts", headers=guest).json()["lifts"] == []
+            assert server.client.get(f"/lifts/{server.done}", headers=guest).status_code == 404
             return
-    assert house.client.get("/lifts", headers=guest).status_code == 401
+    assert server.client.get("/lifts", headers=guest).status_code == 401
 
 
-def share_of(house: Guarded, secret: str, **more: Any) -> dict[str, str]:
+def share_of(server: Guarded, secret: str, **more: Any) -> dict[str, str]:
     """The header of a key that Alice's first lift is shared with, by a key of hers."""
     body = {"name": "guest", **more}
-    made = house.client.post(f"/lifts/{house.done}/shares", headers=bearer(secret), json=body)
+    made = server.client.post(f"/lifts/{server.done}/shares", headers=bearer(secret), json=body)
     assert made.status_code == 201, made.text
     return bearer(made.json()["key"])
 
 
-def may_read(house: Guarded, guest: dict[str, str]) -> bool:
-    return house.client.get(f"/lifts/{house.done}", headers=guest).status_code == 200
+def may_read(server: Guarded, guest: dict[str, str]) -> bool:
+    return server.client.get(f"/lifts/{server.done}", headers=guest).status_code == 200
 
 
 @pytest.mark.parametrize("options", [[], ["--grace", "1h"], ["--keep-shares"]])
 def test_shares_end_with_the_secret_that_made_them_unless_they_are_kept(
-    options: list[str], house: Guarded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    options: list[str], server: Guarded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    other, guest = share_of(house, house.secrets["boss"]), share_of(house, house.secrets["alice"])
-    rotate = ["keys", "rotate", house.ids["alice"], *options, "--data", str(tmp_path / "data")]
+    other, guest = share_of(server, server.secrets["boss"]), share_of(server, server.secrets["alice"])
+    rotate = ["keys", "rotate", server.ids["alice"], *options, "--data", str(tmp_path / "data")]
     assert main(rotate) == 0
     said = capsys.readouterr()
     new = bearer(said.out.strip())
     assert ("of guest" in said.err) == ("--keep-shares" not in options)
-    assert may_read(house, other) and may_read(house, new) and may_read(house, guest) == bool(options)
+    assert may_read(server, other) and may_read(server, new) and may_read(server, guest) == bool(options)
     if options == ["--grace", "1h"]:
-        late = share_of(house, house.secrets["alice"], expires_s=86_400)  # with the secret before, which still counts
-        for ending in (guest, late, bearer(house.secrets["alice"])):
-            expires = house.client.get("/key", headers=ending).json()["expires"]
+        late = share_of(
+            server, server.secrets["alice"], expires_s=86_400
+        )  # with the secret before, which still counts
+        for ending in (guest, late, bearer(server.secrets["alice"])):
+            expires = server.client.get("/key", headers=ending).json()["expires"]
             assert expires == pytest.approx(time.time() + 3600, abs=60)
-        mine = share_of(house, said.out.strip())
+        mine = share_of(server, said.out.strip())
         assert main(rotate) == 0  # the first secret ends now
-        assert not may_read(house, late) and may_read(house, mine)
+        assert not may_read(server, late) and may_read(server, mine)
 
 
 def test_revoked_key_names_the_shares_that_end_with_it(
-    house: Guarded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    server: Guarded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    guest, where = share_of(house, house.secrets["alice"]), ["--data", str(tmp_path / "data")]
-    assert main(["keys", "revoke", house.ids["alice"], *where]) == 0
-    assert "1 that it made" in capsys.readouterr().out and not may_read(house, guest)
+    guest, where = share_of(server, server.secrets["alice"]), ["--data", str(tmp_path / "data")]
+    assert main(["keys", "revoke", server.ids["alice"], *where]) == 0
+    assert "1 that it made" in capsys.readouterr().out and not may_read(server, guest)
     assert main(["keys", "list", *where]) == 0
-    (line,) = [line for line in capsys.readouterr().out.splitlines() if f"by {house.ids['alice']}" in line]
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if f"by {server.ids['alice']}" in line]
     assert "revoked" in line
 
 
 @pytest.mark.parametrize("moment", [1e18, 253_402_300_800.0, float("inf"), -1e18, float("-inf")])
-def test_moments_beyond_the_calendar_are_told_as_its_ends(
-    moment: float, house: Guarded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_moments_beyond_the_calendar_are_shown_as_its_ends(
+    moment: float, server: Guarded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    share_of(house, house.secrets["alice"])
-    with house.store.database.write() as connection:
+    share_of(server, server.secrets["alice"])
+    with server.store.database.write() as connection:
         never_before = moment if moment > 0 else None  # else nobody would be let in
         connection.execute("UPDATE keys SET created = ?, expires = ?", (moment, never_before))
         connection.execute("UPDATE jobs SET created = ?1, started = ?1, ended = ?1", (moment,))
         connection.execute("UPDATE lifts SET created = ?", (moment,))
     end = "9999-12-31" if moment > 0 else "0001-01-01"
-    for path in ("/jobs", f"/jobs/{house.done}", "/lifts", f"/lifts/{house.done}/shares", "/key"):
-        reply = house.ask("alice", "GET", path)
+    for path in ("/jobs", f"/jobs/{server.done}", "/lifts", f"/lifts/{server.done}/shares", "/key"):
+        reply = server.ask("alice", "GET", path)
         assert reply.status_code == 200 and (f"{end}T00:00:00" in reply.text or path == "/key"), reply.text
     assert main(["keys", "list", "--data", str(tmp_path / "data")]) == 0
     assert end in capsys.readouterr().out
 
 
 def test_lifts_are_given_by_the_command_line_with_no_other_scope(
-    house: Guarded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    server: Guarded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     create = ["keys", "create", "--name", "guest", "--data", str(tmp_path / "data")]
-    assert main([*create, "--lifts", house.done]) == 0
+    assert main([*create, "--lifts", server.done]) == 0
     guest = bearer(capsys.readouterr().out.strip())
-    assert house.client.get(f"/lifts/{house.done}", headers=guest).status_code == 200
-    for wrong in (["--lifts", NOBODY], ["--lifts", house.done, "--scopes", "read"], ["--scopes", "shared"], []):
+    assert server.client.get(f"/lifts/{server.done}", headers=guest).status_code == 200
+    for wrong in (["--lifts", NOBODY], ["--lifts", server.done, "--scopes", "read"], ["--scopes", "shared"], []):
         assert main([*create, *wrong]) == 2, wrong
         assert "splatlift: " in capsys.readouterr().err
 
@@ -363,51 +367,51 @@ def test_lifts_are_given_by_the_command_line_with_no_other_scope(
 
 
 def test_open_until_the_first_key_and_never_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with guarded(tmp_path / "data") as house:
-        with house.store.database.write() as connection:
+    with guarded(tmp_path / "data") as server:
+        with server.store.database.write() as connection:
             connection.execute("DELETE FROM keys")
             connection.execute("UPDATE jobs SET owner = ''")
             connection.execute("UPDATE asset_owners SET owner = ''")
         (tmp_path / "data" / "keys.required").unlink()  # as if there never had been one
-        assert house.ask(None, "GET", "/jobs").status_code == 200
-        assert len(house.ask(None, "GET", "/lifts").json()["lifts"]) == 1
-        assert "security" not in str(house.ask(None, "GET", "/openapi.json").json()["paths"])
+        assert server.ask(None, "GET", "/jobs").status_code == 200
+        assert len(server.ask(None, "GET", "/lifts").json()["lifts"]) == 1
+        assert "security" not in str(server.ask(None, "GET", "/openapi.json").json()["paths"])
         where = ["--data", str(tmp_path / "data")]
         assert main(["keys", "create", "--name", "first", "--scopes", "read", *where]) == 0  # while the server runs
         secret = capsys.readouterr().out.strip()
-        assert house.ask(None, "GET", "/jobs").status_code == 401
+        assert server.ask(None, "GET", "/jobs").status_code == 401
         require_keys(ServiceSettings.model_validate({"data": tmp_path / "data", "host": "0.0.0.0"}))
-        mine = house.client.get("/jobs", headers=bearer(secret))
+        mine = server.client.get("/jobs", headers=bearer(secret))
         assert mine.status_code == 200 and mine.json()["jobs"] == []  # what was before keys is of admins
-        _, admin = make_key(house.store, "admin")
-        assert len(house.client.get("/jobs", headers=bearer(admin)).json()["jobs"]) == 3
+        _, admin = make_key(server.store, "admin")
+        assert len(server.client.get("/jobs", headers=bearer(admin)).json()["jobs"]) == 3
         assert main(["keys", "list", *where]) == 0
         line = capsys.readouterr().out.splitlines()[0].split()
         assert secret not in " ".join(line) and "valid" in line
         assert main(["keys", "revoke", line[0], *where]) == 0
         assert "revoked" in capsys.readouterr().out
-        gone = house.client.get("/jobs", headers=bearer(secret))
+        gone = server.client.get("/jobs", headers=bearer(secret))
         assert gone.status_code == 401 and 'error="invalid_token"' in gone.headers["www-authenticate"]
-        assert house.ask(None, "GET", "/jobs").status_code == 401
-        document = house.ask(None, "GET", "/openapi.json").json()
+        assert server.ask(None, "GET", "/jobs").status_code == 401
+        document = server.ask(None, "GET", "/openapi.json").json()
         assert document["paths"]["/lift"]["post"]["security"] == [{"key": ["write"]}]
         assert "security" not in document["paths"]["/healthz"]["get"]
 
 
 @pytest.mark.parametrize("grace", ["1h", None])
 def test_rotated_key_has_a_new_secret_and_keeps_what_is_its_own(
-    grace: str | None, house: Guarded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    grace: str | None, server: Guarded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    old, where = house.secrets["alice"], ["--data", str(tmp_path / "data")]
-    assert main(["keys", "rotate", house.ids["alice"], *([] if grace is None else ["--grace", grace]), *where]) == 0
+    old, where = server.secrets["alice"], ["--data", str(tmp_path / "data")]
+    assert main(["keys", "rotate", server.ids["alice"], *([] if grace is None else ["--grace", grace]), *where]) == 0
     new = capsys.readouterr().out.strip()
-    assert house.client.get(f"/jobs/{house.done}", headers=bearer(new)).status_code == 200
-    assert house.client.get("/jobs", headers=bearer(old)).status_code == (401 if grace is None else 200)
-    with house.store.database.write() as connection:
+    assert server.client.get(f"/jobs/{server.done}", headers=bearer(new)).status_code == 200
+    assert server.client.get("/jobs", headers=bearer(old)).status_code == (401 if grace is None else 200)
+    with server.store.database.write() as connection:
         connection.execute("UPDATE keys SET old_until = ?", (time.time(),))
-    assert house.client.get("/jobs", headers=bearer(old)).status_code == 401
-    house.store.keys.revoke(house.ids["alice"])
-    assert house.client.get("/jobs", headers=bearer(new)).status_code == 401
+    assert server.client.get("/jobs", headers=bearer(old)).status_code == 401
+    server.store.keys.revoke(server.ids["alice"])
+    assert server.client.get("/jobs", headers=bearer(new)).status_code == 401
 
 
 def test_key_is_rotated_by_its_name_where_one_has_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -416,45 +420,45 @@ def test_key_is_rotated_by_its_name_where_one_has_it(tmp_path: Path, capsys: pyt
         assert main(["keys", "create", "--name", name, "--scopes", "read", *where]) == 0
     assert main(["keys", "rotate", "anna", *where]) == 0
     capsys.readouterr()
-    for name, told in (("bob", "name one of"), ("nobody", "valid key")):
+    for name, message in (("bob", "name one of"), ("nobody", "valid key")):
         assert main(["keys", "rotate", name, *where]) == 2
-        assert told in capsys.readouterr().err
+        assert message in capsys.readouterr().err
 
 
-def test_key_expires_and_stays_revoked_since_the_first_time(house: Guarded) -> None:
-    key, secret = house.store.keys.create("guest", frozenset({Scope.READ}), Quota(), expires=time.time() + 3600)
-    assert house.client.get("/jobs", headers=bearer(secret)).status_code == 200
-    assert house.store.keys.revoke(house.ids["bob"])[0].revoked is not None
-    with house.store.database.write() as connection:
+def test_key_expires_and_stays_revoked_since_the_first_time(server: Guarded) -> None:
+    key, secret = server.store.keys.create("guest", frozenset({Scope.READ}), Quota(), expires=time.time() + 3600)
+    assert server.client.get("/jobs", headers=bearer(secret)).status_code == 200
+    assert server.store.keys.revoke(server.ids["bob"])[0].revoked is not None
+    with server.store.database.write() as connection:
         connection.execute("UPDATE keys SET expires = ? WHERE id = ?", (time.time(), key.id))
-        connection.execute("UPDATE keys SET revoked = 7 WHERE id = ?", (house.ids["bob"],))
-    gone = house.client.get("/jobs", headers=bearer(secret))
+        connection.execute("UPDATE keys SET revoked = 7 WHERE id = ?", (server.ids["bob"],))
+    gone = server.client.get("/jobs", headers=bearer(secret))
     assert gone.status_code == 401 and 'error="invalid_token"' in gone.headers["www-authenticate"]
-    assert house.store.keys.revoke(house.ids["bob"])[0].revoked == 7
+    assert server.store.keys.revoke(server.ids["bob"])[0].revoked == 7
 
 
 def test_log_names_client_and_key_and_every_use_of_admin_and_no_secret(
-    house: Guarded, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    server: Guarded, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    secret = house.secrets["alice"]
+    secret = server.secrets["alice"]
     assert len(secret) >= len("splatlift_") + 43  # 256 bits in base64
     with caplog.at_level(logging.DEBUG):
-        house.ask("alice", "GET", "/lifts/nothing", params={"access_token": secret})
-        house.ask(None, "GET", "/jobs")
-        house.ask("boss", "DELETE", "/jobs/nothing")
+        server.ask("alice", "GET", "/lifts/nothing", params={"access_token": secret})
+        server.ask(None, "GET", "/jobs")
+        server.ask("boss", "DELETE", "/jobs/nothing")
     told = [vars(record)["fields"] for record in caplog.records if record.name == "service.access"]
     assert [fields["client"] for fields in told] == ["testclient"] * 3
-    assert [fields.get("key") for fields in told] == [house.ids["alice"], None, house.ids["boss"]]
+    assert [fields.get("key") for fields in told] == [server.ids["alice"], None, server.ids["boss"]]
     assert ["admin" in fields for fields in told] == [False, False, True]
     (used,) = [vars(record)["fields"] for record in caplog.records if record.getMessage() == "an admin key is used"]
-    assert (used["key"], used["method"], used["path"]) == (house.ids["boss"], "DELETE", "/jobs/nothing")
+    assert (used["key"], used["method"], used["path"]) == (server.ids["boss"], "DELETE", "/jobs/nothing")
     ours = [str(vars(record)) for record in caplog.records if not record.name.startswith("http")]  # not the client's
     assert ours and not any(secret in line for line in ours)
     files = [path for path in (tmp_path / "data").rglob("*") if path.is_file()]
     assert files and not any(secret.encode() in path.read_bytes() for path in files)
 
 
-def test_revoked_key_loses_its_streams(house: Guarded, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_revoked_key_loses_its_streams(server: Guarded, monkeypatch: pytest.MonkeyPatch) -> None:
     replies, sent = list[Any](), threading.Event()
 
     def noted(event: Event) -> bool:  # asked when the event is on its way
@@ -464,26 +468,26 @@ def test_revoked_key_loses_its_streams(house: Guarded, monkeypatch: pytest.Monke
     monkeypatch.setattr("service.content.is_last", noted)
 
     def follow() -> None:
-        replies.append(house.ask("alice", "GET", f"/jobs/{house.queued}/events"))  # its job does not end
+        replies.append(server.ask("alice", "GET", f"/jobs/{server.queued}/events"))  # its job does not end
 
     following = threading.Thread(target=follow, daemon=True)
     following.start()
-    assert sent.wait(PATIENCE_SECONDS) and parts_of(house.client).streams.open == 1
-    house.store.keys.revoke(house.ids["alice"])
+    assert sent.wait(PATIENCE_SECONDS) and parts_of(server.client).streams.open == 1
+    server.store.keys.revoke(server.ids["alice"])
     following.join(PATIENCE_SECONDS)
     (reply,) = replies
     assert reply.status_code == 200 and '"queued"' in reply.text
-    assert house.ask("alice", "GET", "/jobs").status_code == 401
+    assert server.ask("alice", "GET", "/jobs").status_code == 401
 
 
-def test_only_one_whole_key_as_bearer_counts(house: Guarded) -> None:
-    secret, other = house.secrets["alice"], house.secrets["bob"]
+def test_only_one_whole_key_as_bearer_counts(server: Guarded) -> None:
+    secret, other = server.secrets["alice"], server.secrets["bob"]
     for header in ("", "Bearer", "Bearer ", f"Basic {secret}", secret, f"Bearer {secret} x", f"Bearer {secret[:-1]}"):
-        assert house.client.get("/jobs", headers={"Authorization": header}).status_code == 401
+        assert server.client.get("/jobs", headers={"Authorization": header}).status_code == 401
     twice = [("Authorization", f"Bearer {one}") for one in (secret, other)]
-    assert house.client.get("/jobs", headers=twice).status_code == 401
-    assert house.client.get("/jobs", params={"access_token": secret}).status_code == 401  # nor in URLs
-    assert house.client.get("/jobs", headers={"Authorization": f"bearer  {secret}"}).status_code == 200
+    assert server.client.get("/jobs", headers=twice).status_code == 401
+    assert server.client.get("/jobs", params={"access_token": secret}).status_code == 401  # nor in URLs
+    assert server.client.get("/jobs", headers={"Authorization": f"bearer  {secret}"}).status_code == 200
 
 
 def test_keys_speak_json_and_say_until_when_they_are_valid(
@@ -623,15 +627,15 @@ def test_own_page_may_change_things_and_foreign_ones_only_look() -> None:
                 check(HERE, method, host="localhost:8787", origin=origin)
 
 
-def test_gate_answers_with_problems(house: Guarded) -> None:
-    reply = house.ask("alice", "GET", "/jobs", headers={"Host": "evil.example"})
+def test_gate_answers_with_problems(server: Guarded) -> None:
+    reply = server.ask("alice", "GET", "/jobs", headers={"Host": "evil.example"})
     assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/misdirected", 421)
-    assert house.ask(None, "GET", "/healthz", headers={"Host": "evil.example"}).status_code == 421
-    assert house.ask("alice", "GET", "/jobs", headers={"Host": "LIFT.example.org:80"}).status_code == 200
-    reply = house.ask("alice", "POST", f"/jobs/{house.queued}/cancel", headers={"Origin": "https://evil.example"})
+    assert server.ask(None, "GET", "/healthz", headers={"Host": "evil.example"}).status_code == 421
+    assert server.ask("alice", "GET", "/jobs", headers={"Host": "LIFT.example.org:80"}).status_code == 200
+    reply = server.ask("alice", "POST", f"/jobs/{server.queued}/cancel", headers={"Origin": "https://evil.example"})
     assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/foreign-origin", 403)
     assert "access-control-allow-origin" not in reply.headers
-    own = house.ask("alice", "POST", f"/jobs/{house.queued}/cancel", headers={"Origin": "http://127.0.0.1"})
+    own = server.ask("alice", "POST", f"/jobs/{server.queued}/cancel", headers={"Origin": "http://127.0.0.1"})
     assert own.status_code == 200
 
 
@@ -639,30 +643,30 @@ LAB = "https://lab.example"
 PREFLIGHT = {"Origin": LAB, "Access-Control-Request-Method": "GET", "Access-Control-Request-Headers": "authorization"}
 
 
-def test_no_page_of_another_site_reads_unless_it_is_named(house: Guarded) -> None:
-    assert house.ask(None, "OPTIONS", "/jobs", headers=PREFLIGHT).status_code >= 400
-    reply = house.ask("alice", "GET", "/jobs", headers={"Origin": LAB})
+def test_no_page_of_another_site_reads_unless_it_is_named(server: Guarded) -> None:
+    assert server.ask(None, "OPTIONS", "/jobs", headers=PREFLIGHT).status_code >= 400
+    reply = server.ask("alice", "GET", "/jobs", headers={"Origin": LAB})
     assert not [name for name in reply.headers if name.startswith("access-control")]
 
 
 def test_pages_of_named_origins_read_with_a_key_and_change_nothing(tmp_path: Path) -> None:
-    with guarded(tmp_path / "data", cors_origins=f"http://localhost:3000, {LAB}") as house:
-        preflight = house.ask(None, "OPTIONS", "/jobs", headers=PREFLIGHT)
+    with guarded(tmp_path / "data", cors_origins=f"http://localhost:3000, {LAB}") as server:
+        preflight = server.ask(None, "OPTIONS", "/jobs", headers=PREFLIGHT)
         assert preflight.status_code == 200 and preflight.headers["access-control-allow-origin"] == LAB
         assert "authorization" in preflight.headers["access-control-allow-headers"].lower()
         for name, status in (("alice", 200), (None, 401)):  # refusals are read, too
-            reply = house.ask(name, "GET", "/jobs", headers={"Origin": LAB})
+            reply = server.ask(name, "GET", "/jobs", headers={"Origin": LAB})
             assert (reply.status_code, reply.headers["access-control-allow-origin"]) == (status, LAB)
             assert "access-control-allow-credentials" not in reply.headers
             assert "X-Request-ID" in reply.headers["access-control-expose-headers"]
         asked = {"json": {"text": ["apple"], "lift": NOBODY}, "headers": {"Origin": LAB}}
-        assert house.ask("alice", "POST", "/query", **asked).status_code == 404  # a question reads
-        refused = house.ask("alice", "POST", f"/jobs/{house.queued}/cancel", headers={"Origin": LAB})
+        assert server.ask("alice", "POST", "/query", **asked).status_code == 404  # a question reads
+        refused = server.ask("alice", "POST", f"/jobs/{server.queued}/cancel", headers={"Origin": LAB})
         assert assert_problem(refused)["type"] == "/problems/foreign-origin"
-        other = house.ask("alice", "GET", "/jobs", headers={"Origin": "https://evil.example"})
+        other = server.ask("alice", "GET", "/jobs", headers={"Origin": "https://evil.example"})
         assert "access-control-allow-origin" not in other.headers
         asked["headers"] = {"Origin": "https://evil.example"}
-        assert assert_problem(house.ask("alice", "POST", "/query", **asked))["type"] == "/problems/foreign-origin"
+        assert assert_problem(server.ask("alice", "POST", "/query", **asked))["type"] == "/problems/foreign-origin"
 
 
 @pytest.mark.parametrize(
@@ -675,8 +679,8 @@ def test_pages_of_named_origins_read_with_a_key_and_change_nothing(tmp_path: Pat
     ],
 )
 def test_preflight_that_is_refused_is_a_problem(header: str, value: str, tmp_path: Path) -> None:
-    with guarded(tmp_path / "data", cors_origins=LAB) as house:
-        reply = house.ask(None, "OPTIONS", "/jobs", headers=PREFLIGHT | {header: value})
+    with guarded(tmp_path / "data", cors_origins=LAB) as server:
+        reply = server.ask(None, "OPTIONS", "/jobs", headers=PREFLIGHT | {header: value})
         problem = assert_problem(reply)
         assert problem["argument"] == header and value in problem["got"]
 
@@ -690,12 +694,12 @@ def test_origins_that_no_browser_sends_are_refused_and_all_only_where_keys_are_r
     assert ServiceSettings.model_validate({"cors_origins": "*", "keys": "required"}).cors_origins == ("*",)
 
 
-def gate_of(store: Store, app: Any, **settings: int) -> Gate:
+def gate_of(store: Store, app: Any, **settings: int) -> AuthMiddleware:
     chosen = ServiceSettings.model_validate({"data": store.files.root, **settings})
-    return Gate(app, store.keys, chosen, lambda: False)
+    return AuthMiddleware(app, store.keys, chosen, lambda: False)
 
 
-async def through(gate: Gate, secret: str, path: str = "/assets/splats", method: str = "PUT") -> None:
+async def through(gate: AuthMiddleware, secret: str, path: str = "/assets/splats", method: str = "PUT") -> None:
     """A request with a key, of which nobody reads or answers anything."""
     headers = [(b"host", b"localhost"), (b"authorization", f"Bearer {secret}".encode())]
     nothing: Any = None
@@ -767,45 +771,47 @@ def test_streams_at_a_time_have_a_share_a_key() -> None:
         follow("alice")
 
 
-def test_database_that_is_held_at_the_gate_is_503_with_retry_after(house: Guarded, monkeypatch: Any) -> None:
+def test_database_that_is_held_at_the_gate_is_503_with_retry_after(server: Guarded, monkeypatch: Any) -> None:
     held = sqlite3.OperationalError("database is locked")
     held.sqlite_errorcode = sqlite3.SQLITE_BUSY
-    monkeypatch.setattr(house.store.database, "read", mock.Mock(side_effect=held))
-    reply = house.ask("alice", "GET", "/jobs")
+    monkeypatch.setattr(server.store.database, "read", mock.Mock(side_effect=held))
+    reply = server.ask("alice", "GET", "/jobs")
     assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/busy", 503)
     assert int(reply.headers["retry-after"]) > 0
 
 
 def test_stored_bytes_have_a_quota(tmp_path: Path) -> None:
-    with guarded(tmp_path / "data", key_bytes=10_000) as house:
-        used = sum(asset["bytes"] for asset in house.ask("alice", "GET", "/assets").json()["assets"]) + len(b"a lift")
-        ident, secret = make_key(house.store, "read write", max_bytes=used)
-        with house.store.database.write() as connection:
+    with guarded(tmp_path / "data", key_bytes=10_000) as server:
+        used = sum(asset["bytes"] for asset in server.ask("alice", "GET", "/assets").json()["assets"]) + len(
+            b"a lift"
+        )
+        ident, secret = make_key(server.store, "read write", max_bytes=used)
+        with server.store.database.write() as connection:
             connection.execute("UPDATE asset_owners SET owner = ?", (ident,))
             connection.execute("UPDATE jobs SET owner = ?", (ident,))
         replies = [
-            house.client.put("/assets/splats", headers=bearer(secret), content=b"x"),
-            house.client.post("/lift", headers=bearer(secret), json=house.body()),
+            server.client.put("/assets/splats", headers=bearer(secret), content=b"x"),
+            server.client.post("/lift", headers=bearer(secret), json=server.body()),
         ]
         for reply in replies:
             assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/over-quota", 403)
             assert str(used) in reply.json()["expected"]
-        assert house.client.delete(f"/jobs/{house.done}?with_lift=true", headers=bearer(secret)).status_code == 204
-        reply = house.client.post("/lift", headers=bearer(secret), json=house.body())
+        assert server.client.delete(f"/jobs/{server.done}?with_lift=true", headers=bearer(secret)).status_code == 204
+        reply = server.client.post("/lift", headers=bearer(secret), json=server.body())
         assert reply.status_code == 403  # the trade-off counts, too
-        gone = house.client.delete(f"/jobs/{house.compared}?with_tradeoff=true", headers=bearer(secret))
+        gone = server.client.delete(f"/jobs/{server.compared}?with_tradeoff=true", headers=bearer(secret))
         assert gone.status_code == 204
-        assert house.client.post("/lift", headers=bearer(secret), json=house.body()).status_code == 202
+        assert server.client.post("/lift", headers=bearer(secret), json=server.body()).status_code == 202
 
 
 def test_jobs_in_line_have_a_quota_a_key(tmp_path: Path) -> None:
-    with guarded(tmp_path / "data", key_queued=2) as house:
-        assert house.ask("alice", "POST", "/lift", json=house.body()).status_code == 202
-        reply = house.ask("alice", "POST", "/lift", json=house.body())
+    with guarded(tmp_path / "data", key_queued=2) as server:
+        assert server.ask("alice", "POST", "/lift", json=server.body()).status_code == 202
+        reply = server.ask("alice", "POST", "/lift", json=server.body())
         assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/too-many", 429)
         assert int(reply.headers["retry-after"]) > 0
-        order(house.store, Owner(house.ids["bob"], sees_all=False))
-        assert house.ask("bob", "POST", "/lift", json=house.body()).status_code == 202
+        order(server.store, Owner(server.ids["bob"], sees_all=False))
+        assert server.ask("bob", "POST", "/lift", json=server.body()).status_code == 202
         for _ in "ba":  # keys take turns, and hers was the last
-            finish(house.store, b"")
-        assert house.ask("alice", "POST", "/lift", json=house.body()).status_code == 202
+            finish(server.store, b"")
+        assert server.ask("alice", "POST", "/lift", json=server.body()).status_code == 202

@@ -31,7 +31,7 @@ from service.content import EventStreams
 from service.errand import ErrandLimits
 from service.errors import Busy, NoSpace
 from service.models import BODY_BRACKETS, BODY_COMMAS, PACKS, SETTINGS, AssetKind, Question
-from service.observe import SAME_A_MINUTE, JsonLines, Sparing, TextLines, working_for
+from service.observe import SAME_A_MINUTE, JsonLines, LogRateLimit, TextLines, working_for
 from service.query_client import Frame
 from service.state import Stopping
 from service.store.assets import SHOWN_CHARACTERS
@@ -423,7 +423,7 @@ def test_few_requests_begin_at_a_time_and_none_waits_for_slow_ones(
             if scope["path"] == "/slow":
                 await go_on.wait()
 
-        turns: Any = layers.Turns(app)
+        turns: Any = layers.ConcurrencyLimit(app)
         async with anyio.create_task_group() as asked:
             for path in ["/slow"] * 2 * layers.PLACES + ["/healthz"]:
                 asked.start_soon(turns, {"type": "http", "path": path}, None, None)
@@ -561,7 +561,7 @@ def test_every_answer_tells_browsers_to_guess_and_frame_nothing(client: TestClie
 
 def test_log_of_one_thing_again_and_again_is_thinned_out() -> None:
     now = [0.0]
-    sparing, access = Sparing(lambda: now[0]), logging.LogRecord("service.access", 20, "x", 1, "m", (), None)
+    sparing, access = LogRateLimit(lambda: now[0]), logging.LogRecord("service.access", 20, "x", 1, "m", (), None)
     repeated = [logging.LogRecord("service.jobs", 40, "x", 1, "m", (), None) for _ in range(10_000)]
     assert sum(map(sparing.filter, repeated)) == SAME_A_MINUTE
     assert all(sparing.filter(access) for _ in range(1000))

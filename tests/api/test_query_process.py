@@ -211,11 +211,11 @@ class Patient(NoQueries):
 
     def call(self, request: dict[str, Any], waiter: Waiter) -> Frame:
         self.waiters.append(waiter)
-        until(lambda: waiter.left)
+        until(lambda: waiter.disconnected)
         raise ClientLeft("query", expected="a client that waits", got="one that left")
 
     def cancel(self, waiter: Waiter) -> None:
-        waiter.left = True
+        waiter.disconnected = True
 
 
 @pytest.mark.parametrize("method", ["GET", "POST"])
@@ -232,8 +232,8 @@ def test_closed_connection_is_a_client_that_left(tmp_path: Path, method: str) ->
         with socket.create_connection(address_of(server), timeout=60) as connection:
             connection.sendall((head + sent[method]).encode())
             until(lambda: queries.waiters)
-            assert not queries.waiters[0].left and queries.waiters[0].key == house.ids["alice"]
-        until(lambda: queries.waiters[0].left)
+            assert not queries.waiters[0].disconnected and queries.waiters[0].key == house.ids["alice"]
+        until(lambda: queries.waiters[0].disconnected)
         until(lambda: not server.server_state.connections)
 
 

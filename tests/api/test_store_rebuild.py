@@ -27,11 +27,13 @@ from .following import ended
 from .guarded import Guarded, address, bearer, every_route, guarded, make_key
 from .tiny_scene import TinyScene, colmap_zip, labels, masks
 
+StoredData = tuple[Path, dict[str, Any]]  # a data directory, and its contents over HTTP
+
 
 @pytest.fixture(scope="module")
-def kept(tmp_path_factory: pytest.TempPathFactory, scene: TinyScene, table: Path) -> tuple[Path, dict[str, Any]]:
-    """A data directory with an asset of each kind and a lift that was changed, and what the service told of them."""
-    data = tmp_path_factory.mktemp("kept") / "data"
+def stored_data(tmp_path_factory: pytest.TempPathFactory, scene: TinyScene, table: Path) -> StoredData:
+    """A data directory with an asset of each kind and a lift that was changed, and its contents over HTTP."""
+    data = tmp_path_factory.mktemp("stored_data") / "data"
     with serving(data, table) as client:
         contents = {"splats": scene.splats, "cameras": scene.cameras, "features": scene.features}
         ids = [client.put(f"/assets/{kind}", content=body).json()["id"] for kind, body in contents.items()]
@@ -42,19 +44,19 @@ def kept(tmp_path_factory: pytest.TempPathFactory, scene: TinyScene, table: Path
         assert job["state"] == "succeeded", job
         for change in ({"name": "first"}, {"world": {"up": [0, -1, 0], "metres_per_unit": 0.5}}, {"name": "last"}):
             assert client.patch(f"/lifts/{job['id']}", json=change).status_code == 200
-        told = all_told(client)
-        assert (told["lift"]["name"], told["lift"]["world"]["metres_per_unit"]) == ("last", 0.5)
-    return data, told
+        contents = contents_of(client)
+        assert (contents["lift"]["name"], contents["lift"]["world"]["metres_per_unit"]) == ("last", 0.5)
+    return data, contents
 
 
 @pytest.fixture
-def filled(kept: tuple[Path, dict[str, Any]], tmp_path: Path) -> tuple[Path, dict[str, Any]]:
+def copied_data(stored_data: StoredData, tmp_path: Path) -> StoredData:
     """A copy of it."""
-    shutil.copytree(kept[0], tmp_path / "data")
-    return tmp_path / "data", kept[1]
+    shutil.copytree(stored_data[0], tmp_path / "data")
+    return tmp_path / "data", stored_data[1]
 
 
-def all_told(client: TestClient) -> dict[str, Any]:
+def contents_of(client: TestClient) -> dict[str, Any]:
     """Assets, lift and an answer, without the times at which they were made."""
     assets = {asset["id"]: asset for asset in client.get("/assets").json()["assets"]}
     (lift,) = client.get("/lifts").json()["lifts"]
@@ -65,16 +67,18 @@ def all_told(client: TestClient) -> dict[str, Any]:
     return {"assets": assets, "lift": lift, "settings": job["settings"], "state": job["state"], "answer": answer}
 
 
-def test_lift_in_a_data_directory_opens_with_the_splats_that_lie_there(kept: tuple[Path, dict[str, Any]]) -> None:
-    (lift,) = kept[0].glob("lifts/*.safetensors")
+def test_lift_in_a_data_directory_opens_with_the_splats_that_lie_there(
+    stored_data: StoredData,
+) -> None:
+    (lift,) = stored_data[0].glob("lifts/*.safetensors")
     scene = Scene(lift)
-    assert scene.splats.count == kept[1]["lift"]["count"] and scene.cameras
+    assert scene.splats.count == stored_data[1]["lift"]["count"] and scene.cameras
 
 
 def test_rebuild_makes_the_database_of_the_files(
-    filled: tuple[Path, dict[str, Any]], table: Path, capsys: pytest.CaptureFixture[str]
+    copied_data: StoredData, table: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    data, told = filled
+    data, contents = copied_data
     (data / DATABASE).unlink()
     broken = data / "blobs" / "ab" / f"{'ab' * 32}.ply"
     broken.parent.mkdir(exist_ok=True)
@@ -89,16 +93,16 @@ def test_rebuild_makes_the_database_of_the_files(
     assert [left["file"] for left in found["left"]] == [str(path.relative_to(data)) for path in (broken, strange)]
     assert "trade-offs" in found["lost"] and "keys" in found["lost"]
     with serving(data, table) as client:
-        assert all_told(client) == told
+        assert contents_of(client) == contents
     store = Store.open(data)
     assert set(collect(store, 1e12)) == {broken, strange}  # all else has its row
     store.close()
 
 
-def test_rebuild_brings_an_older_database_up_to_its_files(filled: tuple[Path, dict[str, Any]], table: Path) -> None:
-    data, told = filled
+def test_rebuild_brings_an_older_database_up_to_its_files(copied_data: StoredData, table: Path) -> None:
+    data, contents = copied_data
     store = Store.open(data)
-    lift = told["lift"]["id"]
+    lift = contents["lift"]["id"]
     with store.database.write() as connection:  # as it was while the job was in line
         connection.execute("DELETE FROM lifts")
         connection.execute("UPDATE jobs SET state = 'queued', ended = NULL, owner = 'somebody'")
@@ -113,13 +117,13 @@ def test_rebuild_brings_an_older_database_up_to_its_files(filled: tuple[Path, di
         assert connection.execute("SELECT owner FROM jobs").fetchone()["owner"] == "somebody"
     store.close()
     with serving(data, table) as client:
-        assert all_told(client) == told
+        assert contents_of(client) == contents
 
 
 def test_changes_of_a_lift_that_are_damaged_or_of_photos_that_are_gone_cost_no_lift(
-    filled: tuple[Path, dict[str, Any]], capsys: pytest.CaptureFixture[str]
+    copied_data: StoredData, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    data, told = filled
+    data, contents = copied_data
     (changes,) = data.glob("lifts/*.json")
     for text, left, name in (('{"name": "x", "photos": "sha256:%s"}' % ("0" * 64), 0, "x"), ('{"name": 7}', 1, None)):
         (data / DATABASE).unlink()
@@ -128,27 +132,27 @@ def test_changes_of_a_lift_that_are_damaged_or_of_photos_that_are_gone_cost_no_l
         found = json.loads(capsys.readouterr().out)
         assert (found["lifts"], len(found["left"])) == (1, left) and changes.exists() == (not left)
         store = Store.open(data)
-        lift = store.lifts.get(SERVICE, told["lift"]["id"])
+        lift = store.lifts.get(SERVICE, contents["lift"]["id"])
         assert (lift.name, lift.photos) == (name, None)
         store.close()
 
 
-def test_changes_of_a_lift_go_with_it_and_into_backups(filled: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
-    data, told = filled
+def test_changes_of_a_lift_go_with_it_and_into_backups(copied_data: StoredData, tmp_path: Path) -> None:
+    data, contents = copied_data
     (changes,) = data.glob("lifts/*.json")
     back_up(data, tmp_path / "backup")
     assert (tmp_path / "backup" / "lifts" / changes.name).read_text() == changes.read_text()
     store = Store.open(data)
     assert collect(store, 1e12) == [] and changes.exists()
-    store.jobs.delete(SERVICE, told["lift"]["id"], given_up=(JobKind.LIFT,))
+    store.jobs.delete(SERVICE, contents["lift"]["id"], given_up=(JobKind.LIFT,))
     assert not changes.exists()
     store.close()
 
 
 def test_rebuild_that_was_cut_off_does_not_let_the_server_start(
-    filled: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    copied_data: StoredData, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    data, _ = filled
+    data, _ = copied_data
     for name in (DATABASE, "generation"):
         (data / name).unlink()
 
@@ -165,10 +169,8 @@ def test_rebuild_that_was_cut_off_does_not_let_the_server_start(
     Store.open(data).close()
 
 
-def test_lift_whose_splats_are_gone_is_left_out(
-    filled: tuple[Path, dict[str, Any]], capsys: pytest.CaptureFixture[str]
-) -> None:
-    data, _ = filled
+def test_lift_whose_splats_are_gone_is_left_out(copied_data: StoredData, capsys: pytest.CaptureFixture[str]) -> None:
+    data, _ = copied_data
     (data / DATABASE).unlink()
     (splats,) = data.glob("blobs/*/*.ply")
     splats.unlink()
@@ -188,32 +190,32 @@ def test_rebuild_beside_a_server_or_nowhere_is_one_line(tmp_path: Path, capsys: 
     assert not (tmp_path / "nowhere").exists()
 
 
-def without_keys(house: Guarded) -> None:
+def without_keys(server: Guarded) -> None:
     """As after the loss of the database that held them."""
-    with house.store.database.write() as connection:
+    with server.store.database.write() as connection:
         connection.execute("DELETE FROM keys")
 
 
-def statuses(house: Guarded, secret: str | None = None) -> dict[str, int]:
+def statuses(server: Guarded, secret: str | None = None) -> dict[str, int]:
     """What each route answers that needs a key; no body, so what is let in is refused for that or found missing."""
     headers = {} if secret is None else bearer(secret)
     found = {}
-    for method, path in every_route(app_of(house.client)):
+    for method, path in every_route(app_of(server.client)):
         if required_scope(method, path) is not None:
             asked = address(path, "0" * 32, "sha256:" + "0" * 64)
-            found[f"{method} {path}"] = house.client.request(method, asked, headers=headers).status_code
+            found[f"{method} {path}"] = server.client.request(method, asked, headers=headers).status_code
     return found
 
 
 def test_lost_keys_open_no_door(tmp_path: Path) -> None:
-    with guarded(tmp_path / "data", allowed_hosts="proxy.example") as house:
-        without_keys(house)
-        found = statuses(house, house.secrets["boss"])
+    with guarded(tmp_path / "data", allowed_hosts="proxy.example") as server:
+        without_keys(server)
+        found = statuses(server, server.secrets["boss"])
         assert len(found) > 20 and set(found.values()) == {401}, found
-        assert house.client.get("/assets", headers={"Host": "proxy.example"}).status_code == 401
-        assert "securitySchemes" in house.client.get("/openapi.json").json()["components"]
-        _, secret = make_key(house.store, "read")
-        assert house.client.get("/assets", headers=bearer(secret)).status_code == 200
+        assert server.client.get("/assets", headers={"Host": "proxy.example"}).status_code == 401
+        assert "securitySchemes" in server.client.get("/openapi.json").json()["components"]
+        _, secret = make_key(server.store, "read")
+        assert server.client.get("/assets", headers=bearer(secret)).status_code == 200
 
 
 def test_database_of_a_release_that_did_not_remember_keys_is_remembered(tmp_path: Path) -> None:
@@ -226,18 +228,18 @@ def test_database_of_a_release_that_did_not_remember_keys_is_remembered(tmp_path
 
 
 def test_keys_required_closes_a_service_that_never_had_one(tmp_path: Path) -> None:
-    with guarded(tmp_path / "data", keys="required") as house:
-        without_keys(house)
+    with guarded(tmp_path / "data", keys="required") as server:
+        without_keys(server)
         (tmp_path / "data" / "keys.required").unlink()
-        assert set(statuses(house).values()) == {401}
+        assert set(statuses(server).values()) == {401}
     require_keys(ServiceSettings.model_validate({"data": tmp_path / "x", "host": "0.0.0.0", "keys": "required"}))
 
 
 def test_keys_none_asks_nobody_for_one_and_stays_on_this_machine(tmp_path: Path) -> None:
-    with guarded(tmp_path / "data", keys="none") as house:
-        for secret in (None, house.secrets["bob"], "no-key"):
-            assert not {401, 403} & set(statuses(house, secret).values())
-        assert len(house.client.get("/jobs").json()["jobs"]) == 3
+    with guarded(tmp_path / "data", keys="none") as server:
+        for secret in (None, server.secrets["bob"], "no-key"):
+            assert not {401, 403} & set(statuses(server, secret).values())
+        assert len(server.client.get("/jobs").json()["jobs"]) == 3
     with pytest.raises(Misconfigured, match="SPLATLIFT_KEYS is none"):
         require_keys(ServiceSettings.model_validate({"data": tmp_path / "data", "host": "0.0.0.0", "keys": "none"}))
 

@@ -167,11 +167,11 @@ def kept_connections(client: httpx.Client, url: str, seconds: float) -> dict[str
         return client.post("/query", json={"text": ["x"], "lift": "0" * 32}).status_code
 
     statuses = at_once([ask] * 16)
-    begun = connections_of(url)
+    before = connections_of(url)
     time.sleep(seconds)
-    left = connections_of(url)
+    after_pause = connections_of(url)
     statuses += at_once([ask] * 16)
-    return {"begun": begun, "after_s": seconds, "left": left, "statuses": sorted(set(statuses))}
+    return {"before": before, "after_s": seconds, "left": after_pause, "statuses": sorted(set(statuses))}
 
 
 def main() -> int:
@@ -213,8 +213,8 @@ def main() -> int:
     parts = figures["ranges"]
     whole = sent["whole"] and parts["whole"] and all(parts["parts"].values()) and parts["if_none_match"] == 304
     pool = figures["kept_connections"]
-    ended = pool["left"] <= 1 < pool["begun"] and pool["statuses"] == [404]  # one is kept by the checks of health
-    return 0 if reached and whole and ended and figures["events"]["same"] and not figures["errors"] else 1
+    is_closed = pool["left"] <= 1 < pool["before"] and pool["statuses"] == [404]  # of the health checks
+    return 0 if reached and whole and is_closed and figures["events"]["same"] and not figures["errors"] else 1
 
 
 if __name__ == "__main__":
