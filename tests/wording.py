@@ -219,7 +219,7 @@ def main() -> int:
         fewer = sorted(path for path in bounds if lower[path] != bounds[path])
         print(f"{len(fewer)} files have fewer than their bounds: lower these with python -m tests.wording --write")
     print(summary(reports.values()))
-    return 1 if above else 0
+    return 1 if above and not options.write else 0
 
 
 def counts_below(report: Report | None, bounds: dict[str, int]) -> dict[str, int]:

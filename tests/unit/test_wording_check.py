@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.wording import Report, excess, report_on_code
+from tests.wording import Report, counts_below, excess, report_on_code
 
 CLEAN = '''
 class Answer:
@@ -55,3 +55,10 @@ def test_a_count_above_its_bound_fails_and_one_within_it_does_not() -> None:
     lines = list(excess(reports, {"a.py": {"names": 1}}))
     assert len(lines) == 3 and "a.py:1 found" in lines[1]
     assert len(list(excess(reports, {}))) == 3
+
+
+def test_bounds_are_lowered_to_what_a_file_has_and_never_raised() -> None:
+    report = report_on_code("found = given = 1")
+    assert counts_below(report, {"names": 5, "told": 1}) == {"names": 2}
+    assert counts_below(report, {"names": 1}) == {"names": 1}
+    assert counts_below(None, {"names": 1}) == {}
