@@ -675,7 +675,7 @@ class ListedSelection(OfLift):
     id: str
     name: str
     count: int = Field(description="splats")
-    box: Box | None = Field(description="of its largest group of splats that touch; null of none")
+    box: Box | None = Field(description="of its large groups of splats that touch; null of none")
     step: int = Field(description="where in its history it is")
     first: int = Field(description="the steps that it can go to, by PATCH")
     last: int

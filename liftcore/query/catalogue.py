@@ -20,7 +20,7 @@ from typing import Any, Literal
 import numpy as np
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.objects import largest_box, size_of
+from liftcore.query.objects import size_of, thing_box
 from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.question import ListedObjects, Point, SceneNode, SceneObject, SceneTree
 from liftcore.query.relations import relations as related
@@ -179,7 +179,7 @@ def _described(
         weights = evidence[rows] if evidence[rows].any() else np.ones(rows.size)
         key = int(nodes[one]), rows.size
         if key not in scene.node_boxes:
-            scene.node_boxes[key] = largest_box(scene.splats, rows, weights)
+            scene.node_boxes[key] = thing_box(scene.splats, rows, weights)
         box = scene.node_boxes[key]
         x, y, z = np.mean(box, axis=0).tolist()
         shown = tuple(known[view] for view in views[one] if 0 <= view < len(known))

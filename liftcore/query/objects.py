@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from liftcore.scene.world import WorldFrame
 
 LEAST_EVIDENCE = 0.05  # of an object, as a share of the largest's
-LEAST_OF_FRAGMENT = 0.25  # the same of a fragment of another thing, where the largest is a thing itself
+LEAST_OF_FRAGMENT = 0.25  # the same of a fragment of another thing, where the largest is a thing itself, and in one
 MOST_SPLATS = 1 << 20  # that are grouped: a million take seven seconds of two cores and a gigabyte
 _TAIL = 1e-3  # of an object's evidence that its box leaves out at each end of each axis
 
@@ -65,7 +65,7 @@ def objects(scene: OpenedLift, answer: Answer) -> Objects:
         inside = numbers[rows] == number
         own, mine = rows[inside], weights[inside]
         mine = mine if mine.any() else np.ones(len(own))
-        box = largest_box(scene.splats, own, mine) if sets else trimmed_box(scene.splats.positions(own), mine)
+        box = thing_box(scene.splats, own, mine) if sets else trimmed_box(scene.splats.positions(own), mine)
         found.append(
             FoundObject(
                 splats=int(inside.sum()),
@@ -116,8 +116,10 @@ def _set_numbers(scene: OpenedLift, sets: Sequence[SplatSet]) -> np.ndarray:
     return numbers
 
 
-def largest_box(splats: "Splats", rows: np.ndarray, weights: np.ndarray) -> Box:
-    """The box of one thing without its strays: `trimmed_box` of the group of touching splats with the most weight.
+def thing_box(splats: "Splats", rows: np.ndarray, weights: np.ndarray) -> Box:
+    """The box of one thing without its strays: `trimmed_box` of its large groups of touching splats.
+
+    A group is large with a quarter of the weight of the largest one, as each side of two things that were joined.
 
     Args:
         splats: the scene. rows: [n] i64, at least one; more than are grouped have the box of all. weights: [n].
@@ -126,7 +128,8 @@ def largest_box(splats: "Splats", rows: np.ndarray, weights: np.ndarray) -> Box:
     if len(rows) > MOST_SPLATS:
         return trimmed_box(means, weights)
     groups = touching(splats, rows)
-    inside = groups == np.bincount(groups, weights).argmax()
+    sums = np.bincount(groups, weights)
+    inside = (sums >= LEAST_OF_FRAGMENT * sums.max())[groups]
     return trimmed_box(means[inside], weights[inside])
 
 

@@ -554,7 +554,7 @@ class SceneObject(Value):
     splats: int = Field(description="how many")
     share: float = Field(description="of the evidence of all splats")
     centre: Point = Field(description="the middle of its box: x y z, frame of the splat file")
-    box: Box = Field(description="of its largest group of splats that touch, without outliers elsewhere")
+    box: Box = Field(description="of its large groups of splats that touch, without outliers elsewhere")
     size: Point = Field(description="the sides of its box, in `unit`")
     views: tuple[str, ...] = Field(description="that show most of it, the best first")
     feature: tuple[float, ...] | None = Field(

@@ -182,6 +182,11 @@ export class Ask {
     await Promise.all(anew.map(question => this.things(question)));
   }
 
+  // Once the service is back: what it did not answer.
+  resume() {
+    if (this.questions.some(({ problem }) => problem && !problem.status)) this.ask();
+  }
+
   async answer(question, mine) {
     try {
       const got = await answered(this.lift, question, this.negatives);

@@ -526,7 +526,7 @@ let away = 0; // the timer that asks a service which does not answer
 onHeard(answers => {
   at("offline").hidden = answers;
   if (answers || away) return;
-  away = setInterval(() => json("/healthz").then(() => { clearInterval(away); away = 0; bring.refresh(); if (!at("trouble").hidden) location.reload(); }).catch(() => {}), 3000);
+  away = setInterval(() => json("/healthz").then(() => { clearInterval(away); away = 0; bring.refresh(); ask.resume(); if (!at("trouble").hidden) location.reload(); }).catch(() => {}), 3000);
 });
 at("open-example").addEventListener("click", () => bring.example());
 onRefused(() => { at("door-wrong").hidden = !keyOf(); if (!at("door").open) at("door").showModal(); });
