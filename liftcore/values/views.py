@@ -18,6 +18,7 @@ from liftcore.runtime.one_line import one_line
 from liftcore.scene.splats import shared_tensor
 
 NO_LABEL = -1  # a pixel that a level leaves unlabelled
+DENSE_ROWS = 1 << 17  # of a view's codebook, beyond which a map is dense: near to a vector a pixel
 LARGEST = 1e15  # of a feature; float32 sums of squares over all channels stay finite far beyond
 MAX_CHANNELS = 1 << 16
 PLANES = "masks [M, h, w], a plane for each row of vectors, are Regions.from_masks(masks.astype(bool), vectors)"

@@ -35,16 +35,19 @@ from liftcore.scene.cameras import Camera, Cameras, distortion_warning
 from liftcore.scene.compositing import TILE
 from liftcore.scene.render_mode import rendering_reason, rendering_warnings
 from liftcore.scene.splats import Splats
-from liftcore.solve.codebook import TABLE_BYTES
+from liftcore.solve.codebook import LEAST_CHANNELS, TABLE_BYTES
 from liftcore.solve.consensus import BLOCK_ENTRIES
 from liftcore.solve.diagnostics import shape_warnings
+from liftcore.solve.rays import sample_pixels
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.pack import Views
 from liftcore.values.region_weights import MEMORY_LIMIT
 from liftcore.values.settings import LiftSettings
+from liftcore.values.views import DENSE_ROWS
 
 FEW_VIEWS = 32  # and below, view_cosine takes all: a pilot would cost what it saves
 TIMED_VIEWS = 32  # and more have one of them timed: it costs a part of what it tells
+TRACED_RAYS = 1_000  # of a view of a dense map, that tell how many splats a ray meets
 SHOWN_VIEWS = 6  # names in a line for people
 MIB, GIB = 2**20, 2**30
 LIBRARIES = 450_000_000  # of torch, numba, numpy and the compiled kernels, before anything is read
@@ -52,6 +55,7 @@ SCENE_BYTES = 230  # of a splat: as the raster has it, its order and counts in a
 RECORD_BYTES = 240  # of a splat that a view shows: projected, with its row of W
 TILE_BYTES = 100  # of a splat in a tile: its place in the tile's list, and what the tile found of it
 ENTRY_BYTES, ROW_BYTES = 8, 20  # of W: region and weight; a splat's number, row start and evidence
+DENSE_BYTES = 27  # of an entry of a dense map as it is found: from tiles, and gathered by splat
 JUDGED_BYTES = 12  # of an entry: factors, and the products and squares that they are made of
 CONSENSUS_BYTES = 10  # of an entry: what it gets, of how many views, whether it belongs; the tuple of its view
 BLOCK_BYTES = 9  # of an entry that lies by region
@@ -232,8 +236,13 @@ def plan_lift(
         wrong = contradictions(raster, views.only(names), settings, seen.seen_share)
     if look and raster is not None and device.kind == "cpu":
         seconds = _seconds(raster, views, names, settings)
-    weights = weight_bytes(seen, features, names, settings)
-    parts = memory_parts(splats, seen, cameras, features, names, settings)
+    dense = [name for name in names if _is_dense(features, name)]
+    if dense and raster is None:
+        raster = open_raster(splats, device, threads)
+    met = _met_share(raster, views.only(dense), settings, seen) if dense and raster is not None else 1.0
+    entries = _entries(seen, cameras, features, names, settings, met)
+    weights = weight_bytes(seen, entries, settings)
+    parts = memory_parts(splats, seen, cameras, features, names, settings, entries)
     free, on_card = (None, None) if apart else (free_memory(), None if short else device.free_bytes())
     kept = 0 if on_card is None else min(weights, int(CARD_SPARE * on_card) // 4)
     in_files = 0 if apart else max(0, weights - MEMORY_LIMIT - kept)
@@ -303,21 +312,75 @@ def _seconds(raster: Raster, views: LiftViews, names: Sequence[str], settings: L
     return len(names) * (time.perf_counter() - begin)
 
 
-def weight_bytes(seen: Visibility, features: Views, names: Sequence[str], settings: LiftSettings) -> int:
-    """Bytes of W of all views, about."""
+def weight_bytes(seen: Visibility, entries: np.ndarray, settings: LiftSettings) -> int:
+    """Bytes of W of all views with so many entries each [V], about."""
     judged = 4 if settings.robust_steps or settings.loss == "huber" else 0
-    return int(ROW_BYTES * _shown(seen) + (ENTRY_BYTES + judged) * _entries(seen, features, names, settings))
+    return int(ROW_BYTES * _shown(seen).sum() + (ENTRY_BYTES + judged) * entries.sum())
 
 
-def _shown(seen: Visibility) -> float:
-    """Splats that the views show, each as often as views show it."""
-    return int(seen.in_view.sum()) / seen.areas.shape[1] * seen.splats
+def _shown(seen: Visibility) -> np.ndarray:
+    """[V] f64, the splats that each view shows, about."""
+    return seen.in_view.sum(axis=1) / seen.areas.shape[1] * seen.splats
 
 
-def _entries(seen: Visibility, features: Views, names: Sequence[str], settings: LiftSettings) -> float:
-    """Of W of all views, about: a splat meets a region or four cells in each tile and level that it touches."""
+def _entries(
+    seen: Visibility,
+    cameras: Sequence[Camera],
+    features: Views,
+    names: Sequence[str],
+    settings: LiftSettings,
+    met: float,
+) -> np.ndarray:
+    """[V] f64, of W of each view, about: a splat meets a region or four cells in each tile and level that it touches.
+
+    Of a dense map it meets the cells under its outline, as far as rays get to it.
+
+    Args:
+        met: of `_met_share`.
+    """
     parts = max(_parts_a_tile(features, name, settings) for name in names)
-    return _shown(seen) * parts * _tiles(seen)
+    found = _shown(seen) * parts * _tiles(seen)
+    for number, (name, camera) in enumerate(zip(names, cameras, strict=True)):
+        if _is_dense(features, name):
+            sides = np.sqrt(seen.areas[number][seen.in_view[number]], dtype=np.float64)
+            across, down = (
+                sides * min(cells, reads * -(-pixels // settings.stride)) / pixels + reads
+                for cells, pixels in zip(_cells(features, name, camera), (camera.width, camera.height), strict=True)
+                for reads in (1 if cells == pixels or features.is_regions(name) else 2,)  # of a pixel, in a line
+            )
+            levels = 1 if isinstance(settings.levels, int) else _levels(features, name)
+            found[number] = met * levels * float(across @ down) / seen.areas.shape[1] * seen.splats
+    return found
+
+
+def _is_dense(features: Views, view: str) -> bool:
+    return math.prod(_codebook(features, view)[:-1]) > DENSE_ROWS
+
+
+def _cells(features: Views, view: str, camera: Camera) -> tuple[float, float]:
+    """Columns and rows of a grid; of regions those that as many squares on each level would have."""
+    if not features.is_regions(view):
+        rows, columns, _ = _codebook(features, view)
+        return columns, rows
+    side = math.sqrt(_codebook(features, view)[0] / _levels(features, view))
+    return side * math.sqrt(camera.width / camera.height), side * math.sqrt(camera.height / camera.width)
+
+
+def _met_share(raster: Raster, views: LiftViews, settings: LiftSettings, seen: Visibility) -> float:
+    """The share of the outlines' area that rays get to, by some rays of a few views: what is opaque hides the rest.
+
+    Args:
+        views: of dense maps. seen: of all views that are lifted, whose mean area stands for that of each.
+    """
+    counts = list[float]()
+    for number in sorted({0, len(views) // 2, len(views) - 1}):
+        camera = views.cameras[views.names[number]]
+        places = sample_pixels(camera, TRACED_RAYS, (settings.seed, number), settings.lift_params)
+        lengths = raster.ray_rows(camera, places, settings.lift_params).indptr.diff().numpy()
+        most = settings.k if settings.selection == "top-k" else lengths.max(initial=0)
+        counts.append(float(lengths.clip(max=most).mean()) * camera.width * camera.height)
+    area = float(seen.areas.sum(dtype=np.float64)) / len(seen.areas) / seen.areas.shape[1] * seen.splats
+    return min(1.0, float(np.mean(counts)) / max(area, 1.0))
 
 
 def memory_parts(
@@ -327,35 +390,39 @@ def memory_parts(
     features: Views,
     names: Sequence[str],
     settings: LiftSettings,
+    entries: np.ndarray,
 ) -> dict[str, int]:
-    """Bytes of each part of a lift at its peak, about."""
+    """Bytes of each part of a lift at its peak, about.
+
+    Args:
+        entries: [V], of W of each view.
+    """
     inputs = sum(t.nbytes for t in (splats.means, splats.quats, splats.log_scales, splats.opacity_logits))
     largest, channels = max(camera.width * camera.height for camera in cameras), features.channels
-    weights = weight_bytes(seen, features, names, settings)
-    shown = seen.in_view.sum(axis=1).max(initial=0) / seen.areas.shape[1] * splats.count
-    view = int(shown * (RECORD_BYTES + TILE_BYTES * _tiles(seen))) + 16 * largest
+    weights, of_all = weight_bytes(seen, entries, settings), float(entries.sum())
+    view = int(_shown(seen).max(initial=0) * (RECORD_BYTES + TILE_BYTES * _tiles(seen))) + 16 * largest
+    dense = max((int(own) for own, name in zip(entries, names, strict=True) if _is_dense(features, name)), default=0)
     books = [math.prod(_codebook(features, name)) for name in names]
+    regions = sum(books) // max(channels, 1)
     size = 2 if settings.dtype == "float16" else 4
     parts = {
         "libraries": LIBRARIES,
         "splats": inputs,
         "scene": splats.count * SCENE_BYTES,
-        "view": 2 * view,  # two are in work, or one and what is made of it
+        "view": 2 * view + DENSE_BYTES * dense,  # two are in work, or one and what is made of it; of dense ones one
         "weights": min(weights, MEMORY_LIMIT),  # a view at a time
         "gathered": min(weights, MEMORY_LIMIT),  # of all views, a row a splat
-        "codebooks": size * sum(books) + min(8 * sum(books), 2 * TABLE_BYTES),
+        "codebooks": size * sum(books) + min(8 * sum(books), 2 * max(TABLE_BYTES, 4 * LEAST_CHANNELS * regions)),
         "features": splats.count * channels * size,
     }
     if settings.robust_steps or settings.loss == "huber":
-        entries = _entries(seen, features, names, settings)
-        parts["reweighting"] = int(JUDGED_BYTES * min(entries, MEMORY_LIMIT / ENTRY_BYTES))  # more lies in files
-        if settings.consensus:
-            parts["reweighting"] += int(CONSENSUS_BYTES * entries + BLOCK_BYTES * min(entries, BLOCK_ENTRIES))
+        parts["reweighting"] = int(JUDGED_BYTES * min(of_all, MEMORY_LIMIT / ENTRY_BYTES))  # more lies in files
+        if settings.consensus and any(features.is_regions(name) for name in names):
+            parts["reweighting"] += int(CONSENSUS_BYTES * of_all + BLOCK_BYTES * min(of_all, BLOCK_ENTRIES))
     if settings.cg_steps or settings.reference_channels:
         parts["refinement"] = 4 * (splats.count * (CG_VECTORS * CG_CHANNELS) + 3 * largest * CG_CHANNELS)
     if settings.smoothness:
-        entries = _entries(seen, features, names, settings)
-        parts["smoothing"] = SMOOTHING_BYTES * splats.count + int(MEMBER_BYTES * entries)
+        parts["smoothing"] = SMOOTHING_BYTES * splats.count + int(MEMBER_BYTES * of_all)
     if settings.aggregation:
         parts["aggregation"] = CLUSTERING + 24 * channels * min(splats.count, settings.aggregation_sample)
         if settings.aggregation_clusters in ("auto", "touching"):  # afterwards, and of one cluster at a time

@@ -56,6 +56,7 @@ from liftcore.runtime.cores import cores
 from liftcore.runtime.device import give_back_memory
 from liftcore.scene.compositing import TILE, CompositingParams, Weighting, every_pixel
 from liftcore.values.region_weights import RegionWeights, one_view
+from liftcore.values.views import DENSE_ROWS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Sequence
@@ -120,13 +121,18 @@ class CpuRaster:
         return found
 
     def iterate_views(self, requests: Iterable[ViewRequest]) -> Generator[ViewWeights]:
-        """``region_weights`` and ``ray_rows`` of views, ``views_at_a_time`` side by side."""
+        """``region_weights`` and ``ray_rows`` of views, ``views_at_a_time`` side by side.
+
+        Dense maps one after the other: what is found of one takes gigabytes.
+        """
         requests = iter(requests)
         first = list(islice(requests, views_at_a_time(self.threads)))  # fewer views than that have more threads each
         if not first:
             return
         self._activated(first[0].params.opacity_logit_scale)  # once for all: the views of a lift have one
-        rasters = [self._beside(end - begin) for begin, end in _shares(self.threads, len(first))]
+        dense = any(len(request.observation.codebook) > DENSE_ROWS for request in first)
+        together = 1 if dense else len(first)
+        rasters = [self._beside(end - begin) for begin, end in _shares(self.threads, together)]
         try:
             yield from side_by_side(rasters, chain(first, requests))
         finally:

@@ -77,6 +77,7 @@ NO_SLOT = -1
 LAST_BIT = 63
 SEVERAL = -2  # a segment whose pixels read several slots, or parts of one
 _ROW_BITS = np.uint64((1 << SIDES) - 1)  # of a row of cells, in a set of slots
+RANGE_ENTRIES = 1 << 23  # that are merged at a time, at least one splat's: each range reads all entries again
 _WORD = 64  # columns of a set that a word holds
 _NEAR, _FAR = 12, 24  # entries ahead whose places in memory are asked for, and whose cursors, by which they are known
 
@@ -521,8 +522,10 @@ def merged(
     """One sparse row a splat, of the entries of all shares, as ``weigh_tiles`` gives them.
 
     A range's rows depend on its own entries only, so the number of ranges may follow the threads: fewer reads of all.
+    Maps of a vector a pixel give tens of millions of entries, whose ranges are bounded beside them.
 
     Args:
+        entries: of all shares, in their order; the list is emptied, as what it held takes more than the result.
         ids: [P] i32, the splat of each row. run: runs a function for each of a list of tuples of arguments.
 
     Returns:
@@ -549,8 +552,10 @@ def merged(
             gather_entries(first, last, share[:4], base, cursors, gathered)
         return merge_range(starts, gathered, slot_rows, codebook_rows, ids[first:last])
 
-    marks = np.searchsorted(ends, np.linspace(0, ends[-1], threads + 1)[1:-1], side="right")
+    ranges = max(threads, -(-int(ends[-1]) // RANGE_ENTRIES)) if len(ids) else 1
+    marks = np.searchsorted(ends, np.linspace(0, ends[-1], ranges + 1)[1:-1], side="right")
     parts = run(merge, list(pairwise([0, *marks.tolist(), len(ids)])))
+    entries.clear()
     splats, lengths, columns, weights, met, evidence = (np.concatenate(part) for part in zip(*parts, strict=True))
     return splats, np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64), columns, weights, met, evidence
 

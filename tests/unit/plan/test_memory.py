@@ -1,0 +1,50 @@
+"""What the plan says of memory, beside what a lift makes."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+import liftcore as lc
+from liftcore.evaluate.synthetic import room_cameras, room_splats
+from liftcore.raster.cpu import weights
+from liftcore.raster.cpu.raster import CpuRaster
+from liftcore.scene.compositing import CompositingParams, Weighting
+from tests.scenes import random_camera, random_regions, random_splats
+
+WIDTH, HEIGHT, CHANNELS = 416, 320, 2  # 133,120 pixels
+
+
+def vector_a_pixel(rows: int, columns: int) -> torch.Tensor:
+    return torch.rand(rows, columns, CHANNELS, generator=torch.Generator().manual_seed(0))
+
+
+DENSE = {
+    "a vector a pixel": lc.FeatureGrid(vector_a_pixel(HEIGHT, WIDTH)),
+    "finer than pixels": lc.FeatureGrid(vector_a_pixel(HEIGHT * 5 // 4, WIDTH * 5 // 4)),
+    "a region a pixel": lc.Regions(
+        torch.arange(WIDTH * HEIGHT, dtype=torch.int32).reshape(HEIGHT, WIDTH),
+        vector_a_pixel(HEIGHT, WIDTH).reshape(-1, CHANNELS),
+    ),
+}
+
+
+@pytest.mark.parametrize(("map_of", "stride"), [(map_of, 1) for map_of in DENSE] + [("a vector a pixel", 2)])
+def test_plan_says_what_region_weights_of_dense_maps_take(map_of: str, stride: int) -> None:
+    (camera,) = room_cameras(1, WIDTH, HEIGHT)
+    views = {camera.name: DENSE[map_of]}
+    made = lc.lift(room_splats(300), {camera.name: camera}, views, "row-sum", stride=stride, certificate_rays=0)
+    taken = 8 * made.diagnostics["weights_entries"]  # four bytes each for the region and the weight
+    assert 0.7 < made.metadata.certificate["plan"]["memory"]["weights"] / taken < 2.0
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_merging_in_parts_changes_no_bit(monkeypatch: pytest.MonkeyPatch, threads: int) -> None:
+    camera, splats = random_camera(1), random_splats(3, 60)
+    request = camera, random_regions(1), CompositingParams(), Weighting()
+    whole = CpuRaster(splats, threads=1).region_weights(*request)
+    monkeypatch.setattr(weights, "RANGE_ENTRIES", 50)
+    parts = CpuRaster(splats, threads).region_weights(*request)
+    assert whole.region.shape[0] > 100
+    for name, tensor in whole.tensors().items():
+        assert torch.equal(tensor, parts.tensors()[name]), name
