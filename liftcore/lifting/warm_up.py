@@ -9,6 +9,7 @@ import torch
 
 from liftcore.raster.cpu.warm_up import warm_up
 from liftcore.solve.aggregate import explained_by
+from liftcore.solve.closed_form import solve
 from liftcore.solve.codebook import Codebook, ViewCodebook
 from liftcore.solve.consensus import mask_consensus
 from liftcore.solve.directions import RegionDirections
@@ -30,6 +31,7 @@ def warm_up_lift(kernel: Kernel, device: Device, settings: LiftSettings) -> None
     first, one = torch.zeros(1, dtype=torch.int32), torch.ones(1, dtype=torch.float32)
     W = one_view(first, torch.tensor([0, 1]), first, one, first, one, regions=1)
     book = Codebook((ViewCodebook(one[None]),))
+    solve(W, book, torch.float32, threads=1)
     if settings.objects or settings.aggregation:
         region_objects(W, np.zeros(1, np.int8), np.ones(1), 1)
     if settings.consensus:

@@ -1,8 +1,8 @@
 """The closed form: ``x_j = sum_v W_v[j] E_v / sum W[j]`` (paper Eq. 6, App. Tikhonov for squared weights).
 
-torch's ``embedding_bag`` makes the sums, on the CPU and on a device: one thread adds up a bag in a fixed order, so
-the bits repeat for any number of threads. A product with a sparse tensor would take cuSPARSE's default algorithm, and
-``index_add_`` atomic sums: neither has a fixed order.
+On the CPU `liftcore.solve.shared_rows` makes the sums, on a device torch's ``embedding_bag``: one thread adds up a
+row in a fixed order, so the bits repeat for any number of threads. A product with a sparse tensor would take
+cuSPARSE's default algorithm, and ``index_add_`` atomic sums: neither has a fixed order.
 
 Weights are divided by their sum before they meet the codebook: a mean cannot overflow where its inputs do not, and
 faint splats keep their digits. float32 adds LONG terms one by one; longer bags, of a splat behind a million regions,
@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
@@ -23,12 +24,14 @@ from liftcore.runtime.memory import zeros
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, silent
 from liftcore.solve.codebook import Codebook
+from liftcore.solve.shared_rows import LONG, flat_table, sum_rows
 from liftcore.values.region_weights import BLOCK_ENTRIES, BLOCK_ROWS, RegionWeights, from_zero, row_blocks, run_each
 
-LONG = 256  # terms of a sum that float32 adds up one by one
 DEVICE_ROWS, DEVICE_ENTRIES = 1 << 16, 1 << 24  # of a block on a device; halved where its memory runs out
 LEAST_ROWS = 256  # of a block that is halved no more
 BESIDE = 4  # blocks of a device in work together: to write one into X takes longer than to sum it up
+
+Sums = Callable[[Tensor], tuple[Tensor, Tensor]]  # of rows [n] i64: means of vectors and of unit ones, [n, C] f32
 
 
 @dataclass(frozen=True)
@@ -107,25 +110,19 @@ def solve_rows(
         table = codebook.values(channels, device.place)
         units = None if codebook.unit or inverse is not None else codebook.unit_values(channels, device.place)
 
-        def solve_block(
-            first: int, last: int, table: Tensor = table, units: Tensor | None = units, channels: slice = channels
-        ) -> None:
+        if device.kind == "cpu":
+            sums_of = _sums_by_processor(W, scale, table, units, inverse)
+        else:
+            sums_of = _sums_by_device(W, scale, table, units, inverse)
+
+        def solve_block(first: int, last: int, sums_of: Sums = sums_of, channels: slice = channels) -> None:
             own = rows[first:last]
-            starts, entries = W.take(own)
-            scales = scale[own].repeat_interleave(starts.diff(), output_size=entries.shape[0])
-            shares = (W.weight.index_select(0, entries) * scales).float().to(device.place)
-            region, starts = W.region.index_select(0, entries).to(device.place), starts.to(device.place)
-            del entries, scales
+            sums, unit_sums = sums_of(own)
             own = own.cpu()
-            sums = bag_sums(region, table, starts, shares)
             X[:, channels].index_copy_(0, own, sums.to(X.dtype).cpu())
-            if units is not None:
-                sums = bag_sums(region, units, starts, shares)
-            elif inverse is not None:
-                sums = bag_sums(region, table, starts, shares.mul_(inverse.index_select(0, region)))
             if unit is not None:
-                unit[:, channels].index_copy_(0, own, sums.cpu())
-            squares[own] += torch.linalg.vector_norm(sums, dim=1).double().square().cpu()
+                unit[:, channels].index_copy_(0, own, unit_sums.cpu())
+            squares[own] += torch.linalg.vector_norm(unit_sums, dim=1).double().square().cpu()
 
         if device.kind == "cpu":
             run_each(solve_block, blocks, threads)
@@ -136,6 +133,52 @@ def solve_rows(
                 _halved_to_fit(solve_block, *block)
         progress("solve", number + 1, len(slices), "slices")
     return squares
+
+
+def _sums_by_processor(
+    W: RegionWeights, scale: Tensor, table: Tensor, units: Tensor | None, inverse: Tensor | None
+) -> Sums:
+    """Sums of rows of W on the CPU."""
+    indptr, region, weight, scales = (part.cpu().numpy() for part in (W.indptr, W.region, W.weight, scale))
+    flat, width, none = flat_table(table), table.shape[1], np.empty(0, np.float32)
+    flat_units = None if units is None else flat_table(units)
+    lengths = none if inverse is None else inverse.numpy()
+
+    def summed(rows: np.ndarray, table: np.ndarray, lengths: np.ndarray = none) -> Tensor:
+        sums = np.empty((rows.size, width), np.float32)
+        sum_rows(*[rows, indptr, region, weight, scales, lengths, table, width, sums])
+        return torch.from_numpy(sums)
+
+    def sums_of(own: Tensor) -> tuple[Tensor, Tensor]:
+        rows = own.cpu().numpy()
+        sums = summed(rows, flat)
+        if flat_units is not None:
+            return sums, summed(rows, flat_units)
+        return sums, sums if inverse is None else summed(rows, flat, lengths)
+
+    return sums_of
+
+
+def _sums_by_device(
+    W: RegionWeights, scale: Tensor, table: Tensor, units: Tensor | None, inverse: Tensor | None
+) -> Sums:
+    """Sums of rows of W, wherever it lies, on the device of the table."""
+    place = table.device
+
+    def sums_of(own: Tensor) -> tuple[Tensor, Tensor]:
+        starts, entries = W.take(own)
+        scales = scale[own].repeat_interleave(starts.diff(), output_size=entries.shape[0])
+        shares = (W.weight.index_select(0, entries) * scales).float().to(place)
+        region, starts = W.region.index_select(0, entries).to(place), starts.to(place)
+        del entries, scales
+        sums = bag_sums(region, table, starts, shares)
+        if units is not None:
+            return sums, bag_sums(region, units, starts, shares)
+        if inverse is not None:
+            return sums, bag_sums(region, table, starts, shares.mul_(inverse.index_select(0, region)))
+        return sums, sums
+
+    return sums_of
 
 
 def bag_sums(index: Tensor, table: Tensor, starts: Tensor, shares: Tensor | None = None) -> Tensor:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
+from liftcore.solve.shared_rows import new_table
 from liftcore.values.levels import label_tuples
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.views import NO_LABEL, Regions, ViewFeatures
@@ -124,7 +125,7 @@ class Codebook:
         return self._table(channels, place, divided)
 
     def _table(self, channels: slice, place: torch.device, of_rows: Callable[[int, Tensor], Tensor]) -> Tensor:
-        table, base = torch.empty(self.regions, channels.stop - channels.start, device=place, dtype=torch.float32), 0
+        table, base = new_table(self.regions, channels.stop - channels.start, place), 0
         for number, view in enumerate(self.views):
             table[base : base + view.regions] = view.means(of_rows(number, view.rows[:, channels].to(place)))
             base += view.regions

@@ -21,6 +21,7 @@ from torch import Tensor
 from liftcore.io.safetensors_file import map_tensors, write_tensors
 from liftcore.runtime.jit import kernel
 from liftcore.solve.codebook import LEAST_CHANNELS, TABLE_BYTES, Codebook
+from liftcore.solve.shared_rows import new_table
 from liftcore.solve.sums import PieceSums, added, piece_sums
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import DIRECTIONS
@@ -71,7 +72,7 @@ class RegionDirections:
         """Some columns of e of all regions, [M, C] f32; zeros for none."""
         if self._axes is None:
             return self._centred(self._codebook.unit_values(columns, CPU), columns)
-        table = torch.zeros(self._codebook.regions, columns.stop - columns.start, dtype=torch.float32)
+        table = new_table(self._codebook.regions, columns.stop - columns.start, CPU).zero_()
         for own in self._codebook.slices():
             table += self._centred(self._codebook.unit_values(own, CPU), own) @ self._axes[own, columns]
         return table

@@ -56,19 +56,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from liftcore.runtime.jit import kernel, vectorised
+from liftcore.runtime.jit import kernel
 from liftcore.runtime.memory import zeros
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, silent
 from liftcore.solve.closed_form import morton_codes
 from liftcore.solve.codebook import Codebook
 from liftcore.solve.directions import RegionDirections
+from liftcore.solve.shared_rows import compare_rows, flat_table
 from liftcore.solve.sums import PieceSums, piece_sums
 from liftcore.values.region_weights import MEMORY_LIMIT, RegionWeights, row_blocks, run_each
 from liftcore.values.settings import DIRECTIONS
 
 BLOCK_ROWS, BLOCK_ENTRIES = 1 << 11, 1 << 15  # a splat has a sum for each view of it
-LONG = 256  # terms of a sum that float32 adds up one by one
+POWERS = 1 << 12  # of consensus, between which others lie on lines, off by 3e-5 of themselves at most
+STEEP = np.float32(1 / 16)  # consensus below which powers under one are no lines there; few have so little
 NO_CONSENSUS = 1e-6  # of a splat's weight: a shorter r is what rounding leaves of inputs that cancel
 SHARPNESS = 4.0  # the most that costs right masks of no scene more than .001 of accuracy (docs/method.md)
 
@@ -243,8 +245,8 @@ class ViewConsistency:
         """
         found, squares, factors = self._entries(), self._entries(), _or_ones(factors)
         for columns in directions.slices():
-            table = directions.table(columns)
-            arrays = [*self._arrays(factors), *(part.numpy() for part in (table, found, squares))]
+            table, width = flat_table(directions.table(columns)), columns.stop - columns.start
+            arrays = [self._arrays(factors), table, width, found.numpy(), squares.numpy()]
             blocks = [(self.rows[first:last].numpy(), *arrays) for first, last in self.blocks]
             run_each(compare_rows, blocks, self.threads)
         arrays = [*self._arrays(factors), found.numpy(), squares.numpy()]
@@ -270,15 +272,9 @@ class ViewConsistency:
             [2, n] f32: the confidence of each splat, and how well its own feature explains what views say of it.
         """
         scores = torch.zeros(2, self.W.indptr.shape[0] - 1, dtype=torch.float32)
-        parts = (
-            cosines,
-            scene.regions,
-            torch.zeros(0, dtype=torch.float32) if consensus is None else consensus,
-            scores,
-            scene.usual,
-            scene.power,
-        )
-        arrays = [*self._arrays(_or_ones(factors)), *(part.numpy() for part in parts)]
+        parts = cosines, scene.regions, _or_ones(consensus), scores, scene.usual, scene.power
+        powers = ((np.arange(POWERS + 2) / POWERS) ** scene.power.numpy()[:, None]).astype(np.float32)
+        arrays = [*self._arrays(_or_ones(factors)), *(part.numpy() for part in parts), powers]
         blocks = [(self.rows[first:last].numpy(), *arrays) for first, last in self.blocks]
         run_each(weigh_rows, blocks, self.threads)
         return scores
@@ -295,82 +291,15 @@ class ViewConsistency:
 
 
 def _or_ones(factors: Tensor | None) -> Tensor:
-    """Factors [nnz] f32 for a kernel, which takes none [0] for ones."""
+    """Factors or consensus [nnz] f32 for a kernel, which takes none [0] for ones."""
     return torch.zeros(0, dtype=torch.float32) if factors is None else factors
-
-
-@vectorised
-def compare_rows(rows, indptr, region, weight, factors, view, level, table, products, squares):
-    """Add ``e_m . r_jv`` and ``|r_jv|^2`` of the entries of some rows, over the channels of the table.
-
-    The sum of the others is that of the views before and that of the views behind: a difference of two float32 sums
-    would be mostly rounding where a view has most of the weight. Of a view float32 adds up LONG entries one by one.
-    """
-    width, longest, levels = table.shape[1], 0, np.int32(0)
-    for row in rows:
-        longest = max(longest, indptr[row + 1] - indptr[row])
-        for k in range(indptr[row], indptr[row + 1]):
-            levels = max(levels, level[region[k]] + 1)
-    most = min(longest, view[-1] + 1)
-    said, before = np.empty((most + 1, width), np.float32), np.empty((most + 1, width), np.float32)
-    behind, others = np.empty(width, np.float32), np.empty(width, np.float32)
-    own = np.empty(longest, np.int64)  # of a level in a row
-    for row in rows:
-        for number_of_level in range(levels):
-            last, total = 0, 0.0
-            for k in range(indptr[row], indptr[row + 1]):
-                if level[region[k]] == number_of_level:
-                    own[last] = k
-                    total += weight[k]
-                    last += 1
-            if total <= 0.0:
-                continue
-            inverse = 1.0 / total
-            before[0] = behind[:] = 0.0
-            k, number = 0, 0
-            while k < last:
-                begin, v = k, view[region[own[k]]]
-                while k < last and view[region[own[k]]] == v:
-                    target = number if k - begin < LONG else most
-                    said[target] = 0.0
-                    for n in range(k, min(k + LONG, last)):
-                        entry = own[n]
-                        m = region[entry]
-                        if view[m] != v:
-                            break
-                        factor = factors[entry] if factors.size > 0 else np.float32(1.0)
-                        share = np.float32(weight[entry] * factor * inverse)
-                        for c in range(width):
-                            said[target, c] += share * table[m, c]
-                        k += 1
-                    if target != number:
-                        for c in range(width):
-                            said[number, c] += said[target, c]
-                for c in range(width):
-                    before[number + 1, c] = before[number, c] + said[number, c]
-                number += 1
-            k = last - 1
-            while k >= 0:
-                number -= 1
-                v, square = view[region[own[k]]], np.float32(0.0)
-                for c in range(width):
-                    others[c] = before[number, c] + behind[c]
-                    square += others[c] * others[c]
-                    behind[c] += said[number, c]
-                while k >= 0 and view[region[own[k]]] == v:
-                    m, product = region[own[k]], np.float32(0.0)
-                    for c in range(width):
-                        product += table[m, c] * others[c]
-                    products[own[k]] += product
-                    squares[own[k]] += square
-                    k -= 1
 
 
 @kernel
 def weigh_rows(
-    rows, indptr, region, weight, factors, view, level, cosines, reliable, consensus, scores, usual, power
-):
-    """`ViewConsistency.weigh` of some rows."""
+    rows, indptr, region, weight, factors, view, level, cosines, reliable, consensus, scores, usual, power, powers
+):  # fmt: skip
+    """`ViewConsistency.weigh` of some rows. Powers of consensus lie on lines between those of a table [K, n]."""
     levels = usual.size
     before, after, gain = np.empty(levels), np.empty(levels), np.empty(levels)
     confirmed, explained, own = np.empty(levels), np.empty(levels), np.empty(levels)
@@ -393,7 +322,12 @@ def weigh_rows(
                 said = (1.0 - share) * cosines[n] + share * usual[a]
                 kept = said * reliable[region[n]]
                 if consensus.size > 0:
-                    kept *= consensus[n] ** np.float32(power[a])
+                    if consensus[n] > STEEP:
+                        place = consensus[n] * np.float32(POWERS)
+                        i = np.int64(place)
+                        kept *= powers[a, i] + (place - np.float32(i)) * (powers[a, i + 1] - powers[a, i])
+                    else:
+                        kept *= consensus[n] ** np.float32(power[a])
                 after[a] += weight[n] * kept
                 confirmed[a] += weight[n] * kept * cosines[n]
                 explained[a] += weight[n] * kept * said

@@ -1,0 +1,95 @@
+"""Sums over groups of rows of W against plain float64 ones, and what groups promise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from liftcore.solve.shared_rows import LONG, compare_rows, flat_table, new_table, sum_rows
+
+VIEWS, REGIONS = 5, 3 * LONG
+VIEW = np.sort(np.arange(REGIONS) % VIEWS)
+LEVEL = (np.arange(REGIONS) % 3 // 2).astype(np.int32)
+widths = pytest.mark.parametrize("width", [1, 6, 32, 33, 70])
+
+
+def weights(seed: int) -> np.ndarray:
+    """Rows of W [n, M] f32: alike, of few regions, of none, of one view, and of more than LONG regions."""
+    rng = np.random.default_rng(seed)
+    shown = rng.random((23, REGIONS)) < 0.02
+    shown[4:8] = shown[4]
+    shown[11] = False
+    shown[12] &= VIEW == 2
+    shown[[0, 9, 10]] = rng.random((3, REGIONS)) < 0.8
+    found = (rng.random(shown.shape) * shown).astype(np.float32)
+    found[14, VIEW == 1] *= 100.0  # most of the splat
+    return found
+
+
+def sparse(dense: np.ndarray) -> list[np.ndarray]:
+    """Indptr, region and weight of rows."""
+    rows, region = np.nonzero(dense)
+    starts = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=len(dense)))])
+    return [starts, region.astype(np.int32), dense[rows, region]]
+
+
+def table_of(width: int) -> torch.Tensor:
+    table = new_table(REGIONS, width, torch.device("cpu"))
+    return table.copy_(torch.randn(REGIONS, width, generator=torch.manual_seed(width)))
+
+
+def inverse_of(dense: np.ndarray) -> np.ndarray:
+    sums = dense.sum(axis=1, dtype=np.float64)
+    return np.divide(1.0, sums, out=np.zeros_like(sums), where=sums > 0)
+
+
+def summed(rows: np.ndarray, dense: np.ndarray, table: torch.Tensor, lengths: np.ndarray) -> np.ndarray:
+    sums = np.full((rows.size, table.shape[1]), np.nan, np.float32)
+    sum_rows(*[rows, *sparse(dense), inverse_of(dense), lengths, flat_table(table), table.shape[1], sums])
+    return sums
+
+
+@widths
+@pytest.mark.parametrize("scaled", [False, True])
+def test_sums_equal_float64_ones_and_those_of_each_row_alone_to_the_bit(width, scaled):
+    dense, table, rows = weights(0), table_of(width), np.random.default_rng(1).permutation(23)
+    lengths = np.random.default_rng(2).random(REGIONS if scaled else 0).astype(np.float32)
+    sums = summed(rows, dense, table, lengths)
+    exact = dense * inverse_of(dense)[:, None] @ (table.numpy() * (lengths[:, None] if scaled else 1.0))
+    np.testing.assert_allclose(sums, exact[rows], atol=1e-6)
+    for row, found in zip(rows, sums, strict=True):
+        assert np.array_equal(summed(np.array([row]), dense, table, lengths)[0], found)
+
+
+def compared(rows: np.ndarray, dense: np.ndarray, table: torch.Tensor) -> np.ndarray:
+    """Products and squares of all entries, [2, nnz]."""
+    indptr, region, weight = sparse(dense)
+    W, found = [indptr, region, weight, np.zeros(0, np.float32), VIEW, LEVEL], np.zeros((2, weight.size), np.float32)
+    compare_rows(rows, W, flat_table(table), table.shape[1], found[0], found[1])
+    return found
+
+
+@widths
+def test_what_other_views_say_on_a_level_equals_float64_and_each_row_alone_to_the_bit(width):
+    dense, table, rows = weights(3), table_of(width), np.random.default_rng(1).permutation(23)
+    found, e = compared(rows, dense, table), table.double().numpy()
+    at, region = np.nonzero(dense)
+    others = np.zeros((at.size, width))
+    for level in range(2):
+        own = dense * (level == LEVEL)
+        own = own * inverse_of(own)[:, None]
+        views = np.stack([np.where(view == VIEW, 0.0, own) @ e for view in range(VIEWS)])
+        others[LEVEL[region] == level] = views[VIEW[region], at][LEVEL[region] == level]
+    np.testing.assert_allclose(found[0], (others * e[region]).sum(axis=1), atol=2e-6)
+    np.testing.assert_allclose(found[1], (others**2).sum(axis=1), atol=2e-6)
+    alone = sum(compared(np.array([row]), dense, table) for row in rows)
+    assert np.array_equal(alone, found)
+
+
+def test_a_table_is_followed_by_zeros_whoever_made_it():
+    for table in (table_of(6), torch.full((3, 5), torch.nan), torch.full((40, 6), torch.nan)[:, 1:4]):
+        flat = flat_table(table)
+        assert np.array_equal(flat[: table.numel()], table.reshape(-1), equal_nan=True)
+        assert flat.size > table.numel()
+        assert not flat[table.numel() :].any()
