@@ -2,6 +2,7 @@
 
     python -m tests.benchmarks.parts DIR [--every N ...] [--json]
     python -m tests.benchmarks.parts DIR --seconds [--every N ...] [--json]
+    python -m tests.benchmarks.parts DIR --words [--every N ...] [--json]
     python -m tests.benchmarks.parts --look DIR VIEW X,Y OUT.png ...
 
 ``nodes`` and ``largest`` are of the tree; ``thing`` and ``part`` the mean IoU, over splats with evidence over 0.5, of
@@ -12,14 +13,21 @@ the plain answer of the same click with the part. ``agreement`` is that of level
 the objects stage, tree and all, of the lift's ``of`` without compilation. ``--seconds`` measures these alone, on any
 scene with such a pack.
 
+``--words`` compares three ways to score splats for a word: by ``sum``, the lift's features; by ``level``, those of
+the lift of one level alone whose best splats are nearest to the word, beside the nearest other word; by ``node``, the
+best node of each splat's path. Figures are the mean IoU of words over splats with evidence over 0.5, each at its best
+threshold. Beside the folder's things it asks those and the parts of the tests' still life under hard masks, whose
+words here share nothing, so that its levels say different things.
+
 ``--look`` draws a view of a scene with the candidates of a click side by side, for eyes.
 """
 
 import argparse
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import product
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -36,12 +44,28 @@ from liftcore.query.ask import ask
 from liftcore.query.candidates import candidates
 from liftcore.query.question import Query
 from liftcore.query.scene import Scene
+from liftcore.values.views import ViewFeatures
 from tests.benchmarks.base import command_line, mask_iou, read_pack, read_scene, tell
+from tests.benchmarks.consensus import still_life_scene
 from tests.benchmarks.tabletop import Truth, tabletop
+from tests.still_life.scene import still_life
 
 PARTS = 4  # of a thing at most, as truth numbers them
 LEAST_PIXELS = 100  # of a part in a view, to be clicked
 CLOTHS = ("tablecloth", "curtain")
+BEST_SPLATS = 100  # by which a level is chosen
+STILL_LIFE_SEED = 7
+
+
+class UnrelatedWords:
+    """A text encoder of random directions, so that no word says anything of another."""
+
+    name, channels = "unrelated", 64
+
+    def encode(self, texts: Sequence[str]) -> np.ndarray:
+        """[n, 64] f32, unit, the same for the same text."""
+        rows = [np.random.default_rng(list(text.encode())).normal(size=self.channels) for text in texts]
+        return np.stack([row / np.linalg.norm(row) for row in rows]).astype(np.float32)
 
 
 def masks(scene: Scene, members: np.ndarray, view: str) -> np.ndarray:
@@ -132,6 +156,84 @@ def seconds(timings: Mapping[str, float]) -> dict[str, float]:
     return {"seconds": timings["objects"], "of": sum(timings.values()) - timings["compile"]}
 
 
+def unit(rows: np.ndarray) -> np.ndarray:
+    """Rows of length one; zeros stay."""
+    lengths = np.linalg.norm(rows.astype(np.float32), axis=1, keepdims=True)
+    return rows.astype(np.float32) / np.where(lengths > 0, lengths, 1)
+
+
+def level_scores(levels: Sequence[np.ndarray], words: np.ndarray, counted: np.ndarray) -> np.ndarray:
+    """[P, n] f32: how near splats are to each word in the level of its own that answers it best.
+
+    Args:
+        levels: [P, F] unit, of each level's lift. words: [n, F] unit. counted: [P] bool, the splats that choose.
+    """
+    tables, margins = [features @ words.T for features in levels], []
+    for table in tables:
+        near = table[counted]
+        ranked = np.sort(near, axis=1)
+        beside = np.where(near == ranked[:, -1:], ranked[:, -2:-1], ranked[:, -1:])  # the nearest other word
+        margins.append(np.sort(near - beside, axis=0)[-BEST_SPLATS:].mean(axis=0))
+    chosen = np.argmax(margins, axis=0)
+    return np.stack([tables[level][:, word] for word, level in enumerate(chosen)], axis=1)
+
+
+def node_scores(scene: Scene, words: np.ndarray) -> np.ndarray:
+    """[P, n] f32: how near the best node of each splat's path is to each word; -1 for splats of no node."""
+    assert scene.node is not None and scene.node_parents is not None and scene.node_features is not None
+    scores = scene.node_features.astype(np.float32) @ words.T
+    for node in np.argsort([len(scene.node_path(node)) for node in range(len(scores))], kind="stable"):
+        if (whole := scene.node_parents[node]) >= 0:
+            scores[node] = np.maximum(scores[node], scores[whole])
+    return np.concatenate([scores, np.full((1, len(words)), -1, np.float32)])[scene.node]
+
+
+def word_iou(scores: np.ndarray, owners: np.ndarray, counted: np.ndarray) -> float:
+    """Mean IoU of words, each at its best threshold.
+
+    Args:
+        scores: [P, n]. owners: [P] int, the word of each splat. counted: [P] bool, the splats that count.
+    """
+    ious, taken = [], np.arange(1, counted.sum() + 1)
+    for word, column in enumerate(scores[counted].T):
+        right = owners[counted] == word
+        hits = np.cumsum(right[np.argsort(-column, kind="stable")])
+        ends = np.append(np.diff(np.sort(-column)) > 0, True)  # equal scores are taken together
+        ious.append(float((hits / (taken + right.sum() - hits))[ends].max()))
+    return float(np.mean(ious))
+
+
+def words_of(folder: Path, packs: Sequence[str], every: Sequence[int]) -> Iterator[dict[str, Any]]:
+    """One row a set of words: IoU by sum, best level and best node."""
+    truth, encoder = tabletop(folder), UnrelatedWords()
+    for pack, step in product(packs, every):
+        views = read_pack(folder, pack, step)
+        things = truth.classes.numpy(), truth.objects.numpy()
+        yield from compared(truth, views, {f"{pack}, {len(views)} views: things": things})
+    made, (other, views) = still_life(STILL_LIFE_SEED), still_life_scene("hard", STILL_LIFE_SEED, encoder=encoder)
+    asked = {"things": (made.things, made.splat_things), "parts": (made.parts, made.splat_parts)}
+    name = f"still life, {len(views)} views"
+    yield from compared(other, views, {f"{name}: {of}": (encoder.encode(a), b) for of, (a, b) in asked.items()})
+
+
+def compared(
+    truth: Truth, views: Mapping[str, ViewFeatures], asked: Mapping[str, tuple[np.ndarray, np.ndarray]]
+) -> Iterator[dict[str, Any]]:
+    """One row a set of words [n, F] with the word of each splat [P]."""
+    scene, counted = truth.opened(truth.lift(views, preset="default")), truth.counted.numpy()
+    alone = [unit(truth.lift(views, preset="default", levels=level).features.numpy()) for level in (0, 1)]
+    for name, (words, owners) in asked.items():
+        found = {
+            "sum": unit(scene.features) @ words.T,
+            "level": level_scores(alone, words, counted),
+            "node": node_scores(scene, words),
+        }
+        facts = scene.metadata.certificate["objects"]
+        yield {"words": name, "agreement": facts["level_agreement"]} | {
+            way: word_iou(scores, owners, counted) for way, scores in found.items()
+        }
+
+
 def seconds_of(folder: Path, packs: list[str], every: list[int]) -> Iterator[dict[str, Any]]:
     """The processor time of one lift by `default` a pack and step."""
     splats, cameras = read_scene(folder)
@@ -183,11 +285,15 @@ def main() -> None:
         ("folder", {"type": Path}),
         ("--features", {"nargs": "+", "default": ["features_hard"]}),
         ("--seconds", {"action": "store_true", "help": "the processor time of the lift alone"}),
+        ("--words", {"action": "store_true", "help": "compare ways to answer words"}),
         ("--every", {"nargs": "+", "type": int, "default": [1, 4], "metavar": "N", "help": "every N-th view alone"}),
     )
     options = parser.parse_args()
     if options.seconds:
         tell(seconds_of(options.folder, options.features, options.every), as_json=options.json)
+        return
+    if options.words:
+        tell(words_of(options.folder, options.features, options.every), as_json=options.json)
         return
     tell(rows_of(options.folder, options.features, options.every), as_json=options.json)
 
