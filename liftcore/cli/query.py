@@ -171,7 +171,8 @@ def _lines(document: dict[str, Any]) -> Iterable[str]:
         view = document["view"]
         yield f"  view {view['name']}: {view['mask_share']:.2%} of the image ({view['explanation']})"
     for one in document["answer"]["candidates"]:
-        shown = f"{one['splats']} splats, {one['share']:.0%} of what is shown there"
+        of = "what is shown there" if document["answer"]["like"] else "the thing"
+        shown = f"{one['splats']} splats, {one['share']:.0%} of {of}"
         yield f"  may be {one['set']}, {one['kind']}: {shown}"
     for best in document.get("top", []):
         yield f"  splat {best['splat']}: score {best['score']:.4g} at {place_of(best['position'])}"

@@ -13,8 +13,8 @@ import numpy as np
 
 from liftcore.errors import InvalidQuery
 from liftcore.io.json_file import finite
-from liftcore.query.candidates import candidates
-from liftcore.query.directions import directions, part_phrase, table_of, wordings
+from liftcore.query.candidates import candidates, parts_of
+from liftcore.query.directions import directions, part_phrase, table_of, unknown_part, wordings
 from liftcore.query.objects import objects
 from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.presence import (
@@ -48,6 +48,7 @@ from liftcore.query.selection import (
     contest,
     nearer_than_rivals,
     part_nodes,
+    things_within,
     with_parts,
     with_things,
 )
@@ -83,6 +84,7 @@ class Question:
     pack: np.ndarray | None = None  # [n, F] f32, unit, all words of a table that has too few to be references
     candidates: tuple[Candidate, ...] = ()  # what clicks among them may mean
     part: PartQuestion | None = None  # of a phrase that names a part of a thing
+    unknown_part: PartPhrase | None = None  # the same where no word stands for the part, so that the thing is asked
 
 
 @dataclass(frozen=True)
@@ -218,7 +220,7 @@ def question(scene: OpenedLift, query: Query, encoder: TextEncoder | None, names
     """
     phrase = part_phrase(scene, query, encoder)
     if phrase is None:
-        return _question(scene, query, encoder, names)
+        return replace(_question(scene, query, encoder, names), unknown_part=unknown_part(scene, query, encoder))
     thing = _question(scene, Query(text=[phrase.thing], weigh=query.weigh, absent=query.absent), encoder)
     asked = _question(scene, query, encoder, names) if not phrase.sure else replace(thing, query=query)
     return replace(asked, part=PartQuestion(phrase, thing, _question(scene, query, encoder, names, phrase)))
@@ -353,12 +355,27 @@ def _answer(scene: OpenedLift, asked: Question, similarities: np.ndarray) -> Ans
     clear = found.clear and presence.present is not False and bool(selected.any())
     least = MOST_OF_IT if clear and presence.present is not None else LEAST_RIVAL
     rivals = _nearer_words(scene, asked, scores, selected, least)
+    meant = asked.candidates
+    if asked.unknown_part is not None and selected.any():
+        meant = parts_of(scene, things_within(scene, selected))
+        presence = presence.model_copy(
+            update={"why": f"{presence.why} {_without_word(asked.unknown_part, len(meant))}"}
+        )
     wording = tuple(AskedAs(**word._asdict()) for word in asked.asked_as.values() if word.how)
     return Answer.of(
         query, scores, seen, selected, wording=wording, rivals=rivals,
-        candidates=asked.candidates, threshold=found, clear=clear, statistics=finite(_statistics(known)),
+        candidates=meant, threshold=found, clear=clear, statistics=finite(_statistics(known)),
         **dict(presence),
     )  # fmt: skip
+
+
+def _without_word(phrase: PartPhrase, parts: int) -> str:
+    """Two sentences on a part that no word stands for, and how it can be asked."""
+    ask = "ask one of its candidates, click the part" if parts else "click the part"
+    return (
+        f"No word stands for {phrase.part!r}, so this is all of {phrase.thing!r}. To have the part, {ask}, or take "
+        "an encoder that reads any text."
+    )
 
 
 def _nearer_words(

@@ -3,6 +3,8 @@
 A pixel shows splats by their weights on its ray, an area by those on the rays of its pixels, a splat itself. From the
 largest node down, the one with most of that weight is taken, a root where it has ROOT_SHARE of it, a part where it
 has half of what its whole has. Of several examples a node must hold each, and none that an example against is in.
+
+A text that names a part for which there is no word may mean any part of its thing (`parts_of`).
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from liftcore.query.opened import OpenedLift
 from liftcore.query.question import Candidate, Query
 from liftcore.query.terms import Area, OneSplat, SplatSet, Term
 
+MOST_PARTS = 8  # that are offered for a word: the largest
 ROOT_SHARE = 0.25  # of what is shown: less is what shines through, or lies beside the thing
 
 
@@ -34,6 +37,20 @@ def candidates(scene: OpenedLift, query: Query) -> tuple[Candidate, ...]:
         if all(node in path for path in paths) and not any(node in other for other in against)
     ]
     return tuple(_candidate(scene, node, min(path[node] for path in paths)) for node in reversed(kept))
+
+
+def parts_of(scene: OpenedLift, things: np.ndarray) -> tuple[Candidate, ...]:
+    """The parts of some objects [N] bool, with the largest first, `MOST_PARTS` at most, and their shares of these."""
+    if scene.node_parents is None or scene.object is None:
+        return ()
+    whole = scene.evidence[np.append(things, False)[scene.object]].sum() or 1.0
+    nodes = np.flatnonzero(
+        np.append(things, np.zeros(len(scene.node_parents) - len(things) + 1, np.bool_))[scene.node_parents]
+    )
+    found = [
+        _candidate(scene, node, float(scene.evidence[scene.members(node)].sum() / whole)) for node in nodes.tolist()
+    ]
+    return tuple(sorted(found, key=lambda one: (-one.share, one.id))[:MOST_PARTS])
 
 
 def _path(scene: OpenedLift, example: Term) -> dict[int, float]:

@@ -71,6 +71,14 @@ def part_phrase(scene: OpenedLift, query: Query, encoder: TextEncoder | None) ->
     return known or next((phrase for phrase in part_phrases(query.text[0]) if phrase.sure), None)
 
 
+def unknown_part(scene: OpenedLift, query: Query, encoder: TextEncoder | None) -> PartPhrase | None:
+    """The part, as typed, that the only positive of a query names and no word of the table stands for; None else."""
+    source = table_of(encoder or scene.table)
+    if source is None or len(query.positives) != 1 or not query.text:
+        return None
+    return source.vocabulary.unknown_part(query.text[0])
+
+
 def askable_words(scene: OpenedLift, encoder: TextEncoder, text: str, count: int) -> AskableWords:
     """What a lift can be asked (`Scene.askable`)."""
     source = table_of(encoder)

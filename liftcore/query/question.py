@@ -359,13 +359,13 @@ NodeKind = Literal["object", "part", "group"]
 
 
 class Candidate(Value):
-    """A node of the lift's tree that a click may mean."""
+    """A node of the lift's tree that a click, or a part without a word, may mean."""
 
     id: int
     set: str = Field(description="its notation, for sets")
     kind: NodeKind
     splats: int = Field(description="how many")
-    share: float = Field(description="of what is shown there, by weight")
+    share: float = Field(description="of what is shown there, by weight; of words, of the thing, by evidence")
     confidence: float | None = Field(description="of the views that see it, the share that has a mask of the whole")
 
 
@@ -418,7 +418,9 @@ class Answer(Found):
     statistics: Mapping[str, Any] = Field(description="of the scores over the seen splats")
     top: tuple[TopSplat, ...] = ()
     candidates: tuple[Candidate, ...] = Field(
-        default=(), description="of clicks: the nested things that they may mean, the smallest first"
+        default=(),
+        description="of clicks: the nested things that they may mean, the smallest first; of a part that no word "
+        "stands for: the parts of its thing, the largest first",
     )
     box: Box | None = Field(default=None, description="around all selected splats, outliers too: see objects")
     _query: Query = PrivateAttr()

@@ -8,7 +8,7 @@ if reference words do not say that it is not (`liftcore.query.presence`; the wor
 Words that are not there name nothing.
 
 The lift's tree has its say: a word that names parts, where levels say different things, names their nodes
-(`liftcore.query.selection.part_nodes`); and what has no word in a node gets the one that names most of the node.
+(`liftcore.query.selection.parts_of_words`); and what has no word in a node gets the one that names most of the node.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.presence import LEAST_WORDS, References, judge, references_beside
 from liftcore.query.question import BestWord, FoundWords, NamedSplats, Query
 from liftcore.query.scores import cosines, norms_of
-from liftcore.query.selection import Rivals, levels_disagree, part_nodes
+from liftcore.query.selection import levels_disagree, parts_of_words
 from liftcore.query.terms import Example
 from liftcore.query.threshold import find_threshold
 from liftcore.runtime.one_line import one_line
@@ -199,8 +199,8 @@ def _parts(scene: OpenedLift, unit: np.ndarray, references: References | str | N
     """[n, N] bool: the nodes of parts that each of some words [n, F] f32 names."""
     found = np.zeros((len(unit), 0 if scene.node_parents is None else len(scene.node_parents)), np.bool_)
     if isinstance(references, References) and levels_disagree(scene):
-        for row in range(len(unit)):
-            found[row, part_nodes(scene, Rivals.among(references, unit[row : row + 1]))] = True
+        for row, nodes in enumerate(parts_of_words(scene, references, unit)):
+            found[row, nodes] = True
     return found
 
 

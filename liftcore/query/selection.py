@@ -198,36 +198,88 @@ def part_nodes(scene: OpenedLift, rivals: Rivals) -> list[int]:
     the same, if the word is among the nearest there, and if it is a part of what says something else. Nodes that are
     nearer to the words than halfway from that whole to that part are parts of the same name.
     """
-    parents = scene.node_parents
-    if parents is None or scene.node_features is None or not levels_disagree(scene):
+    nodes = _NodeMeanings.of(scene)
+    if nodes is None:
         return []
-    vectors = scene.node_features.astype(np.float32)
-    known = np.linalg.norm(vectors, axis=1) > 0
-    scores = np.where(known, (vectors @ rivals.directions.T).max(axis=1), -1.0)
-    node = int(scores.argmax())
-    while parents[node] >= 0 and _about(scene, vectors[parents[node]][None], vectors[node])[0] >= LEVELS_AGREE:
-        node = int(parents[node])
-    whole = int(parents[node])
-    sure = known & (rivals.ahead_of_means(scene, vectors) <= rivals.allowed)
-    if whole < 0 or not known[whole] or not sure[node]:
-        return []
-    others = np.flatnonzero(sure & (scores > (scores[node] + scores[whole]) / 2) & (parents >= 0))
-    found = [node]
-    for other in sorted(others.tolist(), key=lambda one: len(scene.node_path(one))):
-        if not any(one in scene.node_path(other) or other in scene.node_path(one) for one in found):
-            found.append(other)
+    scores = (nodes.vectors @ rivals.directions.T).max(axis=1)
+    return nodes.named(scores, rivals.ahead_of_means(scene, nodes.vectors) <= rivals.allowed)
+
+
+def parts_of_words(scene: OpenedLift, references: References, words: np.ndarray) -> list[list[int]]:
+    """The same for each of n words [n, F] f32, unit, alone; nodes are compared with the references once for all."""
+    nodes = _NodeMeanings.of(scene)
+    if nodes is None:
+        return [[] for _ in words]
+    plain = products(nodes.vectors, np.ones(len(nodes.vectors), np.float32), words, references.vectors)
+    means = words @ scene.rough_mean, references.vectors @ scene.rough_mean
+    centred = tuple(table - mean for table, mean in zip(plain, means, strict=True))
+    found = []
+    for row, word in enumerate(words):
+        others, allowed = references.against(word)
+        ahead = [(near[:, others] >= own[:, row, None]).sum(axis=1) for own, near in (plain, centred)]
+        found.append(nodes.named(plain[0][:, row], np.minimum(*ahead) <= allowed))
     return found
 
 
-def with_parts(scene: OpenedLift, selected: np.ndarray) -> np.ndarray:
-    """[P] bool: the selected splats and the things of which `SOME` or more is, with parts that other words name."""
+@dataclass(frozen=True)
+class _NodeMeanings:
+    """What the nodes of a lift's tree say, where levels say different things."""
+
+    scene: OpenedLift
+    parents: np.ndarray  # [N] i32
+    vectors: np.ndarray  # [N, F] f32, unit; zeros for none
+    widest: np.ndarray  # [N] i64, the largest node above each, or itself, that says the same
+
+    @classmethod
+    def of(cls, scene: OpenedLift) -> _NodeMeanings | None:
+        """None where levels say the same, or the lift has no tree."""
+        parents = scene.node_parents
+        if parents is None or scene.node_features is None or not levels_disagree(scene):
+            return None
+        vectors = scene.node_features.astype(np.float32)
+        widest = np.arange(len(parents))
+        for node in sorted(range(len(parents)), key=lambda one: len(scene.node_path(one))):
+            whole = int(parents[node])
+            if whole >= 0 and _about(scene, vectors[whole][None], vectors[node])[0] >= LEVELS_AGREE:
+                widest[node] = widest[whole]
+        return cls(scene, parents, vectors, widest)
+
+    def named(self, scores: np.ndarray, sure: np.ndarray) -> list[int]:
+        """The parts that a word names (`part_nodes`).
+
+        Args:
+            scores: [N] f32, how near it is to each node. sure: [N] bool, where it is among the nearest words.
+        """
+        known = np.linalg.norm(self.vectors, axis=1) > 0
+        scores = np.where(known, scores, -1.0)
+        node = int(self.widest[scores.argmax()])
+        whole = int(self.parents[node])
+        if whole < 0 or not known[whole] or not (known & sure)[node]:
+            return []
+        halfway = (scores[node] + scores[whole]) / 2
+        others = np.flatnonzero(known & sure & (scores > halfway) & (self.parents >= 0))
+        found, path = [node], self.scene.node_path
+        for other in sorted(others.tolist(), key=lambda one: len(path(one))):
+            if not any(one in path(other) or other in path(one) for one in found):
+                found.append(other)
+        return found
+
+
+def things_within(scene: OpenedLift, selected: np.ndarray) -> np.ndarray:
+    """[N] bool: the things of which `SOME` or more is among the selected splats [P] bool."""
     if scene.object is None or scene.object_views is None or len(scene.object) != len(selected):
-        return selected
+        return np.zeros(0, np.bool_)
     of_thing, number = scene.seen & (scene.object >= 0), len(scene.object_views)
     whole, inside = (
         np.bincount(scene.object[rows], scene.evidence[rows], number) for rows in (of_thing, of_thing & selected)
     )
-    return selected | (of_thing & np.append((inside > 0) & (inside >= SOME * whole), False)[scene.object])
+    return (inside > 0) & (inside >= SOME * whole)
+
+
+def with_parts(scene: OpenedLift, selected: np.ndarray) -> np.ndarray:
+    """[P] bool: the selected splats and the things of which `SOME` or more is, with parts that other words name."""
+    things = things_within(scene, selected)
+    return selected | (scene.seen & np.append(things, False)[scene.object]) if things.any() else selected
 
 
 def _counted(count: int, what: str) -> str:

@@ -9,7 +9,7 @@ it. `Vocabulary.find` tries in this order, and says which of them it was:
 4. these of the singular, or of the plural;
 5. the head of a phrase, "the red cup" as "cup", "a photo of two cows" as "cow".
 
-`Vocabulary.find_part` reads a phrase as a part within a thing, "the mug's handle", "handle of the mug", "mug handle".
+`Vocabulary.find_part` reads a phrase as a part within a thing, "the red mug's handle", "mug handle".
 
 A word that is there is never replaced by another. What none of this finds is refused, with the nearest words.
 """
@@ -87,18 +87,24 @@ def part_phrases(text: str) -> Iterator[PartPhrase]:
     """The ways to read a text as a part of a thing, the likeliest first.
 
     "The cat's tail" and "tail of the cat" say so. Of "a cup of coffee", where no article follows, nothing is a part
-    of the other; nor of what is said of a thing, as "a photo of a cat".
+    of the other; nor of what is said of a thing, as "a photo of a cat". "Handles of mugs" may be either, as "bowls of
+    oranges" shows.
     """
-    parts = [part.strip(_AROUND) for part in text.casefold().replace("_", " ").split()]
-    parts = parts[1:] if parts and parts[0] in _ARTICLES else parts
+    typed = text.casefold().replace("_", " ").split()
+    typed = typed[1:] if typed and typed[0].strip(_AROUND) in _ARTICLES else typed
+    parts = [part.strip(_AROUND) for part in typed]
     if len(parts) > _HEAD_WORDS:
         return
     for place, part in enumerate(parts[:-1]):
-        if part.endswith(("'s", "\u2019s")):
-            yield PartPhrase(" ".join([*parts[:place], part[:-2]]), " ".join(parts[place + 1 :]), True)
-        follows = parts[place + 1] in _ARTICLES | _OWNERS and place + 2 < len(parts)
-        if part == "of" and place and follows and parts[place - 1] not in _PARTS:
-            yield PartPhrase(" ".join(parts[place + 2 :]), " ".join(parts[:place]), True)
+        owner = part[:-2] if part.endswith(("'s", "\u2019s")) else part
+        if owner != part or (typed[place].endswith(("s'", "s\u2019")) and typed[place][0] not in _AROUND):
+            yield PartPhrase(" ".join([*parts[:place], owner]), " ".join(parts[place + 1 :]), True)
+        if part == "of" and place and parts[place - 1] not in _PARTS:
+            of = parts[place + 1 :]
+            if of[0] in _ARTICLES | _OWNERS and len(of) > 1:
+                yield PartPhrase(" ".join(of[1:]), " ".join(parts[:place]), True)
+            elif of[-1] in _IRREGULAR or (len(of[-1]) > 2 and of[-1].endswith("s") and not of[-1].endswith("ss")):
+                yield PartPhrase(" ".join(of), " ".join(parts[:place]), False)
     if len(parts) > 1 and not any(part in _BEHIND | {"of"} for part in parts):
         for place in range(len(parts) - 1, 0, -1):
             yield PartPhrase(" ".join(parts[:place]), " ".join(parts[place:]), False)
@@ -166,20 +172,42 @@ class Vocabulary:
         whole = self._look_up(text)
         if whole is not None:
             return Wording(text, *whole)
-        for head in islice(_heads(text), 4 * _HEAD_WORDS):
-            found = self._look_up(head)
-            if found is not None:
-                return Wording(text, found[0], "head")
-        return None
+        head = self._head(text)
+        return None if head is None else Wording(text, head[1], "head")
 
     def find_part(self, text: str) -> PartPhrase | None:
-        """The words of a part and its thing, where a text names both and is no word as a whole; None else."""
+        """The words of a part and its thing, where a text names both and is no word as a whole; None else.
+
+        Adjectives are left out, as in the heads of other phrases. Of "red toy car" nothing is a part of another where
+        "toy car" is a word.
+        """
         if self.word_of(text) is not None:
             return None
         for phrase in part_phrases(text):
-            thing, part = (self.word_of(name) for name in (phrase.thing, phrase.part))
-            if thing is not None and part is not None:
-                return PartPhrase(thing, part, phrase.sure)
+            thing = self.find(phrase.thing)
+            part = self.find(phrase.part)
+            if thing is None or part is None:
+                continue
+            head = None if thing.how != "head" or " of " in text else self._head(text)
+            if phrase.sure or (part.how != "head" and (head is None or head[0] == phrase.part)):
+                return PartPhrase(thing.word, part.word, phrase.sure)
+        return None
+
+    def unknown_part(self, text: str) -> PartPhrase | None:
+        """A part as it was typed, and the word of its thing, where a text names a part that is no word; None else."""
+        if self.word_of(text) is not None:
+            return None
+        for phrase in part_phrases(text):
+            thing = self.find(phrase.thing) if phrase.sure else None
+            if thing is not None and self.find(phrase.part) is None:
+                return PartPhrase(thing.word, phrase.part, True)
+        return None
+
+    def _head(self, text: str) -> tuple[str, str] | None:
+        """The longest part of a phrase that a word stands for, and this word."""
+        for head in islice(_heads(text), 4 * _HEAD_WORDS):
+            if (found := self._look_up(head)) is not None:
+                return head, found[0]
         return None
 
     def word_of(self, text: str) -> str | None:

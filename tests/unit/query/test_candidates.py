@@ -11,6 +11,7 @@ import pytest
 from liftcore.cli import main
 from liftcore.query.question import Query
 from liftcore.query.scene import Scene
+from liftcore.text.table import TableEncoder
 from tests.unit.query.test_catalogue import with_parts
 
 
@@ -54,3 +55,15 @@ def test_the_command_names_them(nested: Scene, capsys: pytest.CaptureFixture[str
     assert [(one["id"], one["kind"], one["share"]) for one in told] == [(4, "part", 1.0), (0, "object", 1.0)]
     assert main(["query", str(nested.path), "--like", f"splat:{row}"]) == 0
     assert "may be object:4, part" in capsys.readouterr().out
+
+
+def test_a_part_that_no_word_stands_for_may_be_any_part_of_its_thing(nested: Scene) -> None:
+    row = np.flatnonzero(nested.members(3))[0]
+    words = np.stack([nested.features[row], -nested.features[row]]).astype(np.float32)
+    table = TableEncoder("words", ["apple", "lamp"], words)
+    answer = nested.ask("the apple's stalk", encoder=table)
+    assert answer.count and [word.how for word in answer.wording] == ["head"]
+    assert sorted((one.id, one.kind) for one in answer.candidates) == [(3, "part"), (4, "part")]
+    assert "'stalk'" in answer.why and "all of 'apple'" in answer.why
+    assert sum(one.share for one in answer.candidates) <= 1 + 1e-6
+    assert nested.ask("the apple", encoder=table).candidates == ()

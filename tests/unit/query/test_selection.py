@@ -9,8 +9,10 @@ import pytest
 import torch
 
 from liftcore.query.ask import answers, ask, question
+from liftcore.query.presence import References
 from liftcore.query.question import Query
 from liftcore.query.scene import Scene
+from liftcore.query.selection import Rivals, part_nodes, parts_of_words
 from liftcore.query.threshold import METHODS, find_threshold
 from liftcore.text import LVIS_TABLE
 from liftcore.text.table import TableEncoder
@@ -229,3 +231,7 @@ def test_word_of_a_part_takes_its_node_where_levels_disagree(
     assert (np.flatnonzero(found.selected).tolist() == list(range(60))) == by_node
     assert ("parts that it names" in found.threshold.explanation) == by_node
     assert np.flatnonzero(ask(told, "mug", table).selected)[[0, -1]].tolist() == [0, 299]
+    references = References(tuple(table.words), table.embeddings)
+    every = parts_of_words(told, references, table.embeddings)
+    alone = [part_nodes(told, Rivals.among(references, word[None])) for word in table.embeddings]
+    assert every == alone and any(every) == by_node

@@ -77,7 +77,11 @@ def test_what_is_like_nothing_has_no_words_near_to_it(text: str) -> None:
     ("text", "thing", "part"),
     [
         ("the mug's handle", "mug", "handle"), ("handles of the mug", "mug", "handle"),
-        ("mug handle", "mug", "handle"), ("wheel of my old car", None, None),
+        ("mug handle", "mug", "handle"), ("wheel of my old car", "car (automobile)", "wheel"),
+        ("the red mug's handle", "mug", "handle"), ("handles of mugs", "mug", "handle"),
+        ("the mugs' handles", "mug", "handle"), ("red mug handles", "mug", "handle"),
+        ("the broken handle of the red mug", "mug", "handle"), ("handles of red mugs", "mug", "handle"),
+        ("a red coffee mug", None, None), ("slices of apples", None, None), ("glass of water", None, None),
         ("cup of tea", None, None), ("a photo of the cat", None, None),
         ("lamp shade", None, None), ("the red cup", None, None), ("a " * 500, None, None), ("cat", None, None),
     ],
@@ -85,6 +89,13 @@ def test_what_is_like_nothing_has_no_words_near_to_it(text: str) -> None:
 def test_part_and_thing_of_a_phrase_are_found(text: str, thing: str | None, part: str | None) -> None:
     found = lvis().find_part(text)
     assert (found.thing, found.part) == (thing, part) if found else thing is None
+
+
+def test_a_part_that_no_word_stands_for_is_told_from_its_thing() -> None:
+    assert lvis().unknown_part("the black cat's tail") == ("cat", "tail", True)
+    assert lvis().unknown_part("tip of the umbrella") == ("umbrella", "tip", True)
+    texts = ("the mug's handle", "cat", "cat tail", "the zebu's tail", "cup of tea", "a photo of the cat")
+    assert [lvis().unknown_part(text) for text in texts] == [None] * len(texts)
 
 
 def test_words_of_a_short_table_are_found_by_meaning() -> None:
