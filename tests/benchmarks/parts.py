@@ -198,7 +198,8 @@ def word_iou(scores: np.ndarray, owners: np.ndarray, counted: np.ndarray) -> flo
     for word, column in enumerate(scores[counted].T):
         right = owners[counted] == word
         hits = np.cumsum(right[np.argsort(-column, kind="stable")])
-        ends = np.append(np.diff(np.sort(-column)) > 0, True)  # equal scores are taken together
+        ranked = np.sort(-column)
+        ends = np.append(ranked[1:] > ranked[:-1], True)  # equal scores are taken together
         ious.append(float((hits / (taken + right.sum() - hits))[ends].max()))
     return float(np.mean(ious))
 
