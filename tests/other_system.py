@@ -92,10 +92,10 @@ class WindowsMap(mmap.mmap):
 class WindowsLibrary(ctypes.CDLL):
     """A library by its name: the process itself is none."""
 
-    def __init__(self, name: str | None, *arguments: Any, **more: Any) -> None:
+    def __init__(self, name: str | None, *arguments: Any, **keywords: Any) -> None:
         if name is None:
             raise TypeError("LoadLibrary() argument 1 must be str, not None")
-        super().__init__(name, *arguments, **more)
+        super().__init__(name, *arguments, **keywords)
 
 
 def become(system: System) -> None:
@@ -124,16 +124,16 @@ def become(system: System) -> None:
 
 def _refuse_system_files() -> None:
     """Have ``/proc`` and ``/sys`` lie nowhere."""
-    opened, is_file = os.open, Path.is_file
-    read = Path.read_text
+    system_open, is_file = os.open, Path.is_file
+    read_text = Path.read_text
 
-    def refuse(path: Any, *arguments: Any, **more: Any) -> Any:
+    def refuse(path: Any, *arguments: Any, **keywords: Any) -> Any:
         _refuse(path)
-        return opened(path, *arguments, **more)
+        return system_open(path, *arguments, **keywords)
 
-    def refuse_text(path: Path, *arguments: Any, **more: Any) -> str:
+    def refuse_text(path: Path, *arguments: Any, **keywords: Any) -> str:
         _refuse(path)
-        return read(path, *arguments, **more)
+        return read_text(path, *arguments, **keywords)
 
     mock.patch("os.open", refuse).start()
     mock.patch.object(Path, "read_text", refuse_text).start()
@@ -150,27 +150,27 @@ def _keep_used_files() -> None:
     readlink, listdir, reader = os.readlink, os.listdir, open
 
     def check(path: Any) -> None:
-        own = os.path.realpath(path)
+        target = os.path.realpath(path)
         numbers = listdir("/proc/self/fd")
-        used = set[str]()
+        used_files = set[str]()
         for number in numbers:
             try:
-                used.add(readlink(f"/proc/self/fd/{number}"))
+                used_files.add(readlink(f"/proc/self/fd/{number}"))
             except FileNotFoundError:  # that of the listing itself
                 continue
         with reader("/proc/self/maps", encoding="utf-8") as lines:
-            used |= {line.split(maxsplit=5)[5].rstrip("\n") for line in lines if line.count("/")}
-        if own in used:
+            used_files |= {line.split(maxsplit=5)[5].rstrip("\n") for line in lines if line.count("/")}
+        if target in used_files:
             raise PermissionError(13, "The process cannot access the file because it is being used", str(path))
 
-    def checked(call: Any, targets: int) -> Any:
-        def refuse(*paths: Any, **more: Any) -> Any:
+    def guard(call: Any, targets: int) -> Any:
+        def refuse(*paths: Any, **keywords: Any) -> Any:
             for path in paths[:targets]:
                 check(path)
-            return call(*paths, **more)
+            return call(*paths, **keywords)
 
         return refuse
 
     for name, targets in (("unlink", 1), ("remove", 1), ("replace", 2), ("rename", 2)):
-        mock.patch.object(os, name, checked(getattr(os, name), targets)).start()
+        mock.patch.object(os, name, guard(getattr(os, name), targets)).start()
     mock.patch.object(shutil, "_use_fd_functions", False).start()  # removal by paths, as Windows has it

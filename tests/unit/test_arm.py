@@ -23,7 +23,7 @@ RELEASE = re.compile(r"define[^\n]*@NRT_decref\([^)]*\)[^{\n]*\{.*?\n\}", re.DOT
 VECTORS = re.compile(r"\tf(?:mla|mul|add|sub)\.4s\t|\tf(?:mla|mul|add|sub)\tv\d+\.4s")
 CALL = re.compile(r"\tbl?\t([A-Za-z_][\w.$]*)$", re.MULTILINE)
 # Numba's runtime, Python's, the C library's and those of other kernels, whose names numba makes.
-BROUGHT = re.compile(
+LIBRARY_CALL = re.compile(
     r"_?(NRT_\w+|numba_\w+|_?Py\w+|mem(cpy|move|set)|bzero|(exp2?|log2?|log1p|sin|cos|pow|floor)f?|_?ZN\w.*)$"
 )
 
@@ -32,13 +32,13 @@ BROUGHT = re.compile(
 def kernels() -> dict[str, str]:
     """Name of each kernel of the default lift -> LLVM's code of it."""
     warm_up_lift(next(iter(Kernel)), CPU, LiftSettings.of())
-    found: dict[str, str] = {}
-    for one in gc.get_objects():
-        if type(one) is CPUDispatcher and one.py_func.__module__.startswith("liftcore."):
-            for number, overload in enumerate(one.overloads.values()):
+    codes: dict[str, str] = {}
+    for candidate in gc.get_objects():
+        if type(candidate) is CPUDispatcher and candidate.py_func.__module__.startswith("liftcore."):
+            for number, overload in enumerate(candidate.overloads.values()):
                 module = overload.library._get_module_for_linking()  # also of those that lay compiled on the disk
-                found[f"{one.py_func.__module__}.{one.py_func.__name__} {number}"] = str(module)
-    return found
+                codes[f"{candidate.py_func.__module__}.{candidate.py_func.__name__} {number}"] = str(module)
+    return codes
 
 
 @pytest.mark.slow
@@ -52,14 +52,14 @@ def test_kernels_compile_for_arm_with_vectors_and_without_missing_calls(kernels:
     for name, compiled in kernels.items():
         code = RELEASE.sub("declare void @NRT_decref(ptr)", compiled)
         assert not re.search(r"call [^\n]*@llvm\.x86\.", code), name
-        for what, own in (("datalayout", machine.target_data), ("triple", triple)):
-            code = re.sub(f'target {what} = "[^"]*"', f'target {what} = "{own}"', code)
+        for key, value in (("datalayout", machine.target_data), ("triple", triple)):
+            code = re.sub(f'target {key} = "[^"]*"', f'target {key} = "{value}"', code)
         module = llvm.parse_assembly(code)
         module.verify()
         assert machine.emit_object(module)
         assembly = machine.emit_assembly(module)
         defined = set(re.findall(r"^([A-Za-z_][\w.$]*):", assembly, re.MULTILINE))
-        missing |= {call for call in set(CALL.findall(assembly)) - defined if not BROUGHT.match(call)}
+        missing |= {call for call in set(CALL.findall(assembly)) - defined if not LIBRARY_CALL.match(call)}
         vectors[name.split()[0].rsplit(".", 1)[1]] = len(VECTORS.findall(assembly))
     assert not missing
     assert len(kernels) > 20 and min(vectors["_weigh"], vectors["_render"]) > 50

@@ -1,0 +1,37 @@
+# pyright: strict
+"""Take the things of a lift into other programs, each with the name of the nearest word.
+
+python examples/exports.py scene.lift.safetensors words.safetensors out
+
+``.glb`` opens in viewers of glTF, ``.spz`` in those of mobile phones, ``.ply`` in editors of splats. ``.json`` has
+COCO's masks in the views, ``.jsonl`` an object a line, and the ZIP all of it. The PLY is read again at the end.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+import liftcore as lc
+
+SUFFIXES = (".glb", ".spz", ".ply", ".json", ".jsonl", ".zip")
+
+
+def main(lift: str, table: str, out: str) -> None:
+    """Write ``out/things`` with each of the suffixes."""
+    scene, encoder = lc.Scene(lift), f"table:{table}"
+    objects = scene.catalogue(scene.words(encoder), encoder=encoder)
+    folder = Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    for suffix in SUFFIXES:
+        path = folder / f"things{suffix}"
+        scene.export(path, objects)
+        print(f"{path.name}: {path.stat().st_size} bytes")
+    names = [item.name or f"object {item.id}" for item in objects.objects]
+    numbers = np.asarray(lc.read_splats(folder / "things.ply").extras["instance_id"])
+    for number, name in enumerate(names, start=1):  # 0 is none
+        print(f"{name}: {int((numbers == number).sum())} splats")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:4])

@@ -1,0 +1,31 @@
+# pyright: strict
+"""Make a folder that another person opens: the lift with its splats and cameras, found again wherever it is put.
+
+python examples/share_folder.py scene.ply sparse/0 features.safetensors shared
+
+Whoever has it runs ``splatlift view shared/lift.safetensors``, or opens it in Python as at the end.
+"""
+
+import sys
+from pathlib import Path
+
+import liftcore as lc
+
+
+def main(splats_path: str, cameras_path: str, features_path: str, out: str) -> None:
+    """Write ``out`` with three files, and open it again."""
+    splats, cameras = lc.read_splats(splats_path), lc.read_cameras(cameras_path)
+    result = lc.lift(splats, cameras, lc.read_features(features_path))
+    folder = Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    lift = result.save_scene(folder, splats, cameras)
+    for file in sorted(folder.iterdir()):
+        print(f"{file.name}: {file.stat().st_size} bytes")
+
+    scene = lc.Scene(lift)
+    objects = scene.catalogue()
+    print(objects.explanation)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:5])
