@@ -1,6 +1,6 @@
 // The things in the scene, which the lift found by masks alone, and their parts: a list before anything is asked, and
 // what a click takes.
-import { at, el, plural, tell, twice } from "./dom.js";
+import { at, count, el, plural, tell, twice } from "./dom.js";
 import { search } from "./question.js";
 import { json, patch, picture, post, remove, words } from "./service.js";
 
@@ -19,12 +19,14 @@ export class Things {
 
   async of(lift) {
     Object.assign(this, { lift, found: [], own: [], last: null, undone: null, nodes: new Map(), open: new Set(), all: false });
+    at("catalogue-most").textContent = "";
     this.show();
     if (lift) json(`/lifts/${lift.id}/selections`).then(({ selections }) => { if (lift === this.lift) this.have(this.found, selections); }).then(() => this.show(), () => {});
     if (!lift?.links.objects) return; // of a lift from before there were any
     try {
-      const { objects, named } = await objectsOf(lift);
+      const { objects, named, count: all } = await objectsOf(lift);
       if (lift === this.lift) this.have(objects);
+      if (lift === this.lift && all > objects.length) at("catalogue-most").textContent = `These are the first ${count(objects.length)} of ${count(all)}. A click takes the others, too.`;
       this.show();
       const { nodes } = objects.length && lift.links.tree ? await json(`${lift.links.tree}?limit=${NODES}${named}`) : { nodes: [] };
       if (lift === this.lift) this.nodes = new Map(nodes.map(node => [node.id, node]));
@@ -292,12 +294,12 @@ export class Things {
   }
 }
 
-// The things of a lift, and the part of the route that had them named.
+// The first things of a lift, how many there are, and the part of the route that had them named.
 async function objectsOf(lift) {
   const route = `/lifts/${lift.id}/objects?limit=${MOST}`;
   let named = lift.text_space === "none" ? "" : `&encoder=${encodeURIComponent(lift.text_space)}`;
-  const { objects } = await json(route + named).catch(() => { named = ""; return json(route); }); // that space has no table of words
-  return { objects, named };
+  const { objects, count: all } = await json(route + named).catch(() => { named = ""; return json(route); }); // that space has no table of words
+  return { objects, named, count: all };
 }
 
 // Things of one name are numbered.
