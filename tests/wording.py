@@ -29,7 +29,7 @@ ROOT = Path(__file__).resolve().parents[1]
 BOUNDS = Path(__file__).with_suffix(".json")
 KINDS = ("names", "docstrings", "told")
 CODE = ("liftcore/**/*.py", "service/**/*.py", "tests/**/*.py", "examples/**/*.py")
-TEXTS = ("*.md", "Makefile", "docs/*.md", "docs/*.rst", "docs/*.ipynb", "docker/*", "service/web/src/**/*.*")
+TEXTS = ("*.md", "Makefile", "docs/*.md", "docs/*.rst", "docs/*.ipynb", "docker/*", "service/web/src/**/*.[chj]*")
 UNBOUND = ("CHANGELOG.md", "tests/wording.py")  # history stays as it was written; this file must name the words
 
 # A participle says that something was done to a value, not what the value is. Terms of the field are not listed, such
@@ -149,8 +149,9 @@ def bound_names(scope: Scope) -> Iterator[Place]:
 
 def files_of(patterns: Iterable[str]) -> list[Path]:
     """Return the files that patterns match, in order, without those that no bound holds."""
-    files = {path for pattern in patterns for path in ROOT.glob(pattern) if path.is_file()}
-    return sorted(path for path in files if path.relative_to(ROOT).as_posix() not in UNBOUND)
+    files = {path.relative_to(ROOT) for pattern in patterns for path in ROOT.glob(pattern) if path.is_file()}
+    project_files = (path for path in files if path.as_posix() not in UNBOUND and "node_modules" not in path.parts)
+    return [ROOT / path for path in sorted(project_files)]
 
 
 def report_on_tree() -> dict[str, Report]:
