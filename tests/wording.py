@@ -59,7 +59,7 @@ QUESTIONS = frozenset({"what", "whether", "how", "who", "whom", "whose", "which"
 TOLD = re.compile(r"(?<![a-z])told(?![a-z])", re.IGNORECASE)
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
-Scope = Function | ast.ClassDef | ast.Module | ast.Lambda
+Scope = Function | ast.ClassDef | ast.Module
 Place = tuple[int, str]  # a line from 1, and what stands there
 
 
@@ -79,10 +79,11 @@ class Report:
 
 def report_on_code(text: str) -> Report:
     """Report on the Python module with this source."""
-    report, tree = Report(), ast.parse(text)
-    scopes = [tree, *(node for node in ast.walk(tree) if isinstance(node, Function | ast.ClassDef))]
+    report, scopes = Report(), [ast.parse(text)]
     for scope in scopes:
-        bindings = list(bound_names(scope))
+        nodes = nodes_of(scope)
+        scopes += [node for node in nodes if isinstance(node, Scope)]
+        bindings = [place for node in nodes for place in bound_names(node)]
         listed = [place for place in bindings if is_listed(place[1], {name for _, name in bindings})]
         if isinstance(scope, Function | ast.ClassDef) and is_listed(scope.name, function=True):
             listed.append((scope.lineno, scope.name))
@@ -122,29 +123,27 @@ def is_listed(name: str, beside: Collection[str] = (), *, function: bool = False
     return word in PARTICIPLES or word in RIDDLES
 
 
-def bound_names(scope: Scope) -> Iterator[Place]:
-    """Yield the names that a scope itself binds: parameters, targets, attributes assigned, fields, `as` names.
+def nodes_of(scope: Scope) -> list[ast.AST]:
+    """Return the nodes of a scope, with the scopes inside of it and not with what these hold.
 
-    Scopes inside of it bind their own, but for lambdas and comprehensions, which count as part of the scope.
+    Lambdas and comprehensions count as part of the scope that they are in.
     """
     nodes: list[ast.AST] = [*ast.iter_child_nodes(scope)]
-    while nodes:
-        node = nodes.pop()
-        match node:
-            case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
-                nodes += [*node.decorator_list]
-                continue
-            case ast.Name(ctx=ast.Store()):
-                yield node.lineno, node.id
-            case ast.Attribute(ctx=ast.Store()):
-                yield node.lineno, node.attr
-            case ast.arg():
-                yield node.lineno, node.arg
-            case ast.alias(asname=str(name)) | ast.ExceptHandler(name=str(name)):
-                yield node.lineno, name
-            case ast.MatchAs(name=str(name)) | ast.MatchStar(name=str(name)):
-                yield node.lineno, name
-        nodes += ast.iter_child_nodes(node)
+    for node in nodes:
+        if not isinstance(node, Scope):
+            nodes += ast.iter_child_nodes(node)
+    return nodes
+
+
+def bound_names(node: ast.AST) -> Iterator[Place]:
+    """Yield the name that a node binds: a parameter, a target, an attribute assigned, a field, an `as` name."""
+    match node:
+        case ast.Name(ctx=ast.Store(), id=name) | ast.Attribute(ctx=ast.Store(), attr=name) | ast.arg(arg=name):
+            yield node.lineno, name
+        case ast.alias(asname=str(name)) | ast.ExceptHandler(name=str(name)):
+            yield node.lineno, name
+        case ast.MatchAs(name=str(name)) | ast.MatchStar(name=str(name)):
+            yield node.lineno, name
 
 
 def files_of(patterns: Iterable[str]) -> list[Path]:
