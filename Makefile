@@ -83,10 +83,12 @@ lint: $(READY)
 	$(BIN)/basedpyright
 	$(BIN)/lint-imports
 	$(BIN)/lint-imports --config service/imports.toml
+	$(BIN)/python -m tests.wording
 
 format: $(READY)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+	$(BIN)/python -m tests.wording --write
 
 serve: $(READY)
 	$(BIN)/splatlift serve
