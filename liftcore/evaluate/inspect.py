@@ -256,6 +256,7 @@ def describe_packs(packs: Views) -> dict[str, Any]:
         "text_space": packs.text_space,
         "normalised": packs.normalised,
         "sizes": sorted({view.size for view in found}),
+        "level_names": list(packs.level_names),
         "codebook_rows": sum(view.rows for view in found),
         "norms": {"min": low, "max": high},
         "unlabelled": sum(view.unlabelled for view in regions) / len(regions) if regions else 0.0,

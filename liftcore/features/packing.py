@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack, get_args
@@ -32,6 +33,7 @@ OPTIONS = {  # of the kinds of files
     "prompts": ("unlabelled", "names", "folders", "unannotated"),
 }
 CHOICES = {"layout": get_args(Layout), "folders": get_args(Folders), "unannotated": get_args(Unannotated)}
+LANGSPLAT_LEVELS = ("default", "s", "m", "l")  # SAM's masks, then subparts, parts and wholes
 NAMES = ("encoder", "text_space")  # of a pack
 
 
@@ -106,6 +108,8 @@ def pack_folder(
         check_output(out, views.inputs, "pack")
         texts = {name: value if isinstance(value, str) else str(value).lower() for name, value in names.items()}
         metadata = {"source": kind} | {name: text for name, text in texts.items() if names[name] is not None}
+        if kind == "langsplat" and len(views[next(iter(views))].labels) == len(LANGSPLAT_LEVELS):
+            metadata["levels"] = json.dumps(LANGSPLAT_LEVELS)
         with writing(out), landing(out) as file:
             write_pack(file, views, metadata, reporter, table)
     keeps = kind in ("langsplat", "prompts") or is_encoded  # their files are not named after images

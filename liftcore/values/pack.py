@@ -75,6 +75,7 @@ class Views(Mapping[str, ViewFeatures]):
     table: TableEncoder | None = None  # the packs' own words
     paths: tuple[Path, ...] = ()  # of the packs that it reads; () where views come from elsewhere
     _cameras: Mapping[str, Camera] = field(default_factory=dict, repr=False)
+    level_names: tuple[str, ...] = ()  # of region maps' levels, in their order; () where the packs name none
 
     @property
     def views(self) -> tuple[str, ...]:
@@ -206,7 +207,7 @@ def read_features(*paths: str | Path) -> Views:
     encoder, text_space = _agreed(packs, "encoder"), _agreed(packs, "text_space")
     table = _table(packs, next(iter(channels)))
     told = (encoder, text_space, normalised, sources, table, tuple(pack.path for pack in packs))
-    return Views(next(iter(channels)), *told)
+    return Views(next(iter(channels)), *told, level_names=_level_names(packs))
 
 
 def pair(views: Views, cameras: Mapping[str, Camera]) -> tuple[Views, list[str]]:
@@ -243,7 +244,8 @@ def write_pack(
     Args:
         path: the file to write.
         views: view name -> what it observes.
-        metadata: ``encoder``, ``text_space``, ``normalised`` ("true" or "false") and what else to keep.
+        metadata: ``encoder``, ``text_space``, ``normalised`` ("true" or "false"), ``levels`` (a JSON list of their
+            names) and what else to keep.
         progress: told about the stages "check" and "pack", in views.
         table: words of the pack's own, of as many channels.
 
@@ -504,6 +506,16 @@ def _table(packs: Sequence[_PackFile], channels: int) -> TableEncoder | None:
                 "features", expected="one table in all packs", got=f"two in {first} and {path}", hint=hint
             )
     return found[first] if first else None
+
+
+def _level_names(packs: Sequence[_PackFile]) -> tuple[str, ...]:
+    """The names of levels that all packs have; () where they have none, differ, or are no list of texts."""
+    (said, *more) = {pack.metadata.get("levels", "") for pack in packs}
+    try:
+        names = json.loads(said) if said and not more else []
+    except ValueError:
+        return ()
+    return tuple(names) if isinstance(names, list) and all(isinstance(name, str) for name in names) else ()
 
 
 def _agreed(packs: Sequence[_PackFile], key: str) -> str:

@@ -7,6 +7,7 @@ import re
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from liftcore.values.pack import read_features
@@ -16,8 +17,6 @@ from .command_line import assert_one_line, run
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-    import pytest
 
 
 def save(path: Path, values: np.ndarray) -> None:
@@ -128,3 +127,14 @@ def test_what_nobody_annotated_or_decided_is_told_and_left_out(
     regions = read_features(pack)["a"]
     assert isinstance(regions, Regions)
     assert regions.labels.tolist() == [[[1, 0], [0, -1]]]  # the last row is of what is no mug
+
+
+@pytest.mark.parametrize(("levels", "names"), [(4, ["default", "s", "m", "l"]), (1, [])])
+def test_levels_of_langsplat_are_named_where_all_four_are_there(
+    levels: int, names: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, pack = tmp_path / "features", tmp_path / "p.safetensors"
+    save(folder / "a_s.npy", np.broadcast_to(np.arange(levels)[:, None, None], (levels, 2, 2)).astype(np.float32))
+    save(folder / "a_f.npy", np.eye(levels, 5, dtype=np.float16))
+    assert run(capsys, "pack", "langsplat", folder, "-o", pack)[0] == 0
+    assert json.loads(run(capsys, "inspect", pack, "--json")[1])["level_names"] == names
