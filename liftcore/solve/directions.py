@@ -20,6 +20,7 @@ from torch import Tensor
 
 from liftcore.io.safetensors_file import map_tensors, write_tensors
 from liftcore.runtime.jit import kernel
+from liftcore.solve.clusters import EXACT_CHANNELS, principal_axes
 from liftcore.solve.codebook import LEAST_CHANNELS, TABLE_BYTES, Codebook
 from liftcore.solve.shared_rows import new_table
 from liftcore.solve.sums import PieceSums, added, piece_sums
@@ -118,7 +119,11 @@ class RegionDirections:
         if codebook.channels <= number or entries <= number * codebook.regions:
             return None
         step = -(-codebook.regions // SAMPLE)
-        e = self._whole_rows(slice(None, None, step)).double()
+        e = self._whole_rows(slice(None, None, step))
+        if codebook.channels > EXACT_CHANNELS:
+            weighted = e * self.totals[::step, None].sqrt().float()
+            return torch.from_numpy(principal_axes(weighted.numpy(), number))
+        e = e.double()
         return torch.linalg.eigh((e * self.totals[::step, None]).T @ e)[1][:, -number:].float().contiguous()
 
     def _whole_rows(self, chosen: slice) -> Tensor:

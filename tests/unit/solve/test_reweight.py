@@ -159,6 +159,18 @@ def test_neither_threads_nor_files_nor_order_change_a_bit_and_the_first_weights_
     assert torch.equal(W.weight, before)
 
 
+@pytest.mark.parametrize("channels", [600, 1_200])
+def test_principal_directions_have_the_cosines_of_all_channels(channels: int) -> None:
+    rng = np.random.default_rng(1)
+    vectors = rng.standard_normal((40, 6)) @ rng.standard_normal((6, channels))
+    codebook, totals = codebook_of([torch.from_numpy(vectors).float()]), torch.from_numpy(rng.uniform(0.5, 2, 40))
+    principal = RegionDirections(codebook, totals, 10_000, 12).table(slice(0, 12))
+    unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    offsets = unit - totals.numpy() @ unit / totals.sum().item()
+    e = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
+    np.testing.assert_allclose((principal @ principal.T).numpy(), e @ e.T, atol=2e-6)
+
+
 @pytest.mark.parametrize("table_bytes", [None, 1])
 def test_what_a_cluster_explains_is_its_mean_cosine_in_float64(monkeypatch, table_bytes):
     if table_bytes:
