@@ -14,7 +14,7 @@ from typing import Annotated, Any, BinaryIO
 
 import anyio
 from fastapi import Query, Request
-from fastapi.responses import FileResponse, Response, StreamingResponse
+from fastapi.responses import Response, StreamingResponse
 from fastapi.sse import EventSourceResponse, format_sse_event
 from pydantic import BaseModel
 from starlette.types import Receive, Scope, Send
@@ -81,7 +81,8 @@ def file_answer(
         RangeNotSatisfiable: the range begins beyond the end.
         NotFound: the file is not there, or no longer what was stored.
     """
-    status, offset = require_whole(path, size), 0
+    require_whole(path, size)
+    offset = 0
     if header is not None:
         with path.open("rb") as handle:
             offset = 8 + int.from_bytes(handle.read(8), "little")
@@ -92,9 +93,7 @@ def file_answer(
         return not_modified
     range_header, condition = request.headers.get("range"), request.headers.get("if-range", etag)
     part = _range_of(range_header, size) if range_header is not None and condition == etag else None
-    if header is not None:
-        return _ChangedFile(path, header, offset, part, size, cache_headers(etag) | _saved_as(name))
-    return _FileAnswer(part, path, headers=cache_headers(etag), filename=name, stat_result=status)
+    return _FilePart(path, header or b"", offset, part, size, cache_headers(etag) | _saved_as(name))
 
 
 def _range_of(header: str, size: int) -> tuple[int, int] | None:
@@ -116,20 +115,6 @@ def _range_of(header: str, size: int) -> tuple[int, int] | None:
     return (begin, last) if begin <= last else None
 
 
-class _FileAnswer(FileResponse):
-    """Starlette's, of the part that `_range_of` found, or of the whole file."""
-
-    def __init__(self, part: tuple[int, int] | None, *file: Any, **answer: Any) -> None:
-        super().__init__(*file, media_type=BINARY, **answer)
-        self._part = part
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        headers = [header for header in scope["headers"] if header[0] not in (b"range", b"if-range")]
-        if self._part is not None:
-            headers.append((b"range", b"bytes=%d-%d" % self._part))
-        await super().__call__({**scope, "headers": headers}, receive, send)
-
-
 class _OpenFile(StreamingResponse):
     """An answer from a file that is closed with it, however it ends."""
 
@@ -143,8 +128,8 @@ class _OpenFile(StreamingResponse):
                 await anyio.to_thread.run_sync(self.file.close)  # gigabytes of a draft take their time to go
 
 
-class _ChangedFile(_OpenFile):
-    """A file with another header before all that lies behind an offset in it, or a part of that."""
+class _FilePart(_OpenFile):
+    """A header before all that lies behind an offset in a file, or a part of that; a file as it is has neither."""
 
     def __init__(
         self, path: Path, header: bytes, offset: int, part: tuple[int, int] | None, size: int, headers: dict[str, str]

@@ -19,8 +19,10 @@ from fastapi.responses import HTMLResponse, JSONResponse
 
 from service import models
 from service.auth import with_keys
+from service.content import BINARY
 from service.state import CHECKS, Deps
 
+EXAMPLE = Path(__file__).parents[1] / "commands" / "tabletop"
 WEB = Path(__file__).parents[1] / "web" / "built"  # by `make web`
 SWAGGER = Path(str(files("fastapi_offline"))) / "static"  # shipped, as a robot's network may lead nowhere
 NO_PICTURE = "data:,"  # the page asks another host for one unless it is told
@@ -140,30 +142,19 @@ def docs() -> HTMLResponse:
 
 
 def _serve(path: str, file: Path, media_type: str, headers: dict[str, str] | None = None) -> None:
-    """Register a file that a page asks for."""
+    """Register a file that a page asks for; one that ends in .zst is sent unpacked."""
 
     @router.get(path, include_in_schema=False)
     def content() -> Response:
-        return Response(file.read_bytes(), media_type=media_type, headers=headers)
-
-
-EXAMPLE = Path(__file__).parents[1] / "commands" / "tabletop"
-
-
-def _serve_example(name: str, file_name: str) -> None:
-    """Register a file of the scene that ships: the page orders a lift of it, as of files that were brought."""
-
-    @router.get(f"/web/example/{name}", include_in_schema=False)
-    def content() -> Response:
-        stored = (EXAMPLE / file_name).read_bytes()
-        if file_name.endswith(".zst"):
+        stored = file.read_bytes()
+        if file.suffix == ".zst":
             stored = zstandard.ZstdDecompressor().decompress(stored)
-        return Response(stored, media_type="application/octet-stream")
+        return Response(stored, media_type=media_type, headers=headers)
 
 
-_serve_example("point_cloud.spz", "point_cloud.spz")
-_serve_example("cameras.json", "cameras.json")
-_serve_example("features.safetensors", "features.safetensors.zst")
+# The scene that ships: the page orders a lift of it, as of files that were brought.
+for name in ("point_cloud.spz", "cameras.json", "features.safetensors.zst"):
+    _serve(f"/web/example/{name.removesuffix('.zst')}", EXAMPLE / name, BINARY)
 _serve("/web/page.js", WEB / "page.js", "text/javascript", KEPT)
 _serve("/web/page.css", WEB / "page.css", "text/css", KEPT)
 _serve("/web/LICENSES.txt", WEB / "LICENSES.txt", "text/plain; charset=utf-8")
