@@ -358,9 +358,10 @@ def _answer(scene: OpenedLift, asked: Question, similarities: np.ndarray) -> Ans
     meant = asked.candidates
     if asked.unknown_part is not None and selected.any():
         meant = parts_of(scene, things_within(scene, selected))
-        presence = presence.model_copy(
-            update={"why": f"{presence.why} {_without_word(asked.unknown_part, len(meant))}"}
-        )
+        thing = presence.why.replace(
+            repr(query.text[0]), repr(asked.unknown_part.thing)
+        )  # what is there is the thing
+        presence = presence.model_copy(update={"why": f"{thing} {_without_word(asked.unknown_part, len(meant))}"})
     wording = tuple(AskedAs(**word._asdict()) for word in asked.asked_as.values() if word.how)
     return Answer.of(
         query, scores, seen, selected, wording=wording, rivals=rivals,
