@@ -510,9 +510,10 @@ def _table(packs: Sequence[_PackFile], channels: int) -> TableEncoder | None:
 
 def _level_names(packs: Sequence[_PackFile]) -> tuple[str, ...]:
     """The names of levels that all packs have; () where they have none, differ, or are no list of texts."""
-    (said, *more) = {pack.metadata.get("levels", "") for pack in packs}
+    texts = {pack.metadata.get("levels", "") for pack in packs}
+    text = texts.pop() if len(texts) == 1 else ""
     try:
-        names = json.loads(said) if said and not more else []
+        names = json.loads(text) if text else []
     except ValueError:
         return ()
     return tuple(names) if isinstance(names, list) and all(isinstance(name, str) for name in names) else ()
