@@ -120,8 +120,8 @@ class VectorAnswer:
     """the things that they make up, with boxes; None where no splats were given"""
 
     def __repr__(self) -> str:
-        found = f"{int(self.splats.sum())} of {len(self.splats)} splats at or above {self.threshold:.4g}"
-        return f"VectorAnswer({found}, present={self.present}, clear={self.clear})"
+        selection = f"{int(self.splats.sum())} of {len(self.splats)} splats at or above {self.threshold:.4g}"
+        return f"VectorAnswer({selection}, present={self.present}, clear={self.clear})"
 
 
 def ask(scene: OpenedLift, query: Query | str, encoder: TextEncoder | None = None) -> Answer:
@@ -443,9 +443,9 @@ def _selected(
     if standing.lowest > found.value:
         again = find_threshold(known, "auto", alone, standing.lowest, counted)
         value = max(again.value, standing.lowest)
-        told = f"Below {standing.lowest:.4g} other words are nearer. {again.explanation}"
+        explanation = f"Below {standing.lowest:.4g} other words are nearer. {again.explanation}"
         found = again.model_copy(
-            update={"value": value, "explanation": told, "clear": again.clear and again.value == value}
+            update={"value": value, "explanation": explanation, "clear": again.clear and again.value == value}
         )
         selected = scene.seen & (scores >= np.float32(value))
     found = found.model_copy(update={"clear": found.clear and standing.first >= LEAST_FIRST})
@@ -454,11 +454,11 @@ def _selected(
     parts = part_nodes(scene, rivals[0])
     if parts:
         selected = scene.seen & np.logical_or.reduce([scene.members(node) for node in parts])
-        told = f"levels say different things, so the parts that it names are taken: {', '.join(map(str, parts))}"
+        addition = f"levels say different things, so the parts that it names are taken: {', '.join(map(str, parts))}"
     else:
-        selected, told = with_things(scene, selected, weights, rivals[0])
-    if told:
-        found = found.model_copy(update={"explanation": f"{found.explanation.removesuffix('.')}; {told}."})
+        selected, addition = with_things(scene, selected, weights, rivals[0])
+    if addition:
+        found = found.model_copy(update={"explanation": f"{found.explanation.removesuffix('.')}; {addition}."})
     return found, selected
 
 
@@ -481,13 +481,13 @@ def _presence(scene: OpenedLift, asked: Question, similarities: np.ndarray) -> t
     if isinstance(asked.references, str):
         return Presence(present=None, presence=None, why=asked.references), kept
     names = [repr(term) if isinstance(term, str) else str(term) for term in asked.query.positives]
-    told = [judge(scene, names[k], asked.rows[k], similarities[:, k], asked.references) for k in words]
-    here = together(told)
-    if here.present is False and len(words) < positives:  # examples are not questioned
-        here = here.model_copy(update={"present": None})
-    if here.present is not False and asked.query.absent == "drop":
-        kept[[k for k, one in zip(words, told, strict=True) if one.present is False]] = False
-    return here, kept
+    presences = [judge(scene, names[k], asked.rows[k], similarities[:, k], asked.references) for k in words]
+    presence = together(presences)
+    if presence.present is False and len(words) < positives:  # examples are not questioned
+        presence = presence.model_copy(update={"present": None})
+    if presence.present is not False and asked.query.absent == "drop":
+        kept[[k for k, word in zip(words, presences, strict=True) if word.present is False]] = False
+    return presence, kept
 
 
 def _statistics(scores: np.ndarray) -> dict[str, float]:
