@@ -1,11 +1,22 @@
-"""The docs site (`make docs`): the Markdown pages here, and a reference from docstrings of the public modules."""
+"""The docs site (`make docs`): the Markdown pages here, and a reference from docstrings of the public modules.
 
+Tables that repeat what code says are in no page: a comment of a page, such as ``<!-- settings -->``, stands where the
+site has one of `TABLES`.
+"""
+
+import json
+import pkgutil
 import re
 import tomllib
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from fastapi.routing import APIRoute
+
 import liftcore
+import service.routes
+from liftcore.values.settings import Preset
 
 ROOT = Path(__file__).parents[1]
 
@@ -28,6 +39,7 @@ suppress_warnings = ["ref.python"]  # a value that several public modules offer 
 
 
 NAMES = "(all names of liftcore)"  # in reference.rst: autodoc does not see what is loaded at first use
+PUBLIC_MODULES = ("cli", "errors", "evaluate", "files", "models", "testing", "text", "text.table")
 
 
 def list_names() -> str:
@@ -36,10 +48,97 @@ def list_names() -> str:
     return "\n".join(f".. auto{kind}:: liftcore.{name}\n" for name, kind in kinds.items())
 
 
-def prepare_page(app: Any, page: str, source: list[str]) -> None:
-    """Fill in the names, and name files of the checkout that are no pages without a link: there is none here."""
-    text = source[0].replace(NAMES, list_names()) if page == "reference" else source[0]
-    source[0] = re.sub(r"\[([^\]]*)\]\(\.\./[^)]*\)", r"\1", text)
+def table(*rows: tuple[str, ...]) -> str:
+    """Return a Markdown table, whose first row is its head."""
+    cells = ([cell.replace("|", "\\|") for cell in row] for row in rows)
+    head, *body = (f"| {' | '.join(row)} |" for row in cells)
+    return "\n".join([head, "|---" * len(rows[0]) + "|", *body])
+
+
+def table_of_settings() -> str:
+    """Return each setting of a lift with its default, those of presets that have another, and its meaning."""
+    settings_of = liftcore.LiftSettings.of
+    defaults = settings_of().model_dump(mode="json")
+    presets = {preset.value: settings_of(preset=preset).model_dump(mode="json") for preset in Preset}
+
+    def default_of(name: str) -> str:
+        exceptions = {preset: values[name] for preset, values in presets.items() if values[name] != defaults[name]}
+        if name == "preset" or not exceptions:
+            return f"`{code(defaults[name])}`"
+        if len(exceptions) == len(presets) - 1 and len({*exceptions.values()}) == 1:
+            return f"`{code(defaults[name])}` (the other presets: `{code(next(iter(exceptions.values())))}`)"
+        others = (f"`{preset}`: `{code(value)}`" for preset, value in exceptions.items())
+        return f"`{code(defaults[name])}` ({', '.join(others)})"
+
+    fields = liftcore.LiftSettings.model_fields
+    return table(
+        ("setting", "default", "meaning"),
+        *((f"`{name}`", default_of(name), field.description or "") for name, field in fields.items()),
+    )
+
+
+def table_of_question() -> str:
+    """Return each field of `Query` with its default and its meaning."""
+    fields = liftcore.Query.model_fields
+    rows = (
+        (f"`{name}`", "none" if field.default in (None, []) else f"`{field.default}`", field.description or "")
+        for name, field in fields.items()
+    )
+    return table(("field of `Query`", "default", "meaning"), *rows)
+
+
+def table_of_names() -> str:
+    """Return the names of each public module beside `liftcore`."""
+    names = {f"liftcore.{module}": import_module(f"liftcore.{module}").__all__ for module in PUBLIC_MODULES}
+    rows = ((f"`{module}`", ", ".join(f"`{name}`" for name in sorted(public))) for module, public in names.items())
+    return table(("module", "names"), *rows)
+
+
+def table_of_routes() -> str:
+    """Return each route of the service with the first sentences of its docstring."""
+    modules = [
+        import_module(f"service.routes.{module.name}") for module in pkgutil.iter_modules(service.routes.__path__)
+    ]
+    routers = {id(router): router for module in modules if (router := getattr(module, "router", None))}
+    rows = {
+        (route.path, method): (
+            f"`{method} {route.path}`",
+            " ".join((route.description or "").split("\n\n")[0].split()),
+        )
+        for router in routers.values()
+        for route in router.routes
+        if isinstance(route, APIRoute) and route.description and not route.path.startswith(("/openapi", "/docs"))
+        for method in route.methods or ()
+    }
+    return table(("route", "answer"), *(rows[key] for key in sorted(rows)))
+
+
+def code(value: Any) -> str:
+    """Return a value as people type it after `--set NAME=`."""
+    return json.dumps(value).strip('"')
+
+
+TABLES = {
+    "settings": table_of_settings,
+    "fields of a question": table_of_question,
+    "public names": table_of_names,
+    "routes": table_of_routes,
+}
+
+
+def fill_page(text: str) -> str:
+    """Return a page with its tables, and names of files of the checkout in place of links to them."""
+    text = re.sub(
+        r"<!-- ([a-z ]+) -->",
+        lambda comment: TABLES[comment[1]](),
+        text.replace(NAMES, list_names() if NAMES in text else ""),
+    )
+    return re.sub(r"\[([^\]]*)\]\(\.\./[^)]*\)", r"\1", text)
+
+
+def prepare_page(_app: Any, _page: str, source: list[str]) -> None:
+    """Fill the source of a page in place."""
+    source[0] = fill_page(source[0])
 
 
 def setup(app: Any) -> None:

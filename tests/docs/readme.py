@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import re
+import runpy
 from pathlib import Path
-
-from pydantic import BaseModel
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = ("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md")
@@ -40,18 +39,9 @@ def shell_commands(name: str) -> list[str]:
     return [match[1].strip() for match in found if match]
 
 
-def field_table(model: type[BaseModel]) -> str:
-    """The rows of a table of a model's fields, as a document has them: name, default, meaning."""
-    rows = (
-        f"| `{name}` | {'none' if field.default in (None, []) else f'`{field.default}`'} | {field.description} |"
-        for name, field in model.model_fields.items()
-    )
-    return "\n".join(rows) + "\n"
-
-
-def without_links(line: str) -> str:
-    """A line whose links are their text, but for those in brackets, which are gone: ``([figures](results.md))``."""
-    return re.sub(r"\[([^\]]+)\]\([^)]*\)", r"\1", re.sub(r" \(\[[^\]]+\]\([^)]*\)\)", "", line))
+def site_text(name: str) -> str:
+    """Return a page of docs/ as the docs site has it: with the tables that `make docs` makes of code."""
+    return runpy.run_path(str(ROOT / "docs" / "conf.py"))["fill_page"](text(name))
 
 
 def table_heads(name: str) -> list[str]:

@@ -28,12 +28,11 @@ from .readme import (
     SERVICE,
     SETTINGS,
     blocks,
-    field_table,
     inline_code,
     shell_commands,
+    site_text,
     table_heads,
     text,
-    without_links,
 )
 
 
@@ -133,20 +132,19 @@ def test_every_command_is_told_and_every_option_has_help() -> None:
         assert not [action.dest for action in _actions(parser) if action.option_strings and not action.help], name
 
 
-def test_every_setting_of_a_lift_is_told_with_its_default() -> None:
-    section = text(SETTINGS).partition("## All settings")[2].partition("\n## ")[0]
-    rows = dict(re.findall(r"^\| `([a-z_]+)` \| (.*?) \|", section, flags=re.MULTILINE))
-    meanings = {
-        name: without_links(meaning).replace(r"\|", "|")
-        for name, meaning in re.findall(r"^\| `([a-z_]+)` \| .*? \| (.*) \|$", section, flags=re.MULTILINE)
+def test_every_setting_of_a_lift_is_in_the_sites_table_with_its_default() -> None:
+    section = site_text(SETTINGS).partition("## All settings")[2].partition("\n## ")[0]
+    rows = {
+        name: cells for name, *cells in re.findall(r"^\| `([a-z_]+)` \| (.*?) \| (.*) \|$", section, re.MULTILINE)
     }
     for name, default in LiftSettings.of().model_dump(mode="json").items():
-        shown = rows[name].split(" (")[0].strip("`")
-        assert shown in (str(default), json.dumps(default)) or float(shown) == default, name
-        assert meanings[name] == LiftSettings.model_fields[name].description, name
+        default_cell, meaning = rows[name]
+        assert default_cell.split(" (")[0].strip("`") in (str(default), json.dumps(default)), name
+        assert meaning.replace(r"\|", "|") == LiftSettings.model_fields[name].description, name
+    assert rows["k"][0] == "`40` (`argmax`: `1`)" and rows["robust_steps"][0] == "`1` (the other presets: `0`)"
 
 
-def test_help_of_a_lift_lists_every_setting_in_a_group(
+def test_help_of_a_lift_lists_every_setting_with_its_default_and_meaning_in_a_group(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
@@ -157,10 +155,16 @@ def test_help_of_a_lift_lists_every_setting_in_a_group(
     lines = capsys.readouterr().out.partition("settings of a lift")[2]
     assert re.findall(r"^    ([a-z_]+)=", lines, flags=re.MULTILINE) == names
     assert max(map(len, lines.splitlines())) <= 80
+    for name, default in LiftSettings.of().model_dump(mode="json").items():
+        meaning = " ".join((LiftSettings.model_fields[name].description or "").replace("`", "").split())
+        assert f"{name}={json.dumps(default).strip(chr(34))}: {meaning}" in " ".join(lines.split()), name
 
 
-def test_every_field_of_a_question_is_in_the_table() -> None:
-    assert field_table(Query) in text(PYTHON), f"the table of docs/python.md should be:\n{field_table(Query)}"
+def test_every_field_of_a_question_is_in_the_sites_table_with_its_default() -> None:
+    rows = dict(re.findall(r"^\| `([a-z_]+)` \| (.*) \|$", site_text(PYTHON), flags=re.MULTILINE))
+    for name, field in Query.model_fields.items():
+        default = "none" if field.default in (None, []) else f"`{field.default}`"
+        assert field.description and rows[name] == f"{default} | {field.description}", name
 
 
 def test_every_preset_is_told() -> None:

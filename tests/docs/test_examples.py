@@ -40,7 +40,7 @@ from service.routes import assets, jobs, lifts, operations, queries, selections
 from tests.api.tiny_scene import HEIGHT, WIDTH, WORDS, cameras_document, codebook, colmap_zip, labels, make_scene
 from tests.run_lengths import sam_records
 
-from .readme import FOR_USERS, GUIDE, PYTHON, ROOT, SERVICE, SETTINGS, blocks, text
+from .readme import FOR_USERS, GUIDE, PYTHON, ROOT, SERVICE, SETTINGS, blocks, site_text, text
 
 ROUTES: tuple[ModuleType, ...] = (operations, assets, jobs, lifts, queries, selections)
 SHAPES: dict[str, type[BaseModel]] = {  # a field that no other answer has -> the answer
@@ -245,9 +245,9 @@ def test_json_examples_show_fields_that_the_service_sends() -> None:
     assert seen == set(SHAPES.values())
 
 
-def test_every_route_is_told_and_no_other() -> None:
-    rows = [line.split(" | ")[0] for line in text(SERVICE).splitlines() if line.startswith("| `")]
-    named = {match for row in rows for match in re.findall(r"`([A-Z]+ /[^`]*)`", row)}
+def test_every_route_is_in_the_sites_table_and_no_other() -> None:
+    rows = site_text(SERVICE).partition("| route | answer")[2]
+    named = set(re.findall(r"^\| `([A-Z]+ /[^`]*)` \| .", rows, flags=re.MULTILINE))
     real = set()
     for module in ROUTES:
         for route in module.router.routes:
@@ -255,6 +255,9 @@ def test_every_route_is_told_and_no_other() -> None:
             real |= {f"{method} {route.path}" for method in route.methods or ()}
     in_a_sentence = {f"GET {path}" for path in OPEN if path.startswith(("/openapi", "/docs", "/web"))}
     assert named == real - in_a_sentence
+    overview = text(SERVICE).partition("## Routes")[2].partition("\n## ")[0]
+    families = {f"/{route.split('/')[1]}" for route in named} - {"/"}
+    assert families <= set(re.findall(r"`(/[a-z]+)`", overview))
 
 
 # Scenes of nerfstudio and gsplat

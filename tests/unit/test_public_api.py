@@ -21,6 +21,7 @@ import torch
 import liftcore as lc
 from liftcore import models
 from liftcore.lifting.files import lift_files
+from tests.docs.readme import site_text
 from tests.scenes import observed, random_splats, write_scene
 
 ROOT = Path(__file__).parents[2]
@@ -49,7 +50,7 @@ def public_names() -> dict[str, list[str]]:
 
 
 def test_public_names_are_few_load_and_are_in_the_documents():
-    found, page = public_names(), (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+    found, page = public_names(), site_text("docs/python.md")
     assert len(found["liftcore"]) <= MOST_NAMES and len({*chain(*found.values())}) <= MOST_OF_ALL
     for module, names in found.items():
         assert len(names) == len(set(names))
