@@ -12,6 +12,7 @@ codebook, of the size of M.
 """
 
 from collections.abc import Iterator
+from math import prod
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from liftcore.io.safetensors_file import map_tensors, write_tensors
 from liftcore.runtime.jit import kernel
 from liftcore.solve.clusters import EXACT_CHANNELS, principal_axes
 from liftcore.solve.codebook import LEAST_CHANNELS, TABLE_BYTES, Codebook
-from liftcore.solve.shared_rows import new_table
+from liftcore.solve.shared_rows import flat_table, new_table
 from liftcore.solve.sums import PieceSums, added, piece_sums
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import DIRECTIONS
@@ -81,7 +82,7 @@ class RegionDirections:
     def save(self, folder: Path) -> None:
         """Write them for `StoredDirections`: a file a table, of which each is made once."""
         for number, columns in enumerate(self.slices()):
-            write_tensors(folder / _table_file(number), {"e": self.table(columns)}, {})
+            write_tensors(folder / _table_file(number), {"e": torch.from_numpy(flat_table(self.table(columns)))}, {})
         axes = {} if self._axes is None else {"axes": self._axes}
         write_tensors(folder / FILE, {"mean": self.mean, "totals": self.totals, **axes}, {})
 
@@ -152,7 +153,9 @@ class StoredDirections(RegionDirections):
     def table(self, columns: slice) -> Tensor:
         """See `RegionDirections`; the columns are one of the slices."""
         number = [own.start for own in self.slices()].index(columns.start)
-        return torch.from_numpy(map_tensors(self._folder / _table_file(number))[0]["e"])
+        flat = torch.from_numpy(map_tensors(self._folder / _table_file(number))[0]["e"])  # as `flat_table` has it
+        shape = self.totals.shape[0], columns.stop - columns.start
+        return flat[: prod(shape)].view(shape)
 
 
 def _table_file(number: int) -> str:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import unicodedata
 from contextlib import suppress
 from pathlib import Path
@@ -40,6 +41,7 @@ TENSORS = ("features", "evidence", "agreement", "seen")
 CONFIDENCE = "confidence"  # in lifts that were reweighted
 NEAR = 3  # folders of an input's path, and above a lift, among which it is looked for
 MOST_BESIDE = 16  # files of one kind beside a lift, that are read to know one of them
+DIGEST = re.compile("[0-9a-f]{64}")  # SHA-256, as `sha256_of` has it
 CLUSTER_TENSORS = ("cluster", "cluster_features")  # in lifts with aggregation only
 OBJECT_TENSORS = ("object", "object_views")  # in lifts that looked for objects
 NODE_TENSORS = ("node", "node_parents", "node_views", "node_confidence", "node_features")  # beside objects
@@ -292,7 +294,8 @@ def _beside(lift: Path, path: Path) -> Iterator[Path]:
 
 def _in_store(lift: Path, sha256: str) -> Iterator[Path]:
     """The places of an input beside ``lifts/ID.safetensors`` of a service: ``blobs/ab/abcd....ply``."""
-    yield from Path(os.path.abspath(lift)).parents[1].glob(f"blobs/{sha256[:2]}/{sha256}.*")
+    if DIGEST.fullmatch(sha256):  # what another lift remembers may be no digest but a pattern
+        yield from Path(os.path.abspath(lift)).parent.parent.glob(f"blobs/{sha256[:2]}/{sha256}.*")
 
 
 def has_poses(place: Path, metadata: LiftMetadata) -> bool:

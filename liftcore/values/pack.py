@@ -509,14 +509,16 @@ def _table(packs: Sequence[_PackFile], channels: int) -> TableEncoder | None:
 
 
 def _level_names(packs: Sequence[_PackFile]) -> tuple[str, ...]:
-    """The names of levels that all packs have; () where they have none, differ, or are no list of texts."""
+    """The names of levels that all packs have; () where they have none, differ, or are no list of texts in print."""
     texts = {pack.metadata.get("levels", "") for pack in packs}
     text = texts.pop() if len(texts) == 1 else ""
     try:
         names = json.loads(text) if text else []
-    except ValueError:
+    except (ValueError, RecursionError):
         return ()
-    return tuple(names) if isinstance(names, list) and all(isinstance(name, str) for name in names) else ()
+    # Control characters move a terminal, and no UTF-8 carries half of a surrogate pair.
+    are_texts = isinstance(names, list) and all(isinstance(name, str) and name.isprintable() for name in names)
+    return tuple(names) if are_texts else ()
 
 
 def _agreed(packs: Sequence[_PackFile], key: str) -> str:

@@ -202,6 +202,22 @@ def test_all_types_of_labels_and_floats_mean_the_same(tmp_path: Path) -> None:
         assert view.codebook.dtype == torch.float32 and torch.equal(view.codebook, CODEBOOK)
 
 
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ('["whole", "Türgriff"]', ("whole", "Türgriff")),
+        ("4", ()),
+        ('["whole", 2]', ()),
+        ("[" * 100_000, ()),
+        (r'["\ud800"]', ()),
+        (r'["\u001b[2J"]', ()),
+    ],
+    ids=["texts", "a number", "one is none", "too deep", "half of a pair", "a terminal's command"],
+)
+def test_names_of_levels_are_texts_that_print_or_none(text: str, names: tuple[str, ...], tmp_path: Path) -> None:
+    assert read_features(saved(tmp_path / "p", regions(0), levels=text)).level_names == names
+
+
 def test_several_packs_make_one_set_of_views(tmp_path: Path) -> None:
     one = saved(tmp_path / "one", regions(0), encoder="clip")
     other = saved(tmp_path / "other", {"B/grid": torch.ones(1, 1, 3)})

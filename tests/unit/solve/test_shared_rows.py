@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from liftcore.solve.directions import RegionDirections, StoredDirections
 from liftcore.solve.shared_rows import LONG, compare_rows, flat_table, new_table, sum_rows
+from tests.unit.solve.sparse_views import codebook_of
 
 VIEWS, REGIONS = 5, 3 * LONG
 VIEW = np.sort(np.arange(REGIONS) % VIEWS)
@@ -93,3 +95,12 @@ def test_a_table_is_followed_by_zeros_whoever_made_it():
         assert np.array_equal(flat[: table.numel()], table.reshape(-1), equal_nan=True)
         assert flat.size > table.numel()
         assert not flat[table.numel() :].any()
+
+
+def test_stored_directions_are_those_that_were_made_and_are_compared_where_they_lie(tmp_path):
+    books = [torch.randn(3, 5, generator=torch.manual_seed(view)) for view in range(3)]
+    directions = RegionDirections(codebook_of(books), torch.ones(9, dtype=torch.float64), 9)
+    directions.save(tmp_path)
+    columns, table = slice(0, 5), StoredDirections(tmp_path).table(slice(0, 5))
+    assert torch.equal(table, directions.table(columns))
+    assert np.shares_memory(flat_table(table), table.numpy())

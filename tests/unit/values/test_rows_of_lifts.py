@@ -9,6 +9,8 @@ import pytest
 import torch
 
 import liftcore as lc
+from liftcore.values.lift import InputFile
+from liftcore.values.lift_file import found_input, input_file
 from tests.scenes import random_camera, random_splats, write_scene
 
 MOVE = {"scale": 2.0, "rotation": np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), "translation": [1.0, 2.0, 3.0]}
@@ -107,3 +109,21 @@ def test_lift_of_files_knows_its_splats_in_memory(tmp_path: Path) -> None:
         again.query(np.eye(1, 6), splats=loaded[::-1])
     with pytest.raises(lc.InvalidSplats, match=r"got 49 splats; crop a lift as its splats"):
         again.query(np.eye(1, 6), splats=loaded[1:])
+
+
+@pytest.mark.parametrize("digest", ["0" * 64, "", "**x", "../../etc/*"])
+@pytest.mark.parametrize("lift", ["/x.safetensors", "/lifts/x.safetensors"])
+def test_an_input_that_is_nowhere_is_not_found_wherever_the_lift_lies(lift: str, digest: str, scene) -> None:
+    absent = InputFile(path="/nowhere/splats.none", sha256=digest)
+    assert found_input("splats", absent, scene[2].metadata, Path(lift)) is None
+
+
+def test_an_input_of_a_store_is_found_by_its_digest(scene, tmp_path: Path) -> None:
+    blob = tmp_path / "blobs" / "x.ply"
+    blob.parent.mkdir()
+    blob.write_bytes(b"splats")
+    digest = input_file(blob).sha256
+    (blob.parent / digest[:2]).mkdir()
+    stored = blob.rename(blob.parent / digest[:2] / f"{digest}.ply")
+    absent = InputFile(path="/nowhere/splats.ply", sha256=digest)
+    assert found_input("splats", absent, scene[2].metadata, tmp_path / "lifts" / "x.safetensors") == stored
