@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,27 @@ NAMES = {
     **{name: f"--{name}" for name in ("device", "encoder", "names", "photos", "unlabelled")},
 }  # of arguments
 LARGEST_GREY = 65_535  # of a picture of 16 bits
+MASK_LAYOUTS = """\
+layouts of FOLDER: vectors IMG.npy [M, F] of each image, unless --encoder makes
+them, with one of
+  IMG.json              SAM's generator with output_mode uncompressed_rle or
+                        coco_rle, SA-1B's files, or polygons
+  IMG_masks.npy (.npz)  booleans [M, H, W] or [M, 1, H, W], or ids [H, W] or
+                        [L, H, W] with -1 for none
+  IMG.png               a label picture of 8 or 16 bits or a palette: value v has
+                        row v - 1, and 0 means none; with --unlabelled 255 (or
+                        another value) that one means none, and v has row v
+
+Masks may overlap: the largest come first, each on the first level with its
+pixels free; more than 32 levels are refused. Hidden files, Thumbs.db and the
+like are left out.
+"""
+ARRAY_LAYOUTS = """\
+layouts of FOLDER: maps IMG.npy or IMG.jpg.npy, also .npz of one array and .pt of
+one tensor, read as tensors only, so no code runs. feature-3dgs'
+IMG_fmap_CxHxW.pt has its channels first. Hidden files, Thumbs.db and the like
+are left out.
+"""
 PROMPT_LAYOUTS = """\
 layouts of FOLDER, with sub-folders where views have some:
   PHRASE/VIEW.png       binary pictures, or arrays [h, w] in .npy or .npz; with
@@ -83,7 +105,8 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
     prompts.add_argument("--unlabelled", type=_grey, metavar="VALUE", help=by)
     by = "COCO's images without an annotation are left out (skip), or show none of the phrases (negative)"
     prompts.add_argument("--unannotated", choices=("skip", "negative"), default="skip", help=by)
-    prompts.appendix = lambda: PROMPT_LAYOUTS
+    for command, layouts in ((arrays, ARRAY_LAYOUTS), (masks, MASK_LAYOUTS), (prompts, PROMPT_LAYOUTS)):
+        command.appendix = partial(str, layouts)
     retag = formats.add_parser("retag", parents=[shared], help="a pack under other names of its encoder or space")
     space = (
         "the text encoder whose words lie in the space of the features, as query's --encoder names it "
