@@ -16,7 +16,7 @@ with:
 - A thing that is mostly selected may be **taken whole**: its other splats got wrong masks. It may hold two things,
   though. So the rest of it must be nearer to the part that is selected than to any other thing, in features; else
   only those splats of the rest are taken that are, one by one. Where less than `MOST` is selected, the whole rest is
-  taken or none, and no other thing's best word may be nearer to it.
+  taken or none, and no other thing's best word may be nearer to it, as words lie and about the scene's mean.
 - Of a thing of which less than `SOME` is selected **none is taken** where that part, too, is nearer to the best word
   of the thing than to the query's: masks say that it is of the thing, and hardly that it is what was asked for. What
   shines through a thing, or was merged with it, has its own word as the nearest and stays.
@@ -169,7 +169,7 @@ def with_things(
             if shares[thing] < MOST:
                 continue
             more = _nearest_to(scene, more, means[known], int(known[:thing].sum()))
-        elif shares[thing] < MOST and (words @ rest).max(initial=-1.0) > (rivals.directions @ rest).max():
+        elif shares[thing] < MOST and _nearer_both_ways(scene, words, rivals.directions, rest):
             continue
         changed[more] = True
         grown += bool(more.size)
@@ -302,6 +302,15 @@ def _other_things(
         if ((word - rivals.directions) @ np.concatenate([pair, pair - scene.rough_mean]).T > 0).all():
             found.append(thing)
     return found
+
+
+def _nearer_both_ways(scene: OpenedLift, words: np.ndarray, directions: np.ndarray, mean: np.ndarray) -> bool:
+    """Tell whether a word of some [m, F] is nearer to a mean [F] than directions [p, F], also about the scene's mean.
+
+    Words lie in a cone: one that is near to all of a scene is nearer to much that it does not mean.
+    """
+    sides = np.stack([mean, mean - scene.rough_mean])
+    return bool(len(words)) and bool(((words @ sides.T) > (directions @ sides.T).max(axis=0)).all(axis=1).any())
 
 
 def _nearest_to(scene: OpenedLift, rows: np.ndarray, means: np.ndarray, thing: int) -> np.ndarray:

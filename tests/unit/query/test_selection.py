@@ -12,7 +12,7 @@ from liftcore.query.ask import answers, ask, question
 from liftcore.query.presence import References
 from liftcore.query.question import Query
 from liftcore.query.scene import Scene
-from liftcore.query.selection import Rivals, part_nodes, parts_of_words
+from liftcore.query.selection import Rivals, part_nodes, parts_of_words, with_things
 from liftcore.query.threshold import METHODS, find_threshold
 from liftcore.text import LVIS_TABLE
 from liftcore.text.table import TableEncoder
@@ -133,6 +133,21 @@ def test_thing_that_is_mostly_selected_is_taken_whole_unless_it_holds_two(scene:
     assert np.flatnonzero(whole.selected).tolist() == list(range(300))
     mixed = ask(lifted(scene, rows, object=two, object_views=views), "cat", table)
     assert not mixed.selected[300:].any()
+
+
+def test_word_near_to_all_of_a_scene_keeps_no_rest_from_its_thing(scene: Scene, table: TableEncoder) -> None:
+    rows = pictures(table, ["cat"] * 300 + ["boat"] * 200 + ["pizza"] * 200, 0.1)
+    rows[130:300] *= 0.8
+    boat, cat = table.encode(["boat", "cat"])
+    bias = 0.12 * (boat - cat)  # of all splats alike: the rest of the cat is nearer to the boat's word as it lies
+    numbers = torch.from_numpy(np.repeat([0, 1, 2], [300, 200, 200]).astype(np.int32))
+    views, cats = torch.zeros((3, 5), dtype=torch.int32), np.arange(700) < 130
+    rivals = Rivals.among(References(tuple(table.words), table.embeddings), cat[None])
+    subject = lifted(scene, rows + bias, object=numbers, object_views=views)
+    remainder = subject.mean_of(np.arange(130, 300))
+    assert remainder @ boat > remainder @ cat
+    answer, _ = with_things(subject, cats, np.ones(700, np.float32), rivals)
+    assert np.array_equal(answer, np.arange(700) < 300)
 
 
 def test_of_a_thing_with_another_nearer_word_nothing_is_selected(scene: Scene, table: TableEncoder) -> None:
