@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 import pytest
@@ -11,6 +12,7 @@ import torch
 from liftcore.raster.base import ViewRequest
 from liftcore.raster.cpu.raster import side_by_side, views_at_a_time
 from liftcore.scene.compositing import CompositingParams, Weighting
+from liftcore.values.views import DENSE_ROWS, FeatureGrid
 from tests.scenes import random_camera, random_regions
 
 if TYPE_CHECKING:
@@ -65,6 +67,15 @@ def test_views_come_in_their_order_whichever_ends_first() -> None:
     assert [walked.weights for walked in side_by_side(beside(raster, 3), looks(*names))] == names
     assert raster.forgotten  # no view is kept
     assert [views_at_a_time(threads) for threads in (1, 2, 64)] == [1, 2, 4]
+
+
+def test_of_dense_maps_one_is_in_work_wherever_they_come_among_the_views() -> None:
+    raster = Staged({"d0": "v1 begun"})  # d1 waits for d0 meanwhile, and v1 for neither
+    dense = FeatureGrid(torch.zeros(1, DENSE_ROWS + 1, 1))
+    requests = [replace(request, observation=dense) for request in looks("d0", "d1")]
+    answers = side_by_side(beside(raster, 3), [*requests, *looks("v1")])
+    assert [answer.weights for answer in answers] == ["d0", "d1", "v1"]
+    assert raster.happened.index("d0 ended") < raster.happened.index("d1 begun")
 
 
 def test_an_error_comes_in_the_place_of_its_view() -> None:

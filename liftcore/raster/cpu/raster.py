@@ -10,9 +10,11 @@ import copy
 import math
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from functools import partial
 from itertools import chain, islice, pairwise
 from queue import SimpleQueue
+from threading import Lock
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -130,8 +132,7 @@ class CpuRaster:
         if not first:
             return
         self._activated(first[0].params.opacity_logit_scale)  # once for all: the views of a lift have one
-        dense = any(len(request.observation.codebook) > DENSE_ROWS for request in first)
-        together = 1 if dense else len(first)
+        together = 1 if any(map(_is_dense, first)) else len(first)
         rasters = [self._beside(end - begin) for begin, end in _shares(self.threads, together)]
         try:
             yield from side_by_side(rasters, chain(first, requests))
@@ -313,19 +314,20 @@ def side_by_side(rasters: Sequence[Raster], requests: Iterable[ViewRequest]) -> 
 
     The next request is taken, and its view read, while the others are in work. Results come in the order of the
     requests; what they are does not depend on which raster worked where. When the iterator is closed, the views in
-    work are awaited.
+    work are awaited. Of dense maps one is in work, beside others that are not.
     """
     if len(rasters) == 1:
         yield from one_by_one(rasters[0], requests)
         return
-    free: SimpleQueue[Raster] = SimpleQueue()
+    free, lock = SimpleQueue[Raster](), Lock()
     for raster in rasters:
         free.put(raster)
 
     def work(request: ViewRequest) -> ViewWeights:
         raster = free.get()
         try:
-            return _weights_of(raster, request)
+            with lock if _is_dense(request) else nullcontext():
+                return _weights_of(raster, request)
         finally:
             free.put(raster)
 
@@ -342,6 +344,10 @@ def side_by_side(rasters: Sequence[Raster], requests: Iterable[ViewRequest]) -> 
         pool.shutdown(cancel_futures=True)
         for raster in rasters:
             raster.forget()
+
+
+def _is_dense(request: ViewRequest) -> bool:
+    return len(request.observation.codebook) > DENSE_ROWS
 
 
 def _weights_of(raster: Raster, request: ViewRequest) -> ViewWeights:
