@@ -73,8 +73,12 @@ class Steps(Protocol[Weights]):
         """W with the consensus of masks, for `reweight`."""
         ...
 
-    def reweight(self, W: Weights) -> tuple[Weights, float | None]:
-        """W after the robust steps, and the median reliability of regions; None where it is not asked for."""
+    def reweight(self, W: Weights, levels_apart: bool) -> tuple[Weights, float | None]:
+        """W after the robust steps, and the median reliability of regions; None where it is not asked for.
+
+        Args:
+            levels_apart: whether regions are compared with those of their own level alone.
+        """
         ...
 
     def discount_distance(self, W: Weights) -> Weights:

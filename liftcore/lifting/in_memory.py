@@ -141,13 +141,13 @@ class InMemory(Steps[SceneWeights]):
         shares = mask_consensus(W.on_processor, levels, self.threads, means=means, members=W.members)
         return replace(W, consensus=torch.from_numpy(shares))
 
-    def reweight(self, W: SceneWeights) -> tuple[SceneWeights, float | None]:
+    def reweight(self, W: SceneWeights, levels_apart: bool) -> tuple[SceneWeights, float | None]:
         def apply_agreement(weights: RegionWeights, on_card: bool) -> tuple[SceneWeights, float | None]:
             agreement = agreement_factors(
                 weights, W.geometry.codebook, self.settings.robust_steps, self.timings.progress,
                 principal=self.settings.robust_directions, means=self.splats.means, threads=self.threads,
                 reliability=whole_regions(self.settings.reliability, W.geometry.levels), consensus=W.consensus,
-                levels=W.geometry.levels, on_card=on_card,
+                levels=W.geometry.levels if levels_apart else None, on_card=on_card,
             )  # fmt: skip
             result = replace(W.with_factors(weights, agreement.factors), consensus=None, agreement=agreement)
             return result, agreement.reliability

@@ -125,12 +125,10 @@ def _run(
     settings, views = inputs.settings, inputs.views
     with timings.stage("geometry"):
         W, weighed = steps.weigh(views, plan, on_plan)
-    objects = said = aggregation = None
-    if settings.finds_objects(weighed.masks):
-        with timings.stage("objects"):
-            objects = steps.find_objects(W)
-            said = steps.node_vectors(W, objects) if settings.objects else None
-    W, reliability = reweigh(steps, W, weighed.masks, settings, timings)
+    aggregation = None
+    objects, node_vectors = find_objects(steps, W, weighed.masks, settings, timings)
+    levels_apart = node_vectors is not None and node_vectors.levels_disagree
+    W, reliability = reweigh(steps, W, weighed.masks, levels_apart, settings, timings)
     clusters = objects if settings.clusters_by_masks else None
     with timings.stage("solve"):
         X, support = steps.solve(W, clusters)
@@ -147,9 +145,9 @@ def _run(
             X, aggregation = steps.aggregate(W, X, clusters)
         facts["aggregation"] = aggregation.facts
     if settings.robust_steps:
-        facts["reweighting"] = agreement_facts(weighed.levels, reliability, support.confidence)
-    if objects and said:
-        facts["objects"] = object_facts(objects, said)
+        facts["reweighting"] = agreement_facts(weighed.levels, reliability, support.confidence, levels_apart)
+    if objects and node_vectors and settings.objects:
+        facts["objects"] = object_facts(objects, node_vectors)
     with timings.step("certify"):
         measures = steps.measure(W, X)
         diagnostics = diagnose(inputs, weighed, X.dtype, support, measures, facts)
@@ -164,7 +162,7 @@ def _run(
         cluster=aggregation.clusters if aggregation else None,
         cluster_features=aggregation.cluster_features if aggregation else None,
         embeddings=torch.from_numpy(table.embeddings) if table else None,
-        **(object_tensors(objects, said) if objects and said else {}),
+        **(object_tensors(objects, node_vectors) if objects and node_vectors and settings.objects else {}),
     )
     return steps.deliver(W, lift)
 
@@ -177,8 +175,23 @@ def object_tensors(objects: RegionObjects, said: NodeVectors) -> dict[str, torch
     return {name: torch.from_numpy(column) for name, column in columns.items()}
 
 
-def reweigh(
+def find_objects(
     steps: Steps[Weights], W: Weights, masks: bool, settings: LiftSettings, timings: Timings
+) -> tuple[RegionObjects | None, NodeVectors | None]:
+    """Objects and what the masks of their nodes say, where the settings ask for objects; else None.
+
+    Args:
+        masks: whether any view has masks.
+    """
+    if not settings.finds_objects(masks):
+        return None, None
+    with timings.stage("objects"):
+        objects = steps.find_objects(W)
+        return objects, steps.node_vectors(W, objects)
+
+
+def reweigh(
+    steps: Steps[Weights], W: Weights, masks: bool, levels_apart: bool, settings: LiftSettings, timings: Timings
 ) -> tuple[Weights, float | None]:
     """W as it is solved, and the median reliability of regions, where that is asked for.
 
@@ -186,6 +199,7 @@ def reweigh(
 
     Args:
         masks: whether any view has masks.
+        levels_apart: whether regions are compared with those of their own level alone.
 
     Raises:
         InvalidSettings: consensus is asked for, and no view has masks.
@@ -196,7 +210,7 @@ def reweigh(
             W = steps.compare_masks(W)
     if settings.robust_steps:
         with timings.stage("robust"):
-            W, reliability = steps.reweight(W)
+            W, reliability = steps.reweight(W, levels_apart)
     if settings.loss == "huber":
         with timings.stage("loss"):
             W = steps.discount_distance(W)

@@ -351,10 +351,15 @@ def numbered(labels: np.ndarray, tree: RegionTree, numbers: NodeNumbers, shown: 
 
 @dataclass(frozen=True)
 class NodeVectors:
-    """What the masks of nodes say."""
+    """Vectors of the masks of nodes."""
 
     vectors: np.ndarray  # [N, F] f32, the unit mean of the unit vectors of a node's own regions; zeros for none
     level_agreement: float | None  # cosine of parts and their wholes, about the scene's mean; None without parts
+
+    @property
+    def levels_disagree(self) -> bool:
+        """True where masks of things and of their parts say different things."""
+        return self.level_agreement is not None and self.level_agreement < SAY_THE_SAME
 
     @classmethod
     def of(cls, codebook: Codebook, totals: np.ndarray, found: RegionObjects) -> "NodeVectors":
@@ -410,7 +415,7 @@ def object_facts(found: RegionObjects, said: NodeVectors) -> dict[str, Any]:
         largest = int(held.argmax())
         rest = "objects are its parts" if largest >= found.count else "no part of it was found: take finer masks"
         told.append(f"masks hold {facts['largest_share']:.0%} of the splats together as one thing; {rest}")
-    if said.level_agreement is not None and said.level_agreement < SAY_THE_SAME:
+    if said.levels_disagree:
         told.append(
             f"masks of things and of their parts say different things (their vectors' cosine is "
             f"{said.level_agreement:.2f}), and a splat's feature is the sum of both: ask nodes of the tree, which "

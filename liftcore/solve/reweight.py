@@ -20,10 +20,11 @@ before, and starts from the first W again. Nothing is tuned; each part has its r
   weights in proportion to the signal give the least noise. There is no bandwidth; a region merged of two things
   keeps part of its weight, and one that points away from the others loses it.
 
-**Each level by itself.** A whole and its part may have a vector each, and both are right: their sum is neither, and
-things that say the same on two levels would outvote those that do not at every border. So p, c, r, s and all sums are
-taken among the regions of one level, and each level keeps its weight at each splat. Levels that say the same lose
-nothing by it that docs/results.md can show. Cells of grids are a level.
+**Each level by itself where levels disagree.** A whole and its part may have a vector each, and both are right:
+their sum is neither, and things that say the same on two levels would outvote those that do not at every border.
+Where masks of parts and wholes say different things (`NodeVectors.levels_disagree`), p, c, r, s and all sums are
+taken among the regions of one level, and each level keeps its weight at each splat. Cells of grids are a level. Levels
+that say the same are judged together: each is a witness more, which counts where views are few.
 
 A splat of one view does not change. A region without direction (a zero vector, or the mean itself) has c_jm = 0, and
 where nothing in the scene has a direction nothing changes.
@@ -96,13 +97,16 @@ def whole_regions(reliability: bool | str, levels: np.ndarray) -> Tensor | None:
     return torch.from_numpy(chosen) if chosen.any() else None
 
 
-def agreement_facts(levels: np.ndarray, reliability: float | None, confidence: Tensor | None) -> dict[str, Any]:
+def agreement_facts(
+    levels: np.ndarray, reliability: float | None, confidence: Tensor | None, levels_apart: bool
+) -> dict[str, Any]:
     """What reweighting tells of the scene's features, for the diagnostics.
 
     Args:
         levels: [M] i8, -1 for cells of grids. confidence: [P] f32.
+        levels_apart: whether regions were compared with those of their own level alone.
     """
-    facts: dict[str, Any] = {"masks": int((levels >= 0).sum())}
+    facts: dict[str, Any] = {"masks": int((levels >= 0).sum()), "levels_apart": levels_apart}
     if reliability is not None:
         facts["reliability_median"] = reliability
     if confidence is not None:
@@ -167,8 +171,14 @@ def agreement_factors(
     return Agreement(factors, directions, scores[0], scores[1], scene.reliability)
 
 
-def level_numbers(levels: np.ndarray) -> np.ndarray:
-    """[M] i32: the levels [M] i8 that there are, numbered from 0 on; cells of grids, which have -1, are one."""
+def level_numbers(levels: np.ndarray | None, count: int) -> np.ndarray:
+    """[M] i32: the levels [M] i8 that there are, numbered from 0 on; cells of grids, which have -1, are one.
+
+    Args:
+        levels: None: all regions are of one. count: M.
+    """
+    if levels is None:
+        return np.zeros(count, np.int32)
     return np.unique(levels, return_inverse=True)[1].reshape(-1).astype(np.int32)
 
 
@@ -220,7 +230,7 @@ class ViewConsistency:
         self, W: RegionWeights, means: Tensor | None, threads: int | None, levels: np.ndarray | None = None
     ) -> None:
         self.W, self.threads = W, threads
-        self.level = level_numbers(np.zeros(int(W.offsets[-1]), np.int8) if levels is None else levels)
+        self.level = level_numbers(levels, int(W.offsets[-1]))
         self.levels = int(self.level.max(initial=0)) + 1
         self.view = torch.repeat_interleave(W.offsets.diff())
         self.rows = torch.nonzero(W.indptr.diff())[:, 0]

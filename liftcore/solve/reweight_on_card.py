@@ -56,7 +56,7 @@ class ViewConsistencyOnCard:
 
     def __init__(self, W: RegionWeights, levels: np.ndarray | None = None) -> None:
         self.W, self.place = W, W.device
-        self.level = level_numbers(np.zeros(int(W.offsets[-1]), np.int8) if levels is None else levels)
+        self.level = level_numbers(levels, int(W.offsets[-1]))
         self.levels = int(self.level.max(initial=0)) + 1
         self.region_level = torch.from_numpy(self.level).long().to(self.place)
         self.view = torch.repeat_interleave(W.offsets.diff()).to(self.place)

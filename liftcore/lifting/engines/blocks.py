@@ -66,6 +66,7 @@ class Job:
     related: bool = False  # whether tuples of masks are needed
     usual_share: float | None = None  # the mean share of mask consensus; None where there is none
     by_region: bool = False  # whether regions are weighted as a whole
+    levels_apart: bool = False  # whether regions are compared with those of their own level alone
     delta: float | None = None  # of Huber's loss
     clusters: int = 0  # whose features splats may take
     guarded: bool = False  # whether they do where it explains them

@@ -297,15 +297,16 @@ class InBlocks(Steps[Job]):
         told, asked = np.sum(parts, axis=0)
         return replace(W, usual_share=mean_share(int(told), int(asked)))
 
-    def reweight(self, W: Job) -> tuple[Job, float | None]:
+    def reweight(self, W: Job, levels_apart: bool) -> tuple[Job, float | None]:
         """See the protocol: all but the last step's factors, which blocks take when they are solved."""
-        codebook, levels = steps.codebook_of(W), steps.mapped(W.folder / steps.REGIONS)["levels"]
-        whole = whole_regions(W.settings.reliability, levels)
+        W = replace(W, levels_apart=levels_apart)
+        codebook = steps.codebook_of(W)
+        whole = whole_regions(W.settings.reliability, steps.mapped(W.folder / steps.REGIONS)["levels"])
         totals = _sums(W, "rows", (1, codebook.regions))
         entries = sum(part["region"].size for part in _pieces(W, "rows"))
         principal = W.settings.robust_directions
         RegionDirections(codebook, torch.from_numpy(totals[0]), entries, principal).save(W.folder)
-        level, scene = level_numbers(levels), None
+        level, scene = level_numbers(steps.compared_levels(W), codebook.regions), None
         shape = 2, codebook.regions + int(level.max(initial=0)) + 1
         for step in range(W.settings.robust_steps):
             self.run("robust", steps.compare, replace(W, step=step, by_region=whole is not None), W.solutions)

@@ -368,7 +368,12 @@ def write_agreement(job: Job, step: int, scene: SceneAgreement) -> None:
 
 
 def _judge(job: Job, block: SplatBlock, threads: int | None) -> ViewConsistency:
-    return ViewConsistency(block.W, block.means, threads, mapped(job.folder / REGIONS)["levels"])
+    return ViewConsistency(block.W, block.means, threads, compared_levels(job))
+
+
+def compared_levels(job: Job) -> np.ndarray | None:
+    """[M] i8: the level of each region where levels are judged apart; else None."""
+    return mapped(job.folder / REGIONS)["levels"] if job.levels_apart else None
 
 
 def _weighed(
