@@ -23,8 +23,8 @@ before, and starts from the first W again. Nothing is tuned; each part has its r
 **Each level by itself where levels disagree.** A whole and its part may have a vector each, and both are right:
 their sum is neither, and things that say the same on two levels would outvote those that do not at every border.
 Where masks of parts and wholes say different things (`NodeVectors.levels_disagree`), p, c, r, s and all sums are
-taken among the regions of one level, and each level keeps its weight at each splat. Cells of grids are a level. Levels
-that say the same are judged together: each is a witness more, which counts where views are few.
+taken among the regions of one level, and each level keeps its weight at each splat. Cells of grids are a level.
+Levels that say the same are judged together: each is a witness more, which counts where views are few.
 
 A splat of one view does not change. A region without direction (a zero vector, or the mean itself) has c_jm = 0, and
 where nothing in the scene has a direction nothing changes.
