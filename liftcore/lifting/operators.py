@@ -13,7 +13,7 @@ from liftcore.errors import InvalidCameras, InvalidSettings
 from liftcore.lifting.geometry import weigh_views
 from liftcore.lifting.in_memory import InMemory, SceneWeights
 from liftcore.lifting.inputs import LiftInputs
-from liftcore.lifting.pipeline import find_objects, reweigh
+from liftcore.lifting.pipeline import find_objects, judges_apart, reweigh
 from liftcore.raster import check_given, open_raster
 from liftcore.runtime.device import choose_device
 from liftcore.runtime.progress import Progress, Timings, shown_progress
@@ -177,6 +177,6 @@ def region_weights(
             masks, levels_apart = bool((geometry.levels >= 0).any()), False
             if inputs.settings.robust_steps and np.unique(geometry.levels).size > 1:
                 _, node_vectors = find_objects(steps, W, masks, inputs.settings, steps.timings)
-                levels_apart = node_vectors is not None and node_vectors.levels_disagree
+                levels_apart = judges_apart(node_vectors, len(inputs.views.names))
             W, _ = reweigh(steps, W, masks, levels_apart, inputs.settings, steps.timings)
     return W.weights.cpu()

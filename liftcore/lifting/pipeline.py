@@ -36,6 +36,10 @@ from liftcore.values.settings import LiftSettings, Preset
 
 log = logging.getLogger(__name__)
 
+LEAST_WITNESSES = (
+    6  # views: from 4 a word of a small scene was lost with levels apart, from 8 they gain; between untried
+)
+
 
 @usual_modes()
 def lift(
@@ -127,7 +131,7 @@ def _run(
         W, weighed = steps.weigh(views, plan, on_plan)
     aggregation = None
     objects, node_vectors = find_objects(steps, W, weighed.masks, settings, timings)
-    levels_apart = node_vectors is not None and node_vectors.levels_disagree
+    levels_apart = judges_apart(node_vectors, len(plan.views))
     W, reliability = reweigh(steps, W, weighed.masks, levels_apart, settings, timings)
     clusters = objects if settings.clusters_by_masks else None
     with timings.stage("solve"):
@@ -188,6 +192,11 @@ def find_objects(
     with timings.stage("objects"):
         objects = steps.find_objects(W)
         return objects, steps.node_vectors(W, objects)
+
+
+def judges_apart(node_vectors: NodeVectors | None, views: int) -> bool:
+    """True where each level of masks is judged by itself: levels disagree, and enough views can witness each."""
+    return node_vectors is not None and node_vectors.levels_disagree and views >= LEAST_WITNESSES
 
 
 def reweigh(
