@@ -13,6 +13,7 @@ from fastapi.responses import JSONResponse, StreamingResponse
 from liftcore.errors import NotFound
 from liftcore.files import in_camera_orientation
 from service import models
+from service.auth import bearer
 from service.content import FILE, TAGGED, Cursor, Limit, cache_headers, file_answer, page_response, unchanged
 from service.errors import InvalidRequest, OverLimit
 from service.requests import JsonRoute
@@ -32,7 +33,7 @@ from service.routes.queries import (
 )
 from service.settings import encoder_label
 from service.state import AppState, Deps
-from service.store.keys import KeyRecord, Quota, earliest
+from service.store.keys import KeyRecord, Quota
 from service.store.lifts import LiftRecord, TradeoffRecord
 from service.store.owners import Scope
 from service.uploads import LIFT, LiftIntake
@@ -180,21 +181,20 @@ def list_shares(lift: str, deps: Deps) -> models.Shares:
 
 
 @router.post("/lifts/{lift}/shares", response_model=models.NewShare, status_code=201, tags=["keys"])
-def create_share(lift: str, asked: models.AskedShare, deps: Deps) -> Response:
+def create_share(lift: str, asked: models.AskedShare, request: Request, deps: Deps) -> Response:
     """Make a key that looks at this lift and asks it. It is shown this once, and in a link of the page."""
     record = deps.store.lifts.get(deps.owner, lift)
-    maker = deps.caller.record
-    if maker is None:
+    if deps.caller.record is None:
         raise InvalidRequest(
             "Authorization", expected="a service that wants keys", got="one that is open to its machine",
             hint="the operator makes a first key with splatlift keys create",
         )  # fmt: skip
     if len(deps.store.keys.of_lift(record.id)) >= MOST_SHARES:
         raise OverLimit("share", expected=f"at most {MOST_SHARES} of a lift", got="more", hint="delete some first")
-    expires = earliest(time.time() + asked.expires_s, maker.expires)
     key, secret = deps.store.keys.create(
-        asked.name, frozenset({Scope.SHARED}), Quota(), expires=expires, lifts=[record.id], maker=maker.id
-    )
+        asked.name, frozenset({Scope.SHARED}), Quota(), expires=time.time() + asked.expires_s, lifts=[record.id],
+        maker=bearer(request.headers),
+    )  # fmt: skip
     share = shape_share(key, record.id)
     # After the #, which browsers send nobody: neither the log of a proxy nor another site comes to know it.
     links = share.links | {"page": f"/?lift={record.id}#key={secret}"}

@@ -9,12 +9,12 @@ import secrets
 import sqlite3
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal, Self
 
 from liftcore.errors import NotFound
-from service.errors import InvalidRequest
+from service.errors import InvalidRequest, Unauthorized
 from service.store.database import Database, insert, keys_were_made, open_to_read, remember_keys, unusable
 from service.store.jobs import stop_waiting
 from service.store.owners import ENDED_KEYS, Scope, parse_scopes
@@ -90,7 +90,7 @@ class KeyStore:
             scopes, quota: what it may do, and fill.
             expires: when it ends; None = never.
             lifts: what it is given, with the scope `shared`, which it then has alone.
-            maker: the id of the key that shares the lifts, with whose end it ends.
+            maker: the secret of the key that shares the lifts, with whose end it ends.
 
         Returns:
             The key, and its secret, which nobody can ask for again.
@@ -98,26 +98,40 @@ class KeyStore:
         Raises:
             InvalidRequest: it is given lifts without that scope, or has that scope with another, or without lifts.
             NotFound: there is no such lift.
+            Unauthorized: the maker's secret does not count, or no longer.
         """
         if (Scope.SHARED in scopes or lifts) and not (scopes == {Scope.SHARED} and lifts):
             got = f"{', '.join(sorted(scopes))} and {len(lifts)} lifts"
             raise InvalidRequest("scopes", expected="shared alone, with the lifts that the key is given", got=got)
-        secret, lift_ids = _new_secret(), tuple(sorted(set(lifts)))
-        key = KeyRecord(secrets.token_hex(6), name, scopes, quota, time.time(), None, expires, lift_ids, maker)
-        row = {
-            "id": key.id,
-            "name": name,
-            "digest": digest_of(secret),
-            "scopes": " ".join(sorted(scopes)),
-            "max_bytes": quota.max_bytes,
-            "max_queued": quota.max_queued,
-            "max_uploads": quota.max_uploads,
-            "created": key.created,
-            "expires": expires,
-            "maker": maker,
-        }
+        secret = _new_secret()
         remember_keys(self._data)  # first: a key whose database is lost must not leave the door open
         with self._database.write(counted=True) as connection:
+            sharer = None if maker is None else _key_of(connection, maker)
+            if maker is not None and sharer is None:  # a rotation ends what the secret before has made, and no more
+                raise Unauthorized(
+                    "Authorization", expected="Bearer and a key of this service", got="one that ended a moment ago",
+                    headers={"WWW-Authenticate": 'Bearer realm="splatlift", error="invalid_token"'},
+                )  # fmt: skip
+            key = KeyRecord(
+                id=secrets.token_hex(6),
+                name=name,
+                scopes=scopes,
+                quota=quota,
+                created=time.time(),
+                expires=earliest(expires, sharer and sharer.expires),
+                lifts=tuple(sorted(set(lifts))),
+                maker=sharer and sharer.id,
+            )
+            row = {
+                "id": key.id,
+                "name": name,
+                "digest": digest_of(secret),
+                "scopes": " ".join(sorted(scopes)),
+                **asdict(quota),
+                "created": key.created,
+                "expires": key.expires,
+                "maker": key.maker,
+            }
             insert(connection, "keys", row)
             for lift in key.lifts:
                 if connection.execute("SELECT 1 FROM lifts WHERE id = ?", (lift,)).fetchone() is None:
@@ -156,8 +170,9 @@ class KeyStore:
                 raise InvalidRequest("key", expected="a name that one key has", got=named, hint=f"name one of {ids}")
             key, old_until = _record(rows[0]), rows[0]["old_until"]
             shares = [] if keep_shares else _shares_of(connection, key, now)
-            for share in shares:  # with a secret that counted for a time, those end that were made with it
-                end = now if share.expires == old_until else earliest(share.expires, now + grace)
+            for share in shares:  # what ends as the secret before, or sooner, may have been made with it
+                is_older = old_until is not None and share.expires is not None and share.expires <= old_until
+                end = now if is_older else earliest(share.expires, now + grace)
                 connection.execute("UPDATE keys SET expires = ? WHERE id = ?", (end, share.id))
             connection.execute(
                 "UPDATE keys SET old_digest = digest, old_until = ?, digest = ? WHERE id = ?",
@@ -229,23 +244,27 @@ class KeyStore:
         with self._database.read() as connection:
             if secret is None:
                 return self._required(connection), None
-            digest = digest_of(secret)
-            row = connection.execute(
-                f"{KEYS} WHERE (digest = :digest OR (old_digest = :digest AND old_until > :now))"
-                f" AND id NOT IN ({ENDED_KEYS})",
-                {"digest": digest, "now": time.time()},
-            ).fetchone()
-            if row is None:
-                return self._required(connection), None
-            key = _record(row)
-            if row["digest"] != digest:
-                key = replace(key, expires=earliest(key.expires, row["old_until"]))
-            return self._rule != "none", key
+            key = _key_of(connection, secret)
+            return (self._required(connection) if key is None else self._rule != "none"), key
 
     def _required(self, connection: sqlite3.Connection) -> bool:
         if self._rule is not None:
             return self._rule == "required"
         return _any(connection) or keys_were_made(self._data)
+
+
+def _key_of(connection: sqlite3.Connection, secret: str) -> KeyRecord | None:
+    """The valid key of a secret, which ends when the secret does; None when there is none."""
+    digest = digest_of(secret)
+    row = connection.execute(
+        f"{KEYS} WHERE (digest = :digest OR (old_digest = :digest AND old_until > :now))"
+        f" AND id NOT IN ({ENDED_KEYS})",
+        {"digest": digest, "now": time.time()},
+    ).fetchone()
+    if row is None:
+        return None
+    key = _record(row)
+    return key if row["digest"] == digest else replace(key, expires=earliest(key.expires, row["old_until"]))
 
 
 def _new_secret() -> str:

@@ -26,11 +26,11 @@ from service.auth import CALLER, OPEN, AuthMiddleware, Hosts, host_name, is_loop
 from service.commands.serve import require_keys
 from service.content import EventStreams, is_last
 from service.errors import Busy, ForeignOrigin, Misconfigured, Misdirected, TooMany
-from service.models import AssetKind, JobState
+from service.models import AssetKind, JobKind, JobState
 from service.settings import ServiceSettings
 from service.store.assets import CheckedUpload
 from service.store.jobs import Event
-from service.store.keys import Quota
+from service.store.keys import KeyRecord, Quota
 from service.store.owners import SERVICE, Owner, Scope
 from service.store.store import Store
 from tests.crash.conftest import order
@@ -269,7 +269,7 @@ def test_owner_gives_a_lift_to_a_key_and_takes_it_away(server: Guarded) -> None:
 
 @pytest.mark.parametrize("end", ["expired", "revoked", "maker revoked", "lift deleted"])
 def test_shared_key_ends(end: str, server: Guarded) -> None:
-    guest, key = shared_key(server, maker=server.ids["alice"]), server.store.keys.of_lift(server.done)[0].id
+    guest, key = shared_key(server, maker=server.secrets["alice"]), server.store.keys.of_lift(server.done)[0].id
     assert server.client.get("/lifts", headers=guest).status_code == 200
     match end:
         case "expired":
@@ -317,9 +317,51 @@ def test_shares_end_with_the_secret_that_made_them_unless_they_are_kept(
         for ending in (guest, late, bearer(server.secrets["alice"])):
             expires = server.client.get("/key", headers=ending).json()["expires"]
             assert expires == pytest.approx(time.time() + 3600, abs=60)
+        soon = share_of(server, server.secrets["alice"], expires_s=600)  # which ends before that secret
         mine = share_of(server, said.out.strip())
         assert main(rotate) == 0  # the first secret ends now
-        assert not may_read(server, late) and may_read(server, mine)
+        assert not may_read(server, late) and not may_read(server, soon) and may_read(server, mine)
+
+
+@pytest.mark.parametrize("grace", [0.0, 3600.0])
+def test_share_that_is_asked_for_in_the_moment_of_a_rotation_ends_as_the_secret_that_asked(
+    grace: float, server: Guarded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    of_lift = server.store.keys.of_lift
+
+    def rotate_first(lift: str) -> list[KeyRecord]:
+        server.store.keys.rotate(server.ids["alice"], grace=grace)
+        return of_lift(lift)
+
+    monkeypatch.setattr(server.store.keys, "of_lift", rotate_first)  # which is asked after the gate
+    reply = server.ask("alice", "POST", f"/lifts/{server.done}/shares", json={"name": "guest"})
+    if grace:
+        assert reply.json()["expires"] == pytest.approx(time.time() + grace, abs=60)
+    else:
+        assert assert_problem(reply)["type"] == "/problems/unauthorized"
+        assert reply.headers["www-authenticate"] and not of_lift(server.done)
+
+
+def test_lift_that_goes_while_it_is_changed_or_read_is_absent(
+    server: Guarded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at, write, open_file = f"/lifts/{server.done}", server.store.database.write, Path.open
+
+    def write_late(**how: Any) -> Any:
+        monkeypatch.undo()
+        server.store.jobs.delete(SERVICE, server.done, given_up=(JobKind.LIFT,))
+        return write(**how)
+
+    def open_lost(path: Path, *how: Any, **more: Any) -> Any:
+        if path.name.startswith(server.done):
+            path.unlink()
+        return open_file(path, *how, **more)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "open", open_lost)
+        assert assert_problem(server.ask("alice", "GET", f"{at}/features"))["type"] == "/problems/not-found"
+    monkeypatch.setattr(server.store.database, "write", write_late)
+    assert assert_problem(server.ask("alice", "PATCH", at, json={"name": "x"}))["type"] == "/problems/not-found"
 
 
 def test_revoked_key_names_the_shares_that_end_with_it(
@@ -675,6 +717,7 @@ def test_pages_of_named_origins_read_with_a_key_and_change_nothing(tmp_path: Pat
         ("Origin", "https://evil.example"),
         ("Access-Control-Request-Method", "DELETE"),
         ("Access-Control-Request-Headers", "authorization, x-other"),
+        ("Access-Control-Request-Headers", "authorization,,accept"),
         ("Access-Control-Request-Private-Network", "true"),
     ],
 )
