@@ -173,7 +173,7 @@ class PagesOfOthers(CORSMiddleware):
         reply = super().preflight_response(request_headers)
         if reply.status_code == HTTPStatus.OK:
             return reply
-        headers = request_headers.get("Access-Control-Request-Headers", "").lower().split(",")
+        headers = request_headers.get("Access-Control-Request-Headers")
         terms = {
             "Origin": (
                 self.is_allowed_origin(request_headers["Origin"]),
@@ -184,7 +184,7 @@ class PagesOfOthers(CORSMiddleware):
                 f"one of {', '.join(self.allow_methods)}",
             ),
             "Access-Control-Request-Headers": (
-                {header.strip() for header in headers} <= {"", *self.allow_headers},
+                headers is None or {header.strip() for header in headers.lower().split(",")} <= {*self.allow_headers},
                 f"some of {', '.join(CORS_HEADERS)}",
             ),
             "Access-Control-Request-Private-Network": (False, "none"),

@@ -82,7 +82,7 @@ def file_answer(
         NotFound: the file is not there, or no longer what was stored.
     """
     require_whole(path, size)
-    offset = 0
+    stored, offset = size, 0
     if header is not None:
         with path.open("rb") as handle:
             offset = 8 + int.from_bytes(handle.read(8), "little")
@@ -93,7 +93,11 @@ def file_answer(
         return not_modified
     range_header, condition = request.headers.get("range"), request.headers.get("if-range", etag)
     part = _range_of(range_header, size) if range_header is not None and condition == etag else None
-    return _FilePart(path, header or b"", offset, part, size, cache_headers(etag) | _saved_as(name))
+    try:
+        return _FilePart(path, header or b"", offset, part, size, cache_headers(etag) | _saved_as(name))
+    except FileNotFoundError:  # deleted since it was looked at
+        require_whole(path, stored)
+        raise
 
 
 def _range_of(header: str, size: int) -> tuple[int, int] | None:

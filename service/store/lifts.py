@@ -234,8 +234,8 @@ class LiftStore:
         Raises:
             NotFound: there is no such lift, or there are no such photos.
         """
-        self.get(owner, lift)
         with self._database.write(counted=True) as connection:
+            self.get(owner, lift)  # here, where nobody deletes it
             photos = changes.get("photos")
             if photos is not None:
                 self._own_photos(connection, owner, lift, photos)
