@@ -88,9 +88,10 @@ def part_phrases(text: str) -> Iterator[PartPhrase]:
 
     "The cat's tail" and "tail of the cat" say so. Of "a cup of coffee", where no article follows, nothing is a part
     of the other; nor of what is said of a thing, as "a photo of a cat". "Handles of mugs" may be either, as "bowls of
-    oranges" shows.
+    oranges" shows, and so may several owners without an article: "men's shoes" are a kind of shoes.
     """
     typed = text.casefold().replace("_", " ").split()
+    is_certain = bool(typed) and typed[0].strip(_AROUND) in _ARTICLES | _OWNERS
     typed = typed[1:] if typed and typed[0].strip(_AROUND) in _ARTICLES else typed
     parts = [part.strip(_AROUND) for part in typed]
     if len(parts) > _HEAD_WORDS:
@@ -98,7 +99,9 @@ def part_phrases(text: str) -> Iterator[PartPhrase]:
     for place, part in enumerate(parts[:-1]):
         owner = part[:-2] if part.endswith(("'s", "\u2019s")) else part
         if owner != part or (typed[place].endswith(("s'", "s\u2019")) and typed[place][0] not in _AROUND):
-            yield PartPhrase(" ".join([*parts[:place], owner]), " ".join(parts[place + 1 :]), True)
+            is_one = owner != part and owner not in _IRREGULAR
+            thing, rest = " ".join([*parts[:place], owner]), " ".join(parts[place + 1 :])
+            yield PartPhrase(thing, rest, is_certain or is_one)
         if part == "of" and place and parts[place - 1] not in _PARTS:
             of = parts[place + 1 :]
             if of[0] in _ARTICLES | _OWNERS and len(of) > 1:

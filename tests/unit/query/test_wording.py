@@ -9,6 +9,7 @@ from liftcore.errors import InvalidQuery
 from liftcore.query.scene import Scene
 from liftcore.text import open_encoder
 from liftcore.text.table import TableEncoder, Vocabulary
+from liftcore.text.wording import part_phrases
 
 OF_SCENE = ["cat", "cow", "doughnut", "boat", "airplane", "flowerpot", "fish", "hammer", "pizza", "violin", "teapot"]
 
@@ -89,6 +90,15 @@ def test_what_is_like_nothing_has_no_words_near_to_it(text: str) -> None:
 def test_part_and_thing_of_a_phrase_are_found(text: str, thing: str | None, part: str | None) -> None:
     found = lvis().find_part(text)
     assert (found.thing, found.part) == (thing, part) if found else thing is None
+
+
+@pytest.mark.parametrize("text", ["men's shoes", "children\u2019s toys", "babies' bottles"])
+def test_several_owners_without_an_article_may_name_a_kind(text: str) -> None:
+    kind, *parts = [next(part_phrases(first + text)).sure for first in ("", "the ", "my ")]
+    assert not kind and all(parts)
+    assert next(part_phrases("baby's bottle")).sure
+    found = lvis().find(text)
+    assert found is not None and found.word in ("shoe", "toy", "bottle")
 
 
 def test_a_part_that_no_word_stands_for_is_told_from_its_thing() -> None:
