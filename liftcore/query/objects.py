@@ -95,15 +95,20 @@ def _without_leaks(
     own = scene.object
     sizes = np.bincount(own + 1)
 
-    def share(group: int) -> float:
-        """Of the thing that a group is of, what the group has; NaN where that is none."""
-        counts = np.bincount(own[rows[groups == group]] + 1)
-        thing = int(counts.argmax())
-        return counts[thing] / sizes[thing] if thing else np.nan
+    def counts_of(group: int) -> np.ndarray:
+        """[1 + objects] i64, how many splats of a group are of no thing, and of each."""
+        return np.bincount(own[rows[groups == group]] + 1, minlength=len(sizes))
 
-    if not share(large[0]) >= MOST:
+    def is_fragment(group: int) -> bool:
+        """True of a group with too little of each thing that it is of; what leaks beside one does not hide it."""
+        counts = counts_of(group)
+        holds = (counts >= SOME * counts.sum()) & (counts >= SOME * sizes)
+        return bool(counts.argmax()) and not holds[1:].any()
+
+    first = counts_of(large[0])
+    if not first.argmax() or first.max() < MOST * sizes[first.argmax()]:
         return large
-    return large[[not (few and share(group) < SOME) for group, few in zip(large, small, strict=True)]]
+    return large[[not (few and is_fragment(group)) for group, few in zip(large, small, strict=True)]]
 
 
 def _set_numbers(scene: OpenedLift, sets: Sequence[SplatSet]) -> np.ndarray:

@@ -85,6 +85,7 @@ def test_small_fragment_of_another_thing_is_no_object_beside_a_whole_one(scene: 
     selected = answer.selected | np.isin(np.arange(len(answer.selected)), fragment)
     things = np.repeat(np.array([0, -1, 1], np.int32), SPLATS_A_CLUSTER)
     cases = {"of the last": things, "a thing itself": np.where(np.isin(np.arange(len(things)), fragment), 2, things)}
+    cases["a thing with a leak beside it"] = np.where(np.isin(np.arange(len(things)), fragment[:2]), 2, things)
     cases["of none"] = np.full(len(things), -1, np.int32)
     found = {}
     for name, own in cases.items():
@@ -97,6 +98,7 @@ def test_small_fragment_of_another_thing_is_no_object_beside_a_whole_one(scene: 
     assert {name: len(one.found) for name, one in found.items()} == {
         "of the last": 1,
         "a thing itself": 2,
+        "a thing with a leak beside it": 2,
         "of none": 2,
     }
     assert found["of the last"].strays == len(fragment)
