@@ -100,8 +100,8 @@ def part_phrases(text: str) -> Iterator[PartPhrase]:
         owner = part[:-2] if part.endswith(("'s", "\u2019s")) else part
         if owner != part or (typed[place].endswith(("s'", "s\u2019")) and typed[place][0] not in _AROUND):
             is_one = owner != part and owner not in _IRREGULAR
-            thing, rest = " ".join([*parts[:place], owner]), " ".join(parts[place + 1 :])
-            yield PartPhrase(thing, rest, is_certain or is_one)
+            owners, piece = " ".join([*parts[:place], owner]), " ".join(parts[place + 1 :])
+            yield PartPhrase(owners, piece, is_certain or is_one)
         if part == "of" and place and parts[place - 1] not in _PARTS:
             of = parts[place + 1 :]
             if of[0] in _ARTICLES | _OWNERS and len(of) > 1:
