@@ -347,15 +347,15 @@ def test_lift_that_goes_while_it_is_changed_or_read_is_absent(
 ) -> None:
     at, write, open_file = f"/lifts/{server.done}", server.store.database.write, Path.open
 
-    def write_late(**how: Any) -> Any:
+    def write_late(**options: Any) -> Any:
         monkeypatch.undo()
         server.store.jobs.delete(SERVICE, server.done, given_up=(JobKind.LIFT,))
-        return write(**how)
+        return write(**options)
 
-    def open_lost(path: Path, *how: Any, **more: Any) -> Any:
+    def open_lost(path: Path, *options: Any, **keywords: Any) -> Any:
         if path.name.startswith(server.done):
             path.unlink()
-        return open_file(path, *how, **more)
+        return open_file(path, *options, **keywords)
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "open", open_lost)
