@@ -97,8 +97,8 @@ def test_several_owners_without_an_article_may_name_a_kind(text: str) -> None:
     kind, *parts = [next(part_phrases(first + text)).sure for first in ("", "the ", "my ")]
     assert not kind and all(parts)
     assert next(part_phrases("baby's bottle")).sure
-    found = lvis().find(text)
-    assert found is not None and found.word in ("shoe", "toy", "bottle")
+    wording = lvis().find(text)
+    assert wording is not None and wording.word in ("shoe", "toy", "bottle")
 
 
 def test_a_part_that_no_word_stands_for_is_told_from_its_thing() -> None:
