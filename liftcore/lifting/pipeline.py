@@ -36,9 +36,7 @@ from liftcore.values.settings import LiftSettings, Preset
 
 log = logging.getLogger(__name__)
 
-LEAST_WITNESSES = (
-    6  # views: from 4 a word of a small scene was lost with levels apart, from 8 they gain; between untried
-)
+LEAST_WITNESSES = 6  # views: with 4, levels apart lost a word of a small scene; with 8 they gain; between: not tried
 
 
 @usual_modes()
