@@ -2,7 +2,8 @@
 
 A pixel shows splats by their weights on its ray, an area by those on the rays of its pixels, a splat itself. From the
 largest node down, the one with most of that weight is taken, a root where it has ROOT_SHARE of it, a part where it
-has half of what its whole has. Of several examples a node must hold each, and none that an example against is in.
+has half of what its whole has. One with more than TWIN_SHARE of the splats of its whole looks like that, and is left
+out. Of several examples a node must hold each, and none that an example against is in.
 
 A text that names a part for which there is no word may mean any part of its thing (`parts_of`).
 """
@@ -17,6 +18,7 @@ from liftcore.query.question import Candidate, Query
 from liftcore.query.terms import Area, OneSplat, SplatSet, Term
 
 MOST_PARTS = 8  # that are offered for a word: the largest
+TWIN_SHARE = 0.75  # of the splats of a whole: mistakes of masks leave such parts, and to the eye they are the whole
 ROOT_SHARE = 0.25  # of what is shown: less is what shines through, or lies beside the thing
 
 
@@ -36,7 +38,12 @@ def candidates(scene: OpenedLift, query: Query) -> tuple[Candidate, ...]:
         for node in paths[0]
         if all(node in path for path in paths) and not any(node in other for other in against)
     ]
-    return tuple(_candidate(scene, node, min(path[node] for path in paths)) for node in reversed(kept))
+    nodes = list[Candidate]()
+    for node in kept:
+        candidate = _candidate(scene, node, min(path[node] for path in paths))
+        if not nodes or candidate.splats <= TWIN_SHARE * nodes[-1].splats:
+            nodes.append(candidate)
+    return tuple(reversed(nodes))
 
 
 def parts_of(scene: OpenedLift, things: np.ndarray) -> tuple[Candidate, ...]:

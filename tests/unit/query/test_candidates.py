@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from liftcore.cli import main
 from liftcore.query.question import Query
@@ -34,6 +36,17 @@ def test_a_splat_means_its_part_and_then_the_whole(nested: Scene) -> None:
     assert meant(nested, first, second) == [(0, "object")]
     assert meant(nested, first, other) == []
     assert meant(nested, first, unlike=(second,)) == [(3, "part")]
+
+
+def test_a_part_that_is_nearly_all_of_its_whole_is_not_offered_beside_it(scene: Scene, tmp_path: Path) -> None:
+    lift = with_parts(scene)
+    assert lift.node is not None and lift.object is not None
+    node, rows = lift.node.clone(), torch.nonzero(lift.object == 0)[:, 0]
+    node[rows], node[rows[: len(rows) // 10]] = 3, 4
+    replace(lift, node=node).save(tmp_path / "parts.lift.safetensors")
+    subject = Scene(tmp_path / "parts.lift.safetensors", scene.splats, scene.cameras)
+    assert meant(subject, f"splat:{int(rows[-1])}") == [(0, "object")]
+    assert meant(subject, f"splat:{int(rows[0])}") == [(4, "part"), (0, "object")]
 
 
 def test_a_pixel_means_what_weighs_most_on_its_ray_and_its_set_is_asked_alone(nested: Scene) -> None:
