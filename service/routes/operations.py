@@ -7,6 +7,8 @@ import base64
 import hashlib
 import re
 import threading
+from collections.abc import Callable
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -141,22 +143,27 @@ def docs() -> HTMLResponse:
     return HTMLResponse(html, headers=policy)
 
 
-def _serve(path: str, file: Path, media_type: str, headers: dict[str, str] | None = None) -> None:
-    """Register a file that a page asks for; one that ends in .zst is sent unpacked."""
+def _serve(
+    path: str, content_of: Callable[[], bytes], media_type: str, headers: dict[str, str] | None = None
+) -> None:
+    """Register a file that a page asks for, which is read at each request."""
 
     @router.get(path, include_in_schema=False)
     def content() -> Response:
-        stored = file.read_bytes()
-        if file.suffix == ".zst":
-            stored = zstandard.ZstdDecompressor().decompress(stored)
-        return Response(stored, media_type=media_type, headers=headers)
+        return Response(content_of(), media_type=media_type, headers=headers)
 
 
-# The scene that ships: the page orders a lift of it, as of files that were brought.
-for name in ("point_cloud.spz", "cameras.json", "features.safetensors.zst"):
-    _serve(f"/web/example/{name.removesuffix('.zst')}", EXAMPLE / name, BINARY)
-_serve("/web/page.js", WEB / "page.js", "text/javascript", KEPT)
-_serve("/web/page.css", WEB / "page.css", "text/css", KEPT)
-_serve("/web/LICENSES.txt", WEB / "LICENSES.txt", "text/plain; charset=utf-8")
-_serve("/docs/swagger-ui-bundle.js", SWAGGER / "swagger-ui-bundle.js", "text/javascript")
-_serve("/docs/swagger-ui.css", SWAGGER / "swagger-ui.css", "text/css")
+def _read_example(name: str) -> bytes:
+    """Read a file of the scene that ships, of which the page orders a lift, as of files that were brought."""
+    if (EXAMPLE / name).exists():
+        return (EXAMPLE / name).read_bytes()
+    return zstandard.ZstdDecompressor().decompress((EXAMPLE / f"{name}.zst").read_bytes())
+
+
+for name in ("point_cloud.spz", "cameras.json", "features.safetensors"):
+    _serve(f"/web/example/{name}", partial(_read_example, name), BINARY)
+_serve("/web/page.js", (WEB / "page.js").read_bytes, "text/javascript", KEPT)
+_serve("/web/page.css", (WEB / "page.css").read_bytes, "text/css", KEPT)
+_serve("/web/LICENSES.txt", (WEB / "LICENSES.txt").read_bytes, "text/plain; charset=utf-8")
+_serve("/docs/swagger-ui-bundle.js", (SWAGGER / "swagger-ui-bundle.js").read_bytes, "text/javascript")
+_serve("/docs/swagger-ui.css", (SWAGGER / "swagger-ui.css").read_bytes, "text/css")
