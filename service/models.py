@@ -375,7 +375,7 @@ class PackChange(Body):
     text_space: Named | None = Field(None, description="the text encoder that shares their space; 'none' for none")
 
 
-class GivenWorld(WorldFrame):
+class WorldUpdate(WorldFrame):
     """Which way is up in a lift, and how long its unit is; what is left out is not known."""
 
     error_type: ClassVar = None
@@ -389,7 +389,7 @@ class LiftChange(Body):
         Annotated[str, Field(max_length=LIFT_NAME_CHARACTERS, pattern=PRINTABLE), AfterValidator(str.strip)] | None
     ) = Field(None, description="for people; null or an empty one takes the name away")
     photos: AssetId | None = Field(None, description="an asset of kind photos; null takes them away")
-    world: GivenWorld | None = Field(
+    world: WorldUpdate | None = Field(
         None, description="which way is up and how long a scene unit is, in place of all that is known; null: neither"
     )
 

@@ -49,7 +49,7 @@ from liftcore.scene.drawing import in_photo
 from liftcore.scene.panorama import with_panoramas
 from liftcore.scene.render_mode import rendering_reason, rendering_warnings
 from liftcore.scene.splats import Splats
-from liftcore.scene.views import cameras_of_views, some_of
+from liftcore.scene.views import cameras_of_views, first_names
 from liftcore.solve.diagnostics import is_stretched, shape_warnings
 from liftcore.values.lens import photo_as_pinhole_sees
 from liftcore.values.lift_views import LiftViews
@@ -203,12 +203,12 @@ def _paired_photos(
         what = "so the features alone tell" if featured else "so nothing tells"
         notes.append(f"photos: none were given, {what} whether these cameras are those of the splats")
     elif not files:
-        named = f"{some_of(photos)}, but the cameras {some_of(cameras)}"
+        named = f"{first_names(photos)}, but the cameras {first_names(cameras)}"
         wrong.append(f"photos: none is named as a camera: the photos are {named}")
     else:
         bare, lost = [name for name in cameras if name not in files], [name for name in photos if name not in paired]
-        notes += [f"photos: {len(bare)} cameras have none: {some_of(bare)}"] if bare else []
-        notes += [f"photos: {len(lost)} have no camera: {some_of(lost)}"] if lost else []
+        notes += [f"photos: {len(bare)} cameras have none: {first_names(bare)}"] if bare else []
+        notes += [f"photos: {len(lost)} have no camera: {first_names(lost)}"] if lost else []
     return files, {name: cameras[name] if name in panoramas else None for name in files}
 
 
@@ -369,7 +369,7 @@ def _some_turned(
         if gains[best] >= LEAST_GAIN:
             turned.setdefault(best, []).append(name)
     return [
-        f"photos: {len(names)} of the {len(compared)} that were compared ({some_of(names)}) are {HOW_TURNED[tag]}: "
+        f"photos: {len(names)} of the {len(compared)} compared ({first_names(names)}) are {HOW_TURNED[tag]}: "
         "take the photos that cameras were made of"
         for tag, names in sorted(turned.items())
     ]

@@ -98,7 +98,7 @@ class CameraSource:
             raise InvalidCameras(str(self.frame), expected=expected, got=got, hint=hint)
         similarity = read_frame(self.frame, document, source)
         with cameras_from(str(self.frame)):
-            return similarity.moved(cameras)
+            return similarity.transformed(cameras)
 
     def _parsed(self, document: object, source: str) -> Cameras:
         assert self.file is not None

@@ -56,7 +56,7 @@ def local_path(path: Path | str, argument: str = "path") -> Path:
     if not is_remote(path):
         return Path(path)
     url = str(path)
-    with _told(url):
+    with name_url_in_errors(url):
         storage, place = _opened(url)
         found: dict[str, Any] = storage.find(place, detail=True)
         if not found:
@@ -97,7 +97,7 @@ def require_storage(url: str) -> None:
     Raises:
         InvalidInput: its storage does not open.
     """
-    with _told(url):
+    with name_url_in_errors(url):
         storage, place = _opened(url)
         storage.exists(place)
 
@@ -117,11 +117,11 @@ def landing(path: Path | str) -> Iterator[Path]:
         return
     url = str(path)
     with scratch_folder("splatlift-") as folder:
-        with _told(url):
+        with name_url_in_errors(url):
             storage, place = _opened(url)
         made = folder / PurePosixPath(place.rstrip("/")).name
         yield made
-        with _told(url):
+        with name_url_in_errors(url):
             if made.is_file():
                 storage.makedirs(str(PurePosixPath(place).parent), exist_ok=True)
                 storage.put_file(str(made), place)
@@ -145,7 +145,7 @@ def _opened(url: str) -> tuple[Any, str]:
 
 
 @contextmanager
-def _told(url: str) -> Iterator[None]:
+def name_url_in_errors(url: str) -> Iterator[None]:
     """Name the URL in whatever a storage raises: each has errors of its own."""
     try:
         yield

@@ -70,7 +70,7 @@ FOCALS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
 
 
 def parse_transforms(document: Any, source: str, photos: PhotosBeside | None = None) -> Cameras:
-    """The cameras of a transforms.json document, in the frame that its poses are in.
+    """Return the cameras of a transforms.json document, in the frame that its poses are in.
 
     A frame's own intrinsics come before the shared ones. A scene trained in another frame (nerfstudio
     normalises poses unless told not to) must be exported together with its cameras.
@@ -98,13 +98,13 @@ def parse_transforms(document: Any, source: str, photos: PhotosBeside | None = N
 
 
 def is_export(document: Any) -> bool:
-    """Whether a document has the form of nerfstudio's camera export."""
+    """Return True if a document has the form of nerfstudio's camera export."""
     records = document if isinstance(document, list) else []
     return bool(records) and all(isinstance(record, dict) and {*EXPORTED} <= record.keys() for record in records[:1])
 
 
 def parse_export(records: Any, source: str, data: Any = None, photos: PhotosBeside | None = None) -> Cameras:
-    """The cameras of nerfstudio's camera export, in the frame of its splats.
+    """Return the cameras of nerfstudio's camera export, in the frame of its splats.
 
     Args:
         records: as JSON has them. source: their file, for errors. photos: as `parse_transforms` has it.
@@ -137,7 +137,7 @@ def parse_export(records: Any, source: str, data: Any = None, photos: PhotosBesi
 
 
 def _named_frames(frames: Any, source: str, each: str) -> tuple[list[str], list[dict[str, Any]]]:
-    """The names of views, and their records."""
+    """Return the names of views, and their records."""
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise InvalidCameras(source, expected="a list of objects", got=repr(frames)[:60])
     check_count(len(frames), source)
@@ -158,7 +158,7 @@ def nerfstudio_world(cameras: Sequence[Camera]) -> WorldFrame:
 
 
 def transforms_of(cameras: Mapping[str, Camera]) -> dict[str, Any]:
-    """A transforms.json document of pinholes, with intrinsics of their own and without lenses of distorted photos."""
+    """Return a transforms.json document of pinhole cameras; lenses of distorted photos are left out."""
     frames = []
     for name, camera in cameras.items():
         pose = np.linalg.inv(camera.viewmat)
@@ -170,7 +170,7 @@ def transforms_of(cameras: Mapping[str, Camera]) -> dict[str, Any]:
 
 
 def _cameras(name: str, keys: ChainMap[str, Any], source: str, photos: PhotosBeside | None) -> list[Camera]:
-    """The view of a frame, or the six of a panorama."""
+    """Return the view of a frame, or the six of a panorama."""
     where = f"{source} frame {name!r}"
     panorama = keys.get("camera_model") == PANORAMA
     distortion = None if panorama else _distortion(keys, where)
@@ -246,7 +246,7 @@ def _focal(keys: Mapping[str, Any], axis: str, side: int, where: str) -> float |
 
 
 def _distortion(keys: ChainMap[str, Any], where: str) -> Distortion | None:
-    """How a frame's photo is distorted; None where it is not."""
+    """Return the distortion of a frame's photo; None where it has none."""
     model = keys.get("camera_model", "PINHOLE")
     other = next((key for scope in keys.maps for key in OTHER_LENSES if scope.get(key)), None)
     if model not in (*PERSPECTIVE, FISHEYE) or other:
@@ -269,7 +269,7 @@ def _distortion(keys: ChainMap[str, Any], where: str) -> Distortion | None:
 
 
 def _given(scope: Mapping[str, Any], where: str) -> dict[str, float] | None:
-    """The parameters that are not zero, by name; None where none is named."""
+    """Return the parameters that are not zero, by name; None where none is named."""
     listed = scope.get("distortion_params")
     if listed is not None and (not isinstance(listed, list) or len(listed) not in (0, len(LISTED))):
         expected = f"a list of the {len(LISTED)} numbers {', '.join(LISTED)}"
@@ -300,7 +300,7 @@ class Similarity:
 
     @classmethod
     def of(cls, moved: np.ndarray, source: str) -> Self:
-        """The map of an affine matrix [4, 4] f64.
+        """Return the map of an affine matrix [4, 4] f64.
 
         Raises:
             InvalidCameras: it does more than turn, shift and scale.
@@ -318,8 +318,8 @@ class Similarity:
         left, _, right = np.linalg.svd(linear)  # the nearest rotation
         return cls(scale, left @ right, moved[:3, 3])
 
-    def moved(self, cameras: Cameras) -> Cameras:
-        """The same views of the moved scene: every pixel shows what it showed.
+    def transformed(self, cameras: Cameras) -> Cameras:
+        """Return the same views of the transformed scene: every pixel shows the same splats.
 
         Of ``x = R p + t`` in a camera it makes ``R' = R rotation^T`` and ``t' = scale t - R' translation``, so that
         x' is scale x.
@@ -335,7 +335,7 @@ class Similarity:
 
 
 def read_frame(path: Path, applied: Mapping[str, Any], source: str) -> Similarity:
-    """The map from the frame of camera files to that of the splats.
+    """Return the map from the frame of camera files to that of the splats.
 
     The file holds ``transform`` T [3, 4] and ``scale`` s, which take the frame of the COLMAP model to that of the
     splats. Poses of a transforms.json have moved from there already, by its ``applied_transform`` A and

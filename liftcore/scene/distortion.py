@@ -1,12 +1,12 @@
-"""How a lens bends rays, and what a pinhole sees of its photo: the models of OpenCV and COLMAP.
+"""Lens distortion, and the pinhole image within a distorted photo: the models of OpenCV and COLMAP.
 
-Rays are told by where they pass the plane one unit before the camera: a pinhole sees the ray (x, y) at (x, y), the
-lens at (x', y'). Where a model turns back, so that two rays would meet in one place, it has no inverse, and
+A ray is given by its point on the plane one unit before the camera: a pinhole images the ray (x, y) at (x, y), the
+lens at (x', y'). Where a model is not monotonic, so that two rays have the same image, it has no inverse, and
 ``straight`` gives NaN.
 
-Splats are drawn by pinholes, so a lens has the pinhole of the same focal lengths whose image is the largest upright
-rectangle all of which the photo shows (``Lens.inner``): what gsplat and nerfstudio train on. Pictures of answers are
-drawn by a wider one, which sees all that the photo shows (``Lens.outer``), and carried to the photo's pixels.
+Splats are rasterized with pinholes, so a lens has the pinhole of the same focal lengths whose image is the largest
+upright rectangle within the photo (``Lens.inner``), as gsplat and nerfstudio train on. Images of answers are rendered
+with a wider one that covers the whole photo (``Lens.outer``), and resampled to the photo's pixels.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ import numpy as np
 
 from liftcore.scene.compositing import MAX_SIDE
 
-ITERATIONS = 30  # of Newton's method, which needs four to six where a lens is one
+ITERATIONS = 30  # of Newton's method, which needs four to six for real lenses
 TOLERANCE = 1e-9  # on the plane: a millionth of a pixel
-RADII, DIRECTIONS = 513, 16  # at which it is looked whether a lens turns back
-FARTHEST = 1e3  # on the plane: what a fisheye sees beside or behind the camera is put so far out
+RADII, DIRECTIONS = 513, 16  # samples at which a model is checked to be monotonic
+FARTHEST = 1e3  # on the plane: stands for rays of a fisheye that point sideways or backwards
 WIDEST = float(np.tan(np.radians(60)))  # of a pinhole's image from its axis, in x and in y, on the plane
 GROWTH = 0.5  # of the photo's sides, by which a pinhole's image is larger on each side at most
-LEAST_SHARE = 0.1  # of the photo that its pinhole has to see: with less the calibration is broken
+LEAST_SHARE = 0.1  # of the photo that its pinhole must cover: below it the calibration is broken
 ROUNDING = 1e-3  # pixels
-BORDER_PLACES = 33  # on each side of the photo, and again between the two about its nearest or farthest one
-NARROWINGS = 3  # so often, which finds that one to 1e-6 pixels of any photo
+BORDER_PLACES = 33  # samples on each side of the photo, and again between the neighbours of the extreme one
+NARROWINGS = 3  # rounds of sampling, which find the extreme one to 1e-6 pixels
 INWARDS = np.array([1.0, 1.0, -1.0, -1.0])  # from the left, top, right and bottom side
-BAND_PIXELS = 1 << 15  # carried at a time: what that takes stays in the cache
+BAND_PIXELS = 1 << 15  # resampled at a time: their arrays fit in the cache
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ class Brown:
     p1: float = 0.0
     p2: float = 0.0
 
-    def bent(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where the lens sees what a pinhole sees at (x, y), f64."""
+    def distorted(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return where the lens images rays that a pinhole images at (x, y), f64, on the plane."""
         p1, p2, squares = self.p1, self.p2, x * x + y * y
         radial = self._radial(squares)[0]
         across = 2 * x * y
@@ -61,31 +61,35 @@ class Brown:
         )
 
     def straight(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The inverse of ``bent``, by Newton's method; NaN where there is none, or the lens turned back before."""
+        """Return the inverse of ``distorted``, by Newton's method; NaN where there is none, or beyond ``reach``."""
         u, v = np.array(x, np.float64), np.array(y, np.float64)
-        with np.errstate(all="ignore"):  # what diverges is found by its residual
+        with np.errstate(all="ignore"):  # divergence shows in the residual
             for _ in range(ITERATIONS):
-                miss_x, miss_y = (bent - given for bent, given in zip(self.bent(u, v), (x, y), strict=True))
+                miss_x, miss_y = (
+                    position - target for position, target in zip(self.distorted(u, v), (x, y), strict=True)
+                )
                 if max(np.abs(miss_x).max(), np.abs(miss_y).max()) < TOLERANCE:
                     break
                 a, b, d = self._slopes(u, v)
                 determinant = a * d - b * b
                 u, v = u - (d * miss_x - b * miss_y) / determinant, v - (a * miss_y - b * miss_x) / determinant
-            miss = np.hypot(*(bent - given for bent, given in zip(self.bent(u, v), (x, y), strict=True)))
-            lost = ~(miss < 100 * TOLERANCE)
-        return np.where(lost, np.nan, u), np.where(lost, np.nan, v)
+            miss = np.hypot(
+                *(position - target for position, target in zip(self.distorted(u, v), (x, y), strict=True))
+            )
+            failed = ~(miss < 100 * TOLERANCE)
+        return np.where(failed, np.nan, u), np.where(failed, np.nan, v)
 
     def reach(self, radius: float) -> float:
-        """How far from the axis of a pinhole the lens turns back, looked for up to a radius; infinity: nowhere."""
+        """Return the radius on the plane up to which the model is monotonic; infinity if it is up to ``radius``."""
         angles = np.arange(DIRECTIONS if self.p1 or self.p2 else 1) * (2 * np.pi / DIRECTIONS)
         radii = np.linspace(0, radius, RADII)
-        with np.errstate(all="ignore"):  # at a pole nothing is above zero
+        with np.errstate(all="ignore"):  # at a pole no comparison is true
             a, b, d = self._slopes(radii[:, None] * np.cos(angles), radii[:, None] * np.sin(angles))
             forth = np.all((a * d - b * b > 0) & (a + d > 0), axis=1, keepdims=True)[:, 0]
         return _first_back(forth, radii)
 
     def _slopes(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The derivatives of x' by x, of x' by y, which is that of y' by x, and of y' by y."""
+        """Return the derivatives of x' by x, of x' by y, which is that of y' by x, and of y' by y."""
         p1, p2 = self.p1, self.p2
         radial, slope = self._radial(x * x + y * y)
         return (
@@ -112,42 +116,44 @@ class Fisheye:
     k3: float = 0.0
     k4: float = 0.0
 
-    def bent(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where the lens sees what a pinhole sees at (x, y), f64."""
+    def distorted(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return where the lens images rays that a pinhole images at (x, y), f64, on the plane."""
         radius = np.hypot(x, y)
-        factor = np.where(radius > 0, self._bent(np.arctan(radius))[0] / np.where(radius > 0, radius, 1.0), 1.0)
+        factor = np.where(
+            radius > 0, self._distorted_radius(np.arctan(radius))[0] / np.where(radius > 0, radius, 1.0), 1.0
+        )
         return x * factor, y * factor
 
     def straight(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The inverse of ``bent``, by Newton's method; at FARTHEST what no pinhole sees, and NaN as for ``Brown``."""
+        """Return the inverse, by Newton's method; at FARTHEST what no pinhole sees; NaN as for ``Brown``."""
         radius = np.hypot(x, y)
         angle = radius.copy()
         with np.errstate(all="ignore"):
             for _ in range(ITERATIONS):
-                bent, slope = self._bent(angle)
-                if np.abs(bent - radius).max() < TOLERANCE:
+                distorted, slope = self._distorted_radius(angle)
+                if np.abs(distorted - radius).max() < TOLERANCE:
                     break
-                angle = angle - (bent - radius) / slope
-            lost = ~((np.abs(self._bent(angle)[0] - radius) < 100 * TOLERANCE) & (angle >= 0))
+                angle = angle - (distorted - radius) / slope
+            failed = ~((np.abs(self._distorted_radius(angle)[0] - radius) < 100 * TOLERANCE) & (angle >= 0))
             reach = np.where(angle < np.pi / 2, np.minimum(np.tan(angle), FARTHEST), FARTHEST)
         factor = np.where(radius > 0, reach / np.where(radius > 0, radius, 1.0), 1.0)
-        return np.where(lost, np.nan, x * factor), np.where(lost, np.nan, y * factor)
+        return np.where(failed, np.nan, x * factor), np.where(failed, np.nan, y * factor)
 
     def reach(self, radius: float) -> float:
-        """How far from the axis of a pinhole the lens turns back, looked for up to a radius; infinity: nowhere."""
+        """Return the radius on the plane up to which the model is monotonic; infinity if it is up to ``radius``."""
         angles = np.linspace(0, np.arctan(radius), RADII)
         with np.errstate(all="ignore"):
-            return _first_back(self._bent(angles)[1] > 0, np.tan(angles))
+            return _first_back(self._distorted_radius(angles)[1] > 0, np.tan(angles))
 
-    def _bent(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _distorted_radius(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """r' and its derivative."""
         k1, k2, k3, k4, a = self.k1, self.k2, self.k3, self.k4, angle * angle
-        bent = angle * (1 + a * (k1 + a * (k2 + a * (k3 + a * k4))))
-        return bent, 1 + a * (3 * k1 + a * (5 * k2 + a * (7 * k3 + a * 9 * k4)))
+        distorted = angle * (1 + a * (k1 + a * (k2 + a * (k3 + a * k4))))
+        return distorted, 1 + a * (3 * k1 + a * (5 * k2 + a * (7 * k3 + a * 9 * k4)))
 
 
 def _first_back(forth: np.ndarray, radii: np.ndarray) -> float:
-    """The last of the radii [n] before the first that is not ``forth`` [n]; infinity where all are."""
+    """Return the last of the radii [n] before the first that is not ``forth`` [n]; infinity where all are."""
     return math.inf if forth.all() else float(radii[max(0, int(np.argmin(forth)) - 1)])
 
 
@@ -177,75 +183,77 @@ class Lens:
     distortion: Distortion
 
     def on_photo(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where on the photo, in pixels, rays lie that pass (x, y) on the plane one unit before the camera."""
-        u, v = self.distortion.bent(x, y)
+        """Project rays through (x, y), on the plane one unit before the camera, to pixels of the photo."""
+        u, v = self.distortion.distorted(x, y)
         return self.fx * u + self.cx, self.fy * v + self.cy
 
     def on_plane(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The inverse: where on that plane the rays pass that the photo shows at pixels (u, v); else NaN."""
+        """Unproject pixels (u, v) of the photo to points on that plane; NaN where a pixel shows no ray."""
         x, y = self.distortion.straight((u - self.cx) / self.fx, (v - self.cy) / self.fy)
         with np.errstate(invalid="ignore"):
-            shown = np.hypot(x, y) <= self._reach
-        return np.where(shown, x, np.nan), np.where(shown, y, np.nan)
+            within = np.hypot(x, y) <= self._reach
+        return np.where(within, x, np.nan), np.where(within, y, np.nan)
 
     @cached_property
     def inner(self) -> Rectangle:
-        """The largest rectangle all of which the photo shows.
+        """The largest rectangle within the photo.
 
         Raises:
-            ValueError: a pinhole sees hardly anything of the photo; the message says why.
+            ValueError: the rectangle is empty or covers hardly any of the photo; the message says why.
         """
-        found = self._within_reach(self._ends_of_sides(INWARDS))
-        if found.left >= found.right or found.top >= found.bottom:
-            raise ValueError("one that leaves a pinhole nothing of the photo")
-        share = self._share_of(found)
+        rectangle = self._within_reach(self._ends_of_sides(INWARDS))
+        if rectangle.left >= rectangle.right or rectangle.top >= rectangle.bottom:
+            raise ValueError("one whose pinhole image within the photo is empty")
+        share = self._share_of(rectangle)
         if math.isnan(share):
-            raise ValueError("one that turns back within the photo, so that two of its places show the same ray")
+            raise ValueError(
+                "one that is not monotonic within the photo, so that two of its pixels show the same ray"
+            )
         if share < LEAST_SHARE:
-            raise ValueError(f"one by which a pinhole sees {share:.1%} of the photo")
-        return found
+            raise ValueError(f"one whose pinhole image covers {share:.1%} of the photo")
+        return rectangle
 
     @cached_property
     def outer(self) -> Rectangle:
-        """The rectangle that shows all of the photo that pinholes may see.
+        """The smallest rectangle that covers the photo, as far as a pinhole can.
 
-        Where the photo's border shows no ray, because the lens turns back before it, what has rays ends there.
+        Where the photo's border shows no ray, because it is beyond ``reach``, the last ray in its direction counts.
         """
         left, top, right, bottom = self._ends_of_sides(-INWARDS)
         return Rectangle(math.floor(left), math.floor(top), math.ceil(right), math.ceil(bottom))
 
     @cached_property
     def share(self) -> float:
-        """How much of the photo's area ``inner`` sees."""
+        """Share of the photo's area that ``inner`` covers."""
         return self._share_of(self.inner)
 
     @cached_property
     def _reach(self) -> float:
-        """How far from the axis rays have places of their own, on the plane; infinity: all that pinholes may see."""
+        """Radius on the plane up to which pixels are unique; infinity: all that a pinhole can see."""
         return self.distortion.reach(2 * WIDEST)
 
     def _ends_of_sides(self, towards: np.ndarray) -> list[float]:
-        """The farthest that the photo's left, top, right and bottom side reach, in pixels of the pinhole, x or y.
+        """Return the extremes of the photo's left, top, right and bottom side, in pixels of the pinhole, x or y.
 
-        A side is curved, and where the principal point is off the centre its end lies anywhere between places that
-        are evenly spaced: it is looked for between its neighbours, again and again.
+        A side is curved, and where the principal point is off the centre its extreme lies between evenly spaced
+        samples: the interval about it is sampled again, NARROWINGS times.
 
         Args:
-            towards: [4], 1 or -1 a side: the direction that is far, growing or shrinking x or y.
+            towards: [4], 1 or -1 of each side: the extreme is the largest or the smallest x or y.
         """
         sides, low, high = np.arange(4), np.zeros((4, 1)), np.ones((4, 1))
-        found, end = np.zeros((4, 1)), np.zeros(4, np.int64)
+        positions, extreme = np.zeros((4, 1)), np.zeros(4, np.int64)
         for _ in range(NARROWINGS):
             places = low + (high - low) * np.linspace(0, 1, BORDER_PLACES)
-            found = self._sides(places)
-            end = np.argmax(found * towards[:, None], axis=1)
-            low, high = (places[sides, (end + step).clip(0, BORDER_PLACES - 1)][:, None] for step in (-1, 1))
-        return found[sides, end].tolist()
+            positions = self._sides(places)
+            extreme = np.argmax(positions * towards[:, None], axis=1)
+            low, high = (places[sides, (extreme + step).clip(0, BORDER_PLACES - 1)][:, None] for step in (-1, 1))
+        return positions[sides, extreme].tolist()
 
     def _sides(self, places: np.ndarray) -> np.ndarray:
-        """Places [4, n] in 0..1 along the photo's left, top, right and bottom side -> pixels of the pinhole, x or y.
+        """Map places [4, n] in 0..1 along the left, top, right and bottom side to pixels of the pinhole, x or y.
 
-        Where a side shows no ray, the last one in its direction stands for it.
+        Where a side shows no ray, the last one in its direction is used.
         """
         down, across = places[::2] * self.height, places[1::2] * self.width
         u = np.stack([0 * down[0], across[0], 0 * down[1] + self.width, across[1]])
@@ -258,7 +266,7 @@ class Lens:
         return np.stack([_pixels(x[0], *of_x), _pixels(y[1], *of_y), _pixels(x[2], *of_x), _pixels(y[3], *of_y)])
 
     def _within_reach(self, sides: list[float]) -> Rectangle:
-        """The whole pixels within such sides, drawn towards the axis until rays at the corners have places."""
+        """Return the whole pixels within such sides, shrunk towards the axis until the corners are within reach."""
         left, top, right, bottom = sides
         corner = np.hypot(
             max(abs(left - self.cx), abs(right - self.cx)) / self.fx,
@@ -270,7 +278,7 @@ class Lens:
         return Rectangle(int(np.ceil(left)), int(np.ceil(top)), int(np.floor(right)), int(np.floor(bottom)))
 
     def _share_of(self, box: Rectangle) -> float:
-        """How much of the photo's area a rectangle sees; NaN where it sees beyond the photo."""
+        """Return the share of the photo's area that a rectangle covers; NaN where it extends beyond the photo."""
         steps = np.linspace(0, 1, BORDER_PLACES)[:-1]
         width, height = box.right - box.left, box.bottom - box.top
         along, back, still = box.left + width * steps, box.right - width * steps, 0 * steps
@@ -287,27 +295,27 @@ class Lens:
 
 
 def _pixels(places: np.ndarray, focal: float, centre: float, length: int) -> np.ndarray:
-    """A side of the photo on the plane as pixels of the pinhole, kept to what a pinhole should draw."""
+    """Convert a side of the photo on the plane to pixels of the pinhole, clipped to a reasonable image."""
     margin = min(GROWTH * length, (MAX_SIDE - length) / 2)
     return np.clip(np.clip(places, -WIDEST, WIDEST) * focal + centre, -margin, length + margin)
 
 
 @lru_cache(maxsize=256)
 def shared_lens(lens: Lens) -> Lens:
-    """The first lens that was equal to this one, which knows its rectangles already."""
+    """Return the first lens that was equal to this one, whose rectangles are computed already."""
     return lens
 
 
-@lru_cache(maxsize=1)  # 8 bytes a pixel: mostly one lens took all photos
+@lru_cache(maxsize=1)  # 8 bytes a pixel; mostly all photos have the same lens
 def photo_places(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
-    """Two arrays [H, W] f32: where in the image of ``lens.outer`` the photo's pixels lie, in its pixels."""
+    """Return x and y [H, W] f32 of the photo's pixels, in pixels of the image of ``lens.outer``."""
     columns = np.arange(lens.width) + 0.5
     places = (np.empty((lens.height, lens.width), np.float32), np.empty((lens.height, lens.width), np.float32))
     rows = max(1, BAND_PIXELS // lens.width)
     for first in range(0, lens.height, rows):
-        here = slice(first, first + rows)
-        v, u = np.meshgrid(np.arange(lens.height)[here] + 0.5, columns, indexing="ij")
+        band = slice(first, first + rows)
+        v, u = np.meshgrid(np.arange(lens.height)[band] + 0.5, columns, indexing="ij")
         x, y = lens.on_plane(u, v)
-        places[0][here] = x * lens.fx + lens.cx - lens.outer.left
-        places[1][here] = y * lens.fy + lens.cy - lens.outer.top
+        places[0][band] = x * lens.fx + lens.cx - lens.outer.left
+        places[1][band] = y * lens.fy + lens.cy - lens.outer.top
     return places

@@ -28,12 +28,12 @@ UNSAYABLE = re.compile("[\\x00-\\x1f\\x7f\\ud800-\\udfff]")
 
 
 def composed(name: str) -> str:
-    """The name in Unicode's composed form (NFC)."""
+    """Return the name in Unicode's composed form (NFC)."""
     return unicodedata.normalize("NFC", name)
 
 
 def view_names(images: Sequence[str]) -> list[str]:
-    """One view name an image: the file's stem; where any stems of the scene collide, all keep their folders.
+    """Return one view name an image: the file's stem; where any stems of the scene collide, all keep their folders.
 
     Were it only those that collide, the longer of two cameras of a rig would have its last photos named otherwise
     than its first.
@@ -49,9 +49,9 @@ def view_names(images: Sequence[str]) -> list[str]:
 
 
 def require_name(name: str, argument: str, fault: type[InvalidInput]) -> str:
-    """The name of a view, a photo or a phrase, refused by an error of that type where UTF-8 or a line cannot say it.
+    """Return the name of a view, a photo or a phrase that UTF-8 and one line can hold.
 
-    Names of files whose bytes are no UTF-8 come with halves of surrogate pairs in them.
+    Names of files whose bytes are no UTF-8 come with halves of surrogate pairs in them. Others raise a ``fault``.
     """
     if UNSAYABLE.search(name):
         expected, hint = "one of printable characters in UTF-8", "rename the file"
@@ -60,7 +60,7 @@ def require_name(name: str, argument: str, fault: type[InvalidInput]) -> str:
 
 
 def without_image_suffix(image: str) -> str:
-    """The relative path of an image, composed, without its extension, if that is one of images."""
+    """Return the relative path of an image, composed, without its extension, if that is one of images."""
     path = PurePosixPath(composed(image).replace("\\", "/").removeprefix("./"))
     return str(path.with_suffix("")) if path.suffix.lower() in IMAGE_SUFFIXES else str(path)
 
@@ -99,7 +99,7 @@ def require_pairs(views: Collection[str], cameras: Collection[str]) -> dict[str,
         raise InvalidFeatures(
             "features",
             expected="views named like the cameras",
-            got=f"views {some_of(views)} and cameras {some_of(cameras)}, none in common",
+            got=f"views {first_names(views)} and cameras {first_names(cameras)}, none in common",
             hint=_difference(views, cameras) or NAMED_AFTER,
         )
     return pairs
@@ -133,12 +133,12 @@ def _shared_start(names: Sequence[str]) -> str:
     return first[:same] if len(names) > 1 else ""
 
 
-def some_of(names: Collection[str]) -> str:
-    """The first few, for an error."""
+def first_names(names: Collection[str]) -> str:
+    """Return the first three names, quoted, for an error."""
     return ", ".join(repr(name) for name in sorted(names)[:3])
 
 
 def _endings(name: str) -> list[str]:
-    """The name, the name without its first folder, without its first two, and so on, down to the last part."""
+    """Return the name, the name without its first folder, without its first two, and so on, down to the last part."""
     parts = name.split("/")
     return ["/".join(parts[start:]) for start in range(len(parts))]

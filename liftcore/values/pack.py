@@ -167,7 +167,7 @@ def as_views(
     if not isinstance(views, Mapping):
         return _spooled(views, scratch)
     given = cast("Mapping[str, ViewFeatures]", views)
-    sources = {name: _Given(given, key) for name, key in _composed_names(given).items()}
+    sources = {name: _MemoryView(given, key) for name, key in _composed_names(given).items()}
     if not sources:
         raise InvalidFeatures("features", expected="at least one view", got="none")
     if isinstance(views, dict):  # other mappings may read files: theirs are checked one by one
@@ -324,7 +324,7 @@ def _spooled(pairs: Iterable[tuple[str, ViewFeatures]], scratch: Path | None) ->
             if name in files:
                 raise InvalidFeatures("features", expected="each view once", got=f"{name!r} twice")
             files[name] = folder / f"{len(files)}.safetensors"
-            view = _Given({name: features}, name).read()
+            view = _MemoryView({name: features}, name).read()
             try:
                 with files[name].open("wb") as handle:
                     _write(handle, {name: view}, {}, silent)
@@ -366,7 +366,7 @@ def _in_callers_modes(values: Iterable[Any]) -> Iterator[Any]:
 
 
 @dataclass(frozen=True)
-class _Given:
+class _MemoryView:
     """A view of a mapping of values."""
 
     views: Mapping[str, ViewFeatures]

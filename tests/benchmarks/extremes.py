@@ -295,7 +295,7 @@ def _moved(scale: float, digits: type = np.float64) -> Scene:
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = scale * TURN, scale * np.array([3.0, -2.0, 1.0])
         similarity = Similarity.of(matrix.astype(digits).astype(np.float64), "here")
-        [camera] = similarity.moved(lc.Cameras((camera_at_origin(),))).values()
+        [camera] = similarity.transformed(lc.Cameras((camera_at_origin(),))).values()
         means = np.asarray(ROW, np.float32).astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
         splats = splats_at(means, LENS_SCALES, quats=THIRD_OF_A_TURN, kernel=kernel)
         return View(replace(splats, log_scales=splats.log_scales + math.log(scale)), camera, PLAIN)

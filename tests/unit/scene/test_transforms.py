@@ -66,7 +66,7 @@ def posed(matrix: Any) -> dict[str, Any]:
 BAD_TRANSFORMS = [
     ({"w": None}, "image size"),
     ({"fl_x": None, "fx": 5}, "neither, but 'fx'; add the focal length in pixels as fl_x"),
-    ({"k1": -1}, r"document.json camera 'a' distortion.*a pinhole sees \d\.\d% of the photo"),
+    ({"k1": -1}, r"document.json camera 'a' distortion.*covers \d\.\d% of the photo"),
     ({"camera_model": "FISHEYE624"}, "FISHEYE624.*undistorter"),
     ({"k4": 0.1}, r"k1, k2, k3, p1, p2 alone of a perspective camera, got k4 = 0\.1.*undistorter"),
     ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, r"k1, k2, k3, k4 alone of a fisheye, got p1 = 0\.1"),
