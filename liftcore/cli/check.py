@@ -61,6 +61,8 @@ def run(options: argparse.Namespace) -> int:
     begin = time.perf_counter()
     found = check_scene(options.splats, options.cameras, photos, packs or None, True, settings)
     document = {name: value for name, value in asdict(found).items() if name != "worst"}
+    for view in document["views"]:
+        view["others"] = view["other_psnr"]  # the older key stays
     document |= {"healthy": not found.wrong, "seconds": time.perf_counter() - begin}
     if options.worst and found.worst is not None:
         with writing(options.worst):
@@ -74,7 +76,7 @@ def _lines(found: CheckReport, document: dict, verbose: bool) -> Iterable[str]:
     if verbose:
         for view in found.views:
             compared = "" if view.psnr is None else f", {view.psnr:.1f} dB to its photo"
-            control = "" if view.others is None else f" and {view.others:.1f} to others"
+            control = "" if view.other_psnr is None else f" and {view.other_psnr:.1f} to others"
             yield f"  {view.view}: row sums {view.row_sum:.3f}{compared}{control}"
         yield f"  {found.in_view:.1%} of the splats are in some view"
         yield from (f"  features, {name.replace('_', ' ')}: {value:.3f}" for name, value in found.features.items())

@@ -78,7 +78,7 @@ class ViewCheck:
     view: str
     row_sum: float  # the mean of A 1
     psnr: float | None  # dB, of the render to the photo; None without a photo or colours
-    others: float | None  # dB, the mean to other views' photos
+    other_psnr: float | None  # dB, the mean to other views' photos
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ def _check(
     odd, told = _other_shapes(headers, sizes)
     wrong += told
     alike = {name: file for name, file in files.items() if name not in odd}
-    names = _some(list(alike) or list(cameras), VIEWS)
+    names = evenly_spaced(list(alike) or list(cameras), VIEWS)
     shown = [name for name in names if name in alike]
     pictures = {name: _photo(files[name], sizes[name], cameras[name].photo_size, whole[name]) for name in shown}
     raster, views, renders = open_raster(splats, CPU), [], {}
@@ -212,7 +212,7 @@ def _paired_photos(
     return files, {name: cameras[name] if name in panoramas else None for name in files}
 
 
-def _some(names: Sequence[str], count: int) -> list[str]:
+def evenly_spaced(names: Sequence[str], count: int) -> list[str]:
     """As many of the names, evenly spread."""
     places = np.linspace(0, len(names) - 1, min(count, len(names))).round()
     return [names[int(place)] for place in places]
@@ -330,7 +330,9 @@ def _unlike_photos(
 ) -> list[str]:
     """That renders are not like their photos, if so, and the cause that makes them alike, if one does."""
     compared = {
-        view.view: (view.psnr, view.others) for view in views if view.psnr is not None and view.others is not None
+        view.view: (view.psnr, view.other_psnr)
+        for view in views
+        if view.psnr is not None and view.other_psnr is not None
     }
     if not compared:
         return []
@@ -486,12 +488,12 @@ def _in_colours_of(render: np.ndarray, photo: np.ndarray) -> tuple[np.ndarray, f
 def _controls(name: str, pictures: Mapping[str, np.ndarray]) -> list[np.ndarray]:
     """Photos of other views that a render is held against, of the shape of its own."""
     alike = [view for view in pictures if view != name and pictures[view].shape == pictures[name].shape]
-    return [pictures[view] for view in _some(alike, CONTROLS)]
+    return [pictures[view] for view in evenly_spaced(alike, CONTROLS)]
 
 
 def _scaled_positions(floor: Mapping[str, float], pictures: Mapping[str, np.ndarray], scaled: _Scaled) -> str:
     """The scale of the cameras' positions by which renders are like the photos; empty where none is."""
-    names, best, scale = _some(list(floor), SCALED_VIEWS), 0.0, 1.0
+    names, best, scale = evenly_spaced(list(floor), SCALED_VIEWS), 0.0, 1.0
     for factor in (*NEAR_SCALES, *FAR_SCALES):
         gains = []
         for name in names:
@@ -518,7 +520,7 @@ def _check_features(
     views = pair(features, cameras)[0]
     grids: list[np.ndarray] = []
     rows: list[tuple[float, float]] = []
-    for name in _some(views.views, VIEWS):
+    for name in evenly_spaced(views.views, VIEWS):
         observed = views[name]
         if isinstance(observed, FeatureGrid):
             grids.append(observed.grid.float().numpy())

@@ -237,7 +237,7 @@ class _ViewFacts:
     unused: int  # rows that no label reads
     unlabelled: float  # share of the labels
     norms: tuple[float, float] | None  # the least and largest of rows with a length
-    alone: bool = False  # whether all labels are of one region
+    single_region: bool = False  # True if all labels are of one region
 
 
 def describe_packs(packs: Views) -> dict[str, Any]:
@@ -297,7 +297,7 @@ def _pack_warnings(packs: Views, found: list[_ViewFacts], low: float, high: floa
         warnings.append(f"{unused} of {rows} codebook rows are read by no label")
     if empty:
         warnings.append(f"{empty} views have no label at all")
-    if len(alone := [view for view in found if view.alone]) > len(found) / 2:
+    if len(alone := [view for view in found if view.single_region]) > len(found) / 2:
         warnings.append(
             f"{len(alone)} views have one region alone, over all of their pixels: masks tell nothing apart"
         )

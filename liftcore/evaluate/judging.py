@@ -14,7 +14,7 @@ from liftcore.text import RememberingEncoder, TextEncoder
 
 
 @dataclass(frozen=True)
-class Judged:
+class Judgement:
     """One text in one frame."""
 
     view: str
@@ -52,14 +52,14 @@ def judge(
     predictions: Mapping[str, Prediction],
     *,
     lifted: bool,
-) -> list[Judged]:
+) -> list[Judgement]:
     """Compare a frame's objects with what a protocol found for their categories."""
     rows = []
     for thing in objects:
         found = predictions[thing.category]
         truth = int(thing.mask.sum())
         rows.append(
-            Judged(
+            Judgement(
                 view=view,
                 category=thing.category,
                 intersection=int((found.mask & thing.mask).sum()),
@@ -81,7 +81,7 @@ def _localised(protocol: EvaluationProtocol, thing: LabelledObject, peak: tuple[
     return bool(thing.mask[y, x])
 
 
-def means(rows: Sequence[Judged]) -> Means:
+def means(rows: Sequence[Judgement]) -> Means:
     """The means over some rows; objects that are not in their frames count in the pooled IoU alone."""
     present = [(row, iou) for row in rows if (iou := row.iou) is not None]
     by_frame: dict[str, list[float]] = defaultdict(list)
@@ -100,7 +100,7 @@ def means(rows: Sequence[Judged]) -> Means:
     )
 
 
-def pooled_ious(rows: Sequence[Judged]) -> dict[str, float]:
+def pooled_ious(rows: Sequence[Judgement]) -> dict[str, float]:
     """Class -> IoU over the pixels of all its frames, for the classes that are in one at least."""
     shared: dict[str, int] = defaultdict(int)
     either: dict[str, int] = defaultdict(int)
@@ -145,7 +145,7 @@ class SceneResult:
 
     scene: str
     protocol: EvaluationProtocol
-    rows: tuple[Judged, ...]
+    rows: tuple[Judgement, ...]
 
     @property
     def frames(self) -> tuple[str, ...]:
@@ -209,9 +209,9 @@ def evaluate_scene(
     results = []
     for protocol in protocols:
         segmenter = SEGMENTERS[protocol](scene, texts, encoder, settings.threshold, settings.negatives)
-        rows: list[Judged] = []
+        rows: list[Judgement] = []
         for done, (view, things) in enumerate(truth.items(), start=1):
-            rows += judge(protocol, view, things, segmenter.look(view), lifted=view in lifted)
+            rows += judge(protocol, view, things, segmenter.predict_view(view), lifted=view in lifted)
             progress(f"{labels.name} {protocol}", done, len(truth), "frames")
         results.append(SceneResult(labels.name, protocol, tuple(rows)))
     return results, warnings

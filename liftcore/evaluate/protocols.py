@@ -79,7 +79,7 @@ class Segmenter(ABC):
         self.threshold, self.negatives = threshold, tuple(negatives)
 
     @abstractmethod
-    def look(self, view: str) -> dict[str, Prediction]:
+    def predict_view(self, view: str) -> dict[str, Prediction]:
         """What each text finds in a view."""
 
     def answers(self) -> dict[str, Answer]:
@@ -105,7 +105,7 @@ class RenderedFeatures(Segmenter):
         blocks = [block.float() @ vectors.T for block in self.scene.lift.features.split(65_536)]
         return torch.cat(blocks)
 
-    def look(self, view: str) -> dict[str, Prediction]:
+    def predict_view(self, view: str) -> dict[str, Prediction]:
         """What each text finds in a view."""
         cosines = self.cosines(view)
         shape, count, flat = cosines.shape[:2], len(self.texts), cosines.flatten(0, 1).numpy()
@@ -158,7 +158,7 @@ class SelectedSplats(Segmenter):
         """The splats that each text selects, for all views."""
         return {text: answer.selected for text, answer in self.answers().items()}
 
-    def look(self, view: str) -> dict[str, Prediction]:
+    def predict_view(self, view: str) -> dict[str, Prediction]:
         """What each text finds in a view."""
         splats, found = self.scene.splats, {}
         for text, selected in self._selected.items():
@@ -180,7 +180,7 @@ class RenderedScores(Segmenter):
         columns.append(np.ones(len(self.scene.features), np.float32))
         return torch.from_numpy(np.stack(columns, axis=1))
 
-    def look(self, view: str) -> dict[str, Prediction]:
+    def predict_view(self, view: str) -> dict[str, Prediction]:
         """What each text finds in a view."""
         scene, found = self.scene, {}
         image = scene.image(view, lambda camera: scene.raster.render(camera, self._values, scene.compositing))
@@ -206,11 +206,11 @@ class OwnMasks(Segmenter):
         """What each text found, filled as views ask for it."""
         return {}
 
-    def look(self, view: str) -> dict[str, Prediction]:
+    def predict_view(self, view: str) -> dict[str, Prediction]:
         """What each text finds in a view."""
-        return {text: self._look(text, view) for text in self._answers}
+        return {text: self._predict_view(text, view) for text in self._answers}
 
-    def _look(self, text: str, view: str) -> Prediction:
+    def _predict_view(self, text: str, view: str) -> Prediction:
         def group(scene: OpenedLift, answer: Answer) -> Objects:
             if text not in self._objects:
                 self._objects[text] = objects(scene, answer)

@@ -339,17 +339,17 @@ def _phrase_ious(spec: RunSpec, scene: Scene, masks: Mapping[str, Tensor]) -> li
     showing = [
         [view for view in spec.labelled if (masks[view] == number).any()] for number in range(len(spec.scene.classes))
     ]
-    for number in _some([number for number, views in enumerate(showing) if views], MOST_PHRASES):
+    for number in evenly_spaced([number for number, views in enumerate(showing) if views], MOST_PHRASES):
         answer = ask(scene, Query.of(spec.scene.classes[number]), encoder)
         found = cache(partial(objects, scene, answer))  # once for all views, if they ask for it
-        for view in _some(showing[number], PHRASE_VIEWS):
+        for view in evenly_spaced(showing[number], PHRASE_VIEWS):
             seen = view_mask(scene, answer, view, group=lambda *_, found=found: found())
             mine, real = _resized(torch.from_numpy(seen.mask), masks[view]), masks[view] == number
             ious.append(int((mine & real).sum()) / int((mine | real).sum()))
     return ious
 
 
-def _some(items: Sequence[Any], most: int) -> list[Any]:
+def evenly_spaced(items: Sequence[Any], most: int) -> list[Any]:
     """As many of them, evenly spread."""
     return [items[int(place)] for place in spread(len(items), min(most, len(items)))]
 

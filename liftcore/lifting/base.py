@@ -26,7 +26,7 @@ Weights = TypeVar("Weights")  # W of all views, wherever it lies; a value that n
 
 
 @dataclass(frozen=True)
-class WeighedViews:
+class WeightStatistics:
     """W in numbers, as the views were weighed."""
 
     plan: Plan  # as the first views correct it
@@ -41,7 +41,7 @@ class WeighedViews:
 
 
 @dataclass(frozen=True)
-class Support:
+class SplatSupport:
     """What supports X, a value a splat."""
 
     sums: np.ndarray  # [P] f64, of rows of W as it was weighed
@@ -50,14 +50,16 @@ class Support:
     confidence: Tensor | None  # [P] f32; None where W was not reweighted
 
 
-class Steps(Protocol[Weights]):
+class LiftSteps(Protocol[Weights]):
     """The steps of a lift. Each returns what it finds; an X that a step takes is given up to it."""
 
     def plan(self, views: LiftViews, device: Device) -> Plan:
         """Plan the lift of these views, which may leave some out and take another device."""
         ...
 
-    def weigh(self, views: LiftViews, plan: Plan, on_plan: Callable[[Plan], None]) -> tuple[Weights, WeighedViews]:
+    def weigh(
+        self, views: LiftViews, plan: Plan, on_plan: Callable[[Plan], None]
+    ) -> tuple[Weights, WeightStatistics]:
         """W of the views that the plan leaves; ``on_plan`` is called once, as early as contradictions are known."""
         ...
 
@@ -85,7 +87,7 @@ class Steps(Protocol[Weights]):
         """W with the factors of Huber's loss."""
         ...
 
-    def solve(self, W: Weights, clusters: RegionObjects | None) -> tuple[Tensor, Support]:
+    def solve(self, W: Weights, clusters: RegionObjects | None) -> tuple[Tensor, SplatSupport]:
         """X [P, F] in closed form, and what supports it; `aggregate` may take the clusters' features."""
         ...
 
@@ -93,7 +95,7 @@ class Steps(Protocol[Weights]):
         """X after the least squares of the settings, for the splats seen [P] bool; and what is known of it."""
         ...
 
-    def smooth(self, W: Weights, X: Tensor, support: Support) -> tuple[Tensor, dict[str, Any]]:
+    def smooth(self, W: Weights, X: Tensor, support: SplatSupport) -> tuple[Tensor, dict[str, Any]]:
         """X after the smoothness of the settings, for all splats; and what is known of it."""
         ...
 

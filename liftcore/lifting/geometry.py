@@ -49,7 +49,7 @@ class Geometry:
 
 
 @dataclass(frozen=True)
-class Question:
+class WeightRequest:
     """What the raster is asked of one view, and what its answer will mean."""
 
     request: ViewRequest
@@ -64,7 +64,7 @@ class Question:
         return replace(part, views=(self.request.camera.name,), evidence=part.evidence * rays)
 
 
-def question_of(views: LiftViews, number: int, settings: LiftSettings, by_rows: bool) -> Question:
+def weight_request(views: LiftViews, number: int, settings: LiftSettings, by_rows: bool) -> WeightRequest:
     """What a lift asks of the view of that number, which is read for it.
 
     Args:
@@ -80,7 +80,7 @@ def question_of(views: LiftViews, number: int, settings: LiftSettings, by_rows: 
     else:
         levels = np.full(codebook.regions, -1, np.int8)
     request = ViewRequest(camera, regions, params, settings.weighting, pixels)
-    return Question(request, read_pixels(observation, camera, pixels), codebook, levels)
+    return WeightRequest(request, read_pixels(observation, camera, pixels), codebook, levels)
 
 
 @one_thread()
@@ -110,11 +110,11 @@ def weigh_views(
     """
     order = [*first, *sorted({*range(len(views))} - {*first})]
     weighed = dict[int, _WeighedView]()
-    waiting = deque[Question]()
+    waiting = deque[WeightRequest]()
 
     def requests() -> Iterator[ViewRequest]:
         for number in order:
-            waiting.append(question_of(views, number, settings, by_rows))
+            waiting.append(weight_request(views, number, settings, by_rows))
             yield waiting[-1].request
 
     answers = raster.iterate_views(requests()) if checkpoint is None else checkpoint.answers(raster, requests())

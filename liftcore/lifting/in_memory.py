@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from liftcore.lifting.base import Steps, Support, WeighedViews
+from liftcore.lifting.base import LiftSteps, SplatSupport, WeightStatistics
 from liftcore.lifting.checkpoint import Checkpoint
 from liftcore.lifting.geometry import Geometry, as_read, weigh_views
 from liftcore.lifting.planning.contradictions import contradictions, probe_views
@@ -89,7 +89,7 @@ class SceneWeights:
 
 
 @dataclass(frozen=True)
-class InMemory(Steps[SceneWeights]):
+class InMemory(LiftSteps[SceneWeights]):
     """Steps of which one process holds all; see the protocol."""
 
     splats: Splats
@@ -104,7 +104,7 @@ class InMemory(Steps[SceneWeights]):
 
     def weigh(
         self, views: LiftViews, plan: Plan, on_plan: Callable[[Plan], None]
-    ) -> tuple[SceneWeights, WeighedViews]:
+    ) -> tuple[SceneWeights, WeightStatistics]:
         raster = open_raster(self.splats, plan.device, self.threads, plan.kept_on_card)
         first, begin = probe_views(len(views)), time.perf_counter()
         plans = [plan]
@@ -125,7 +125,7 @@ class InMemory(Steps[SceneWeights]):
             first=first, on_first=look,
         )  # fmt: skip
         W = SceneWeights(raster, plan.device, plan.features_room, views, geometry, threads=self.threads)
-        return W, WeighedViews(plans[-1], geometry.levels, W.weights.region.shape[0], geometry.blind)
+        return W, WeightStatistics(plans[-1], geometry.levels, W.weights.region.shape[0], geometry.blind)
 
     def find_objects(self, W: SceneWeights) -> RegionObjects:
         evidence = W.geometry.evidence().numpy()
@@ -166,13 +166,13 @@ class InMemory(Steps[SceneWeights]):
         weights, how = W.on_processor, {"means": self.splats.means, "threads": self.threads}
         return W.with_factors(weights, huber_factors(weights, W.geometry.codebook, self.timings.progress, **how))
 
-    def solve(self, W: SceneWeights, clusters: RegionObjects | None) -> tuple[Tensor, Support]:
+    def solve(self, W: SceneWeights, clusters: RegionObjects | None) -> tuple[Tensor, SplatSupport]:
         solution = solve(
             W.weights, W.geometry.codebook, getattr(torch, self.settings.dtype), self.timings.progress,
             means=self.splats.means, threads=self.threads, device=W.device, memory=W.memory,
         )  # fmt: skip
         confidence = W.agreement.confidence if W.agreement else None
-        return solution.features, Support(W.row_sums(), W.geometry.evidence(), solution.agreement, confidence)
+        return solution.features, SplatSupport(W.row_sums(), W.geometry.evidence(), solution.agreement, confidence)
 
     def refine(self, W: SceneWeights, X: Tensor, seen: np.ndarray) -> tuple[Tensor, dict[str, Any]]:
         settings, progress, books, facts = self.settings, self.timings.progress, W.geometry.books, dict[str, Any]()
@@ -191,7 +191,7 @@ class InMemory(Steps[SceneWeights]):
                 facts["reference"] = reference(rays, X, seen, W.geometry.samples, books, settings, progress)
         return X, facts
 
-    def smooth(self, W: SceneWeights, X: Tensor, support: Support) -> tuple[Tensor, dict[str, Any]]:
+    def smooth(self, W: SceneWeights, X: Tensor, support: SplatSupport) -> tuple[Tensor, dict[str, Any]]:
         weights, strength, choice = W.on_processor, self.settings.smoothness, dict[str, Any]()
         graph, parted = weaken_edges(
             SplatGraph.of(self.splats, self.threads), weights, W.geometry.levels, self.threads

@@ -21,7 +21,7 @@ class LiftInputs:
     """Splats, views and settings that suit each other."""
 
     splats: Splats
-    given: Views  # as the caller has them
+    source_views: Views  # as the caller has them
     views: LiftViews  # paired with cameras
     settings: LiftSettings
 

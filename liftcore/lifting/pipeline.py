@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from liftcore.errors import InvalidSettings
-from liftcore.lifting.base import Steps, Support, WeighedViews, Weights
+from liftcore.lifting.base import LiftSteps, SplatSupport, WeightStatistics, Weights
 from liftcore.lifting.checkpoint import Checkpoint
 from liftcore.lifting.engines.base import Engine
 from liftcore.lifting.engines.lift import plan_of_a_worker, steps_in_blocks
@@ -105,7 +105,9 @@ def lift(
     return result
 
 
-def run(steps: Steps[Weights], inputs: LiftInputs, timings: Timings, on_plan: Callable[[Plan], None]) -> LiftResult:
+def run(
+    steps: LiftSteps[Weights], inputs: LiftInputs, timings: Timings, on_plan: Callable[[Plan], None]
+) -> LiftResult:
     """Take the steps of a lift, whoever holds W and X."""
     splats, views, settings = inputs.splats, inputs.views, inputs.settings
     device = choose_device(settings.device)
@@ -121,7 +123,7 @@ def run(steps: Steps[Weights], inputs: LiftInputs, timings: Timings, on_plan: Ca
 
 
 def _run(
-    steps: Steps[Weights], inputs: LiftInputs, plan: Plan, timings: Timings, on_plan: Callable[[Plan], None]
+    steps: LiftSteps[Weights], inputs: LiftInputs, plan: Plan, timings: Timings, on_plan: Callable[[Plan], None]
 ) -> LiftResult:
     """Take the steps after the plan."""
     settings, views = inputs.settings, inputs.views
@@ -178,7 +180,7 @@ def object_tensors(objects: RegionObjects, said: NodeVectors) -> dict[str, torch
 
 
 def find_objects(
-    steps: Steps[Weights], W: Weights, masks: bool, settings: LiftSettings, timings: Timings
+    steps: LiftSteps[Weights], W: Weights, masks: bool, settings: LiftSettings, timings: Timings
 ) -> tuple[RegionObjects | None, NodeVectors | None]:
     """Objects and what the masks of their nodes say, where the settings ask for objects; else None.
 
@@ -198,7 +200,7 @@ def judges_apart(node_vectors: NodeVectors | None, views: int) -> bool:
 
 
 def reweigh(
-    steps: Steps[Weights], W: Weights, masks: bool, levels_apart: bool, settings: LiftSettings, timings: Timings
+    steps: LiftSteps[Weights], W: Weights, masks: bool, levels_apart: bool, settings: LiftSettings, timings: Timings
 ) -> tuple[Weights, float | None]:
     """W as it is solved, and the median reliability of regions, where that is asked for.
 
@@ -226,9 +228,9 @@ def reweigh(
 
 def diagnose(
     inputs: LiftInputs,
-    weighed: WeighedViews,
+    weighed: WeightStatistics,
     stored: torch.dtype,
-    support: Support,
+    support: SplatSupport,
     measures: ViewMeasures,
     steps: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, Any]:

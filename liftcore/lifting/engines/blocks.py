@@ -24,7 +24,7 @@ from torch import Tensor
 from liftcore.errors import InvalidInput
 from liftcore.io.safetensors_file import map_tensors, write_tensors
 from liftcore.io.shards import ROWS, features_file
-from liftcore.lifting.geometry import Question, question_of
+from liftcore.lifting.geometry import WeightRequest, weight_request
 from liftcore.lifting.warm_up import warm_up_lift
 from liftcore.raster import open_raster
 from liftcore.raster.base import RayRows, ViewWeights
@@ -110,7 +110,7 @@ class Job:
         return self.folder / f"columns-{number:05}.safetensors"
 
 
-class FoundView(NamedTuple):
+class ViewFiles(NamedTuple):
     """What a weighing wrote of a view, beside its W."""
 
     codebook: ViewCodebook
@@ -120,7 +120,7 @@ class FoundView(NamedTuple):
     blind: bool  # whether it meets no splat
 
 
-class FoundWeights(NamedTuple):
+class WeightBlock(NamedTuple):
     """W of a piece of views: rows of splats, in each the entries of one view after the other's."""
 
     splats: np.ndarray  # [n] i32 ascending
@@ -163,11 +163,11 @@ def _weigh_views(job: Job, numbers: list[int], threads: int | None) -> None:
     splats, ids = seen_splats(job, cameras, threads)
     warm_up_lift(job.kernel, device, job.settings)
     raster = open_raster(splats, device, threads)
-    waiting = deque[Question]()
+    waiting = deque[WeightRequest]()
 
     def requests():
         for number in numbers:
-            waiting.append(question_of(views, number, job.settings, by_rows=job.settings.weighs_rows))
+            waiting.append(weight_request(views, number, job.settings, by_rows=job.settings.weighs_rows))
             yield waiting[-1].request
 
     with closing(raster.iterate_views(requests())) as found:
@@ -257,7 +257,7 @@ def _renumbered(view: ViewWeights, ids: Tensor) -> ViewWeights:
 # A view's file: the codebook and the sampled rays, and how much there is of its W.
 
 
-def _write_view(path: Path, weights: RegionWeights, asked: Question, rows: RayRows) -> None:
+def _write_view(path: Path, weights: RegionWeights, asked: WeightRequest, rows: RayRows) -> None:
     readout, tuples = asked.readout, asked.codebook.tuples
     tensors = {f"rays/{name}": getattr(rows, name) for name in ("indptr", "splats", "weights")}
     tensors |= {f"read/{name}": torch.from_numpy(getattr(readout, name)) for name in ("rays", "columns", "shares")}
@@ -266,7 +266,7 @@ def _write_view(path: Path, weights: RegionWeights, asked: Question, rows: RayRo
     write_tensors(path, tensors | ({} if tuples is None else {"tuples": tuples}), {})
 
 
-def read_view(path: Path) -> FoundView:
+def read_view(path: Path) -> ViewFiles:
     """What a weighing wrote of a view, mapped."""
     arrays = map_tensors(path)[0]
     found = {name: torch.from_numpy(array) for name, array in arrays.items()}
@@ -274,7 +274,7 @@ def read_view(path: Path) -> FoundView:
     readout = Readout(**{name: arrays[f"read/{name}"] for name in ("rays", "columns", "shares")})
     codebook, sample = ViewCodebook(found["codebook"], found.get("tuples")), SampledRays(rows, readout)
     entries, met = arrays["counts"].tolist()
-    return FoundView(codebook, sample, arrays["levels"], entries, blind=not met)
+    return ViewFiles(codebook, sample, arrays["levels"], entries, blind=not met)
 
 
 # The file of a piece of views: their W, put together by splats.
@@ -311,6 +311,6 @@ def _union(parts: list[Tensor], count: int) -> np.ndarray:
     return np.flatnonzero(found).astype(np.int32)
 
 
-def read_weights(job: Job, piece: int) -> FoundWeights:
+def read_weights(job: Job, piece: int) -> WeightBlock:
     """W of a piece of views, mapped."""
-    return FoundWeights(**map_tensors(job.weights_file(piece))[0])
+    return WeightBlock(**map_tensors(job.weights_file(piece))[0])

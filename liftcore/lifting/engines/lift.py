@@ -25,7 +25,7 @@ from torch import Tensor
 from liftcore.errors import InvalidSettings, Unavailable
 from liftcore.io.safetensors_file import map_tensors, write_tensors
 from liftcore.io.shards import ROWS, map_rows, shard_at, write_index
-from liftcore.lifting.base import Steps, Support, WeighedViews
+from liftcore.lifting.base import LiftSteps, SplatSupport, WeightStatistics
 from liftcore.lifting.checkpoint import Checkpoint
 from liftcore.lifting.engines import steps
 from liftcore.lifting.engines.base import Engine, LocalEngine
@@ -194,7 +194,7 @@ def _facts(camera: Camera) -> list[Any]:
     return [camera.name, *size, camera.K.tolist(), camera.viewmat.tolist(), repr(camera.lens or camera.face)]
 
 
-class InBlocks(Steps[Job]):
+class InBlocks(LiftSteps[Job]):
     """Steps by an engine; see the protocol. W is a job, whose files have it, and X lies in shards that are mapped."""
 
     def __init__(
@@ -221,7 +221,7 @@ class InBlocks(Steps[Job]):
             device = CPU  # workers elsewhere may have other cards than this machine, or none
         return plan_lift(self.inputs.splats, views, self.inputs.settings, device, self.threads, apart=True, look=look)
 
-    def weigh(self, views: LiftViews, plan: Plan, on_plan: Callable[[Plan], None]) -> tuple[Job, WeighedViews]:
+    def weigh(self, views: LiftViews, plan: Plan, on_plan: Callable[[Plan], None]) -> tuple[Job, WeightStatistics]:
         own = plan_of_a_worker(plan)
         on_plan(replace(own, warnings=(*own.warnings, *_lack_of_disk(self.folder, plan))))
         with self.timings.step("share"):
@@ -240,7 +240,7 @@ class InBlocks(Steps[Job]):
 
     def _share(self, views: LiftViews, plan: Plan) -> Job:
         """Write what all workers read, who all take the device of the plan."""
-        splats, given = self.inputs.splats, self.inputs.given
+        splats, given = self.inputs.splats, self.inputs.source_views
         settings = self.inputs.settings.model_copy(update={"device": plan.device.kind})
         packs = tuple(Path(path).resolve() for path in given.paths)
         sizes = splats.count, views.features.channels
@@ -318,20 +318,20 @@ class InBlocks(Steps[Job]):
         self.run("loss", steps.measure, W, W.solutions)
         return replace(W, delta=mean_distance(_sums(W, "measure", (2, 1))))
 
-    def solve(self, W: Job, clusters: RegionObjects | None) -> tuple[Tensor, Support]:
+    def solve(self, W: Job, clusters: RegionObjects | None) -> tuple[Tensor, SplatSupport]:
         job = _with_clusters(W, clusters)
         self.run("solve", steps.solve, job, job.solutions)
         sums, evidence = _column(job, "rows", "sums"), _column(job, "rows", "evidence")
         agreement, robust = _column(job, "columns", "agreement"), job.settings.robust_steps
         confidence = torch.from_numpy(_column(job, "columns", "confidence")) if robust else None
-        support = Support(sums, torch.from_numpy(evidence), torch.from_numpy(agreement), confidence)
+        support = SplatSupport(sums, torch.from_numpy(evidence), torch.from_numpy(agreement), confidence)
         return _mapped(job, job.solved_file), support
 
     def refine(self, W: Job, X: Tensor, seen: np.ndarray) -> NoReturn:
         """See the protocol: `LiftSettings.check_blocks` has refused what asks for it."""
         raise AssertionError("least squares need all rays in one place")
 
-    def smooth(self, W: Job, X: Tensor, support: Support) -> NoReturn:
+    def smooth(self, W: Job, X: Tensor, support: SplatSupport) -> NoReturn:
         """See the protocol: `LiftSettings.check_blocks` has refused what asks for it."""
         raise AssertionError("the graph of neighbours crosses blocks")
 
@@ -395,7 +395,7 @@ def _mapped(job: Job, file: Callable[[int], Path]) -> Tensor:
     return torch.from_numpy(map_rows([shard_at(file(number)) for number in range(job.solutions)]))
 
 
-def _share_regions(job: Job, plan: Plan) -> WeighedViews:
+def _share_regions(job: Job, plan: Plan) -> WeightStatistics:
     """Write the numbers of regions and the codebook of all views."""
     counts, levels, blind, entries = [0], list[np.ndarray](), list[str](), 0
     for number, name in enumerate(job.names):
@@ -411,7 +411,7 @@ def _share_regions(job: Job, plan: Plan) -> WeighedViews:
         raise Unavailable("features", expected=f"at most {MOST_REGIONS} regions", got=got, hint=hint)
     steps.write_piece(job.folder / steps.REGIONS, together)
     write_tensors(job.folder / steps.CODEBOOK, _Books(job), {})
-    return WeighedViews(plan, together["levels"], entries, tuple(blind))
+    return WeightStatistics(plan, together["levels"], entries, tuple(blind))
 
 
 class _Books(Mapping[str, Tensor]):

@@ -30,7 +30,7 @@ import torch
 
 from liftcore.features.smoothness import some_grids, unlike_maps
 from liftcore.lifting.geometry import Geometry, weigh_views
-from liftcore.lifting.planning.views import PILOT_CHANNELS, SAMPLE, Said, spread
+from liftcore.lifting.planning.views import PILOT_CHANNELS, SAMPLE, ViewDisagreement, spread
 from liftcore.raster.base import Raster
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import silent
@@ -129,7 +129,7 @@ def _scaled(views: LiftViews, factor: float) -> LiftViews:
     """Those views that are looked at, their cameras' positions times a factor."""
     scale = np.ones((4, 4))
     scale[:3, 3] = factor
-    names = _some(views.names, FLOWN)
+    names = evenly_spaced(views.names, FLOWN)
     cameras = [views.cameras[name].replace(viewmat=views.cameras[name].viewmat * scale) for name in names]
     return replace(views, names=names, cameras=Cameras(cameras))
 
@@ -142,7 +142,7 @@ def agreement_of_views(
     Args:
         rays: of all of them, whose sums of weights are taken.
     """
-    few = views.only(_some(views.names, FLOWN))
+    few = views.only(evenly_spaced(views.names, FLOWN))
     longest = max(max(few.camera(k).width, few.camera(k).height) for k in range(len(few)))
     coarse = {"stride": max(1, longest // SIDE), "certificate_rays": rays, "robust_steps": 0, "consensus": False}
     own = settings.model_copy(update=coarse)
@@ -172,7 +172,7 @@ def _agreement_of(geometry: Geometry) -> float | None:
     read = torch.nn.functional.normalize(torch.cat([book.means(book.rows.float()) for book in books]), dim=1)
     read = read - (mass / mass.sum()) @ read
     channels, rows = read.shape[1], torch.from_numpy(spread(len(W.indptr) - 1, min(SAMPLE, len(W.indptr) - 1)))
-    said = Said(W, read @ random_axes(channels, min(PILOT_CHANNELS, channels), 0), rows)
+    said = ViewDisagreement(W, read @ random_axes(channels, min(PILOT_CHANNELS, channels), 0), rows)
     if not said.weights.any():
         return None
     alone, together, once = said.means(said.weights)
@@ -188,6 +188,6 @@ def _agreement_of(geometry: Geometry) -> float | None:
     return (together - once * alone) / (1 - once) / alone / possible
 
 
-def _some(names: Sequence[str], count: int) -> list[str]:
+def evenly_spaced(names: Sequence[str], count: int) -> list[str]:
     """As many of the names, evenly spread."""
     return [names[int(place)] for place in spread(len(names), min(count, len(names)))]

@@ -18,7 +18,7 @@ from liftcore.lifting.planning.views import (
     PILOT_VIEWS,
     WELL_COVERED,
     Visibility,
-    fly_pilot,
+    estimate_view_noise,
     spare_views,
     view_order,
     views_to_show,
@@ -296,7 +296,7 @@ def _choose_views(
         return sorted(order[:least]), None
     if raster is None or len(every) <= max(FEW_VIEWS, least + PILOT_VIEWS):
         return every, None
-    pilot = fly_pilot(raster, views, settings, seen)
+    pilot = estimate_view_noise(raster, views, settings, seen)
     count, expected = pilot.views_for(settings.view_cosine, order, least)
     return sorted(order[:count]), expected
 

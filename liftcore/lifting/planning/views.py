@@ -213,7 +213,7 @@ def spare_views(seen: Visibility) -> list[int]:
 
 
 @dataclass(frozen=True)
-class Pilot:
+class ViewNoiseEstimate:
     """What is expected of some of the views."""
 
     areas: np.ndarray  # [V, n] f32, of the sampled splats in all views
@@ -241,7 +241,9 @@ class Pilot:
         return len(order), expected
 
 
-def fly_pilot(raster: Raster, views: LiftViews, settings: LiftSettings, seen: Visibility) -> Pilot:
+def estimate_view_noise(
+    raster: Raster, views: LiftViews, settings: LiftSettings, seen: Visibility
+) -> ViewNoiseEstimate:
     """Weigh evenly spaced views of those of which ``seen`` tells, two at least."""
     total, count = len(views.names), min(PILOT_VIEWS, len(views.names))
     flown: list[int] = spread(total, count).tolist()
@@ -255,17 +257,17 @@ def fly_pilot(raster: Raster, views: LiftViews, settings: LiftSettings, seen: Vi
     with one_thread():
         geometry = weigh_views(raster, raster.splats.count, chosen, own, silent, by_rows=False)
         read = [view.means(view.rows.float() @ axes) for view in geometry.codebook.views]
-        said = Said(geometry.weights, torch.cat(read), torch.from_numpy(rows))
+        said = ViewDisagreement(geometry.weights, torch.cat(read), torch.from_numpy(rows))
     evidence = _evidence(geometry.evidence().numpy()[rows], seen.areas, seen.areas[flown])
     if not evidence.any():  # no ray met a splat, so nothing is known of any view
-        return Pilot(seen.areas, np.ones(len(evidence)), np.ones(len(evidence)))
+        return ViewNoiseEstimate(seen.areas, np.ones(len(evidence)), np.ones(len(evidence)))
     variance, together = said.disagreement(evidence)
     share = together / (together + (1.0 - together) * (total - 1) / (count - 1))  # B, in the mean
     by_area = _ratio((seen.areas.astype(np.float64) ** 2).sum(axis=0), seen.areas.sum(axis=0, dtype=np.float64) ** 2)
-    return Pilot(seen.areas, _errors(variance, by_area * share / _mean(by_area, evidence)), evidence)
+    return ViewNoiseEstimate(seen.areas, _errors(variance, by_area * share / _mean(by_area, evidence)), evidence)
 
 
-class Said:
+class ViewDisagreement:
     """What views say of some splats, in sums over the views."""
 
     def __init__(self, W: RegionWeights, read: Tensor, rows: Tensor) -> None:

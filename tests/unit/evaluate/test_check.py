@@ -60,7 +60,7 @@ def test_what_belongs_together_is_healthy(scene: StillLife, photos, grids) -> No
     found = check_scene(scene.splats, scene.cameras, photos, as_views(grids))
     assert found.wrong == () and found.notes == ()
     assert {view.view for view in found.views} == set(scene.cameras) and found.in_view > 0.9
-    assert all(view.psnr and view.others and view.psnr > 30 > view.others for view in found.views)
+    assert all(view.psnr and view.other_psnr and view.psnr > 30 > view.other_psnr for view in found.views)
     assert found.features["neighbouring_cells"] > found.features["[F, h, w]"] and found.worst is not None
 
 

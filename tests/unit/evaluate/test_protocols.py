@@ -153,7 +153,7 @@ def test_p2_sees_the_selected_splats_alone(scene: Scene) -> None:
         extras={},
     )
     alone = CpuRaster(few).row_sums(scene.cameras["frame_00001"], scene.compositing)
-    found = protocol.look("frame_00001")
+    found = protocol.predict_view("frame_00001")
     assert (found["red apple"].mask == (alone > 0.7).numpy()).all() and found["red apple"].mask.any()
     assert not found["unicorn"].mask.any() and found["unicorn"].peak is None
 
@@ -161,7 +161,7 @@ def test_p2_sees_the_selected_splats_alone(scene: Scene) -> None:
 @pytest.mark.parametrize("threshold", ["auto", 0.4])
 def test_p3_cuts_the_rendered_scores_of_a_query(scene: Scene, threshold: str | float) -> None:
     texts, encoder = ["book", "red apple"], words(scene)
-    found = RenderedScores(scene, texts, encoder, threshold).look("frame_00002")
+    found = RenderedScores(scene, texts, encoder, threshold).predict_view("frame_00002")
     for text in texts:
         seen = view_mask(scene, ask(scene, Query.of((text,), threshold=threshold), encoder), "frame_00002")
         met = seen.row_sums >= 0.5

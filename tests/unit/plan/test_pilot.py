@@ -13,7 +13,7 @@ from liftcore.io.inria import write_inria_cameras
 from liftcore.io.splats import write_splats
 from liftcore.lifting.files import lift_files, open_files
 from liftcore.lifting.planning.plan import FEW_VIEWS
-from liftcore.lifting.planning.views import PILOT_VIEWS, Pilot, fly_pilot, visibility
+from liftcore.lifting.planning.views import PILOT_VIEWS, ViewNoiseEstimate, estimate_view_noise, visibility
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Cameras
 from liftcore.values.lift_views import LiftViews
@@ -71,8 +71,8 @@ def test_the_more_views_disagree_the_more_are_lifted(tmp_path):
     assert counts[-1] > 0.9 * VIEWS
 
 
-def pilot_of(areas: list[list[float]], errors: list[float], weights: list[float]) -> Pilot:
-    return Pilot(np.array(areas, np.float32), np.array(errors), np.array(weights))
+def pilot_of(areas: list[list[float]], errors: list[float], weights: list[float]) -> ViewNoiseEstimate:
+    return ViewNoiseEstimate(np.array(areas, np.float32), np.array(errors), np.array(weights))
 
 
 def test_cosines_are_those_of_the_variance_and_of_the_splats_that_views_show():
@@ -154,12 +154,12 @@ def test_few_views_are_all_taken(tmp_path):
     assert len(lifted.metadata.views) == VIEWS // 2 <= FEW_VIEWS
 
 
-def flown(splats, cameras, pack, threads=1) -> Pilot:
+def flown(splats, cameras, pack, threads=1) -> ViewNoiseEstimate:
     settings = LiftSettings.of()
     scene, views, packs = open_files(splats, cameras, [pack], settings)
     found = LiftViews.of(packs, views, settings)
     seen = visibility(scene, [found.camera(k) for k in range(len(found.names))], settings.lift_params)
-    return fly_pilot(CpuRaster(scene, threads), found, settings, seen)
+    return estimate_view_noise(CpuRaster(scene, threads), found, settings, seen)
 
 
 def test_a_pilot_repeats_on_any_number_of_threads(tmp_path):
