@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from liftcore.errors import InvalidSettings
-from liftcore.lifting.base import LiftSteps, SplatSupport, WeightStatistics, Weights
+from liftcore.lifting.base import LiftSteps, SplatSupport, Weights, WeightStatistics
 from liftcore.lifting.checkpoint import Checkpoint
 from liftcore.lifting.engines.base import Engine
 from liftcore.lifting.engines.lift import plan_of_a_worker, steps_in_blocks
