@@ -20,13 +20,13 @@ from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.presence import (
     NOT_IN_WORDS,
     References,
+    any_present,
     best_splats,
-    judge,
+    estimate_presence,
     pack_of,
     products,
-    references_beside,
     references_of,
-    together,
+    references_of_space,
 )
 from liftcore.query.question import (
     Answer,
@@ -44,13 +44,13 @@ from liftcore.query.scores import LEAST_LIKENESS, LOWEST_COSINE, combine, cosine
 from liftcore.query.selection import (
     LEAST_FIRST,
     SAME_WORD,
-    Rivals,
-    contest,
-    nearer_than_rivals,
+    CompetingWords,
+    add_objects,
+    compare_ranks,
+    correct_by_objects,
+    nearest_to_query,
+    objects_within,
     part_nodes,
-    things_within,
-    with_parts,
-    with_things,
 )
 from liftcore.query.selections import set_members
 from liftcore.query.terms import Vector
@@ -188,7 +188,7 @@ def query_vectors(
     elif reader is not None:
         others = references_of(reader, scene.metadata.text_space)
     else:
-        others = references_beside(rows, scene.metadata.text_space)
+        others = references_of_space(rows, scene.metadata.text_space)
     pack = None if reader is None else pack_of(reader)
     answer = answers(scene, [Question(query, rows, np.ones(len(rows), np.bool_), others, asked_as, pack)])[0]
     scores, selected = map(torch.from_numpy, (answer.scores, answer.selected))
@@ -244,7 +244,7 @@ def _question(
     rows = directions(scene, query, encoder, names, asked_as)
     if phrase is not None:
         asked_as = asked_as | {0: Wording(query.text[0], str(phrase), "part")}
-    scene.counted(query.weigh)
+    scene.splat_weights(query.weigh)
     encoder = encoder or scene.table
     if encoder is None or not words[: len(query.positives)].any():
         return Question(query, rows, words, "", asked_as, candidates=candidates(scene, query))
@@ -272,7 +272,7 @@ def _part_answer(scene: OpenedLift, asked: Question) -> Answer:
     sure, part = asked.part.phrase.sure, asked.part.part
     (thing,) = answers(scene, [asked.part.thing])
     if thing.count:
-        inside = with_parts(scene, thing.selected)
+        inside = add_objects(scene, thing.selected)
         (found,) = answers(scene.within(inside), [part])
         nothing = "" if found.count or found.present is False else " Nothing stands out there."
         told = f"{asked.part.phrase.thing!r} has {thing.count:,} splats. Within it: {found.why}{nothing}"
@@ -351,20 +351,20 @@ def _answer(scene: OpenedLift, asked: Question, similarities: np.ndarray) -> Ans
         found = Threshold(value=math.inf, method=method, explanation=presence.why, clear=False)
         selected = np.zeros_like(seen)
     else:
-        found, selected = _selected(scene, asked, kept, scores, scene.counted(query.weigh))
+        found, selected = _selected(scene, asked, kept, scores, scene.splat_weights(query.weigh))
     clear = found.clear and presence.present is not False and bool(selected.any())
     least = MOST_OF_IT if clear and presence.present is not None else LEAST_RIVAL
-    rivals = _nearer_words(scene, asked, scores, selected, least)
+    competitors = _nearer_words(scene, asked, scores, selected, least)
     meant = asked.candidates
     if asked.unknown_part is not None and selected.any():
-        meant = parts_of(scene, things_within(scene, selected))
+        meant = parts_of(scene, objects_within(scene, selected))
         thing = presence.why.replace(
             repr(query.text[0]), repr(asked.unknown_part.thing)
         )  # what is there is the thing
         presence = presence.model_copy(update={"why": f"{thing} {_without_word(asked.unknown_part, len(meant))}"})
     wording = tuple(AskedAs(**word._asdict()) for word in asked.asked_as.values() if word.how)
     return Answer.of(
-        query, scores, seen, selected, wording=wording, rivals=rivals,
+        query, scores, seen, selected, wording=wording, rivals=competitors,
         candidates=meant, threshold=found, clear=clear, statistics=finite(_statistics(known)),
         **dict(presence),
     )  # fmt: skip
@@ -433,13 +433,13 @@ def _selected(
     in_words = (asked.plain & kept)[:positives]
     least = -math.inf if in_words.any() else LEAST_LIKENESS
     counted = "evidence" if query.weigh == "evidence" else "evidence times confidence"
-    alone = scene.weights if query.weigh == "evidence" else scene.seen_alone(weights)
+    alone = scene.weights if query.weigh == "evidence" else scene.weights_with_feature(weights)
     found = find_threshold(known, query.threshold, alone, least, counted)
     selected = scene.seen & (scores >= np.float32(found.value))
-    rivals = _rivals(asked, asked.rows[:positives][in_words])
-    if query.threshold != "auto" or not rivals or in_words.sum() < kept[:positives].sum():
+    competitors = _rivals(asked, asked.rows[:positives][in_words])
+    if query.threshold != "auto" or not competitors or in_words.sum() < kept[:positives].sum():
         return found, selected
-    standing = contest(scene, scores, weights, found.value, rivals[0])
+    standing = compare_ranks(scene, scores, weights, found.value, competitors[0])
     if standing.lowest > found.value:
         again = find_threshold(known, "auto", alone, standing.lowest, counted)
         value = max(again.value, standing.lowest)
@@ -449,27 +449,29 @@ def _selected(
         )
         selected = scene.seen & (scores >= np.float32(value))
     found = found.model_copy(update={"clear": found.clear and standing.first >= LEAST_FIRST})
-    if rivals[-1].allowed == 0:
-        selected = nearer_than_rivals(scene, selected, rivals[-1])
-    parts = part_nodes(scene, rivals[0])
+    if competitors[-1].nearer_limit == 0:
+        selected = nearest_to_query(scene, selected, competitors[-1])
+    parts = part_nodes(scene, competitors[0])
     if parts:
         selected = scene.seen & np.logical_or.reduce([scene.members(node) for node in parts])
         addition = f"levels say different things, so the parts that it names are taken: {', '.join(map(str, parts))}"
     else:
-        selected, addition = with_things(scene, selected, weights, rivals[0])
+        selected, addition = correct_by_objects(scene, selected, weights, competitors[0])
     if addition:
         found = found.model_copy(update={"explanation": f"{found.explanation.removesuffix('.')}; {addition}."})
     return found, selected
 
 
-def _rivals(asked: Question, directions: np.ndarray) -> list[Rivals]:
+def _rivals(asked: Question, directions: np.ndarray) -> list[CompetingWords]:
     """The words that compete with the positives [p, F]: reference words, then the others of a pack."""
     if not len(directions):
         return []
-    rivals = [Rivals.among(asked.references, directions)] if isinstance(asked.references, References) else []
+    competitors = (
+        [CompetingWords.among(asked.references, directions)] if isinstance(asked.references, References) else []
+    )
     if asked.pack is not None:
-        rivals.append(Rivals.of_pack(asked.pack, directions))
-    return [some for some in rivals if len(some.vectors)]
+        competitors.append(CompetingWords.of_pack(asked.pack, directions))
+    return [some for some in competitors if len(some.vectors)]
 
 
 def _presence(scene: OpenedLift, asked: Question, similarities: np.ndarray) -> tuple[Presence, np.ndarray]:
@@ -481,8 +483,10 @@ def _presence(scene: OpenedLift, asked: Question, similarities: np.ndarray) -> t
     if isinstance(asked.references, str):
         return Presence(present=None, presence=None, why=asked.references), kept
     names = [repr(term) if isinstance(term, str) else str(term) for term in asked.query.positives]
-    presences = [judge(scene, names[k], asked.rows[k], similarities[:, k], asked.references) for k in words]
-    presence = together(presences)
+    presences = [
+        estimate_presence(scene, names[k], asked.rows[k], similarities[:, k], asked.references) for k in words
+    ]
+    presence = any_present(presences)
     if presence.present is False and len(words) < positives:  # examples are not questioned
         presence = presence.model_copy(update={"present": None})
     if presence.present is not False and asked.query.absent == "drop":

@@ -15,7 +15,7 @@ import numpy as np
 from liftcore.query.areas import splats_shown
 from liftcore.query.opened import OpenedLift
 from liftcore.query.question import Candidate, Query
-from liftcore.query.terms import Area, OneSplat, SplatSet, Term
+from liftcore.query.terms import Area, SplatSet, SplatTerm, Term
 
 MOST_PARTS = 8  # that are offered for a word: the largest
 TWIN_SHARE = 0.75  # of the splats of a whole: mistakes of masks leave such parts, and to the eye they are the whole
@@ -29,10 +29,10 @@ def candidates(scene: OpenedLift, query: Query) -> tuple[Candidate, ...]:
         InvalidQuery, NotFound, InvalidLift: as `liftcore.query.areas.feature_shown`.
     """
     wanted, unwanted = query.positives, query.terms[len(query.positives) :]
-    if not wanted or scene.object_views is None or not all(isinstance(one, Area | OneSplat) for one in wanted):
+    if not wanted or scene.object_views is None or not all(isinstance(one, Area | SplatTerm) for one in wanted):
         return ()
     paths = [_path(scene, one) for one in wanted]
-    against = [set(_path(scene, one)) for one in unwanted if isinstance(one, Area | OneSplat)]
+    against = [set(_path(scene, one)) for one in unwanted if isinstance(one, Area | SplatTerm)]
     kept = [
         node
         for node in paths[0]
@@ -62,7 +62,7 @@ def parts_of(scene: OpenedLift, things: np.ndarray) -> tuple[Candidate, ...]:
 
 def _path(scene: OpenedLift, example: Term) -> dict[int, float]:
     """The nodes that hold what an example shows, the largest first, and what share of it each holds."""
-    if isinstance(example, OneSplat):
+    if isinstance(example, SplatTerm):
         rows, weights = np.array([example.splat]), np.ones(1)
     else:
         assert isinstance(example, Area)

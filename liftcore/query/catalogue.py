@@ -193,9 +193,9 @@ def _described(
 
 def object_features(scene: OpenedLift) -> np.ndarray:
     """[N, F] f32: the unit mean of each object's unit features, by evidence; zeros where none has a feature."""
-    if scene.object_means is None:
-        scene.object_means = _object_means(scene)
-    return scene.object_means
+    if scene.object_features is None:
+        scene.object_features = _object_means(scene)
+    return scene.object_features
 
 
 def _object_means(scene: OpenedLift) -> np.ndarray:

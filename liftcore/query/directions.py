@@ -18,7 +18,7 @@ from liftcore.query.presence import references_of
 from liftcore.query.question import AskableWord, AskableWords, Query
 from liftcore.query.regions import codebook_row, regions_of
 from liftcore.query.selections import set_members
-from liftcore.query.terms import Area, Example, OneSplat, Region, SplatSet, Term, Vector, parse_example
+from liftcore.query.terms import Area, Example, Region, SplatSet, SplatTerm, Term, Vector, parse_example
 from liftcore.text import RememberingEncoder, TextEncoder, check_texts
 from liftcore.text.table import TableEncoder
 from liftcore.text.wording import PartPhrase, Wording, part_phrases, shipped_words
@@ -100,12 +100,12 @@ def named_things(scene: OpenedLift, words: Sequence[str], vectors: np.ndarray) -
     Args:
         words: n. vectors: [n, F] f32, unit.
     """
-    if scene.object is None or vectors.shape[1] != scene.channels or not len(scene.thing_means):
+    if scene.object is None or vectors.shape[1] != scene.channels or not len(scene.object_means):
         return ()
-    plain = (scene.thing_means @ vectors.T).argmax(axis=1)
-    apart = (scene.thing_means - scene.rough_mean) @ vectors.T
+    plain = (scene.object_means @ vectors.T).argmax(axis=1)
+    apart = (scene.object_means - scene.rough_mean) @ vectors.T
     ahead = (apart > np.take_along_axis(apart, plain[:, None], axis=1)).sum(axis=1)
-    sure = (ahead < max(1, len(words) // 100)) & scene.thing_means.any(axis=1)
+    sure = (ahead < max(1, len(words) // 100)) & scene.object_means.any(axis=1)
     rows: list[int] = np.flatnonzero(sure).tolist()
     return tuple(dict.fromkeys(words[int(plain[row])].replace("_", " ") for row in rows))
 
@@ -206,7 +206,7 @@ def _regions(scene: OpenedLift, query: Query, named: _Names) -> dict[int, np.nda
     return rows
 
 
-def _feature(scene: OpenedLift, example: Area | OneSplat | SplatSet | Vector) -> np.ndarray:
+def _feature(scene: OpenedLift, example: Area | SplatTerm | SplatSet | Vector) -> np.ndarray:
     if isinstance(example, Area):
         return feature_shown(scene, example)
     if isinstance(example, Vector):

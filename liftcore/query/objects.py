@@ -8,7 +8,7 @@ import numpy as np
 from liftcore.errors import InvalidQuery
 from liftcore.query.opened import OpenedLift
 from liftcore.query.question import Answer, Box, FoundObject, Objects, Point
-from liftcore.query.selection import MOST, SOME
+from liftcore.query.selection import MOSTLY_SELECTED, PARTLY_SELECTED
 from liftcore.query.terms import SplatSet
 from liftcore.scene.touching import touching
 
@@ -46,7 +46,7 @@ def objects(scene: OpenedLift, answer: Answer) -> Objects:
     numbers = np.full(len(answer.scores), -1, np.int32)
     if not len(rows):
         return Objects.of((), numbers, 0, scene.world)
-    weights = scene.counted(answer.query.weigh)[rows].astype(np.float64)
+    weights = scene.splat_weights(answer.query.weigh)[rows].astype(np.float64)
     weights = weights if weights.any() else np.ones(len(rows))
     groups = _set_numbers(scene, sets)[rows] if sets else touching(scene.splats, rows)
     sums = np.bincount(groups, weights)
@@ -102,11 +102,11 @@ def _without_leaks(
     def is_fragment(group: int) -> bool:
         """True of a group with too little of each thing that it is of; what leaks beside one does not hide it."""
         counts = counts_of(group)
-        holds = (counts >= SOME * counts.sum()) & (counts >= SOME * sizes)
+        holds = (counts >= PARTLY_SELECTED * counts.sum()) & (counts >= PARTLY_SELECTED * sizes)
         return bool(counts.argmax()) and not holds[1:].any()
 
     first = counts_of(large[0])
-    if not first.argmax() or first.max() < MOST * sizes[first.argmax()]:
+    if not first.argmax() or first.max() < MOSTLY_SELECTED * sizes[first.argmax()]:
         return large
     return large[[not (few and is_fragment(group)) for group, few in zip(large, small, strict=True)]]
 

@@ -87,7 +87,7 @@ class OpenedLift:
         self.labelled: tuple[Any, Any] | None = None  # what was last exported, and its `Labels`, for two files of it
         self.selections: dict[str, Selection] = {}  # by their names; `Scene.select` makes them
         self.node_boxes: dict[tuple[int, int], Box] = {}  # of listed nodes, by their ids and numbers of splats
-        self.object_means: np.ndarray | None = None  # [N, F], of `liftcore.query.catalogue.object_features`
+        self.object_features: np.ndarray | None = None  # [N, F], of `liftcore.query.catalogue.object_features`
         self._encoders: dict[str | None, TextEncoder] = {}
         places = {"splats": splats, "cameras": cameras}
         self._moved = {role: Path(at) if isinstance(at, str | Path) else None for role, at in places.items()}
@@ -228,9 +228,9 @@ class OpenedLift:
     @cached_property
     def weights(self) -> np.ndarray | None:
         """How much each seen splat counts in a histogram, its evidence; None when none has evidence."""
-        return self.seen_alone(self.evidence)
+        return self.weights_with_feature(self.evidence)
 
-    def counted(self, weigh: str) -> np.ndarray:
+    def splat_weights(self, weigh: str) -> np.ndarray:
         """[P] f32, how much each splat counts: by its evidence, or by that times its confidence.
 
         Raises:
@@ -243,7 +243,7 @@ class OpenedLift:
             raise InvalidQuery("weigh", expected="a lift with confidence", got=got, hint=hint)
         return self.evidence * self.confidence
 
-    def seen_alone(self, weights: np.ndarray) -> np.ndarray | None:
+    def weights_with_feature(self, weights: np.ndarray) -> np.ndarray | None:
         """Weights [P] of the seen splats; None when none is above zero, so that they count alike."""
         weights = weights if self.all_seen else weights[self.seen]
         return weights if weights.max(initial=0.0) > 0 else None
@@ -260,7 +260,7 @@ class OpenedLift:
         return mean_direction(self.features[rows], self.norms[rows], self.evidence[rows])
 
     @cached_property
-    def thing_means(self) -> np.ndarray:
+    def object_means(self) -> np.ndarray:
         """[N, F] f32, the unit mean of the features of each object of the lift (`mean_of`)."""
         assert self.object is not None and self.object_views is not None
         own = np.where(self.seen, self.object, -1)
@@ -321,7 +321,7 @@ class OpenedLift:
         Means and shares of evidence are those of these splats, so that a question tells them from one another.
         """
         inner = copy(self)
-        for name in ("seen", "all_seen", "weights", "mean", "thing_means", "principal"):
+        for name in ("seen", "all_seen", "weights", "mean", "object_means", "principal"):
             inner.__dict__.pop(name, None)
         inner._has_feature = self.seen & members
         inner.evidence = np.where(members, self.evidence, np.float32(0.0))

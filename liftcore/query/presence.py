@@ -1,23 +1,24 @@
-"""Whether a thing is there at all: a word's best splats, asked for other words too.
+"""Presence of a word's object in a scene: a comparison of the word's best splats with other words.
 
-A score says where a scene is most like a word, never whether it is there. So the splats that are most like the word
-are compared with some hundreds of **reference words** of the same encoder. A thing that is there is among the first
-of them; for one that is not, the words of what really is there come first, and many more with them.
+A score says where a scene is most similar to a word, and not that the object is in the scene. So the splats most
+similar to the word are compared with some hundreds of **reference words** of the same encoder. If the object is in
+the scene, its word is among the nearest of them; else the words of the objects that are there are nearer.
 
-    presence = share, by evidence, of the word's best splats at which at most MOST_AHEAD of the references are nearer
+    presence = share, by evidence, of the word's best splats at which at most MOST_NEARER of the references are nearer
 
-taken twice: with the words as they lie, and about the scene's mean, which takes away what all of a scene's features
-share. (Images lie apart from words, and some words lie nearer to all images than the right ones.) It is present where
-both shares are a half or more. It is absent where the first is less and, about the mean, not even a half has the word
-as the nearest of all. Between these it is **not sure**: there is no saying, and what stands apart is shown. A phrase
-that is none of the references may have twice as many ahead: they are more
-to the point than it is. The best splats are the few with LEAST_SHARE of the scene's evidence: less is no
-thing to a threshold either. A reference that means nearly the same takes nothing away: those related to the word,
-with RELATED of the similarity of the word's nearest reference, are left out (an encoder's words share a cone, so they
-are compared about their mean). ``tests.benchmarks.presence`` is where the constants are measured.
+This share is computed twice: from the cosines, and about the scene's mean, which removes what all features of the
+scene share. (Features of images and of words lie apart, and some words are nearer to all images than the right ones.)
+The word is present if both shares are at least a half. It is absent if the first is below a half and, about the mean,
+the word is the nearest of all for less than a half. Otherwise the answer is **not sure**, and the threshold selects.
 
-Reference words are a table's own where it has enough of them, else those that ship for CLIP ViT-B/32, else what the
-encoder makes once of the same words and keeps in the user's cache.
+- A phrase that is not among the references may have twice as many nearer words, as these are more specific.
+- The best splats are the few with LEAST_SHARE of the scene's evidence: a threshold selects no less either.
+- References related to the word, with at least RELATED of the similarity of its nearest reference, are left out:
+  a synonym does not compete. All words of an encoder share a cone, so they are compared about their mean.
+- ``tests.benchmarks.presence`` measures the constants.
+
+Reference words are the words of a table if it has enough of them, else the shipped ones of CLIP ViT-B/32, else
+vectors that the encoder computes once for the same words, which are cached in the user's cache folder.
 """
 
 from __future__ import annotations
@@ -44,13 +45,13 @@ from liftcore.text.table import TableEncoder
 from liftcore.text.wording import base_of, plain
 
 LEAST_WORDS = 200  # of a table, to be references
-EVERY = 4  # of the shipped words, that another encoder is asked for: 301 take it seconds
-MOST_AHEAD = 0.0033  # of the references, that may be nearer to a splat than what is there: synonyms, wrong masks
+WORD_STEP = 4  # an encoder without references encodes each 4th of the shipped words: 301 take seconds
+MOST_NEARER = 0.0033  # share of the references that may be nearer to a splat than its own word: synonyms, wrong masks
 _ITSELF = 0.9  # similarity about the mean from which a word is one of the references
 RELATED = 0.55  # of the similarity of a word's nearest reference, from which references are left out
-MOST_SPLATS = 256  # of the best ones that are looked at, those with the most evidence
-_FIRST = 1_024  # splats in which the best ones are looked for at first
-_SAME = 0.99  # cosine of two vectors of one text that come from one encoder
+MOST_SPLATS = 256  # of the best ones that are compared, those with the most evidence
+_FIRST = 1_024  # splats among which the best ones are searched first
+_SAME_TEXT = 0.99  # least cosine of two vectors of one text that come from one encoder
 _IN_CONE = 0.5  # cosine to the shipped words' mean direction: they have .75 to .93, other spaces' vectors about 0
 
 
@@ -63,10 +64,10 @@ class References:
 
     @classmethod
     def of(cls, vectors: Any, channels: int) -> Self:
-        """Of vectors [n, F], torch or numpy, of any length above zero.
+        """Return references of vectors [n, F], torch or numpy, of any length above zero.
 
         Raises:
-            InvalidQuery: too few, of another length, of zeros or not finite.
+            InvalidQuery: fewer than LEAST_WORDS vectors, other channels than ``channels``, zero or non-finite ones.
         """
         rows = np.asarray(as_numpy(vectors), np.float32)
         lengths = np.linalg.norm(rows, axis=-1)
@@ -82,7 +83,7 @@ class References:
 
     @cached_property
     def mean(self) -> np.ndarray:
-        """[F] f32, what all words share."""
+        """[F] f32, the mean of all words, which they share."""
         return self.vectors.mean(axis=0, dtype=np.float64).astype(np.float32)
 
     @cached_property
@@ -91,61 +92,63 @@ class References:
 
     @cached_property
     def plain_words(self) -> tuple[str, ...]:
-        """The words as they are compared with others, without what tells their meanings apart."""
+        """The words in plain spelling, without the suffixes that distinguish their meanings."""
         return tuple(plain(base_of(word)) for word in self.words)
 
     def against(self, direction: np.ndarray) -> tuple[np.ndarray, int]:
-        """What a unit vector [F] of the same space is compared with.
+        """Return the references to compare a unit vector [F] of the same space with.
 
         Returns:
-            [m] i64, the words that mean something else, and how many of them may be nearer to what is there.
+            [m] i64, the words of another meaning, and how many of them may be nearer if the object is present.
         """
         similar = self._about_mean @ _unit(direction - self.mean)
         nearest = float(similar.max())
-        allowed = math.ceil(MOST_AHEAD * len(self.words) * (1 if nearest >= _ITSELF else 2))
-        return np.flatnonzero(similar < max(RELATED * nearest, np.finfo(np.float32).eps)), allowed
+        limit = math.ceil(MOST_NEARER * len(self.words) * (1 if nearest >= _ITSELF else 2))
+        return np.flatnonzero(similar < max(RELATED * nearest, np.finfo(np.float32).eps)), limit
 
 
-def judge(
+def estimate_presence(
     scene: OpenedLift, name: str, direction: np.ndarray, scores: np.ndarray, references: References
 ) -> Presence:
-    """Say whether a word is there.
+    """Estimate if the object of a word is in the scene.
 
     Args:
-        scene: an opened lift. name: of the word, as the answer tells it.
-        direction: [F] f32, its unit vector. scores: [P] f32, every splat's cosine to it.
-        references: of its text space.
+        scene: an opened lift. name: the word, as in the answer's explanation.
+        direction: [F] f32, its unit vector. scores: [P] f32, the cosine of every splat to it.
+        references: words of its text space.
     """
     best, weights = best_splats(scene, scores)
     if not len(best):
         return Presence(present=False, presence=0.0, why=f"{name} is not there: no splat has a feature.")
-    others, allowed = references.against(direction)
+    reference_rows, limit = references.against(direction)
     rows, norms, count = scene.features[best], scene.norms[best], len(references.words)
-    nearer, contrast = nearer_counts(rows, norms, scene.rough_mean, direction[None], references.vectors[others])
-    shares = [float(weights[ahead <= allowed].sum() / weights.sum()) for ahead in (nearer, contrast)]
+    nearer, contrast = nearer_counts(
+        rows, norms, scene.rough_mean, direction[None], references.vectors[reference_rows]
+    )
+    shares = [float(weights[counts <= limit].sum() / weights.sum()) for counts in (nearer, contrast)]
     presence = min(shares)
     if presence >= 0.5:
-        told = f"at {presence:.0%} of its best splats at most {allowed} of {count} reference words are nearer"
-        return Presence(present=True, presence=presence, why=f"{name} is there: {told}.")
+        facts = f"at {presence:.0%} of its best splats at most {limit} of {count} reference words are nearer"
+        return Presence(present=True, presence=presence, why=f"{name} is there: {facts}.")
     order = np.argsort(nearer, kind="stable")
     middle = int(nearer[order[np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2)]])
-    near = weights @ products(rows, norms, direction[None], references.vectors[others])[1]
-    nearest = references.words[others[int(near.argmax())]].replace("_", " ")
-    told = f"its best splats are nearer to {middle} of {count} reference words, first of all to {nearest!r}"
+    near = weights @ products(rows, norms, direction[None], references.vectors[reference_rows])[1]
+    nearest = references.words[reference_rows[int(near.argmax())]].replace("_", " ")
+    facts = f"its best splats are nearer to {middle} of {count} reference words, first of all to {nearest!r}"
     first = float(weights[contrast == 0].sum() / weights.sum())
     if shares[0] < 0.5 and first < 0.5:
-        return Presence(present=False, presence=presence, why=f"{name} is not there: {told}.")
+        return Presence(present=False, presence=presence, why=f"{name} is not there: {facts}.")
     if shares[0] < 0.5:
         yet = "but to what sets them apart from the rest of the scene it is the nearest"
-        return Presence(present=None, presence=presence, why=f"Whether {name} is there is not sure: {told}, {yet}.")
-    told = "hardly a reference word is nearer to its best splats, but many are to what sets them apart from the rest"
-    return Presence(present=None, presence=presence, why=f"Whether {name} is there is not sure: {told}.")
+        return Presence(present=None, presence=presence, why=f"Whether {name} is there is not sure: {facts}, {yet}.")
+    facts = "hardly a reference word is nearer to its best splats, but many are to what sets them apart from the rest"
+    return Presence(present=None, presence=presence, why=f"Whether {name} is there is not sure: {facts}.")
 
 
 def nearer_counts(
-    features: np.ndarray, norms: np.ndarray, mean: np.ndarray, directions: np.ndarray, others: np.ndarray
+    features: np.ndarray, norms: np.ndarray, mean: np.ndarray, directions: np.ndarray, references: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How many other words are as near to splats as the nearest of some words: as they lie, and about a mean.
+    """Count the other words that are as near to splats as the nearest of some words: by cosine, and about a mean.
 
     Args:
         features: [n, F] f16 or f32. norms: [n] f32. mean: [F] f32, of unit features.
@@ -154,26 +157,26 @@ def nearer_counts(
     Returns:
         [n] i64 twice.
     """
-    if not len(others):
+    if not len(references):
         return np.zeros(len(features), np.int64), np.zeros(len(features), np.int64)
-    own, near = products(features, norms, directions, others)
-    nearer = (near >= own.max(axis=1, keepdims=True)).sum(axis=1)
-    own -= directions @ mean
-    near -= others @ mean
-    return nearer, (near >= own.max(axis=1, keepdims=True)).sum(axis=1)
+    own_cosines, reference_cosines = products(features, norms, directions, references)
+    nearer = (reference_cosines >= own_cosines.max(axis=1, keepdims=True)).sum(axis=1)
+    own_cosines -= directions @ mean
+    reference_cosines -= references @ mean
+    return nearer, (reference_cosines >= own_cosines.max(axis=1, keepdims=True)).sum(axis=1)
 
 
 def products(
-    features: np.ndarray, norms: np.ndarray, directions: np.ndarray, others: np.ndarray
+    features: np.ndarray, norms: np.ndarray, directions: np.ndarray, references: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The cosines [n, p] and [n, m] f32 of some splats with some words and with many others, by one matrix product.
+    """Compute the cosines [n, p] and [n, m] f32 of splats with words and with others, by one matrix product.
 
-    Of some thousands of splats and a thousand words it takes a fifth of what `scores.cosines` does, whose bits depend
-    on no other row. Arguments as of `nearer_counts`; a zero row has zeros.
+    For some thousands of splats and a thousand words it takes a fifth of the time of `scores.cosines`, in which the
+    bits of a row do not depend on the other rows. Arguments as of `nearer_counts`; a zero row has zeros.
     """
     unit = features.astype(np.float32)
     unit /= np.maximum(norms, np.finfo(np.float32).tiny)[:, None]
-    along = unit @ np.concatenate([directions, others]).T
+    along = unit @ np.concatenate([directions, references]).T
     return along[:, : len(directions)], along[:, len(directions) :]
 
 
@@ -182,14 +185,14 @@ NOT_IN_WORDS = Presence(
 )
 
 
-def together(words: Sequence[Presence]) -> Presence:
-    """Whether any of one or more words is there."""
-    first = max(words, key=lambda one: (one.present is not False, one.present is True, one.presence or 0.0))
-    return Presence(present=first.present, presence=first.presence, why=" ".join(one.why for one in words))
+def any_present(words: Sequence[Presence]) -> Presence:
+    """Combine the presences of one or more words: present if one of them is."""
+    first = max(words, key=lambda word: (word.present is not False, word.present is True, word.presence or 0.0))
+    return Presence(present=first.present, presence=first.presence, why=" ".join(word.why for word in words))
 
 
 def best_splats(scene: OpenedLift, scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The splats of the highest scores [P] that have LEAST_SHARE of the evidence, and how much each counts.
+    """Return the splats of the highest scores [P] that have LEAST_SHARE of the evidence, and their weights.
 
     Returns:
         [m] i64, at most MOST_SPLATS, descending by score; and [m] f64, their evidence.
@@ -211,53 +214,53 @@ def best_splats(scene: OpenedLift, scores: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def references_of(encoder: TextEncoder, text_space: str) -> References | str:
-    """The reference words of an encoder, or why there are none.
+    """Return the reference words of an encoder, or the reason why there are none.
 
-    A table with enough words has its own. Any other encoder is asked once for some hundreds of words.
+    A table with enough words is its own reference. Any other encoder encodes some hundreds of words once.
 
     Args:
-        encoder: that makes the words' vectors. text_space: that the lift names, "" for none.
+        encoder: of the words' vectors. text_space: of the lift, "" for none.
     """
     source = encoder.source if isinstance(encoder, RememberingEncoder) else encoder
     if isinstance(source, TableEncoder):
         if len(source.words) >= LEAST_WORDS:
             return _of_table(source)
-        return references_beside(source.embeddings, text_space)
-    shipped, kept = _shipped(), _kept(encoder.name)
+        return references_of_space(source.embeddings, text_space)
+    shipped, cached = _shipped(), _cached_references(encoder.name)
     try:
-        for known, first in ((shipped, f"a {shipped.words[0]}"), (kept, shipped.words[0])):
-            if known is not None and known.vectors.shape[1] == encoder.channels:
+        for candidate, first in ((shipped, f"a {shipped.words[0]}"), (cached, shipped.words[0])):
+            if candidate is not None and candidate.vectors.shape[1] == encoder.channels:
                 (vector,) = encoder.encode([first])
-                if float(known.vectors[0] @ _unit(np.asarray(vector, np.float32))) >= _SAME:
-                    return known
-        words = shipped.words[::EVERY]
-        made = References(words, _unit(np.asarray(encoder.encode(words), np.float32)))
+                if float(candidate.vectors[0] @ _unit(np.asarray(vector, np.float32))) >= _SAME_TEXT:
+                    return candidate
+        words = shipped.words[::WORD_STEP]
+        references = References(words, _unit(np.asarray(encoder.encode(words), np.float32)))
     except (InvalidQuery, Unavailable) as error:
         return f"Whether it is there is not known: {encoder.name} makes no reference words ({error})."
-    _keep(encoder.name, made)
-    return made
+    _cache_references(encoder.name, references)
+    return references
 
 
-def references_beside(vectors: np.ndarray, text_space: str) -> References | str:
-    """The reference words of the space that unit vectors [n, F] of words lie in, or why there are none.
+def references_of_space(vectors: np.ndarray, text_space: str) -> References | str:
+    """Return the reference words of the space of some unit vectors [n, F] of words, or the reason why there are none.
 
-    Without an encoder nothing is computed: references kept for the space that the lift names are taken, and the
-    shipped ones where all of the vectors lie in the narrow cone of that encoder's words.
+    Without an encoder nothing is computed. The cached references of the lift's text space are taken, or the shipped
+    ones if all of the vectors lie in the narrow cone of CLIP ViT-B/32's words.
     """
-    kept, channels = _kept(text_space) if text_space else None, vectors.shape[1]
-    if kept is not None and kept.vectors.shape[1] == channels:
-        return kept
+    cached, channels = _cached_references(text_space) if text_space else None, vectors.shape[1]
+    if cached is not None and cached.vectors.shape[1] == channels:
+        return cached
     if channels == _shipped().vectors.shape[1] and (vectors @ _unit(_shipped().mean) >= _IN_CONE).all():
         return _shipped()
     space = f"the text space {text_space!r}" if text_space else "a text space without a name"
-    needed = f"a text table of {LEAST_WORDS} words or more, or a text encoder, has some"
-    return f"Whether it is there is not known: {space} has no reference words here; {needed}."
+    remedy = f"a text table of {LEAST_WORDS} words or more, or a text encoder, has some"
+    return f"Whether it is there is not known: {space} has no reference words here; {remedy}."
 
 
 def pack_of(encoder: TextEncoder) -> np.ndarray | None:
-    """All words of a table that has too few to be references, [n, F] f32, unit; None for any other encoder.
+    """Return all words of a table that has too few to be references, [n, F] f32, unit; None for another encoder.
 
-    They are the references of each other: its author distinguishes these words and no others.
+    They compete with each other: the table's author distinguishes these words and no others.
     """
     source = encoder.source if isinstance(encoder, RememberingEncoder) else encoder
     if isinstance(source, TableEncoder) and 1 < len(source.words) < LEAST_WORDS:
@@ -267,7 +270,7 @@ def pack_of(encoder: TextEncoder) -> np.ndarray | None:
 
 @lru_cache(4)
 def _of_table(table: TableEncoder) -> References:
-    """A table's own words, with what questions share of them."""
+    """Return a table's words as references, cached as queries share their means."""
     return References(table.words, table.embeddings)
 
 
@@ -277,31 +280,31 @@ def _shipped() -> References:
     return References(table.words, table.embeddings)
 
 
-def _place(name: str) -> Path:
+def _cache_path(name: str) -> Path:
     return cache_folder("references") / f"{hashlib.sha256(name.encode()).hexdigest()[:16]}.safetensors"
 
 
-def _kept(name: str) -> References | None:
-    """What this machine keeps of an encoder's name; a broken file is none."""
+def _cached_references(name: str) -> References | None:
+    """Return the cached references of an encoder's name; None if there are none, or their file is invalid."""
     with suppress(InvalidTable, OSError):
-        if (path := _place(name)).is_file():
+        if (path := _cache_path(name)).is_file():
             table = TableEncoder.open(path)
             return References(table.words, table.embeddings)
     return None
 
 
-def _keep(name: str, made: References) -> None:
-    """Keep them for the next time; a cache that cannot be written keeps nothing."""
+def _cache_references(name: str, references: References) -> None:
+    """Write the references of an encoder's name to the cache; a cache that cannot be written stays as it is."""
     from safetensors.numpy import save
 
     from liftcore.io.files import whole_file
 
-    told = {"encoder": name, "words": json.dumps(made.words)}
-    with suppress(OSError), whole_file(_place(name)) as file:
-        vectors = np.ascontiguousarray(made.vectors, np.float16)  # `save` writes memory as it lies
-        file.write(save({"embeddings": vectors}, metadata=told))
+    metadata = {"encoder": name, "words": json.dumps(references.words)}
+    with suppress(OSError), whole_file(_cache_path(name)) as file:
+        vectors = np.ascontiguousarray(references.vectors, np.float16)  # `save` writes the memory in its order
+        file.write(save({"embeddings": vectors}, metadata=metadata))
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
-    """Rows [.., F] f32 of length one; zeros stay."""
+    """Scale rows [.., F] f32 to length one; zeros stay."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), np.float32(1e-30))

@@ -27,7 +27,7 @@ from liftcore.query.colours import cluster_colours
 from liftcore.query.directions import directions
 from liftcore.query.objects import trimmed_box
 from liftcore.query.opened import OpenedLift, as_numpy
-from liftcore.query.presence import LEAST_WORDS, References, judge, references_beside
+from liftcore.query.presence import LEAST_WORDS, References, estimate_presence, references_of_space
 from liftcore.query.question import BestWord, FoundWords, NamedSplats, Query
 from liftcore.query.scores import cosines, norms_of
 from liftcore.query.selection import levels_disagree, parts_of_words
@@ -151,12 +151,12 @@ def segment(
     unit = rows / np.linalg.norm(rows, axis=1, keepdims=True)
     if references is None:
         many = len(words) >= LEAST_WORDS
-        references = References(words, unit) if many else references_beside(unit, scene.metadata.text_space)
+        references = References(words, unit) if many else references_of_space(unit, scene.metadata.text_space)
     parts = _parts(scene, unit, references)
     for row, scores in _scores(scene, rows, np.flatnonzero((shares >= LEAST_OWN) | parts.any(axis=1)).tolist()):
         if (
             isinstance(references, References)
-            and judge(scene, words[row], unit[row], scores, references).present is False
+            and estimate_presence(scene, words[row], unit[row], scores, references).present is False
         ):
             parts[row] = False
             continue

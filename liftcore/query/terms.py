@@ -82,7 +82,7 @@ class Region:
 
 
 @dataclass(frozen=True)
-class OneSplat:
+class SplatTerm:
     """A splat's own feature."""
 
     splat: int  # its row in the splat file
@@ -113,7 +113,7 @@ class Vector:
 
 
 Area = Pixel | PixelBox | Stroke  # of a camera's image
-Example = Area | Region | OneSplat | SplatSet | Vector
+Example = Area | Region | SplatTerm | SplatSet | Vector
 Term = str | Example  # a text, or an example
 
 
@@ -134,7 +134,7 @@ def parse_example(notation: str, argument: str = "like") -> Example:
     if region := _REGION.fullmatch(notation):
         return Region(region[1], int(region[2]), int(region[3]))
     if splat := _SPLAT.fullmatch(notation):
-        return OneSplat(int(splat[1]))
+        return SplatTerm(int(splat[1]))
     if members := _SET.fullmatch(notation):
         return _splat_set(members)
     if area := _AREA.fullmatch(notation):

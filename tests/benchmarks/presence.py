@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from liftcore.query.presence import References, judge, references_of
+from liftcore.query.presence import References, estimate_presence, references_of
 from liftcore.query.scene import Scene
 from liftcore.query.scores import cosines
 from liftcore.text import open_encoder
@@ -37,7 +37,9 @@ NOT_THERE = ("a sofa", "a dog", "a car", "a guitar", "a bicycle", "a shoe", "an 
 def told(scene: Scene, vectors: np.ndarray, references: References) -> np.ndarray:
     """[n] f64, the presence of words with these vectors [n, F]."""
     scores = np.ascontiguousarray(cosines(scene.features, scene.norms, vectors).T)
-    found = (judge(scene, "", vector, row, references) for vector, row in zip(vectors, scores, strict=True))
+    found = (
+        estimate_presence(scene, "", vector, row, references) for vector, row in zip(vectors, scores, strict=True)
+    )
     return np.array([one.presence for one in found])
 
 

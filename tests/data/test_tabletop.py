@@ -15,7 +15,7 @@ from liftcore.query.ask import ask
 from liftcore.query.question import Query
 from liftcore.query.render import view_mask
 from liftcore.query.segment import segment
-from liftcore.query.terms import OneSplat
+from liftcore.query.terms import SplatTerm
 from liftcore.text.table import TableEncoder
 from liftcore.values.pack import read_features, write_pack
 from tests.benchmarks.base import read_pack
@@ -135,7 +135,7 @@ def test_a_thing_stays_found_when_something_else_is_not_wanted(truth: Truth, usu
 
     def iou(thing: int, *unlike: int) -> float:
         """Of the splats found with those of the thing, asked by the splat of each class that was seen best."""
-        like, *against = (OneSplat(best[other]) for other in (thing, *unlike))
+        like, *against = (SplatTerm(best[other]) for other in (thing, *unlike))
         found, wanted = ask(scene, Query.of((like,), tuple(against))).selected, (real == thing) & scene.seen
         return float((found & wanted).sum() / (found | wanted).sum())
 

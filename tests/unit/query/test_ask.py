@@ -26,7 +26,7 @@ from liftcore.query.directions import directions, read_vector
 from liftcore.query.question import Query
 from liftcore.query.result import LiftResult, load_lift
 from liftcore.query.scene import Scene
-from liftcore.query.terms import Example, OneSplat, Pixel, PixelBox, Region, Stroke, Vector, parse_example
+from liftcore.query.terms import Example, Pixel, PixelBox, Region, SplatTerm, Stroke, Vector, parse_example
 from liftcore.query.threshold import find_threshold
 from liftcore.scene.cameras import Cameras
 from liftcore.values.lift_file import save_lift
@@ -108,7 +108,12 @@ def test_splats_without_evidence_or_confidence_do_not_decide_the_threshold(exact
 
 
 def test_questions_together_have_the_bits_of_each_alone(scene: Scene) -> None:
-    queries = [Query.of(("x",)), Query.of(("y", OneSplat(3)), ("z",)), Query.of((OneSplat(1),)), Query.of(("z", "x"))]
+    queries = [
+        Query.of(("x",)),
+        Query.of(("y", SplatTerm(3)), ("z",)),
+        Query.of((SplatTerm(1),)),
+        Query.of(("z", "x")),
+    ]
     asked = [question(scene, query, Axes()) for query in queries]
     for together, one in zip(answers(scene, asked), asked, strict=True):
         (alone,) = answers(scene, [one])
@@ -209,7 +214,7 @@ def test_lift_finds_its_files_beside_it_or_where_told(lift_tiny: Callable[..., P
     assert ask(scene, Query.of((Region("left", 0, 0),))).count > 0
     (after / "another.ply").rename(away / "s.ply")
     lost = Scene(after / lift)
-    assert ask(lost, Query.of((OneSplat(0),))).count > 0  # scores need no splats
+    assert ask(lost, Query.of((SplatTerm(0),))).count > 0  # scores need no splats
     with pytest.raises(InvalidLift, match=r"splats at .*s\.ply, or beside the lift.*--splats"):
         _ = lost.splats
     assert Scene(after / lift, splats=away / "s.ply").splats.count == COUNT
@@ -240,7 +245,7 @@ def test_every_kind_of_example_finds_its_cluster(scene: Scene, cluster: int) -> 
         PixelBox("middle", x - 4, 2, x + 5, HEIGHT - 2),
         Stroke("middle", ((x, 6), (x + 1, 12), (x, 18))),
         Region("left", 0, cluster),
-        OneSplat(cluster * SPLATS_A_CLUSTER + 3),
+        SplatTerm(cluster * SPLATS_A_CLUSTER + 3),
         Vector(tuple(1e30 * np.eye(CHANNELS)[cluster])),
     ]
     for example in kinds:
@@ -288,14 +293,14 @@ def test_threshold_of_examples_is_above_a_least_likeness(scene: Scene) -> None:
     rows = np.zeros((COUNT, CHANNELS))
     rows[:10, 0], rows[10:25, :3], rows[25:, 1] = 1.0, [0.3, 0.3, 0.9], -1.0
     lifted = of(scene, rows + np.random.default_rng(0).normal(0, 0.01, rows.shape))
-    by_example = ask(lifted, Query.of((OneSplat(0),)))
+    by_example = ask(lifted, Query.of((SplatTerm(0),)))
     assert np.flatnonzero(by_example.selected).tolist() == list(range(10))
     assert by_example.threshold.value > 0.4 and find_threshold(by_example.scores).value < 0.0
     in_words = ask(lifted, Query.of(("x", "y")), Axes())
     assert in_words.threshold.value == find_threshold(in_words.scores).value
-    both = ask(lifted, Query.of((OneSplat(0), "x")), Axes())
+    both = ask(lifted, Query.of((SplatTerm(0), "x")), Axes())
     assert both.threshold.value == find_threshold(both.scores).value
-    assert ask(lifted, Query.of((OneSplat(0),), threshold=0.1)).count == 25
+    assert ask(lifted, Query.of((SplatTerm(0),), threshold=0.1)).count == 25
 
 
 @pytest.mark.parametrize(
@@ -316,7 +321,7 @@ def test_threshold_of_examples_is_above_a_least_likeness(scene: Scene) -> None:
         (Region("behind", 0, 0), NotFound, "feature packs"),
         (Region("left", 1, 0), NotFound, r"0\.\.0"),
         (Region("left", 0, 3), NotFound, "label"),
-        (OneSplat(60), InvalidQuery, r"0\.\.59"),
+        (SplatTerm(60), InvalidQuery, r"0\.\.59"),
         (Vector((1.0,) * 7), InvalidQuery, "8 channels"),
         (Vector((0.0,) * CHANNELS), InvalidQuery, "zeros"),
         (Vector((math.nan,) * CHANNELS), InvalidQuery, "NaN"),
@@ -329,7 +334,7 @@ def test_term_without_a_feature_says_why_under_its_name(
     with pytest.raises(error, match=said):
         ask(scene, Query.of((example,)))
     if example != "apple":
-        query = Query.of((OneSplat(0),), (example,))
+        query = Query.of((SplatTerm(0),), (example,))
         with pytest.raises(error, match=r"unlike\.0"):
             question(scene, query, None, query.places)
 
@@ -394,12 +399,12 @@ def test_a_lift_with_other_rows_than_its_splats_answers_nothing(
     rows = ("features", "evidence", "agreement", "seen", "confidence", "cluster", "object", "node")
     cropped = {name: getattr(lift, name)[:-1] for name in rows if getattr(lift, name) is not None}
     save_lift(replace(lift, **cropped), tmp_path / "cropped.lift")
-    ask(Scene(path), Query.of((OneSplat(0),)))
+    ask(Scene(path), Query.of((SplatTerm(0),)))
     with pytest.raises(InvalidLift, match="a row for each of its"):
-        ask(Scene(tmp_path / "cropped.lift"), Query.of((OneSplat(0),)))  # scores alone, without places
+        ask(Scene(tmp_path / "cropped.lift"), Query.of((SplatTerm(0),)))  # scores alone, without places
     splats.write_bytes(b"".join(some_rows(tmp_path / "s.ply", np.arange(len(lift.features)) > 0, suffix)))
     request = {"lift": str(path), "splats": str(splats), "cameras": str(tmp_path / "c.json")}
     with pytest.raises(InvalidLift, match="a row for each of its"):
         open_scene(request)
     (tmp_path / "s.ply").write_bytes(splats.read_bytes())  # another file lies there now: places alone are lost
-    ask(Scene(path), Query.of((OneSplat(0),)))
+    ask(Scene(path), Query.of((SplatTerm(0),)))

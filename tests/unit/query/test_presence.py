@@ -19,7 +19,7 @@ from liftcore.query.render import view_mask
 from liftcore.query.result import LiftResult
 from liftcore.query.scene import Scene
 from liftcore.query.segment import segment
-from liftcore.query.terms import OneSplat
+from liftcore.query.terms import SplatTerm
 from liftcore.text import LVIS_TABLE, RememberingEncoder
 from liftcore.text.table import TableEncoder
 from tests.api.tiny_scene import SPLATS_A_CLUSTER
@@ -88,11 +88,11 @@ def test_of_several_words_the_absent_ones_are_left_out(clip: Scene, table: Table
     assert same(both, cat) and both.present and "'sofa' is not there" in both.why
     assert not same(ask(clip, Query.of(("sofa", "cat"), absent="keep"), table), cat)
     assert ask(clip, Query.of(("cat",), ("sofa",)), table).presence == cat.presence  # negatives are not questioned
-    example = Query.of((OneSplat(0), "sofa"))
+    example = Query.of((SplatTerm(0), "sofa"))
     assert (
-        same(ask(clip, example, table), ask(clip, Query.of((OneSplat(0),)))) and ask(clip, example, table).count > 0
+        same(ask(clip, example, table), ask(clip, Query.of((SplatTerm(0),)))) and ask(clip, example, table).count > 0
     )
-    assert ask(clip, Query.of((OneSplat(0),))).present is None
+    assert ask(clip, Query.of((SplatTerm(0),))).present is None
 
 
 def test_references_that_mean_the_same_hide_nothing(clip: Scene, table: TableEncoder) -> None:

@@ -23,7 +23,7 @@ from liftcore.query.result import LiftResult
 from liftcore.query.scene import Scene
 from liftcore.query.segment import best_words, map_png, named_ply, picture_png, segment, word_map
 from liftcore.query.splat_colours import seen_colours
-from liftcore.query.terms import OneSplat, Pixel, Vector
+from liftcore.query.terms import Pixel, SplatTerm, Vector
 from liftcore.scene.cameras import Cameras
 from tests.api.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH, text_table
 
@@ -186,7 +186,7 @@ def test_labels_go_out_as_columns_and_a_document(tiny_lift: Path, tmp_path: Path
 
 def test_best_words_of_an_example_come_first(clear: Scene) -> None:
     words = ["apple", "book", "lamp"]
-    for example in (OneSplat(SPLATS_A_CLUSTER), Pixel("middle", 16, HEIGHT // 2), Vector(tuple(2 * EYE[1]))):
+    for example in (SplatTerm(SPLATS_A_CLUSTER), Pixel("middle", 16, HEIGHT // 2), Vector(tuple(2 * EYE[1]))):
         best = best_words(clear, example, words, EYE[:3], 2)
         assert best[0].word == "book" and best[0].score > 0.7 and len(best) == 2
 

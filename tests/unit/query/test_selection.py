@@ -12,7 +12,7 @@ from liftcore.query.ask import answers, ask, question
 from liftcore.query.presence import References
 from liftcore.query.question import Query
 from liftcore.query.scene import Scene
-from liftcore.query.selection import Rivals, part_nodes, parts_of_words, with_things
+from liftcore.query.selection import CompetingWords, correct_by_objects, part_nodes, parts_of_words
 from liftcore.query.threshold import METHODS, find_threshold
 from liftcore.text import LVIS_TABLE
 from liftcore.text.table import TableEncoder
@@ -142,11 +142,11 @@ def test_word_near_to_all_of_a_scene_keeps_no_rest_from_its_thing(scene: Scene, 
     bias = 0.12 * (boat - cat)  # of all splats alike: the rest of the cat is nearer to the boat's word as it lies
     numbers = torch.from_numpy(np.repeat([0, 1, 2], [300, 200, 200]).astype(np.int32))
     views, cats = torch.zeros((3, 5), dtype=torch.int32), np.arange(700) < 130
-    rivals = Rivals.among(References(tuple(table.words), table.embeddings), cat[None])
+    rivals = CompetingWords.among(References(tuple(table.words), table.embeddings), cat[None])
     subject = lifted(scene, rows + bias, object=numbers, object_views=views)
     remainder = subject.mean_of(np.arange(130, 300))
     assert remainder @ boat > remainder @ cat
-    answer, _ = with_things(subject, cats, np.ones(700, np.float32), rivals)
+    answer, _ = correct_by_objects(subject, cats, np.ones(700, np.float32), rivals)
     assert np.array_equal(answer, np.arange(700) < 300)
 
 
@@ -248,5 +248,5 @@ def test_word_of_a_part_takes_its_node_where_levels_disagree(
     assert np.flatnonzero(ask(told, "mug", table).selected)[[0, -1]].tolist() == [0, 299]
     references = References(tuple(table.words), table.embeddings)
     every = parts_of_words(told, references, table.embeddings)
-    alone = [part_nodes(told, Rivals.among(references, word[None])) for word in table.embeddings]
+    alone = [part_nodes(told, CompetingWords.among(references, word[None])) for word in table.embeddings]
     assert every == alone and any(every) == by_node

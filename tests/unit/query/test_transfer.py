@@ -17,7 +17,7 @@ from liftcore.io.splats import write_splats
 from liftcore.query.question import Query
 from liftcore.query.result import LiftResult, load_lift
 from liftcore.query.scene import Scene
-from liftcore.query.terms import OneSplat
+from liftcore.query.terms import SplatTerm
 from liftcore.scene.registration import find_similarity
 from liftcore.scene.splats import Splats
 from tests.api.tiny_scene import SPLATS_A_CLUSTER
@@ -167,7 +167,7 @@ def test_the_command_writes_a_lift_that_is_asked_like_the_first(
     assert (facts["rows"], facts["splats"]) == (2 * SPLATS_A_CLUSTER, 2 * SPLATS_A_CLUSTER)
     scene = Scene(new)
     assert torch.equal(load_lift(new).features, load_lift(lift).features[torch.from_numpy(CLUSTER != 1)])
-    assert len(scene.catalogue().objects) == 2 and scene.mask(Query.of((OneSplat(0),)), "middle").any()
+    assert len(scene.catalogue().objects) == 2 and scene.mask(Query.of((SplatTerm(0),)), "middle").any()
     (tmp_path / "m.txt").write_text("1 2 3")
     assert (
         main(
