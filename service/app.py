@@ -1,6 +1,6 @@
-"""Wiring: the parts, the layers, the routes. There is no global application.
+"""Wire the parts, the middleware and the routes together. There is no global application.
 
-The layers around the routes are below: every exchange is recorded, HEAD is GET's head. The gate is in `service.auth`.
+The middleware around the routes is below: it records each exchange and answers HEAD. Authorization is `service.auth`.
 """
 
 from __future__ import annotations
@@ -23,39 +23,39 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from liftcore import __version__
 from liftcore.files import PhotoIndexes
 from service import problems
-from service.auth import CALLER, STRANGER, AuthMiddleware
+from service.auth import ANONYMOUS, CALLER, AuthMiddleware
 from service.content import EventStreams
-from service.errand import revive
-from service.errors import Busy, ForeignOrigin
+from service.errors import ForeignOrigin, ServiceUnavailable
 from service.observe import Metrics, access, chosen_id, versions, working_for
 from service.problems import CLOSE, answer_to
 from service.query_client import QueryClient, QueryLimits
 from service.requests import KnownParameters
 from service.routes import assets, jobs, lifts, operations, queries, selections
+from service.sandbox import revive
 from service.settings import ServiceSettings
 from service.state import AppState, Readiness, Stopping
 from service.store.store import Collector, Store
 from service.supervisor import JobLimits, Supervisor
 
-PLACES = 4  # of requests that are begun at the same time
-TURN_SECONDS = 0.05  # many times what the event loop needs for a request
+PLACES = 4  # requests that may begin at the same time
+TURN_SECONDS = 0.05  # many times longer than the event loop needs for one request
 PROBES = frozenset({"/healthz", "/readyz"})
 PATH_CHARACTERS = 200  # of a path in the log
-# That pages of other sites may send beside what every page may, and read beside what every page reads
+# Headers that pages of other sites may send and read, beside those that CORS always allows
 CORS_HEADERS = ("Authorization", "Content-Type", "If-None-Match", "If-Range", "Range", "Last-Event-ID")
 CORS_EXPOSED = ("ETag", "Content-Range", "Content-Disposition", "Retry-After", "WWW-Authenticate", "X-Request-ID")
-# For browsers: nothing here is guessed at, framed or allowed to load anything; pages bring a policy of their own.
+# For browsers: no sniffing of media types, no frames, nothing loaded. HTML pages set a policy of their own.
 SAFE_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
     "Referrer-Policy": "no-referrer",
-    "Cross-Origin-Resource-Policy": "same-origin",  # renders and photos are no other site's to show
+    "Cross-Origin-Resource-Policy": "same-origin",  # other sites must not embed renders and photos
     "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
 }
 
 
 def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, worker: QueryClient) -> FastAPI:
-    """The application. It starts and stops the runner and the worker; the store is its caller's to close."""
+    """Return the application. It starts and stops the runner and the worker; the caller closes the store."""
 
     threads = anyio.CapacityLimiter
     streams, build = EventStreams(settings.max_streams, settings.key_streams), versions(settings.commit)
@@ -69,14 +69,14 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         app.state.deps = deps = AppState(
-            settings=settings, version=build, store=store, caller=STRANGER,
+            settings=settings, version=build, store=store, caller=ANONYMOUS,
             runner=runner, queries=worker,
             streams=streams, photos=PhotoIndexes(), metrics=metrics, readiness=readiness,
-            checks=threads(settings.parallel_checks),  # uploads that are validated at the same time
-            planning=threads(1),  # plans, for which no upload waits
-            writing=threads(8),  # uploads: a stalled disk stops them, and no other route
+            checks=threads(settings.parallel_checks),  # uploads validated at the same time
+            planning=threads(1),  # plans, separate from uploads
+            writing=threads(8),  # uploads: a stalled disk blocks them and no other route
             parsing=threads(2),  # JSON bodies
-            ordering=threads(2),  # orders, which are compared with all names in their assets: these take memory
+            ordering=threads(2),  # lift orders: each compares all names in its assets, which takes memory
             scrapes=threads(1),  # the metrics
         )  # fmt: skip
         await anyio.to_thread.run_sync(revive)
@@ -99,7 +99,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
         responses=problems.RESPONSES,
         openapi_url=None,  # `service.routes.operations` tells it, and of keys, beside the event loop
         redirect_slashes=False,
-        generate_unique_id_function=lambda route: route.name,  # by which clients call their functions
+        generate_unique_id_function=lambda route: route.name,  # clients name their functions by it
     )
     app.state.readers = settings.cors_origins
     app.state.stopping, app.state.metrics, app.state.documents = stopping, metrics, operations.Documents(app)
@@ -107,19 +107,19 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
     app.add_middleware(AuthMiddleware, keys=store.keys, settings=settings, stopping=lambda: stopping.begun)
     app.add_middleware(ConcurrencyLimit)
     problems.install(app)
-    app.include_router(operations.router)  # probes and links to the page may carry what they like
+    app.include_router(operations.router)  # probes and links to the page accept any parameter
     for module in (assets, jobs, lifts, queries, selections):
         app.include_router(module.router, dependencies=[KnownParameters])
     return app
 
 
 def assemble(settings: ServiceSettings, store: Store) -> FastAPI:
-    """The application with the usual runner and query worker."""
+    """Return the application with the default runner and query worker."""
     return create_app(settings, store, Supervisor(store, job_limits(settings)), QueryClient(query_limits(settings)))
 
 
 def query_limits(settings: ServiceSettings) -> QueryLimits:
-    """What the settings allow queries."""
+    """Return the limits of queries that the settings give."""
     return QueryLimits(
         waiting=settings.query_waiting,
         seconds=settings.query_seconds,
@@ -131,8 +131,8 @@ def query_limits(settings: ServiceSettings) -> QueryLimits:
 
 
 def job_limits(settings: ServiceSettings) -> JobLimits:
-    """What the settings allow a job."""
-    cores = len(os.sched_getaffinity(0))  # the service runs on Linux alone
+    """Return the limits of jobs that the settings give."""
+    cores = len(os.sched_getaffinity(0))  # the service runs on Linux only
     return JobLimits(
         parallel=settings.parallel_lifts,
         threads=settings.lift_threads or max(1, cores // settings.parallel_lifts),
@@ -145,31 +145,31 @@ def job_limits(settings: ServiceSettings) -> JobLimits:
     )
 
 
-# Layers around the routes
+# Middleware around the routes
 
 
 class RecordedApp(FastAPI):
-    """Records its requests outside of all else, so that answers to unforeseen errors are recorded too.
+    """Record requests outside all other middleware, so that answers to unexpected errors are recorded too.
 
-    ``state.metrics`` and ``state.readers``, origins of other sites, must be there before the first request.
+    ``state.metrics`` and ``state.readers`` (origins of other sites) must be set before the first request.
     """
 
     def build_middleware_stack(self) -> ASGIApp:
-        """The usual layers within the recorder; refusals too are read by pages that may read."""
+        """Return the default stack within the recorder; CORS applies to refusals too."""
         stack: ASGIApp = super().build_middleware_stack()
         if readers := self.state.readers:
-            stack = PagesOfOthers(
+            stack = CrossOriginPages(
                 stack, readers, ("GET", "HEAD", "POST"), CORS_HEADERS,
                 allow_credentials=False, expose_headers=CORS_EXPOSED,
             )  # fmt: skip
         return Recorder(stack, self.state.metrics)
 
 
-class PagesOfOthers(CORSMiddleware):
-    """Lets pages of other sites read. A preflight that is refused is a problem, as every error is."""
+class CrossOriginPages(CORSMiddleware):
+    """CORS for pages of other sites. A refused preflight is a problem document, as every error is."""
 
     def preflight_response(self, request_headers: Headers) -> Response:
-        """Answer the browser that asks whether a page may send a request."""
+        """Answer a CORS preflight."""
         reply = super().preflight_response(request_headers)
         if reply.status_code == HTTPStatus.OK:
             return reply
@@ -195,27 +195,27 @@ class PagesOfOthers(CORSMiddleware):
 
 
 class Recorder:
-    """Every answer gets its request's id and `SAFE_HEADERS`; log and counters hear of it."""
+    """Set the request id and `SAFE_HEADERS` on every answer; update the log and the counters."""
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
         self._app = app
         self._metrics = metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on and watch."""
+        """Pass the request on and record it."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
         start, request_id = time.monotonic(), chosen_id(scope["headers"])
         status, received_bytes, sent_bytes, complete = 0, 0, 0, False
 
-        async def counted() -> Message:
+        async def receive_counted() -> Message:
             nonlocal received_bytes
             message = await receive()
             received_bytes += len(message.get("body", b""))
             return message
 
-        async def marked(message: Message) -> None:
+        async def send_marked(message: Message) -> None:
             nonlocal status, sent_bytes, complete
             if message["type"] == "http.response.start":
                 status = message["status"]
@@ -231,12 +231,14 @@ class Recorder:
 
         with working_for(request_id):
             try:
-                await self._app(scope, counted, marked)
-            except asyncio.CancelledError:  # by the server, whose stop has no more time for it
+                await self._app(scope, receive_counted, send_marked)
+            except asyncio.CancelledError:  # by the server, whose time for stopping is over
                 if status:
                     raise
-                error = Busy("server", expected="a running server", got="one that stops", hint="send it again")
-                await answer_to(error, CLOSE)(scope, counted, marked)
+                error = ServiceUnavailable(
+                    "server", expected="a running server", got="one that stops", hint="send it again"
+                )
+                await answer_to(error, CLOSE)(scope, receive_counted, send_marked)
             except Exception:
                 if (
                     not complete
@@ -244,11 +246,13 @@ class Recorder:
                     raise
             finally:
                 seconds, route = time.monotonic() - start, getattr(scope.get("route"), "path", None)
-                self._metrics.count_request(scope["method"], route, status, seconds=seconds, received=received_bytes)
+                self._metrics.count_request(
+                    scope["method"], route, status, seconds=seconds, received_bytes=received_bytes
+                )
                 fields = {
                     "method": scope["method"],
                     "route": route,
-                    "path": scope["path"][:PATH_CHARACTERS],  # never the query: people put secrets there
+                    "path": scope["path"][:PATH_CHARACTERS],  # never the query string: it may hold secrets
                     "status": status,
                     "seconds": round(seconds, 6),
                     "received": received_bytes,
@@ -261,7 +265,7 @@ class Recorder:
 
 
 def _describe_caller(scope: Scope) -> dict[str, Any]:
-    """The key that asked, and whether as an admin."""
+    """Return the log fields of the caller: its key's id, and whether it is an admin."""
     caller = scope.get("state", {}).get(CALLER)
     if caller is None or caller.key is None:
         return {}
@@ -269,10 +273,10 @@ def _describe_caller(scope: Scope) -> dict[str, Any]:
 
 
 class ConcurrencyLimit:
-    """Few requests are begun at a time, and the others wait for nothing but a place: so however many come at once,
-    the event loop is soon done with what it has begun, and probes, which pass the line, are answered at once.
+    """Limit the requests that begin at the same time, so that the event loop stays responsive.
 
-    What takes longer than a turn waits for a query, a disk or its client, and gives up its place to the next.
+    Probes bypass the limit. A request that takes longer than `TURN_SECONDS` waits for a query, a disk or its client:
+    it gives its slot to the next one.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -280,7 +284,7 @@ class ConcurrencyLimit:
         self._places = anyio.Semaphore(PLACES)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on in its turn."""
+        """Pass the request on when a slot is free."""
         if scope["type"] != "http" or scope["path"] in PROBES:
             await self._app(scope, receive, send)
             return
@@ -302,7 +306,7 @@ class ConcurrencyLimit:
 
 
 class AnswerHead:
-    """Asks the routes for GET where HEAD is asked, passes on the head of the answer, and lets the rest go.
+    """Answer HEAD: run the route for GET, send the head of its answer, and cancel the rest.
 
     What would be read or waited for to make the body is cancelled: a file stays unread, and a stream of events ends.
     """
@@ -311,22 +315,22 @@ class AnswerHead:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on; a HEAD as a GET."""
+        """Pass the request on; HEAD as GET."""
         if scope["type"] != "http" or scope["method"] != "HEAD":
             await self._app(scope, receive, send)
             return
-        headers = [(name, value) for name, value in scope["headers"] if name != b"range"]  # which is for GET alone
+        headers = [(name, value) for name, value in scope["headers"] if name != b"range"]  # Range is for GET
         get_scope = {**scope, "method": "GET", "headers": headers}
         with anyio.CancelScope() as rest:
 
-            async def told(message: Message) -> None:
+            async def send_head(message: Message) -> None:
                 if message["type"] == "http.response.start":
                     await send(message)
                     await send({"type": "http.response.body", "body": b"", "more_body": False})
                     rest.cancel()
 
             try:
-                await self._app(get_scope, receive, told)
+                await self._app(get_scope, receive, send_head)
             finally:
                 if "route" in get_scope:
-                    scope["route"] = get_scope["route"]  # which the recorder reads
+                    scope["route"] = get_scope["route"]  # for the recorder

@@ -1,8 +1,8 @@
-"""Who may ask, and for what: the gate that every request goes through before anything of it is read.
+"""Authorization of requests: host, origin, key and scope are checked before anything of a request is read.
 
-First the Host and the Origin: the threat is a page of another site in the browser of somebody who can reach the
-service. It may send requests itself (then its Origin tells), or have its own name point to this machine (DNS
-rebinding; then the Host tells). Then the key, its scope, whether the server stops, and the key's uploads at a time.
+Host and Origin come first: the threat is a page of another site in the browser of a user who can reach the service.
+The page may send requests itself (Origin shows it), or let its own name resolve to this machine (DNS rebinding; Host
+shows it). Then follow the key, its scope, a server that stops, and the limit of the key's uploads at a time.
 """
 
 from __future__ import annotations
@@ -21,21 +21,29 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as AsgiScope
 
-from service.errors import Busy, ForeignOrigin, InvalidRequest, Misdirected, MissingScope, Unauthorized, require_share
+from service.errors import (
+    ForeignOrigin,
+    InvalidRequest,
+    Misdirected,
+    MissingScope,
+    ServiceUnavailable,
+    Unauthorized,
+    require_share,
+)
 from service.problems import CLOSE
 from service.requests import is_json
 from service.settings import ServiceSettings
 from service.store.keys import KeyRecord, KeyStore
 from service.store.owners import NOBODY, SERVICE, Owner, Scope
 
-CALLER = "caller"  # of the scope's state
+CALLER = "caller"  # in the state of the ASGI scope
 LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
 BEARER = re.compile(r"bearer +([A-Za-z0-9._~+/-]+=*)", re.ASCII | re.IGNORECASE)  # RFC 6750, 2.1
-LOOKUPS = 4  # threads that look keys up, so that slow routes cannot keep anyone waiting at the gate
-# Requests that a process each checks
-CHECKED = re.compile("(PUT|PATCH) /assets/.*|POST /assets|POST /lifts|POST (?P<plan>/lift/plan)")
-# Open to everybody: what says nothing of anyone's work. The page asks for a key itself; the API is described to those
-# who have none yet, and browsers send none with a link.
+LOOKUPS = 4  # threads for key lookups, separate from those of slow routes
+# Requests for which a child process validates a file
+UPLOAD = re.compile("(PUT|PATCH) /assets/.*|POST /assets|POST /lifts|POST (?P<plan>/lift/plan)")
+# Routes without a key: they reveal nothing about anyone's data. The page asks for a key itself; the API documents are
+# for people without a key, and browsers send no key with a link.
 OPEN = frozenset(
     {
         "/", "/web/page.js", "/web/page.css", "/web/LICENSES.txt", "/healthz", "/readyz", "/version",
@@ -43,10 +51,10 @@ OPEN = frozenset(
         "/openapi.json", "/docs", "/docs/swagger-ui-bundle.js", "/docs/swagger-ui.css",
     }
 )  # fmt: skip
-# Where the scope `shared` reads and asks: the store shows such a key the lifts that it was given, and no others.
+# Routes for the scope `shared`: the store shows such a key only the lifts that were shared with it.
 SHARED = re.compile(r"/key|/lifts(/[^/]+(/(?!shares(/|$)).*)?)?|/query(/.*)?|/render")
 SAFE = frozenset({"GET", "HEAD"})
-WORKLESS = frozenset({"GET", "HEAD", "OPTIONS"})  # methods that start nothing: a stop refuses the others
+WORKLESS = frozenset({"GET", "HEAD", "OPTIONS"})  # methods that start no work; a server that stops refuses all others
 SCHEMES = {
     "key": {
         "type": "http",
@@ -61,20 +69,20 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Caller:
-    """Who asks."""
+    """The caller of a request."""
 
     owner: Owner
     max_uploads: int | None = None
-    key: str | None = None  # its id, for the log
+    key: str | None = None  # the id of the key, for the log
     record: KeyRecord | None = None
 
 
-EVERYBODY = Caller(SERVICE)  # while there are no keys
-STRANGER = Caller(NOBODY)  # on an open route
+LOCAL_ADMIN = Caller(SERVICE)  # while there are no keys
+ANONYMOUS = Caller(NOBODY)  # on an open route
 
 
 class AuthMiddleware:
-    """ASGI middleware: lets a request pass with its `Caller` in the scope's state, or raises why not."""
+    """ASGI middleware: store the `Caller` in the scope's state, or raise the reason for a refusal."""
 
     def __init__(self, app: ASGIApp, keys: KeyStore, settings: ServiceSettings, stopping: Callable[[], bool]) -> None:
         self._app = app
@@ -82,11 +90,11 @@ class AuthMiddleware:
         self._settings = settings
         self._hosts = Hosts(settings.host, settings.allowed_hosts, settings.cors_origins)
         self._stopping = stopping
-        self._uploads: Counter[str] = Counter()  # by key, those that are on their way, and plans
+        self._uploads: Counter[str] = Counter()  # by key, uploads and plans in progress
         self._lookups = anyio.CapacityLimiter(LOOKUPS)
 
     async def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
-        """Let the request pass.
+        """Check a request and pass it on.
 
         Raises:
             ServiceError: it may not.
@@ -103,12 +111,14 @@ class AuthMiddleware:
             fields = {"key": caller.key, "method": method, "path": scope["path"]}
             log.info("an admin key is used", extra={"fields": fields})
         if self._stopping() and method not in WORKLESS:
-            busy = Busy("server", expected="a running server", got="one that stops", hint="ask the next one")
+            busy = ServiceUnavailable(
+                "server", expected="a running server", got="one that stops", hint="ask the next one"
+            )
             busy.headers |= CLOSE
             raise busy
         scope.setdefault("state", {})[CALLER] = caller
-        upload = CHECKED.fullmatch(f"{method} {scope['path']}")
-        if upload is None or (scope["path"] == "/lifts" and is_json(headers)):  # an order
+        upload = UPLOAD.fullmatch(f"{method} {scope['path']}")
+        if upload is None or (scope["path"] == "/lifts" and is_json(headers)):  # a JSON order, not an upload
             await self._app(scope, receive, send)
             return
         owner, limit = caller.owner.key, caller.max_uploads
@@ -121,25 +131,25 @@ class AuthMiddleware:
             if not self._uploads[owner]:
                 del self._uploads[owner]
 
-    async def _caller(self, wanted: Scope | None, path: str, headers: Headers) -> Caller:
-        if wanted is None:
-            return STRANGER
+    async def _caller(self, required_scope_name: Scope | None, path: str, headers: Headers) -> Caller:
+        if required_scope_name is None:
+            return ANONYMOUS
         required, key = await anyio.to_thread.run_sync(self._keys.admit, bearer(headers), limiter=self._lookups)
         if not required:
-            return EVERYBODY
+            return LOCAL_ADMIN
         if key is None:
             has_header = "authorization" in headers
-            code = ', error="invalid_token"' if has_header else ""  # only where a key was sent (RFC 6750, 3.1)
+            code = ', error="invalid_token"' if has_header else ""  # only if a key was sent (RFC 6750, 3.1)
             raise Unauthorized(
                 "Authorization", expected="Bearer and a key of this service",
                 got="one that is not valid" if has_header else "none",
                 hint="the operator makes keys with splatlift keys create",
                 headers={"WWW-Authenticate": f'Bearer realm="splatlift"{code}'},
             )  # fmt: skip
-        if not allows(key.scopes, wanted, path):
-            challenge = f'Bearer realm="splatlift", error="insufficient_scope", scope="{wanted}"'
+        if not allows(key.scopes, required_scope_name, path):
+            challenge = f'Bearer realm="splatlift", error="insufficient_scope", scope="{required_scope_name}"'
             raise MissingScope(
-                "Authorization", expected=f"a key with the scope {wanted}",
+                "Authorization", expected=f"a key with the scope {required_scope_name}",
                 got=f"one with {', '.join(sorted(key.scopes))}", headers={"WWW-Authenticate": challenge},
             )  # fmt: skip
         return self._caller_of(key)
@@ -157,7 +167,7 @@ class AuthMiddleware:
 
 
 def required_scope(method: str, path: str) -> Scope | None:
-    """The scope that a request needs, None when it needs no key. What is not listed as open is not."""
+    """Return the scope that a request needs; None if it needs no key. Only the routes in `OPEN` need none."""
     if method in SAFE and path in OPEN:
         return None
     if path == "/metrics":
@@ -168,22 +178,22 @@ def required_scope(method: str, path: str) -> Scope | None:
     return Scope.READ if method in SAFE or asks else Scope.WRITE
 
 
-def allows(scopes: frozenset[Scope], wanted: Scope, path: str) -> bool:
-    """Whether a key of these scopes may do what needs that one at that path."""
-    if Scope.SHARED in scopes and wanted is Scope.READ and SHARED.fullmatch(path):
+def allows(scopes: frozenset[Scope], scope: Scope, path: str) -> bool:
+    """Return True if a key with these scopes may do what needs that scope at that path."""
+    if Scope.SHARED in scopes and scope is Scope.READ and SHARED.fullmatch(path):
         return True
-    return wanted in scopes or Scope.ADMIN in scopes
+    return scope in scopes or Scope.ADMIN in scopes
 
 
 def bearer(headers: Headers) -> str | None:
-    """The secret that a request brings, None when it brings none, or not as it should."""
+    """Return the secret of the request's key; None if there is none or it is malformed."""
     values = headers.getlist("authorization")
     match = BEARER.fullmatch(values[0].strip()) if len(values) == 1 else None
     return None if match is None else match[1]
 
 
 def require_one_length(headers: Headers) -> None:
-    """Refuse a body whose end is told in two ways: a proxy may see another end than we do (RFC 9112, 6.1).
+    """Refuse a body with two declared lengths: a proxy may see another end than we do (RFC 9112, 6.1).
 
     Raises:
         InvalidRequest: there are both headers.
@@ -193,7 +203,7 @@ def require_one_length(headers: Headers) -> None:
 
 
 class Hosts:
-    """The names of this service.
+    """Names under which this service may be reached.
 
     Args:
         bound: the address that the service listens on. When that is all of them, every address in digits is this
@@ -202,14 +212,14 @@ class Hosts:
         readers: origins of other sites whose pages may read, `*` for all.
     """
 
-    def __init__(self, bound: str, allowed: Iterable[str], readers: Iterable[str] = ()) -> None:
+    def __init__(self, bound: str, allowed_hosts: Iterable[str], readers: Iterable[str] = ()) -> None:
         self._readers = frozenset(readers)
-        self._allowed = frozenset(name.lower() for name in allowed)
-        self._names = LOOPBACK | {bound.lower()} | self._allowed
+        self._allowed_hosts = frozenset(name.lower() for name in allowed_hosts)
+        self._names = LOOPBACK | {bound.lower()} | self._allowed_hosts
         self._all_addresses = _is_address(bound) and ipaddress.ip_address(bound).is_unspecified
 
     def check(self, method: str, headers: Headers, *, only_reads: bool = False) -> None:
-        """See that a request means this service, and that no foreign page sends it that may not.
+        """Check that a request is for this service, and that no page of another site sends it without permission.
 
         Args:
             method, headers: of the request.
@@ -240,11 +250,11 @@ class Hosts:
             authority = urlsplit(origin).netloc.lower()
         except ValueError:
             return False
-        return authority != "" and (authority == host.lower() or host_name(authority) in self._allowed)
+        return authority != "" and (authority == host.lower() or host_name(authority) in self._allowed_hosts)
 
 
 def host_name(host: str) -> str | None:
-    """The name in a Host header, lower case, without port and brackets; None when it is malformed."""
+    """Return the name in a Host header: lower case, without port and brackets; None if it is malformed."""
     name, bracket, rest = host.strip().lower().rpartition("]")
     if bracket:
         name = name.removeprefix("[")
@@ -254,7 +264,7 @@ def host_name(host: str) -> str | None:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches that address."""
+    """Return True if only this machine can reach the address."""
     return host == "localhost" or (_is_address(host) and ipaddress.ip_address(host).is_loopback)
 
 
@@ -272,7 +282,7 @@ def _is_address(name: str) -> bool:
 
 
 def with_keys(document: dict[str, Any]) -> dict[str, Any]:
-    """An OpenAPI document that says which operations need a key."""
+    """Return an OpenAPI document that marks the operations that need a key."""
     paths = {
         path: {method: _secured(method, path, operation) for method, operation in operations.items()}
         for path, operations in document["paths"].items()

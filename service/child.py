@@ -1,4 +1,4 @@
-"""What the child processes share: how they report, how they tell of errors, and that they end with their server."""
+"""Shared parts of child processes: messages, errors as JSON, and their end with the server."""
 
 from __future__ import annotations
 
@@ -19,39 +19,39 @@ from liftcore.errors import SplatliftError
 
 FIELDS = ("argument", "expected", "got", "hint")
 PIECE = 1 << 16
-ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # for libraries, before they are loaded
-ORPHANED = 3  # the exit status of a process whose server is gone
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # set before numeric libraries are loaded
+ORPHANED = 3  # exit status of a process whose server has ended
 
 
 def own_stdout() -> BinaryIO:
-    """The pipe to whoever started this process, for reports only: what libraries print goes to stderr from now on."""
+    """Return the pipe to the parent process, for messages only; what libraries print goes to stderr from now on."""
     out = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     return out
 
 
 def line_of(message: Mapping[str, Any]) -> bytes:
-    """A message as a line of JSON in UTF-8: of many names in other scripts, escapes would be three times that."""
+    """Return a message as a line of UTF-8 JSON, without escapes: they would triple names in other scripts."""
     return json.dumps(message, ensure_ascii=False).encode("utf-8", "surrogatepass") + b"\n"
 
 
 class Messages:
-    """JSON lines that a process writes to a pipe.
+    """JSON lines that another process writes to a pipe.
 
     Args:
         pipe: its file number, whose closing is the caller's.
     """
 
     def __init__(self, pipe: int) -> None:
-        self.open = True  # until the pipe is closed at its other end
+        self.open = True  # False once the other end of the pipe is closed
         self._pipe = pipe
-        self._poll = select.poll()  # not select(), which takes no file of a number above 1023
+        self._poll = select.poll()  # not select(), which refuses file numbers above 1023
         self._poll.register(pipe, select.POLLIN)
-        self._rest: list[bytes] = []  # pieces of a line whose end has not come
+        self._rest: list[bytes] = []  # pieces of an incomplete line
         os.set_blocking(pipe, False)
 
     def read(self, seconds: float) -> list[dict[str, Any]]:
-        """What has come; returns at the first words, at the end, or after so many seconds."""
+        """Return the messages so far; return at the first line, at the end of the pipe, or after `seconds`."""
         if not self.open:
             time.sleep(seconds)
             return []
@@ -60,29 +60,29 @@ class Messages:
         lines: list[bytes] = []
         with contextlib.suppress(BlockingIOError):
             while piece := os.read(self._pipe, PIECE):
-                first, *more = piece.split(b"\n")
+                first, *rest = piece.split(b"\n")
                 self._rest.append(first)
-                for piece_after in more:  # joined once, at its end: a message may be of a hundred thousand names
+                for piece_after in rest:  # joined once per line: a message may hold a hundred thousand names
                     lines.append(b"".join(self._rest))
                     self._rest = [piece_after]
-            self.open = False  # a half line at the end is what a killed writer leaves
+            self.open = False  # a killed writer may leave an incomplete line at the end
         return [json.loads(line) for line in lines]
 
 
 def end_with_parent(lifeline: int) -> None:
-    """End this process, and the group that it leads, when the other end of a pipe closes: the server's end does,
-    however the server ended. On Linux the kernel sees to that, even within a call that no thread could interrupt.
+    """End this process, and the group that it leads, when the other end of a pipe closes: the server has ended.
+    On Linux a signal of the kernel does it, even within a call that no thread could interrupt.
 
     Args:
         lifeline: the file number of a pipe that nothing is written to.
     """
-    group = os.getpgrp() == os.getpid()  # the server gave us a group of our own: all in it is our doing
+    group = os.getpgrp() == os.getpid()  # the server made us the leader of a group of our own
     if sys.platform == "linux":
         fcntl.fcntl(lifeline, fcntl.F_SETOWN, -os.getpid() if group else os.getpid())
         fcntl.fcntl(lifeline, fcntl.F_SETSIG, signal.SIGKILL)
         fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | os.O_ASYNC)
 
-    def wait() -> None:  # elsewhere; and it may have closed before
+    def wait() -> None:  # on other systems, and if the pipe closed before
         os.read(lifeline, 1)
         if group:
             os.killpg(0, signal.SIGKILL)
@@ -92,17 +92,17 @@ def end_with_parent(lifeline: int) -> None:
 
 
 def children_of(process: int) -> list[int]:
-    """The processes that a process started and that have not been waited for, as far as Linux tells."""
+    """Return the ids of the children of a process that have not been waited for, as Linux reports them."""
     children = list[int]()
     with contextlib.suppress(OSError):
-        for task in Path(f"/proc/{process}/task").iterdir():  # a process is the child of the thread that began it
+        for task in Path(f"/proc/{process}/task").iterdir():  # a process is a child of the thread that started it
             with contextlib.suppress(OSError):
                 children += map(int, (task / "children").read_text().split())
     return children
 
 
 def memory_of(process: int | str, field: str) -> int:
-    """Bytes that Linux tells of a process, by its number or ``self``; 0 where it does not.
+    """Return bytes that Linux reports for a process, by number or ``self``; 0 if it reports none.
 
     Args:
         field: ``RssAnon``, what is in memory but for mapped files; ``VmData``, what RLIMIT_DATA limits.
@@ -115,14 +115,14 @@ def memory_of(process: int | str, field: str) -> int:
 
 
 def is_stopped(process: int) -> bool:
-    """Whether a process is stopped (SIGSTOP), as far as Linux tells: it lives, and answers nobody."""
+    """Return True if a process is stopped (SIGSTOP), as Linux reports it: it lives and does not respond."""
     with contextlib.suppress(OSError):
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] in ("T", "t")
     return False
 
 
 def fault_of(error: SplatliftError, names: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """The error as JSON: kind, argument, expected, got, hint; of a word that cannot be asked also the nearest ones.
+    """Return the error as JSON: kind, argument, expected, got, hint; for an unknown word also the nearest ones.
 
     Args:
         error: the error to send.
@@ -130,20 +130,20 @@ def fault_of(error: SplatliftError, names: Mapping[str, str] | None = None) -> d
     """
     fault = {name: str(getattr(error, name)) for name in FIELDS}
     document: dict[str, Any] = {"kind": error.kind}
-    document |= {field: renamed(text, names or {}) for field, text in fault.items()}
+    document |= {field: replace_names(text, names or {}) for field, text in fault.items()}
     return document if error.nearest is None else document | {"nearest": error.nearest}
 
 
-def renamed(text: str, names: Mapping[str, str]) -> str:
-    """A text in which server paths have the names that the client knows."""
+def replace_names(text: str, names: Mapping[str, str]) -> str:
+    """Return a text with server paths replaced by the names that the client knows."""
     for path, name in names.items():
         text = text.replace(path, name)
     return text
 
 
 def error_of(fault: Mapping[str, Any]) -> SplatliftError:
-    """The error that `fault_of` told of; an unknown kind becomes the base class."""
-    kinds = {cls.kind: cls for cls in reversed(_tree(SplatliftError))}  # of two of a kind the base class counts
+    """Return the error that `fault_of` encoded; an unknown kind becomes the base class."""
+    kinds = {cls.kind: cls for cls in reversed(_tree(SplatliftError))}  # of two with one kind the base class counts
     cls = kinds.get(fault["kind"], SplatliftError)
     error = cls(fault["argument"], expected=fault["expected"], got=fault["got"], hint=fault["hint"])
     error.nearest = tuple(fault["nearest"]) if "nearest" in fault else None

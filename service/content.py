@@ -21,7 +21,7 @@ from starlette.types import Receive, Scope, Send
 
 from liftcore.errors import NotFound
 from service import models
-from service.errors import Busy, RangeNotSatisfiable, require_share
+from service.errors import RangeNotSatisfiable, ServiceUnavailable, require_share
 from service.models import ENDED
 from service.problems import PROBLEM
 from service.store.database import CURSOR, Page
@@ -246,11 +246,11 @@ class EventStreams:
         """The events after a number as they come, until the last state.
 
         Raises:
-            Busy: as many streams are open as may be.
-            TooMany: the key has its share of them.
+            ServiceUnavailable: as many streams are open as may be.
+            KeyLimitReached: the key has its share of them.
         """
         if self.open >= self._limit:
-            raise Busy(
+            raise ServiceUnavailable(
                 "events", expected=f"at most {self._limit} open streams", got="more", hint="GET the job instead"
             )
         require_share("events", self._open[key], None if key is None else self._share)

@@ -1,15 +1,15 @@
-"""What can go wrong around the numerical core: errors of the HTTP service, in the project's one error tree.
+"""Errors of the HTTP service, in the project's one tree of errors.
 
 SplatliftError
 └── ServiceError
-    ├── Unauthorized, MissingScope, ForeignOrigin, Misdirected      who may ask
+    ├── Unauthorized, MissingScope, ForeignOrigin, Misdirected                  authorization
     ├── InvalidRequest, UnreadableBody, DigestMismatch, UnsupportedEncoding,
-    │   UnsupportedMedia, TooLarge, RangeNotSatisfiable, KeyReused
-    ├── InUse, Conflict, Changed                                             what the state of things does not allow
-    ├── OverQuota, OverLimit, NoSpace                               what there is no room for
-    ├── RetryLater: TooMany, Busy (NotReady)                        what may go well in a while
-    ├── TimedOut, ClientLeft, Crashed                               what ended without an answer
-    └── Misconfigured (StaleDatabase)                               at the start only
+    │   UnsupportedMedia, TooLarge, RangeNotSatisfiable, KeyReused              the form of the request
+    ├── InUse, Conflict, VersionMismatch                                        the state of the resource
+    ├── OverQuota, OverLimit, NoSpace                                           limits of size and time
+    ├── RetryLater: KeyLimitReached, ServiceUnavailable (NotReady)              failures that may pass
+    ├── TimedOut, ClientDisconnected, ProcessDied                               requests that ended without an answer
+    └── Misconfigured (StaleDatabase)                                           raised at the start only
 
 Those of liftcore have their statuses and titles in `service.problems`.
 """
@@ -22,7 +22,7 @@ from liftcore.errors import SplatliftError
 
 
 class ServiceError(SplatliftError):
-    """An error of the service around the core; ``headers`` are what an answer tells beside the problem."""
+    """An error of the service; ``headers`` go into the answer beside the problem."""
 
     kind, status, title = "service", 422, "The input is not usable"
 
@@ -34,25 +34,25 @@ class ServiceError(SplatliftError):
 
 
 class Unauthorized(ServiceError):
-    """No key, or one that is not valid (any more)."""
+    """No key, or a key that is not valid."""
 
     kind, status, title = "unauthorized", 401, "A key is needed"
 
 
 class MissingScope(ServiceError):
-    """A key that was not made for this."""
+    """A key without the scope that is needed."""
 
     kind, status, title = "missing-scope", 403, "The key may not do that"
 
 
 class ForeignOrigin(ServiceError):
-    """A web page of another site asks in its visitor's name."""
+    """A web page of another site sends the request."""
 
     kind, status, title = "foreign-origin", 403, "Pages of other sites may not do that"
 
 
 class Misdirected(ServiceError):
-    """A Host header that does not mean this service."""
+    """A Host header with a name that is not this service's."""
 
     kind, status, title = "misdirected", 421, "This is another host"
 
@@ -64,7 +64,7 @@ class OverQuota(ServiceError):
 
 
 class InvalidRequest(ServiceError):
-    """A parameter or a body that the route does not understand."""
+    """A parameter or a body that the route does not accept."""
 
     kind, status, title = "invalid-request", 422, "The request is malformed"
 
@@ -76,19 +76,19 @@ class UnreadableBody(ServiceError):
 
 
 class DigestMismatch(ServiceError):
-    """The body's sha256 is not the promised one."""
+    """The sha256 of the body differs from the declared one."""
 
     kind, status, title = "digest-mismatch", 422, "The body is not what its digest promised"
 
 
 class UnsupportedEncoding(ServiceError):
-    """A body that is compressed."""
+    """A compressed body."""
 
     kind, status, title = "unsupported-encoding", 415, "The content encoding is not supported"
 
 
 class UnsupportedMedia(ServiceError):
-    """A body of a media type that the route does not take."""
+    """A body of a media type that the route does not accept."""
 
     kind, status, title = "unsupported-media-type", 415, "The media type is not supported"
 
@@ -100,7 +100,7 @@ class TooLarge(ServiceError):
 
 
 class RangeNotSatisfiable(ServiceError):
-    """A Range header that asks beyond the end."""
+    """A Range header that begins beyond the end."""
 
     kind, status, title = "range-not-satisfiable", 416, "The range is beyond the end"
 
@@ -112,19 +112,19 @@ class InUse(ServiceError):
 
 
 class Conflict(ServiceError):
-    """What is in a state that does not allow what was asked."""
+    """The state of the resource does not allow the operation."""
 
     kind, status, title = "conflict", 409, "Its state does not allow that"
 
 
-class Changed(ServiceError):
-    """What is to be changed has another version than its ETag was of."""
+class VersionMismatch(ServiceError):
+    """The resource has another version than the one in If-Match."""
 
     kind, status, title = "changed", 412, "It was changed meanwhile"
 
 
 class KeyReused(ServiceError):
-    """An Idempotency-Key that came with another order before."""
+    """An Idempotency-Key that was used with another order."""
 
     kind, status, title = "key-reused", 422, "The key belongs to another order"
 
@@ -136,33 +136,33 @@ class OverLimit(ServiceError):
 
 
 class NoSpace(ServiceError):
-    """Less free disk than the operator wants to keep."""
+    """Less free disk than the operator reserves."""
 
     kind, status, title = "no-space", 507, "There is no room left"
 
 
 class RetryLater(ServiceError):
-    """What may go well in a while."""
+    """A failure that may pass: the client may retry."""
 
     def __init__(self, argument: str, *, expected: str, got: str, hint: str = "", retry_after: int = 2) -> None:
         headers = {"Retry-After": str(retry_after)}  # seconds
         super().__init__(argument, expected=expected, got=got, hint=hint, headers=headers)
 
 
-class TooMany(RetryLater):
-    """More jobs in line, or uploads, queries or streams at a time, than a key may have."""
+class KeyLimitReached(RetryLater):
+    """A key has as many jobs, uploads, queries or streams as it may have at a time."""
 
     kind, status, title = "too-many", 429, "The key asks for too much at a time"
 
 
-class Busy(RetryLater):
-    """The service has as much waiting work as it accepts."""
+class ServiceUnavailable(RetryLater):
+    """The service accepts no more work at the moment."""
 
     kind, status, title = "busy", 503, "The server is busy"
 
 
-class NotReady(Busy):
-    """The service cannot work now: it stops, or a check failed."""
+class NotReady(ServiceUnavailable):
+    """The service is not ready: it stops, or a check failed."""
 
     kind, status, title = "not-ready", 503, "The server is not ready"
 
@@ -173,26 +173,26 @@ class TimedOut(ServiceError):
     kind, status, title = "timed-out", 504, "The query took too long"
 
 
-class ClientLeft(ServiceError):
-    """A client that did not wait for its turn: nobody reads the answer."""
+class ClientDisconnected(ServiceError):
+    """The client disconnected before its turn: nobody reads the answer."""
 
     kind, status, title = "client-left", 400, "The client left"
 
 
-class Crashed(ServiceError):
+class ProcessDied(ServiceError):
     """A process of the service died without an answer."""
 
     kind, status, title = "crashed", 500, "A process of the server died"
 
 
 class Misconfigured(ServiceError):
-    """Settings or a data directory with which the service does not start."""
+    """Settings or a data directory with which the service cannot start."""
 
     kind = "misconfigured"
 
 
 class StaleDatabase(Misconfigured):
-    """A data directory whose database is gone or older than its files: over it they would be garbage."""
+    """A data directory whose database is missing or older than its files: a new one would treat them as garbage."""
 
     def __init__(self, data: object, got: str) -> None:
         super().__init__(
@@ -203,13 +203,13 @@ class StaleDatabase(Misconfigured):
         )  # fmt: skip
 
 
-def require_share(what: str, count: int, most: int | None) -> None:
-    """See that a key may have another one of these at the same time; None = as many as it likes.
+def require_share(argument: str, count: int, limit: int | None) -> None:
+    """Require that a key is below its limit of such requests at a time; None means no limit.
 
     Raises:
         TooMany: it has as many as it may.
     """
-    if most is not None and count >= most:
-        raise TooMany(
-            what, expected=f"at most {most} of this key at a time", got="more", hint="wait for the end of one"
+    if limit is not None and count >= limit:
+        raise KeyLimitReached(
+            argument, expected=f"at most {limit} of this key at a time", got="more", hint="wait for the end of one"
         )

@@ -1,4 +1,4 @@
-"""The process of one job: reads its order, does it, and says how it goes in JSON lines on stdout.
+"""Run one job in a child process: read the order, do it, and report progress as JSON lines on stdout.
 
 Run as ``python -m service.job_child ORDER``, with a JSON file. Messages are ``{"event": "progress", ...}``,
 ``{"event": "plan", ...}`` and ``{"event": "beat"}``, any number of times, then one ``{"event": "done", ...}`` or
@@ -27,14 +27,12 @@ from service.models import JobKind
 
 SECONDS_BETWEEN_BEATS = 1.0
 SECONDS_BETWEEN_WORDS = 0.25
-NICENESS = 10  # queries come first: beside one, a lift gets a tenth of a core
-FIRST_TO_GO = 500  # when the machine runs out of memory, this process is ended rather than the server
+NICENESS = 10  # queries have priority: beside one, a lift gets a tenth of a core
+FIRST_TO_GO = 500  # if memory runs out, the kernel ends this process rather than the server
 
 
 class Reporter:
-    """Progress as JSON lines: every new stage and every end of one, and now and then in between. And what else
-    there is to say, a line each.
-    """
+    """Write progress and other messages as JSON lines: the begin and the end of each stage, four a second between."""
 
     def __init__(self, out: BinaryIO) -> None:
         self._out = out
@@ -42,16 +40,16 @@ class Reporter:
         self._last = 0.0
         self._turn = threading.Lock()  # one message at a time
 
-    def __call__(self, stage: str, done: int, total: int, unit: str) -> None:
-        """Say how far the work is (`liftcore.runtime.progress.Progress`)."""
+    def __call__(self, stage: str, completed: int, total: int, unit: str) -> None:
+        """Report progress (`liftcore.runtime.progress.Progress`)."""
         now = time.monotonic()
-        if stage == self._stage and done < total and now - self._last < SECONDS_BETWEEN_WORDS:
+        if stage == self._stage and completed < total and now - self._last < SECONDS_BETWEEN_WORDS:
             return
         self._stage, self._last = stage, now
-        self.say({"event": "progress", "stage": stage, "done": done, "total": total, "unit": unit})
+        self.say({"event": "progress", "stage": stage, "done": completed, "total": total, "unit": unit})
 
     def plan(self, plan: dict[str, Any]) -> None:
-        """Say what the work is going to be, as `service.models.Plan` has it."""
+        """Report the plan of the work, as `service.models.Plan` has it."""
         self.say({"event": "plan", "plan": plan})
 
     def say(self, message: dict[str, Any]) -> None:
@@ -61,24 +59,24 @@ class Reporter:
             self._out.flush()
 
     def beat(self) -> None:
-        """Say for ever that this process is alive."""
+        """Send a heartbeat every second, for ever."""
         while True:
             self.say({"event": "beat"})
             time.sleep(SECONDS_BETWEEN_BEATS)
 
 
-Work = Callable[[dict[str, Any], Reporter], dict[str, Any]]  # an order to what is told of its result
+Work = Callable[[dict[str, Any], Reporter], dict[str, Any]]  # takes an order, returns the fields of its result
 
 
 def work_of(kind: JobKind) -> Work:
-    """What a job of that kind does, imported beside the heartbeats."""
+    """Return the function for jobs of that kind, imported while heartbeats run."""
     from service import tasks
 
     return tasks.compare_as_ordered if kind is JobKind.TRADEOFF else tasks.lift_as_ordered
 
 
 def run(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
-    """Do what an order says.
+    """Do the work of an order.
 
     Returns:
         The last message.
@@ -89,7 +87,7 @@ def run(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
     try:
         return {"event": "done", **work_of(kind)(order, report)}
     except (SplatliftError, OSError) as error:
-        cause = error.__cause__ or error  # a lift in blocks says in its own words that its folder is full
+        cause = error.__cause__ or error  # a lift in blocks wraps the error of a full folder
         if not isinstance(cause, OSError) or cause.errno not in (errno.ENOSPC, errno.EDQUOT):
             if isinstance(error, SplatliftError):
                 return {"event": "fault", "fault": fault_of(error, order["names"])}

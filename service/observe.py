@@ -1,4 +1,4 @@
-"""What the service tells its operator: ids of requests, the log, counters, and what runs here."""
+"""Request ids, the log, the metrics and the version information of the service."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _CURRENT: ContextVar[str | None] = ContextVar("request_id", default=None)
 
 
 def chosen_id(headers: Iterable[tuple[bytes, bytes]]) -> str:
-    """The id for a request with these headers (names in lower case): the client's own when it is a sane one."""
+    """Return the id of a request with these headers (names in lower case): the client's own if it is well-formed."""
     values = [value for name, value in headers if name == REQUEST_ID]
     if len(values) == 1 and SANE.fullmatch(values[0]):
         return values[0].decode("ascii")
@@ -58,13 +58,13 @@ def chosen_id(headers: Iterable[tuple[bytes, bytes]]) -> str:
 
 
 def current_id() -> str | None:
-    """The id of the request that this task or thread works for, None when it works for none."""
+    """Return the id of the request that this task or thread works for; None if there is none."""
     return _CURRENT.get()
 
 
 @contextmanager
 def working_for(request: str | None) -> Iterator[None]:
-    """What is done in the block, and in threads that it awaits, is done for that request."""
+    """Set the current request for the block and for threads that it awaits."""
     token = _CURRENT.set(request)
     try:
         yield
@@ -75,8 +75,8 @@ def working_for(request: str | None) -> Iterator[None]:
 # The log
 
 SECRET = re.compile(r"(?i)\b(bearer|basic)\s+[^\s\"',;]+")
-WAITING_RECORDS = 10_000  # for a reader of stderr that is slow; more are dropped, and counted
-SAME_A_MINUTE = 60  # records from one line of code that are no access: what fails in a loop must not fill a disk
+WAITING_RECORDS = 10_000  # for a slow reader of stderr; more records are dropped and counted
+SAME_A_MINUTE = 60  # records from one line of code, access log excepted: an error in a loop must not fill the disk
 
 log = logging.getLogger(__name__)
 access = logging.getLogger("service.access")
@@ -84,7 +84,7 @@ access = logging.getLogger("service.access")
 
 @contextmanager
 def logging_to_stderr(log_format: str) -> Iterator[None]:
-    """Send the records of this process to stderr, warnings and threads that died among them, while the block runs.
+    """Send the records of this process to stderr while the block runs, with warnings and exceptions of threads.
 
     A thread of its own writes them: where stderr is stalled nobody waits for it.
     """
@@ -105,19 +105,19 @@ def logging_to_stderr(log_format: str) -> Iterator[None]:
 
 
 class _Line(logging.handlers.QueueHandler):
-    """Notes the request that a record was made for, as the thread that writes it works for none."""
+    """Add the current request to a record; the thread that writes it works for none."""
 
     def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
-        """The record as it is, with its request."""
+        """Return the record itself, with its request."""
         record.request_id = current_id()
         return record
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
-        """Nothing: the line is full, and complaints would go to where nobody reads."""
+        """Ignore the error: the queue is full, and a message would go to the same queue."""
 
 
 class LogRateLimit(logging.Filter):
-    """Lets one line of code say SAME_A_MINUTE things a minute; the access log tells of every request.
+    """Limit each line of code to SAME_A_MINUTE records a minute; the access log is not limited.
 
     Args:
         clock: seconds that never go back.
@@ -126,40 +126,40 @@ class LogRateLimit(logging.Filter):
     def __init__(self, clock: Any = time.monotonic) -> None:
         super().__init__()
         self._clock = clock
-        self._said: dict[tuple[str, int], tuple[float, int]] = {}  # place -> the minute's begin, records in it
+        self._counts: dict[tuple[str, int], tuple[float, int]] = {}  # place -> start of the minute, records in it
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether the record is to be written; the first one after a silence says how long that was."""
+        """Return True if the record is to be written; the first one after a silence has the number left out."""
         if record.name == access.name:
             return True
         place, now = (record.pathname, record.lineno), self._clock()
-        start, count = self._said.get(place, (now, 0))
+        start, count = self._counts.get(place, (now, 0))
         if now - start >= 60:
             left_out = count - SAME_A_MINUTE
             if left_out > 0:
                 record.fields = getattr(record, "fields", {}) | {"left_out": left_out}
             start, count = now, 0
-        self._said[place] = start, count + 1
+        self._counts[place] = start, count + 1
         return count < SAME_A_MINUTE
 
 
 class JsonLines(logging.Formatter):
-    """A JSON object a record: ``time``, ``level``, ``logger``, ``message``, then what the record brings.
+    """Format a record as a JSON object: ``time``, ``level``, ``logger``, ``message``, then the record's own fields.
 
     A record brings ``request_id`` when it is made for a request, ``error`` with an exception's trace, and whatever it
     was given as ``extra={"fields": {...}}``.
     """
 
     def format(self, record: logging.LogRecord) -> str:
-        """One line."""
+        """Return one line."""
         return json.dumps(_fields_of(self, record), ensure_ascii=True, default=str)
 
 
 class TextLines(logging.Formatter):
-    """The same for people: time, level, logger and message, the rest as ``name=value``, then the trace."""
+    """Format a record for people: time, level, logger and message, other fields as ``name=value``, then the trace."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """One line, and those of the trace."""
+        """Return one line, and those of the trace."""
         fields = _fields_of(self, record)
         trace = fields.pop("error", None)
         time, level, logger, message = (fields.pop(name) for name in ("time", "level", "logger", "message"))
@@ -187,24 +187,24 @@ def _fields_of(formatter: logging.Formatter, record: logging.LogRecord) -> dict[
 
 
 def _without_secrets(text: str) -> str:
-    """No record is made of headers; this is for traces that quote them."""
+    """Return a text without secrets. Records quote no headers; traces may."""
     return SECRET.sub(r"\1 [hidden]", text)
 
 
-def _thread_died(died: threading.ExceptHookArgs) -> None:
-    name = died.thread.name if died.thread is not None else "a thread"
-    trace = (died.exc_type, died.exc_value or died.exc_type(), died.exc_traceback)
+def _thread_died(failure: threading.ExceptHookArgs) -> None:
+    name = failure.thread.name if failure.thread is not None else "a thread"
+    trace = (failure.exc_type, failure.exc_value or failure.exc_type(), failure.exc_traceback)
     log.error("%s died", name, exc_info=trace)
 
 
-# What runs here
+# Version information
 
 API = "1"  # of the routes and their JSON: changes when a client that works today would break
 PACKAGES = ("torch", "numpy", "numba", "fastapi", "uvicorn")
 
 
 def versions(commit: str | None) -> models.Version:
-    """What runs here, found without importing it; the commit is told by whoever built this, in the settings."""
+    """Return the versions of this service and of its packages, without importing them; `commit` is a setting."""
     packages = {name: _installed(name) for name in PACKAGES}
     return models.Version(
         version=__version__,
@@ -225,7 +225,7 @@ def _installed(package: str) -> str | None:
 
 # Counters
 
-# A label may take few values: a route is its template, a method one that HTTP defines, and the rest are one value.
+# Labels have few values: a route is its template, a method one of HTTP's; all others are `OTHER`.
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS", "TRACE", "CONNECT"})
 OTHER = "other"
 REQUEST_BUCKETS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 120.0, 600.0)  # seconds
@@ -233,10 +233,10 @@ ATTEMPT_BUCKETS = (1.0, 3.0, 10.0, 30.0, 60.0, 180.0, 600.0, 1800.0, 3600.0, 10_
 
 
 class Metrics:
-    """What is counted for Prometheus, in a registry of its own. Any thread may call any method."""
+    """Metrics for Prometheus, in a registry of their own. Any thread may call any method."""
 
     def __init__(self, store: Store, queries: QueryClient, streams: EventStreams, build: models.Version) -> None:
-        disable_created_metrics()  # a second series for each one that says when it began: nobody reads those
+        disable_created_metrics()  # skip the extra series with creation times
         self._registry = registry = CollectorRegistry()
         self._requests = Counter(
             "splatlift_http_requests", "Requests by route and status.", ("method", "route", "status"),
@@ -246,7 +246,7 @@ class Metrics:
             "splatlift_http_request_seconds", "Time from a request's head to the end of its answer.",
             ("method", "route"), buckets=REQUEST_BUCKETS, registry=registry,
         )  # fmt: skip
-        self._received = Counter(
+        self._received_bytes = Counter(
             "splatlift_http_request_body_bytes", "Bytes of request bodies; of PUT /assets/{asset}: uploads.",
             ("method", "route"), registry=registry,
         )  # fmt: skip
@@ -263,13 +263,15 @@ class Metrics:
         ProcessCollector(registry=registry)
         registry.register(_Gauges(store, queries, streams))
 
-    def count_request(self, method: str, route: str | None, status: int, *, seconds: float, received: int) -> None:
-        """Count a request; its route is the template, None when no route takes the path."""
+    def count_request(
+        self, method: str, route: str | None, status: int, *, seconds: float, received_bytes: int
+    ) -> None:
+        """Count a request. The route is its template; None if no route matches the path."""
         method, route = method if method in METHODS else OTHER, route or OTHER
         self._requests.labels(method, route, str(status)).inc()
         self._seconds.labels(method, route).observe(seconds)
-        if received:
-            self._received.labels(method, route).inc(received)
+        if received_bytes:
+            self._received_bytes.labels(method, route).inc(received_bytes)
 
     def attempted(self, outcome: str, seconds: float) -> None:
         """Count an attempt at a job."""
@@ -280,12 +282,12 @@ class Metrics:
         self._queries.labels(operation, outcome).observe(seconds)
 
     def text(self) -> bytes:
-        """All of it in the text format 0.0.4. Reads the database and the disk."""
+        """Return all metrics in the text format 0.0.4. Reads the database and the disk."""
         return generate_latest(self._registry)
 
 
 class _Gauges(Collector):
-    """What is true when somebody asks."""
+    """Metrics that are read at each scrape."""
 
     def __init__(self, store: Store, queries: QueryClient, streams: EventStreams) -> None:
         self._store = store
@@ -293,11 +295,11 @@ class _Gauges(Collector):
         self._streams = streams
 
     def describe(self) -> Iterable[Metric]:
-        """Nothing: the names are our own, and looking them up would read the database."""
+        """Return nothing: the names are unique, and collecting here would read the database."""
         return ()
 
     def collect(self) -> Iterator[Metric]:
-        """Look."""
+        """Yield the current values."""
         counts = self._store.jobs.count_by_state()
         jobs = GaugeMetricFamily("splatlift_jobs", "Jobs by state.", labels=("state",))
         for state in JobState:

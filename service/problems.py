@@ -1,4 +1,4 @@
-"""The one table from errors to HTTP answers, and the RFC 9457 shape of every one of them."""
+"""Convert every error to an HTTP answer in the shape of RFC 9457, by one table."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ from service.models import Problem
 from service.observe import current_id
 
 MEDIA_TYPE = "application/problem+json"
-METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")  # and HEAD, where there is GET
-PATH_CHARACTERS = 200  # of what a client asked for, told back
-SHOWN = 120  # characters of a value that came
-SHOWN_OF_JSON = 20  # from where it is none
+METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")  # HEAD too, where GET is allowed
+PATH_CHARACTERS = 200  # of a requested path, in an answer
+VALUE_CHARACTERS = 120  # of a value, in an answer
+JSON_CHARACTERS = 20  # of JSON, from the character where it is malformed
 PYDANTIC = re.compile(
     r"^\w+ should (be|have) |, unable to parse .*| after validation, not \d+$"
-)  # around what it expects
-CLOSE = {"Connection": "close"}  # what is still to come of the body would be taken for the next request
-# Of the database's file, or of the disk below it: nobody's request is at fault, and nothing was kept of it.
+)  # text around the expected value
+CLOSE = {"Connection": "close"}  # the rest of the body must not be taken for the next request
+# Errors of the database's file or the disk below it: the request is not at fault, and nothing was stored.
 UNUSABLE = (
     sqlite3.SQLITE_READONLY, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_CANTOPEN,
     sqlite3.SQLITE_NOTADB,
 )  # fmt: skip
-# Of the disk: it may only be read, fails, or was taken away.
+# Errors of the disk: read-only, failing or removed.
 UNWRITABLE = (errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ENODEV, errno.ESTALE)
 NO_SPACE = "There is no room left"
 BUSY = "The server is busy"
 MALFORMED = "The request is malformed"
 
-# Exception of the library -> status and title, of the nearest class in its ancestry; `type` is its `kind`.
+# Exception of the library -> status and title, by the nearest class in its ancestry; `type` is its `kind`.
 TABLE: dict[type[SplatliftError], tuple[int, str]] = {
     SplatliftError: (422, "The input is not usable"),
     core.InvalidInput: (422, "The input is malformed"),
@@ -60,7 +60,7 @@ TABLE: dict[type[SplatliftError], tuple[int, str]] = {
     core.Unavailable: (422, "This server lacks what that needs"),
 }
 
-# Errors that the framework raises by status, not by class.
+# Errors that the framework raises with a status.
 FRAMEWORK: dict[int, tuple[str, str]] = {
     400: ("malformed-request", MALFORMED),
     404: ("no-such-route", "There is no such route"),
@@ -79,7 +79,7 @@ log = logging.getLogger(__name__)
 
 
 def problem_of(error: SplatliftError) -> Problem:
-    """The error as a problem."""
+    """Return the error as a problem."""
     if isinstance(error, errors.ServiceError):
         status, title = error.status, error.title
     else:
@@ -91,35 +91,35 @@ def problem_of(error: SplatliftError) -> Problem:
     )  # fmt: skip
 
 
-def by_status(status: int, detail: str, **told: Any) -> Problem:
-    """A problem that no error of ours tells of."""
+def by_status(status: int, detail: str, **fields: Any) -> Problem:
+    """Return a problem for a status without an error class."""
     phrase = HTTPStatus(status).phrase
     slug, title = FRAMEWORK.get(status, (phrase.lower().replace(" ", "-"), phrase))
-    return Problem(type=f"/problems/{slug}", title=title, status=status, detail=detail, **told)
+    return Problem(type=f"/problems/{slug}", title=title, status=status, detail=detail, **fields)
 
 
 def answer(problem: Problem, headers: Mapping[str, str] | None = None) -> JSONResponse:
-    """The problem as a response to the request that is worked for."""
+    """Return the problem as a response to the current request."""
     problem = problem.model_copy(update={"request_id": current_id()})
-    fields = {name: _plain(value) for name, value in problem.model_dump(exclude_none=True).items()}
+    fields = {name: _one_line(value) for name, value in problem.model_dump(exclude_none=True).items()}
     return JSONResponse(fields, problem.status, headers=headers, media_type=MEDIA_TYPE)
 
 
-def answer_to(error: SplatliftError, more: Mapping[str, str] | None = None) -> JSONResponse:
-    """The error as a response, with the headers that belong to it, and more."""
+def answer_to(error: SplatliftError, headers_beside: Mapping[str, str] | None = None) -> JSONResponse:
+    """Return the error as a response, with its headers and others."""
     headers = error.headers if isinstance(error, errors.ServiceError) else {}
-    return answer(problem_of(error), {**headers, **(more or {})})
+    return answer(problem_of(error), {**headers, **(headers_beside or {})})
 
 
 def install(app: FastAPI) -> None:
-    """Make every error of the application a problem."""
+    """Convert every error of the application to a problem."""
     for kind in (SplatliftError, RequestValidationError, HTTPException, ClientDisconnect, OSError, sqlite3.Error):
-        app.add_exception_handler(kind, _tell)
-    app.add_exception_handler(Exception, _tell)  # of the layers, too: the gate raises what it refuses
+        app.add_exception_handler(kind, _handle_error)
+    app.add_exception_handler(Exception, _handle_error)  # of the middleware too: `service.auth` raises its refusals
 
 
-# Async: a sync handler would wait for a thread of the pool, and a bad request behind every slow route.
-async def _tell(request: Request, error: Exception) -> JSONResponse:
+# Async: a sync handler would wait for a thread of the pool, and a malformed request behind every slow route.
+async def _handle_error(request: Request, error: Exception) -> JSONResponse:
     match error:
         case SplatliftError():
             return answer_to(error)
@@ -127,33 +127,37 @@ async def _tell(request: Request, error: Exception) -> JSONResponse:
             return answer_to(refusal(request, error))
         case HTTPException():
             return _of_framework(request, error)
-        case ClientDisconnect():  # nobody reads this; without it the log would tell of an error of ours
+        case ClientDisconnect():  # nobody reads this; without it the log would show an error of the server
             return answer(by_status(400, "The client left before the end of the body."))
     return _of_system(f"{request.method} {request.url.path}", error)
 
 
-def _of_system(what: str, error: Exception) -> JSONResponse:
-    """What is the operator's to mend, or ours. Details go to the log: they may name what is not the client's."""
+def _of_system(request_line: str, error: Exception) -> JSONResponse:
+    """Answer an error of the server or its operator. Details go to the log only: they may name private things."""
     code = getattr(error, "sqlite_errorcode", None)
     if getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or code == sqlite3.SQLITE_FULL:
-        log.error("%s: the disk is full", what)
+        log.error("%s: the disk is full", request_line)
         detail = "The server's disk is full; what was sent is not kept."
         return answer(Problem(type="/problems/no-space", title=NO_SPACE, status=507, detail=detail))
     if isinstance(error, OSError) and error.errno in UNWRITABLE:
-        log.error("%s: the data directory cannot be used", what, exc_info=error)
-        got = f"another: {error.strerror}"  # without its file, which is the server's
+        log.error("%s: the data directory cannot be used", request_line, exc_info=error)
+        got = f"another: {error.strerror}"  # without its file, which is private
         return answer_to(errors.NotReady("disk", expected="a disk that can be read and written", got=got))
     if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
-        log.error("%s: no file can be opened any more", what)
-        return answer_to(errors.Busy("files", expected="a file to open", got="as many open files as there may be"))
+        log.error("%s: no file can be opened any more", request_line)
+        return answer_to(
+            errors.ServiceUnavailable("files", expected="a file to open", got="as many open files as there may be")
+        )
     if code is not None and code & 0xFF in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
-        log.error("%s: another process holds the database", what)
-        return answer_to(errors.Busy("database", expected="a turn at it", got="one that another process holds"))
+        log.error("%s: another process holds the database", request_line)
+        return answer_to(
+            errors.ServiceUnavailable("database", expected="a turn at it", got="one that another process holds")
+        )
     if code is not None and code & 0xFF in UNUSABLE:
-        log.error("%s: the database cannot be used", what, exc_info=error)
+        log.error("%s: the database cannot be used", request_line, exc_info=error)
         got = "one that is damaged, gone, or on a disk that fails"
         return answer_to(errors.NotReady("database", expected="the database that was opened", got=got))
-    log.error("%s failed", what, exc_info=error)
+    log.error("%s failed", request_line, exc_info=error)
     detail = "Something went wrong on our side; the server's log has the details."
     return answer(Problem(type="/problems/internal", title="An error of the server", status=500, detail=detail))
 
@@ -178,7 +182,7 @@ def _of_framework(request: Request, error: HTTPException) -> JSONResponse:
 
 
 def _methods_of(request: Request) -> list[str]:
-    """What the path takes, by all of its routes: the framework tells of the first one only."""
+    """Return the methods that a path accepts over all of its routes: the framework names the first route's only."""
     scopes = {method: {**request.scope, "method": method} for method in METHODS}
     routes = request.app.routes
     methods = [
@@ -190,15 +194,15 @@ def _methods_of(request: Request) -> list[str]:
 
 
 def refusal(request: Request, error: RequestValidationError) -> errors.ServiceError:
-    """The first thing that is wrong with the form of a request: where, what was expected, what came."""
+    """Return the first error in the form of a request: its place, the expected value, the value."""
     first = error.errors()[0]
     place, kind, context = [str(part) for part in first["loc"]], first["type"], first.get("ctx", {})
     if kind == "json_invalid":
-        return _no_json(error.body, int(place[1]), context["error"])
+        return _malformed_json(error.body, int(place[1]), context["error"])
     if place == ["body"] and isinstance(first.get("input"), bytes):
-        return _unread(request.headers.get("content-type"))
+        return _not_json(request.headers.get("content-type"))
     got = "nothing" if kind == "missing" else _short(first.get("input"))
-    if kind == "unknown_field":  # told of what holds it, `service.models.Body`
+    if kind == "unknown_field":  # reported for the object that holds it, `service.models.Body`
         place.append(context["field"])
         got = repr(context["field"])
     return errors.InvalidRequest(
@@ -218,14 +222,14 @@ def _expected(error: dict[str, Any]) -> str:
     return error.get("ctx", {}).get("expected") or words[:1].lower() + words[1:]
 
 
-def _no_json(body: str, place: int, reason: str) -> errors.UnreadableBody:
-    excerpt = repr(body[place : place + SHOWN_OF_JSON]) if place < len(body) else "its end"
+def _malformed_json(body: str, place: int, reason: str) -> errors.UnreadableBody:
+    excerpt = repr(body[place : place + JSON_CHARACTERS]) if place < len(body) else "its end"
     got = f"{excerpt} at character {place + 1} ({reason[:1].lower()}{reason[1:]})"
     return errors.UnreadableBody("body", expected="JSON", got=got, hint="in the body of the request")
 
 
-def _unread(media: str | None) -> errors.UnsupportedMedia:
-    """A body that is not read, as nothing says that it is JSON: curl says that all it sends is a form."""
+def _not_json(media: str | None) -> errors.UnsupportedMedia:
+    """Return the error for a body that is not declared as JSON: curl declares a form by default."""
     return errors.UnsupportedMedia(
         "Content-Type", expected="application/json", got="nothing" if media is None else _short(media),
         hint="send the header Content-Type: application/json with the body",
@@ -234,11 +238,11 @@ def _unread(media: str | None) -> errors.UnsupportedMedia:
 
 def _short(value: Any) -> str:
     text = repr(value)
-    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
+    return text if len(text) <= VALUE_CHARACTERS else f"{text[:VALUE_CHARACTERS]}..."
 
 
-def _plain(value: Any) -> Any:
-    """Text on one line that UTF-8 can carry: what a client sent may be half a surrogate pair, or hold line ends."""
+def _one_line(value: Any) -> Any:
+    """Return text as one line that UTF-8 can carry: a client may send half a surrogate pair, or line ends."""
     if not isinstance(value, str):
         return value
     return " ".join(value.encode("utf-8", "backslashreplace").decode().split())

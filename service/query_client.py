@@ -18,7 +18,7 @@ from typing import Any
 
 from liftcore.errors import SplatliftError
 from service.child import ONE_THREAD, error_of, is_stopped
-from service.errors import Busy, ClientLeft, Crashed, TimedOut, require_share
+from service.errors import ClientDisconnected, ProcessDied, ServiceUnavailable, TimedOut, require_share
 
 # Without the first two each array of a query is mapped anew and its pages are faulted in one by one: a fifth of its
 # time. A query is a row of small operations, each of which would wait for a team of threads of its library to meet,
@@ -162,11 +162,11 @@ class QueryClient:
 
         Raises:
             SplatliftError: the worker's own error, as if raised here.
-            Busy: too many calls are waiting, this one had no turn in its time, or the server stops.
-            TooMany: too many of them are of this key.
+            ServiceUnavailable: too many calls are waiting, this one had no turn in its time, or the server stops.
+            KeyLimitReached: too many of them are of this key.
             TimedOut: the answer took too long.
-            ClientLeft: nobody waits for it.
-            Crashed: the worker died twice over this call, or failed with an error that is ours.
+            ClientDisconnected: nobody waits for it.
+            ProcessDied: the worker died twice over this call, or failed with an error that is ours.
         """
         start, outcome = time.monotonic(), "crashed"
         call = _Call(json.dumps(request, allow_nan=False).encode(), waiter or Waiter(), start + self._limits.seconds)
@@ -179,7 +179,7 @@ class QueryClient:
             if "fault" in reply.header:
                 raise error_of(reply.header["fault"])
             if "crash" in reply.header:
-                raise Crashed("query", expected="an answer", got="an error of the server")
+                raise ProcessDied("query", expected="an answer", got="an error of the server")
             outcome = "answered"
         except SplatliftError as error:
             outcome = error.kind
@@ -203,7 +203,7 @@ class QueryClient:
         if self._cuda is None:
             try:
                 self._cuda = self.call({"operation": "device", "device": device}).header
-            except (Busy, TimedOut, Crashed):
+            except (ServiceUnavailable, TimedOut, ProcessDied):
                 return
         if self._cuda["lack"] is not None:
             raise error_of(self._cuda["lack"])
@@ -223,9 +223,11 @@ class QueryClient:
                 self._line.remove(call)
                 self._condition.notify_all()
             if self._stopped:
-                raise Busy("query", expected="a running server", got="one that stops", hint="ask the next one")
+                raise ServiceUnavailable(
+                    "query", expected="a running server", got="one that stops", hint="ask the next one"
+                )
             if call.waiter.disconnected:
-                raise ClientLeft("query", expected="a client that waits for its turn", got="one that left")
+                raise ClientDisconnected("query", expected="a client that waits for its turn", got="one that left")
             if not came:
                 raise self._busy()
             self._busy_with = call
@@ -254,9 +256,9 @@ class QueryClient:
             limit = max(1, min(limit, self._limits.waiting - 1))
             require_share("query", sum(call.waiter.key == key for call in calls), limit)
 
-    def _busy(self) -> Busy:
+    def _busy(self) -> ServiceUnavailable:
         line = f"at most {self._limits.waiting} waiting queries"
-        return Busy("query", expected=line, got="more", hint="try again soon")
+        return ServiceUnavailable("query", expected=line, got="more", hint="try again soon")
 
     def _ask(self, call: _Call, ahead: list[bytes]) -> Frame:
         """Ask the process; when it dies over that, a new one."""
@@ -267,11 +269,13 @@ class QueryClient:
             if reply is not None:
                 return reply
             if self._stopped:
-                raise Busy("query", expected="a running server", got="one that stops", hint="ask the next one")
+                raise ServiceUnavailable(
+                    "query", expected="a running server", got="one that stops", hint="ask the next one"
+                )
             log.error("the query worker died; a new one starts")
             self._spawn()
             ahead = []
-        raise Crashed("query", expected="an answer", got="a query process that died twice over it")
+        raise ProcessDied("query", expected="an answer", got="a query process that died twice over it")
 
     def _exchange(self, call: _Call, ahead: list[bytes]) -> Frame | None:
         """What the process says, None when it dies.

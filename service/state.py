@@ -16,14 +16,14 @@ from fastapi import Depends, Request
 
 from liftcore.errors import SplatliftError
 from liftcore.files import PhotoIndexes
-from service import errand
+from service import sandbox
 from service.auth import CALLER, Caller
 from service.content import EventStreams
-from service.errand import ErrandLimits
 from service.errors import NotReady
 from service.models import Version
 from service.observe import Metrics
 from service.query_client import QueryClient
+from service.sandbox import SandboxLimits
 from service.settings import ServiceSettings
 from service.store.owners import Owner
 from service.store.store import Store
@@ -79,7 +79,7 @@ class Readiness:
                 None if queries.revive() else "the query worker has died or was stopped; a new one starts"
             ),
             "uploads": lambda: (
-                None if errand.revive() else "what checks uploads has died or was stopped; a new one starts"
+                None if sandbox.revive() else "what checks uploads has died or was stopped; a new one starts"
             ),
         }
         self._turn = anyio.CapacityLimiter(1)
@@ -162,9 +162,9 @@ class AppState:
     ending: threading.Event = field(default_factory=threading.Event)  # set when what still runs must end
 
     @property
-    def check_limits(self) -> ErrandLimits:
+    def check_limits(self) -> SandboxLimits:
         """What the check of an upload, or a plan, may take."""
-        return ErrandLimits(self.settings.check_seconds, self.settings.check_memory_bytes, self.ending)
+        return SandboxLimits(self.settings.check_seconds, self.settings.check_memory_bytes, self.ending)
 
     @property
     def owner(self) -> Owner:

@@ -23,7 +23,7 @@ from typing import IO, Any, Self
 
 from liftcore.errors import SplatliftError
 from service.child import Messages, children_of, fault_of, memory_of
-from service.errors import Crashed, NoSpace, OverLimit
+from service.errors import NoSpace, OverLimit, ProcessDied
 from service.models import ENDED, JobKind, JobState
 from service.observe import current_id, working_for
 from service.store.assets import kernel_of
@@ -162,7 +162,7 @@ class Supervisor:
                 retry_until_committed(lambda: attempts.release(job.id, job.attempt, reason), self._stopping)
             except Exception as error:
                 log.exception("job %s could not be run", job.id)
-                unforeseen = Crashed("job", expected="a process that runs", got="an error of the server")
+                unforeseen = ProcessDied("job", expected="a process that runs", got="an error of the server")
                 fault = fault_of(error if isinstance(error, SplatliftError) else unforeseen)
                 retry_until_committed(lambda: attempts.fail(job.id, job.attempt, fault), self._stopping)
             outcome, seconds = attempts.state(SERVICE, job.id) or "deleted", time.monotonic() - start

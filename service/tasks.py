@@ -1,5 +1,5 @@
-"""What runs in a process of its own. While a request waits (`service.errand`): an upload is read before it becomes an
-asset, a pack named anew, a lift planned that nobody has ordered yet. And what jobs do (`service.job_child`)."""
+"""Functions that run in child processes: checks, renamed packs and plans while a request waits (`service.sandbox`),
+and the work of jobs (`service.job_child`)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from liftcore.evaluate import inspect_file
 from liftcore.files import finite, identify, with_metadata, wrong_kind
 from liftcore.text.table import TableEncoder
 from service import models
-from service.child import fault_of, renamed
+from service.child import fault_of, replace_names
 from service.models import AssetKind, UploadKind
 from service.store.files import sha256_of
 from service.store.lifts import LONG, SHOWN_BYTES
@@ -273,7 +273,7 @@ def lift_as_ordered(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
 
 def plan_document(plan: Plan, names: Mapping[str, str]) -> dict[str, Any]:
     """A plan as `service.models.Plan` has it, with the names that clients know in place of paths."""
-    warnings = [renamed(warning, names) for warning in (*plan.warnings, *plan.told)]
+    warnings = [replace_names(warning, names) for warning in (*plan.warnings, *plan.told)]
     return finite({"summary": list(plan.summary()), "warnings": warnings, **plan.facts()})
 
 

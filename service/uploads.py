@@ -14,9 +14,9 @@ from liftcore import errors
 from liftcore.errors import InvalidInput, InvalidLift, NotFound
 from liftcore.files import require_pairs
 from service.child import error_of
-from service.errand import ErrandLimits, run_errand
-from service.errors import Crashed, DigestMismatch, TooLarge
+from service.errors import DigestMismatch, ProcessDied, TooLarge
 from service.models import AssetKind, UploadKind
+from service.sandbox import SandboxLimits, run_sandboxed
 from service.store.assets import ALL, SHOWN_CHARACTERS, AssetRecord, CheckedUpload
 from service.store.files import is_whole
 from service.store.lifts import FinishedLift, LiftRecord, order_of
@@ -121,11 +121,11 @@ class Intake(ABC, Generic[Taken]):
             raise DigestMismatch("sha256", expected=promised, got=digest, hint="upload the file again")
         return self._find_same(digest)
 
-    def check(self, limits: ErrandLimits) -> CheckedUpload:
+    def check(self, limits: SandboxLimits) -> CheckedUpload:
         """Read the whole draft in a process of its own.
 
         Raises:
-            InvalidInput, Crashed, Busy: as `check` has it.
+            InvalidInput, ProcessDied, ServiceUnavailable: as `check` has it.
             NotFound: what it is checked beside is not here.
         """
         assert self._draft is not None
@@ -212,7 +212,7 @@ class Report:
     warnings: list[str]
 
 
-def check(kind: UploadKind, path: Path, scratch: Path, limits: ErrandLimits, *beside: Path) -> Report:
+def check(kind: UploadKind, path: Path, scratch: Path, limits: SandboxLimits, *beside: Path) -> Report:
     """Read a whole file in a process of its own, which unpacks into ``scratch`` and ends with this process.
 
     Args:
@@ -220,12 +220,12 @@ def check(kind: UploadKind, path: Path, scratch: Path, limits: ErrandLimits, *be
 
     Raises:
         InvalidInput: the file is malformed, or it takes more time or memory than it may.
-        Crashed: the process did not get as far as opening the file.
-        Busy: as `run_errand` has it.
+        ProcessDied: the process did not get as far as opening the file.
+        ServiceUnavailable: as `run_sandboxed` has it.
     """
     memory = min(limits.memory_bytes, CHECK_BASE_BYTES + CHECK_FACTOR * sum(map(_size, (path, *beside))))
     arguments = [kind, str(path), *map(str, beside)]
-    result = run_errand("service.tasks.check", arguments, scratch, replace(limits, memory_bytes=memory))
+    result = run_sandboxed("service.tasks.check", arguments, scratch, replace(limits, memory_bytes=memory))
     if result is None:
         raise too_slow(kind, limits)
     if result.last["event"] == "valid":
@@ -239,10 +239,10 @@ def check(kind: UploadKind, path: Path, scratch: Path, limits: ErrandLimits, *be
             kind, expected="a file that its reader can take", got=f"one that ended it with {result.returncode}",
             hint="it may be broken, or need more memory than an upload may take",
         )  # fmt: skip
-    raise Crashed("check", expected="a process that starts", got=f"one that ended with {result.returncode}")
+    raise ProcessDied("check", expected="a process that starts", got=f"one that ended with {result.returncode}")
 
 
-def too_slow(kind: UploadKind, limits: ErrandLimits) -> InvalidInput:
+def too_slow(kind: UploadKind, limits: SandboxLimits) -> InvalidInput:
     """What to say of a file that takes longer to read than it may."""
     return INVALID[kind](
         kind, expected=f"a file that is read within {limits.seconds:g} s", got="one that takes longer"

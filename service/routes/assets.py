@@ -13,9 +13,9 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from service import models
 from service.child import error_of
 from service.content import FILE, Cursor, Limit, file_answer, page_response
-from service.errand import run_errand
-from service.errors import Crashed
+from service.errors import ProcessDied
 from service.requests import JsonRoute, require_file
+from service.sandbox import run_sandboxed
 from service.state import AppState, Deps
 from service.store.assets import SHOWN_CHARACTERS, AssetRecord
 from service.store.files import require_whole
@@ -146,13 +146,13 @@ def _retagged(asset: str, change: models.PackChange, deps: AppState) -> tuple[As
         with deps.store.files.scratch() as scratch, source.path.open("rb") as pack:
             header = scratch / "header"
             arguments = [str(source.path), change.model_dump_json(exclude_none=True), str(header)]
-            result = run_errand("service.tasks.rename", arguments, scratch, deps.check_limits)
+            result = run_sandboxed("service.tasks.rename", arguments, scratch, deps.check_limits)
             if result is None:
                 raise too_slow(models.AssetKind.FEATURES, deps.check_limits)
             if result.last["event"] == "invalid":
                 raise error_of(result.last["fault"])
             if result.last["event"] != "valid":
-                raise Crashed(
+                raise ProcessDied(
                     "asset", expected="a pack whose header is read", got="one that is not", hint="try again"
                 )
             intake.feed(header.read_bytes())

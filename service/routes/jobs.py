@@ -18,11 +18,11 @@ from liftcore.text.table import Vocabulary
 from service import models
 from service.child import error_of
 from service.content import Cursor, Limit, page_response
-from service.errand import run_errand
 from service.errors import InvalidRequest, OverLimit
 from service.observe import current_id
 from service.problems import problem_of
 from service.requests import JsonRoute, OrderRoute
+from service.sandbox import run_sandboxed
 from service.state import AppState, Deps
 from service.store.assets import ALL, AssetRecord, kernel_of
 from service.store.jobs import Event, EventKind, JobOrder, JobRecord, fingerprint, labels_of
@@ -117,7 +117,7 @@ def _planned(order: models.LiftRequest, deps: AppState) -> models.Plan:
     with deps.store.files.scratch() as scratch:
         file = scratch / "order.json"
         file.write_text(json.dumps(document))
-        result = run_errand("service.tasks.plan", [str(file)], scratch, deps.check_limits)
+        result = run_sandboxed("service.tasks.plan", [str(file)], scratch, deps.check_limits)
     if result is not None and result.last["event"] == "valid":
         return models.Plan.model_validate(result.last["plan"])
     if result is not None and result.last["event"] == "invalid":

@@ -13,7 +13,7 @@ from fastapi.responses import JSONResponse
 from liftcore.errors import NotFound
 from service import models
 from service.content import cache_headers
-from service.errors import Changed, Conflict, InvalidRequest
+from service.errors import Conflict, InvalidRequest, VersionMismatch
 from service.requests import JsonRoute
 from service.routes.lifts import ObjectId
 from service.routes.queries import NO_ENCODER, Ask, bits_of, query_request, scene_request
@@ -70,7 +70,7 @@ def edit_selection(
     splats = _edited(asked, record, deps, ask, deps.store.selections.bits(before))
     try:  # what was worked on is the version that was read: another that came meanwhile is not overwritten
         after = deps.store.selections.extend(deps.owner, record.id, selection, splats, frozenset({before.version}))
-    except Changed as error:
+    except VersionMismatch as error:
         if _versions(match) is not None:
             raise
         hint = "send the edit again"

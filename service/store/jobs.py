@@ -20,7 +20,7 @@ from typing import Any
 
 from liftcore.errors import NotFound
 from service.child import fault_of
-from service.errors import Busy, Conflict, Crashed, KeyReused, Unauthorized
+from service.errors import Conflict, KeyReused, ProcessDied, ServiceUnavailable, Unauthorized
 from service.models import ENDED, AssetKind, JobKind, JobState
 from service.store.assets import own
 from service.store.database import Database, Page, insert, page_of, parsed, record_of
@@ -125,8 +125,8 @@ class JobStore:
 
         Raises:
             NotFound: an asset was deleted meanwhile, or is not the owner's.
-            Busy: there are ``max_queued`` jobs in line.
-            TooMany, OverQuota: the owner has as many in line, or stored, as it may.
+            ServiceUnavailable: there are ``max_queued`` jobs in line.
+            KeyLimitReached, OverQuota: the owner has as many in line, or stored, as it may.
             KeyReused: the key came with another order before.
         """
         job = secrets.token_hex(16)
@@ -447,7 +447,7 @@ def _of_key(connection: sqlite3.Connection, order: JobOrder, owner: Owner) -> st
 def _require_place(connection: sqlite3.Connection, kind: JobKind, max_queued: int) -> None:
     queued = connection.execute("SELECT count(*) FROM jobs WHERE state = 'queued'").fetchone()[0]
     if queued >= max_queued:
-        raise Busy(
+        raise ServiceUnavailable(
             kind, expected=f"fewer than {max_queued} jobs in line", got=f"{queued}", hint="try again later",
             retry_after=QUEUE_RETRY_SECONDS,
         )  # fmt: skip
@@ -549,7 +549,7 @@ def _release(connection: sqlite3.Connection, row: sqlite3.Row, why: str) -> None
 
 
 def _gave_up(why: str) -> dict[str, str]:
-    crashed = Crashed(
+    crashed = ProcessDied(
         "job", expected="an answer from the job's process", got=f"none in {MAX_ATTEMPTS} attempts; the last: {why}",
         hint="signal 9 is mostly a lack of memory; the server's log has what the process printed",
     )  # fmt: skip

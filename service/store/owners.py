@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from service.errors import InvalidRequest, OverQuota, TooMany
+from service.errors import InvalidRequest, KeyLimitReached, OverQuota
 
 # For WHERE clauses over a table with a column `owner`; its names are bound by `Owner.terms`.
 SEEN = "(:sees_all OR owner = :owner)"
@@ -105,13 +105,13 @@ def require_turn(connection: sqlite3.Connection, kind: str, owner: Owner) -> Non
     """See that an owner may put another job, of that kind, in line.
 
     Raises:
-        TooMany: as many are in line as may be.
+        KeyLimitReached: as many are in line as may be.
     """
     if owner.max_queued is None:
         return
     row = connection.execute("SELECT count(*) FROM jobs WHERE state = 'queued' AND owner = ?", (owner.key,))
     if (queued := row.fetchone()[0]) >= owner.max_queued:
-        raise TooMany(
+        raise KeyLimitReached(
             kind, expected=f"fewer than {owner.max_queued} jobs of this key in line", got=f"{queued}",
             hint="try again later", retry_after=QUEUE_RETRY_SECONDS,
         )  # fmt: skip

@@ -24,9 +24,9 @@ from safetensors import SafetensorError, safe_open
 
 from liftcore.errors import InvalidInput, InvalidLift, NotFound, SplatliftError
 from liftcore.files import identify
-from service.errand import ErrandLimits
 from service.errors import Misconfigured
 from service.models import JOB_ID, AssetKind, LiftChange, UploadKind
+from service.sandbox import SandboxLimits
 from service.settings import ServiceSettings
 from service.store.assets import CheckedUpload
 from service.store.database import DATABASE, KEYS_REQUIRED, copy_database, open_to_read, remember_generation
@@ -229,7 +229,7 @@ def _add_asset(store: Store, settings: ServiceSettings, path: Path) -> AssetKind
 
 def checked(store: Store, settings: ServiceSettings, kind: UploadKind, *paths: Path) -> Report:
     """What the check of an upload finds in a file, beside others."""
-    limits = ErrandLimits(settings.check_seconds, settings.check_memory_bytes, threading.Event())
+    limits = SandboxLimits(settings.check_seconds, settings.check_memory_bytes, threading.Event())
     with store.files.scratch() as scratch:
         return check(kind, paths[0], scratch, limits, *paths[1:])
 

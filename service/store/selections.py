@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from liftcore.errors import NotFound
-from service.errors import Changed, InvalidRequest, OverLimit
+from service.errors import InvalidRequest, OverLimit, VersionMismatch
 from service.store.database import Database, insert, parsed, record_of
 from service.store.files import DataDirectory
 from service.store.owners import SHOWN_JOBS, Owner, require_quota
@@ -94,7 +94,7 @@ class SelectionStore:
 
         Raises:
             NotFound: there is no such selection.
-            Changed: it has another version than these.
+            VersionMismatch: it has another version than these.
             OverQuota, NoSpace: there is no room for it.
         """
         with self._database.write(counted=True) as connection:
@@ -115,7 +115,7 @@ class SelectionStore:
 
         Raises:
             NotFound: there is no such selection.
-            Changed: it has another version than these.
+            VersionMismatch: it has another version than these.
             InvalidRequest: there is no such step.
         """
         with self._database.write(counted=True) as connection:
@@ -133,7 +133,7 @@ class SelectionStore:
 
         Raises:
             NotFound: there is no such selection.
-            Changed: it has another version than these.
+            VersionMismatch: it has another version than these.
         """
         with self._database.write(counted=True) as connection:
             _expected(connection, owner, lift, selection, versions)
@@ -144,7 +144,7 @@ class SelectionStore:
 
         Raises:
             NotFound: the lift has none.
-            Changed: it has another version than these.
+            VersionMismatch: it has another version than these.
         """
         with self._database.read() as connection:
             return _expected(connection, owner, lift, selection, versions)
@@ -244,14 +244,16 @@ def _lift_there(lift: str) -> Iterator[None]:
 def _expected(
     connection: sqlite3.Connection, owner: Owner, lift: str, selection: str, versions: frozenset[int] | None
 ) -> SelectionRecord:
-    """The selection of that id; NotFound where there is none, Changed where it has another version than these."""
+    """Return the selection of that id; raise NotFound, or VersionMismatch if its version is none of ``versions``."""
     terms = owner.terms(lift=lift, selection=selection)
     row = connection.execute(f"{VISIBLE} AND selections.id = :selection", terms).fetchone()
     if row is None:
         raise _none(selection)
     record = _record(row)
     if versions is not None and record.version not in versions:
-        raise Changed("selection", expected="the version that was seen", got="a newer one", hint="GET it again")
+        raise VersionMismatch(
+            "selection", expected="the version that was seen", got="a newer one", hint="GET it again"
+        )
     return record
 
 

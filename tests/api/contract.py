@@ -24,8 +24,8 @@ from unittest import mock
 import httpx
 
 from service.app import create_app, job_limits, query_limits
-from service.errand import TaskResult
 from service.query_client import QueryClient
+from service.sandbox import SandboxResult
 from service.settings import ServiceSettings
 from service.store.keys import Quota
 from service.store.owners import Scope
@@ -67,10 +67,10 @@ def served(data: Path, *, keys: bool, **settings: Any) -> Iterator[tuple[str, st
     metadata = {"splats": nowhere, "cameras": nowhere, "features": [], "settings": {}, "views": ["v"]}
     lift = {"metadata": metadata, "count": 1}
     report = Report(".bin", {"names": ["v"], "channels": 1, "classes": 1, "words": ["apple"], **lift}, [])
-    planned = TaskResult({"event": "valid", "plan": {"summary": [], "warnings": []}}, 0, "")
+    planned = SandboxResult({"event": "valid", "plan": {"summary": [], "warnings": []}}, 0, "")
     with (
         mock.patch("service.uploads.check", lambda *given: report),
-        mock.patch("service.routes.jobs.run_errand", lambda *given: planned),
+        mock.patch("service.routes.jobs.run_sandboxed", lambda *given: planned),
     ):
         try:
             with listening(app, chosen) as server:

@@ -25,7 +25,7 @@ from liftcore.errors import SplatliftError
 from service.auth import CALLER, OPEN, AuthMiddleware, Hosts, host_name, is_loopback, required_scope
 from service.commands.serve import require_keys
 from service.content import EventStreams, is_last
-from service.errors import Busy, ForeignOrigin, Misconfigured, Misdirected, TooMany
+from service.errors import ForeignOrigin, KeyLimitReached, Misconfigured, Misdirected, ServiceUnavailable
 from service.models import AssetKind, JobKind, JobState
 from service.settings import ServiceSettings
 from service.store.assets import CheckedUpload
@@ -773,7 +773,7 @@ def test_uploads_and_plans_at_a_time_have_a_quota_a_key(store: Store) -> None:
                 while len(inside) < 4:
                     await anyio.sleep(0.01)
             for asked, what in (((alice,), "upload"), ((alice, *plan), "plan")):
-                with pytest.raises(TooMany, match=what):
+                with pytest.raises(KeyLimitReached, match=what):
                     await through(gate, *asked)
             release.set()
         await broken(alice)  # what broke off counts no more
@@ -803,14 +803,14 @@ def test_streams_at_a_time_have_a_share_a_key() -> None:
 
     for key in ("alice", "alice", "bob"):
         follow(key)
-    with pytest.raises(TooMany):
+    with pytest.raises(KeyLimitReached):
         follow("alice")
     follow(None)  # while there are no keys there are no shares
-    with pytest.raises(Busy):
+    with pytest.raises(ServiceUnavailable):
         follow("bob")
     streams = EventStreams(2, 8)  # a share is never all of them
     follow("alice")
-    with pytest.raises(TooMany):
+    with pytest.raises(KeyLimitReached):
         follow("alice")
 
 

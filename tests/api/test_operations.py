@@ -28,11 +28,11 @@ from pydantic import ValidationError
 from service import app as layers
 from service.commands.serve import AnnouncingServer
 from service.content import EventStreams
-from service.errand import ErrandLimits
-from service.errors import Busy, NoSpace
+from service.errors import NoSpace, ServiceUnavailable
 from service.models import BODY_BRACKETS, BODY_COMMAS, PACKS, SETTINGS, AssetKind, Question
 from service.observe import SAME_A_MINUTE, JsonLines, LogRateLimit, TextLines, working_for
 from service.query_client import Frame
+from service.sandbox import SandboxLimits
 from service.state import Stopping
 from service.store.assets import SHOWN_CHARACTERS
 from service.store.database import Database
@@ -267,10 +267,10 @@ def test_stop_ends_a_check_that_would_take_long(tmp_path: Path) -> None:
     fifo = tmp_path / "never.ply"
     os.mkfifo(fifo)  # who opens it waits for a writer, for ever
     ending, ended = threading.Event(), []
-    limits = ErrandLimits(300.0, 1 << 33, ending)
+    limits = SandboxLimits(300.0, 1 << 33, ending)
 
     def run() -> None:
-        with pytest.raises(Busy):
+        with pytest.raises(ServiceUnavailable):
             check(AssetKind.SPLATS, fifo, tmp_path, limits)
         ended.append(True)
 

@@ -26,9 +26,9 @@ from liftcore.query.question import Answer, Query, Threshold
 from liftcore.query.terms import Vector
 from service import query_client as client
 from service import query_worker as answers
-from service.auth import EVERYBODY
+from service.auth import LOCAL_ADMIN
 from service.child import children_of
-from service.errors import Busy, ClientLeft, TimedOut, TooMany
+from service.errors import ClientDisconnected, KeyLimitReached, ServiceUnavailable, TimedOut
 from service.models import Question
 from service.query_client import Frame, QueryClient, QueryLimits, Waiter
 from service.query_worker import Answers, bytes_of, reply_to
@@ -133,7 +133,7 @@ def test_call_whose_client_left_is_not_asked(start: Start, tmp_path: Path) -> No
     calls.begin("gone", leaves)
     calls.worker.cancel(leaves)
     until(lambda: "gone" in calls.came)  # at once, while the first is still asked
-    assert calls.came == {"gone": ClientLeft.kind}
+    assert calls.came == {"gone": ClientDisconnected.kind}
     calls.begin("last", stays)
     (tmp_path / "open").touch()
     calls.end()
@@ -145,13 +145,13 @@ def test_key_has_a_share_of_the_places(start: Start, of_a_key: int, waiting: int
     calls = Calls(start(of_a_key=of_a_key, waiting=waiting))
     for number in range(share + 1):
         calls.begin(f"a{number}", Waiter("anna"))
-    until(lambda: calls.came == {f"a{share}": TooMany.kind})
+    until(lambda: calls.came == {f"a{share}": KeyLimitReached.kind})
     calls.begin("b", Waiter("bob"))
     assert "b" not in calls.came
     for number in range(waiting - share):
         calls.begin(f"c{number}", Waiter(f"carl{number}"))
     until(lambda: len(calls.came) == 2)
-    assert Busy.kind in calls.came.values()  # beyond all places
+    assert ServiceUnavailable.kind in calls.came.values()  # beyond all places
     until(lambda: calls.worker.waiting == waiting - 1)
 
 
@@ -169,7 +169,7 @@ def test_every_call_has_one_time_for_waiting_and_answer(start: Start, tmp_path: 
     for name in ("never", "behind"):
         calls.begin(name, Waiter(), after="never")
     calls.end()
-    assert calls.came["never"] == TimedOut.kind and calls.came["behind"] in (TimedOut.kind, Busy.kind)
+    assert calls.came["never"] == TimedOut.kind and calls.came["behind"] in (TimedOut.kind, ServiceUnavailable.kind)
     assert worker.call({"operation": "query", "name": "next", "after": "at once"}) == Frame({"name": "next"})
 
 
@@ -200,7 +200,7 @@ def test_stop_answers_who_waits(start: Start) -> None:
         calls.begin(name, Waiter())
     calls.worker.stop()
     calls.end()
-    assert set(calls.came.values()) == {Busy.kind}
+    assert set(calls.came.values()) == {ServiceUnavailable.kind}
 
 
 class Patient(NoQueries):
@@ -212,7 +212,7 @@ class Patient(NoQueries):
     def call(self, request: dict[str, Any], waiter: Waiter) -> Frame:
         self.waiters.append(waiter)
         until(lambda: waiter.disconnected)
-        raise ClientLeft("query", expected="a client that waits", got="one that left")
+        raise ClientDisconnected("query", expected="a client that waits", got="one that left")
 
     def cancel(self, waiter: Waiter) -> None:
         waiter.disconnected = True
@@ -258,7 +258,7 @@ QUESTIONS: list[dict[str, Any]] = [
 def request_of(client: TestClient, lift: dict[str, Any]) -> Callable[..., dict[str, Any]]:
     """A request as the query process gets it."""
     parts = parts_of(client)
-    here = replace(parts, caller=EVERYBODY)  # as for a caller who sees the lift
+    here = replace(parts, caller=LOCAL_ADMIN)  # as for a caller who sees the lift
     record = here.store.lifts.get(here.owner, lift["id"])
 
     def make(operation: str = "scores", **asked: Any) -> dict[str, Any]:

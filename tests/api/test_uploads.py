@@ -83,7 +83,7 @@ def test_pack_that_was_damaged_or_lost_on_the_disk_is_not_named_anew(client: Tes
 def test_pack_that_takes_too_long_to_name_anew_is_told_as_a_slow_upload_is(
     client: TestClient, uploaded: Uploaded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(assets, "run_errand", lambda *given: None)
+    monkeypatch.setattr(assets, "run_sandboxed", lambda *given: None)
     told = assert_problem(client.patch(f"/assets/{uploaded.features}", json={"encoder": "slow"}))
     assert (told["status"], told["type"]) == (422, "/problems/invalid-features")
     assert "takes longer" in told["got"]

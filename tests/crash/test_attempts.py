@@ -26,7 +26,7 @@ import liftcore as lc
 from liftcore.io.splats import write_splats
 from liftcore.io.transforms import transforms_of
 from liftcore.values.pack import write_pack
-from service import errand, uploads
+from service import sandbox, uploads
 from service.job_child import Reporter
 from service.models import AssetKind, JobState
 from service.observe import JsonLines
@@ -248,15 +248,15 @@ def run(told):
 
 
 @contextlib.contextmanager
-def errand_of(content: str, folder: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
-    """A server whose errand is this module's, and the number that the errand wrote."""
+def sandbox_of(content: str, folder: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    """A server whose sandboxed task is this module's, and the number that the task wrote."""
     (folder / "task.py").write_text(content)
     told = folder / "told"
     code = f"""if True:
         import pathlib, threading
-        from service.errand import ErrandLimits, run_errand
-        limits = ErrandLimits(600, 8 << 30, threading.Event())
-        print(run_errand("task.run", [{str(told)!r}], pathlib.Path({str(folder)!r}), limits).last["event"])
+        from service.sandbox import SandboxLimits, run_sandboxed
+        limits = SandboxLimits(600, 8 << 30, threading.Event())
+        print(run_sandboxed("task.run", [{str(told)!r}], pathlib.Path({str(folder)!r}), limits).last["event"])
     """
     found = {"PYTHONPATH": f"{folder}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
     with subprocess.Popen(
@@ -271,7 +271,7 @@ def errand_of(content: str, folder: Path) -> Iterator[tuple[subprocess.Popen[str
 
 @pytest.mark.skipif(sys.platform != "linux", reason="asks the kernel of Linux for it")
 def test_check_that_cannot_listen_ends_when_its_server_is_killed(tmp_path: Path) -> None:
-    with errand_of(DEAF, tmp_path) as (server, check):
+    with sandbox_of(DEAF, tmp_path) as (server, check):
         assert alive(check)
         server.kill()
         server.wait()
@@ -283,7 +283,7 @@ def test_check_that_cannot_listen_ends_when_its_server_is_killed(tmp_path: Path)
 
 
 def test_check_whose_template_is_killed_goes_on_and_is_heard(tmp_path: Path) -> None:
-    with errand_of(OUTLIVING, tmp_path) as (server, template):
+    with sandbox_of(OUTLIVING, tmp_path) as (server, template):
         os.kill(template, signal.SIGKILL)
         assert server.stdout is not None and server.stdout.read() == "valid\n"
 
@@ -292,15 +292,15 @@ def test_check_whose_template_is_killed_goes_on_and_is_heard(tmp_path: Path) -> 
 def test_check_may_take_memory_by_the_size_of_its_upload(
     size: int, most: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def noted(module: str, given: list[str], scratch: Path, limits: errand.ErrandLimits) -> NoReturn:
+    def noted(module: str, given: list[str], scratch: Path, limits: sandbox.SandboxLimits) -> NoReturn:
         raise OSError(f"may take {limits.memory_bytes}")
 
     with (tmp_path / "upload").open("wb") as handle:
         handle.truncate(size)
-    monkeypatch.setattr(uploads, "run_errand", noted)
+    monkeypatch.setattr(uploads, "run_sandboxed", noted)
     with pytest.raises(OSError, match=f"may take {most}$"):
         uploads.check(
-            AssetKind.SPLATS, tmp_path / "upload", tmp_path, errand.ErrandLimits(1.0, 8 << 30, threading.Event())
+            AssetKind.SPLATS, tmp_path / "upload", tmp_path, sandbox.SandboxLimits(1.0, 8 << 30, threading.Event())
         )
 
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invariant, multiple, precondition, rule
 
 from liftcore.errors import NotFound
-from service.errors import Busy, Conflict, InUse, KeyReused
+from service.errors import Conflict, InUse, KeyReused, ServiceUnavailable
 from service.models import ENDED, AssetKind, JobKind, JobState
 from service.store.assets import CheckedUpload
 from service.store.jobs import MAX_ATTEMPTS, EventKind, JobOrder
@@ -154,7 +154,7 @@ class StoreMachine(RuleBasedStateMachine):
         if known and self.jobs[known[0]].order.fingerprint != print_:
             expected: type[Exception] | None = KeyReused
         elif not known and sum(model.state == "queued" for model in self.jobs.values()) >= MAX_QUEUED:
-            expected = Busy
+            expected = ServiceUnavailable
         elif not known and kinds != wanted:
             expected = NotFound
         else:

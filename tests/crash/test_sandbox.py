@@ -14,9 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from service import errand
-from service.errand import ErrandLimits, TaskResult, run_errand
-from service.errors import Busy
+from service import sandbox
+from service.errors import ServiceUnavailable
+from service.sandbox import SandboxLimits, SandboxResult, run_sandboxed
 
 from .service_process import template_of
 
@@ -46,7 +46,7 @@ def talk():
     return {"event": "valid"}
 """
 
-Run = Callable[..., TaskResult | None]
+Run = Callable[..., SandboxResult | None]
 
 
 def kill_template() -> None:
@@ -62,20 +62,20 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
     """Runs a task of these, in forks of a template that has nothing to import."""
     (tmp_path / "tasks_of_test.py").write_text(TASKS)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(errand, "GONE_SECONDS", 0.3)
-    errand.CONTEXT.set_forkserver_preload([])
+    monkeypatch.setattr(sandbox, "GONE_SECONDS", 0.3)
+    sandbox.CONTEXT.set_forkserver_preload([])
     kill_template()
 
-    def one(task: str, *given: str, ending: threading.Event | None = None) -> TaskResult | None:
-        limits = ErrandLimits(60.0, 8 << 30, ending or threading.Event())
-        return run_errand(f"tasks_of_test.{task}", given, tmp_path, limits)
+    def one(task: str, *given: str, ending: threading.Event | None = None) -> SandboxResult | None:
+        limits = SandboxLimits(60.0, 8 << 30, ending or threading.Event())
+        return run_sandboxed(f"tasks_of_test.{task}", given, tmp_path, limits)
 
     yield one
-    errand.CONTEXT.set_forkserver_preload(errand.IMPORTED)
+    sandbox.CONTEXT.set_forkserver_preload(sandbox.IMPORTED)
     kill_template()
 
 
-def event(result: TaskResult | None) -> str:
+def event(result: SandboxResult | None) -> str:
     assert result is not None
     return result.last["event"]
 
@@ -83,7 +83,7 @@ def event(result: TaskResult | None) -> str:
 def test_template_that_hangs_is_replaced(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     assert event(run("answer")) == "valid"
     os.kill(hung := template_of(os.getpid()), signal.SIGSTOP)
-    monkeypatch.setattr(errand, "FORK_SECONDS", 0.1)
+    monkeypatch.setattr(sandbox, "FORK_SECONDS", 0.1)
     assert event(run("answer")) == "valid"
     assert template_of(os.getpid()) != hung
 
@@ -103,13 +103,13 @@ def test_server_ends_while_its_template_hangs(run: Run) -> None:
         assert not any(one.done() for one in waiting)
         ending.set()
         for one in waiting:
-            with pytest.raises(Busy, match="one that stops"):
-                one.result(errand.FORK_SECONDS / 2)
+            with pytest.raises(ServiceUnavailable, match="one that stops"):
+                one.result(sandbox.FORK_SECONDS / 2)
 
 
 def test_task_that_dies_with_its_template_is_tried_once_more(run: Run, tmp_path: Path) -> None:
     assert event(run("die_with_template", str(tmp_path / "once"), "1")) == "valid"
-    with pytest.raises(Busy):
+    with pytest.raises(ServiceUnavailable):
         run("die_with_template", str(tmp_path / "twice"), "2")
 
 
@@ -126,11 +126,11 @@ def test_process_that_does_not_start_is_told_by_its_reason(run: Run, monkeypatch
     def full() -> None:
         raise OSError(24, "Too many open files")
 
-    monkeypatch.setattr(errand, "get_ready", full)
-    monkeypatch.setattr(errand, "DYING_SECONDS", 0.0)
+    monkeypatch.setattr(sandbox, "get_ready", full)
+    monkeypatch.setattr(sandbox, "DYING_SECONDS", 0.0)
     kill_template()
-    assert not errand.revive()  # nor does the server fail at its start, or a probe
-    with pytest.raises(Busy, match="Too many open files"):
+    assert not sandbox.revive()  # nor does the server fail at its start, or a probe
+    with pytest.raises(ServiceUnavailable, match="Too many open files"):
         run("answer")
 
 
@@ -143,6 +143,6 @@ def test_of_what_a_task_prints_the_end_is_read(run: Run) -> None:
 def test_template_that_the_system_does_not_tell_of_is_taken_to_live(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(errand, "children_of", lambda process: [])
-    monkeypatch.setattr(errand, "CHILDREN", tmp_path / "none")
-    assert errand.revive()
+    monkeypatch.setattr(sandbox, "children_of", lambda process: [])
+    monkeypatch.setattr(sandbox, "CHILDREN", tmp_path / "none")
+    assert sandbox.revive()
