@@ -41,7 +41,7 @@ IMPORT_SECONDS = 300.0  # for the first fork of a template, which does its impor
 FORK_SECONDS = 30.0  # for each later one
 DYING_SECONDS = 1.0  # until a template that does not respond counts as ended
 LONGEST_FOLDER = 70  # characters of the temporary folder, which holds the template's socket: its path may have 107
-PRINTED = "printed"  # file with the output of a task, beside its temporary files
+OUTPUT_FILE = "printed"  # file with the output of a task, beside its temporary files
 TRACE_BYTES = 4000  # of the end of the output, for the log
 CHILDREN = Path("/proc/thread-self/children")  # not every Linux has it
 TEMPLATE_DIED = 255  # multiprocessing reports it in place of an unknown exit status
@@ -153,7 +153,7 @@ def _run_once(task: str, arguments: Sequence[str], scratch: Path, limits: Sandbo
     if last is None:
         _require_running(limits.ending)
         return None
-    return SandboxResult(last, None if status == TEMPLATE_DIED else status, _end_of(scratch / PRINTED))
+    return SandboxResult(last, None if status == TEMPLATE_DIED else status, _end_of(scratch / OUTPUT_FILE))
 
 
 def _require_running(ending: threading.Event) -> None:
@@ -234,7 +234,7 @@ def _child_main(pipe: Connection, task: str, arguments: list[str], scratch: str,
     parent = multiprocessing.parent_process()
     assert parent is not None
     end_with_parent(parent.sentinel)
-    output = os.open(Path(scratch) / PRINTED, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+    output = os.open(Path(scratch) / OUTPUT_FILE, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
     for stream in (1, 2):
         os.dup2(output, stream)
     os.environ["TMPDIR"] = tempfile.tempdir = scratch

@@ -1,4 +1,4 @@
-"""What tasks promise while their template hangs or dies, or the server ends: all waits end, and no file is blamed."""
+"""Sandboxed tasks while their template hangs or dies, or the server stops: every wait ends, no file is blamed."""
 
 from __future__ import annotations
 
@@ -59,18 +59,18 @@ def kill_template() -> None:
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
-    """Runs a task of these, in forks of a template that has nothing to import."""
+    """Run one of TASKS in forks of a template that has nothing to import."""
     (tmp_path / "tasks_of_test.py").write_text(TASKS)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(sandbox, "GONE_SECONDS", 0.3)
     sandbox.CONTEXT.set_forkserver_preload([])
     kill_template()
 
-    def one(task: str, *given: str, ending: threading.Event | None = None) -> SandboxResult | None:
+    def run_task(task: str, *arguments: str, ending: threading.Event | None = None) -> SandboxResult | None:
         limits = SandboxLimits(60.0, 8 << 30, ending or threading.Event())
-        return run_sandboxed(f"tasks_of_test.{task}", given, tmp_path, limits)
+        return run_sandboxed(f"tasks_of_test.{task}", arguments, tmp_path, limits)
 
-    yield one
+    yield run_task
     sandbox.CONTEXT.set_forkserver_preload(sandbox.IMPORTED)
     kill_template()
 
@@ -100,11 +100,11 @@ def test_server_ends_while_its_template_hangs(run: Run) -> None:
     with ThreadPoolExecutor(2) as threads:
         waiting = [threads.submit(run, "answer", ending=ending) for _ in range(2)]
         time.sleep(0.3)
-        assert not any(one.done() for one in waiting)
+        assert not any(task.done() for task in waiting)
         ending.set()
-        for one in waiting:
+        for task in waiting:
             with pytest.raises(ServiceUnavailable, match="one that stops"):
-                one.result(sandbox.FORK_SECONDS / 2)
+                task.result(sandbox.FORK_SECONDS / 2)
 
 
 def test_task_that_dies_with_its_template_is_tried_once_more(run: Run, tmp_path: Path) -> None:
@@ -116,13 +116,13 @@ def test_task_that_dies_with_its_template_is_tried_once_more(run: Run, tmp_path:
 def test_task_runs_where_the_working_directory_is_gone(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (gone := tmp_path / "gone").mkdir()
-    monkeypatch.chdir(gone)
-    gone.rmdir()
+    (folder := tmp_path / "gone").mkdir()
+    monkeypatch.chdir(folder)
+    folder.rmdir()
     assert event(run("answer")) == "valid"
 
 
-def test_process_that_does_not_start_is_told_by_its_reason(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_of_a_process_that_does_not_start_has_the_reason(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def full() -> None:
         raise OSError(24, "Too many open files")
 
