@@ -1,10 +1,10 @@
-"""Cameras from a folder, a JSON file or a zip: which of its files are read, and reading them.
+"""Cameras from a folder, a JSON file or a zip: choice of its files, and their readers.
 
 A folder or zip may hold COLMAP models, a transforms.json or cameras.json, and nerfstudio's ``FRAME_FILE``, which
-tells the frame of the splats. A zip is read as the folder that was zipped, under limits.
+has the transform to the frame of the splats. A zip is read as the folder that was zipped, under limits.
 
-COLMAP writes several models (``sparse/0``, ``sparse/1``, ...) where photos did not all hang together, each in a frame
-of its own. The one that has cameras for most views of the features is read, else the one with most images.
+COLMAP writes several models (``sparse/0``, ``sparse/1``, ...) where photos do not form one connected scene, each in a
+frame of its own. The model with cameras for most views of the features is read, else the one with most images.
 """
 
 import errno
@@ -43,28 +43,28 @@ from liftcore.scene.views import cameras_of_views
 TRANSFORMS, TRAINED_ON = "transforms.json", "transforms_train.json"
 JSON_FILES = (TRANSFORMS, "cameras.json", TRAINED_ON)
 FORMATS = "a COLMAP sparse model (folder or .zip), a transforms.json or a cameras.json"
-# As trainers, COLMAP's reconstructor and its undistorter lay models out; the first that is there is read.
+# Places where trainers, COLMAP's reconstructor and its undistorter put models; the first that exists is read.
 MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "0", "dense/0/sparse", "dense/sparse")
-DEPTH = 4  # folders down that models are looked for, if only to be named
-MAX_FOLDERS = 10_000  # that are looked into for it
+DEPTH = 4  # levels of folders that are searched for other models
+MAX_FOLDERS = 10_000  # of that search
 MAX_UNZIPPED_BYTES = 512 * 1024 * 1024
 MAX_ZIP_MEMBERS = 100_000
-MOST_MODELS = 8  # of a zip that are looked at
-SHOWN = 3  # files or models in a warning
+MAX_MODELS = 8  # of a zip that are compared
+MAX_LISTED = 3  # files or models in a warning
 ONE_RUN = "zip those of one run alone"
 P = TypeVar("P", bound=PurePath)
 
 
 @dataclass(frozen=True)
 class CameraSource:
-    """What cameras are read from: a COLMAP model or one file, and the file that tells the frame of the splats."""
+    """Source of cameras: a COLMAP model or one file, and the file with the transform to the frame of the splats."""
 
     model: Path | None = None  # a folder
     file: Path | None = None  # a JSON document or a zip
     frame: Path | None = None  # a FRAME_FILE
     data: Path | None = None  # a transforms.json or a COLMAP model, with the intrinsics of nerfstudio's camera export
-    photos: zipfile.Path | None = None  # the folder of the file in the zip that it is from; None: that on the disk
-    warnings: tuple[str, ...] = ()  # of what lies beside and is not read
+    photos: zipfile.Path | None = None  # the folder of the file within its zip; None: on the disk
+    warnings: tuple[str, ...] = ()  # about files beside it that are not read
 
     @property
     def files(self) -> list[Path]:
@@ -74,33 +74,33 @@ class CameraSource:
         return cameras + ([self.frame] if self.frame else []) + data
 
     def read(self) -> Cameras:
-        """The cameras, in the frame of the splats where a file tells it.
+        """Read the cameras, in the frame of the splats where ``frame`` has the transform.
 
         Raises:
             InvalidCameras: a file is missing or malformed.
         """
-        cameras = self._moved()
+        cameras = self._read_in_splat_frame()
         cameras.warnings += self.warnings
         return cameras
 
-    def _moved(self) -> Cameras:
+    def _read_in_splat_frame(self) -> Cameras:
         if self.model is not None:
             source, document, cameras = str(self.model), {}, read_colmap(self.model)
         else:
             assert self.file is not None
             source, document = str(self.file), read_json(self.file)
-            cameras = self._parsed(document, source)
+            cameras = self._parse(document, source)
         if self.frame is None or is_export(document):  # an export is in the frame of the splats
             return cameras
         if isinstance(document, list):
-            expected, got = "cameras that are still to be moved", "Inria's, which are in the frame of their splats"
-            hint = f"take {source} or {FRAME_FILE} away, whichever is of another run"
+            expected, got = "cameras in another frame", "Inria's, which are in the frame of their splats"
+            hint = f"remove {source} or {FRAME_FILE}, whichever is of another run"
             raise InvalidCameras(str(self.frame), expected=expected, got=got, hint=hint)
         similarity = read_frame(self.frame, document, source)
         with cameras_from(str(self.frame)):
             return similarity.transformed(cameras)
 
-    def _parsed(self, document: object, source: str) -> Cameras:
+    def _parse(self, document: object, source: str) -> Cameras:
         assert self.file is not None
         photos = PhotosBeside(self.photos or Path(os.path.abspath(self.file)).parent)
         with cameras_from(source):
@@ -112,21 +112,21 @@ class CameraSource:
 
 
 def _intrinsics_in(data: Path) -> object:
-    """A transforms.json, or the intrinsics of a COLMAP model's images as such a document has them, without poses."""
+    """Read a transforms.json, or make one without poses from the intrinsics of a COLMAP model's images."""
     if data.is_file():
         return read_json(data)
     frames = []
     for name, camera in read_colmap(data).items():
         lens = camera.lens
-        whole = lens or camera
-        frame = {"file_path": name, "w": whole.width, "h": whole.height, "fl_x": whole.fx, "fl_y": whole.fy}
-        frame |= {"cx": whole.cx, "cy": whole.cy}
+        image = lens or camera
+        frame = {"file_path": name, "w": image.width, "h": image.height, "fl_x": image.fx, "fl_y": image.fy}
+        frame |= {"cx": image.cx, "cy": image.cy}
         if lens is not None:
             frame |= {key: value for key, value in asdict(lens.distortion).items() if value}
             frame["camera_model"] = FISHEYE if isinstance(lens.distortion, Fisheye) else "OPENCV"
         frames.append(frame)
-    own = [{key: value for key, value in frame.items() if key != "file_path"} for frame in frames]
-    return {"frames": frames, **(own[0] if all(one == own[0] for one in own) else {})}
+    intrinsics = [{key: value for key, value in frame.items() if key != "file_path"} for frame in frames]
+    return {"frames": frames, **(intrinsics[0] if all(entry == intrinsics[0] for entry in intrinsics) else {})}
 
 
 def read_cameras(path: Path | str, *, choosing: bool = True, views: Collection[str] = ()) -> Cameras:
@@ -134,13 +134,13 @@ def read_cameras(path: Path | str, *, choosing: bool = True, views: Collection[s
 
     Args:
         path: the folder or file.
-        choosing: whether distorted cameras beside undistorted ones are refused, as somebody has to choose.
-        views: of features or a lift, by which one of several COLMAP models is chosen.
+        choosing: refuse distorted cameras beside undistorted ones, as the caller has to choose.
+        views: names of views of features or a lift, which select one of several COLMAP models.
 
     Raises:
-        InvalidInput: it lies elsewhere (`io.remote`), and does not come.
-        InvalidCameras: nothing here is a camera format that we know, or what it holds is malformed.
-        Unavailable: the temporary folder has no room for what is in a zip.
+        InvalidInput: it is a URL (`io.remote`) that cannot be read.
+        InvalidCameras: no camera format is recognised, or the content is malformed.
+        Unavailable: the temporary folder has no free space for the files of a zip.
     """
     path = local_path(path)
     try:
@@ -171,14 +171,15 @@ def _read(path: Path, *, choosing: bool, views: Collection[str]) -> Cameras:
 
 
 def camera_source(path: Path, views: Collection[str] = ()) -> CameraSource:
-    """The source of a path: of a folder a whole model, else a JSON file, else half a model; of a file itself.
+    """Return the source of a path: in a folder a complete model, else a JSON file, else an incomplete model.
 
-    A ``FRAME_FILE`` counts in the folder, beside the file, and from a model's folder up to its scene's. In a folder
-    with one a transforms.json comes first: nerfstudio trains on its intrinsics. Before all comes nerfstudio's camera
-    export, which is in the frame of the splats.
+    A ``FRAME_FILE`` applies from the folder, from beside the file, and from a model's folder up to its scene's. Where
+    there is one, a transforms.json is preferred, as nerfstudio trains on its intrinsics. nerfstudio's camera export
+    is preferred to all, as it is in the frame of the splats.
 
     Args:
-        path: the folder or file. views: as `read_cameras` has them.
+        path: the folder or file.
+        views: as `read_cameras` has them.
     """
     if path.is_dir():
         return _source_in_folder(path, views)
@@ -186,7 +187,7 @@ def camera_source(path: Path, views: Collection[str] = ()) -> CameraSource:
 
 
 def camera_files(path: Path | str) -> list[Path]:
-    """The files that `read_cameras` reads of a path, whether they are there or not."""
+    """Return the files that `read_cameras` reads of a path, also those that do not exist."""
     return camera_source(Path(path)).files
 
 
@@ -197,9 +198,9 @@ def _source_in_folder(path: Path, views: Collection[str]) -> CameraSource:
         return _of_document(export, folder=path)
     if (path / TRANSFORMS) in documents and _frame_in(path):
         return _of_document(path / TRANSFORMS)
-    whole = _usual_models(path)
-    if whole:
-        model, warnings = choose_model(whole, path, views)
+    models = _usual_models(path)
+    if models:
+        model, warnings = choose_model(models, path, views)
         return replace(_of_model(model), warnings=warnings)
     halves = [path / name for name in MODEL_FOLDERS if has_model(path / name)]
     if halves and not documents:
@@ -208,90 +209,98 @@ def _source_in_folder(path: Path, views: Collection[str]) -> CameraSource:
 
 
 def other_models(path: Path) -> list[str]:
-    """COLMAP models in a folder or a zip, by their folders, beside those of which one is read.
+    """Return the folders of COLMAP models in a folder or a zip that are of another reconstruction than the one read.
 
-    Those are named in the warnings of the cameras (`choose_model`).
+    The warnings of the cameras name models of the same reconstruction (`choose_model`).
     """
     if path.is_dir():
-        read = camera_source(path).model
+        chosen_model = camera_source(path).model
         return (
-            [] if read is None else [str(model) for model in _models_below(path) if not _is_part(path / model, read)]
+            []
+            if chosen_model is None
+            else [
+                str(model) for model in _models_below(path) if not _is_same_reconstruction(path / model, chosen_model)
+            ]
         )
     if not zipfile.is_zipfile(path):
         return []
     with open_zip(path) as archive:
-        first, *others = _whole_models(_files(archive)) or [PurePosixPath()]
-    return [str(model) for model in others if not _is_part(model, first)]
+        first, *remaining = _complete_models(_files(archive)) or [PurePosixPath()]
+    return [str(model) for model in remaining if not _is_same_reconstruction(model, first)]
 
 
 def choose_model(models: Sequence[Path], scene: Path, views: Collection[str]) -> tuple[Path, tuple[str, ...]]:
-    """The one of COLMAP's several models to read, and a warning that names the others and how many images each has.
+    """Choose one of COLMAP's several models, and return it with a warning that names the others and their sizes.
 
     Args:
-        models: folders, in the order of COLMAP's numbers; of equal ones the first counts.
-        scene: the folder that they are named in. views: of features, which the model should have cameras for.
+        models: folders, in the order of COLMAP's numbers; the first of equal ones wins.
+        scene: the folder that names are relative to.
+        views: names of views of features, which the model should have cameras for.
     """
     if len(models) == 1:
         return models[0], ()
     names: dict[Path, list[str]] = {model: [] for model in models}
     for model in models:
-        with suppress(InvalidCameras):  # of the one that is read it is said when it is read
+        with suppress(InvalidCameras):  # the error of the chosen model is raised when it is read
             names[model] = read_image_names(model)
     paired = {model: len(cameras_of_views(views, names[model])) for model in models}
     best = max(models, key=lambda model: (paired[model], len(names[model])))
 
-    def told(model: Path) -> str:
+    def describe_model(model: Path) -> str:
         cameras = f", cameras of {paired[model]} of the {len(views)} views" if views else ""
         return f"{model.relative_to(scene).as_posix()} ({len(names[model])} images{cameras})"
 
-    others = [told(model) for model in models if model != best]
-    more = f" and {len(others) - SHOWN} more" if len(others) > SHOWN else ""
-    were = "was not" if len(others) == 1 else "were not"
+    descriptions = [describe_model(model) for model in models if model != best]
+    suffix = f" and {len(descriptions) - MAX_LISTED} more" if len(descriptions) > MAX_LISTED else ""
+    were = "was not" if len(descriptions) == 1 else "were not"
     frames = "COLMAP's models have a frame each, so the splats must be those of the one that was read"
-    return best, (f"{told(best)} was read, and {', '.join(others[:SHOWN])}{more} {were}: {frames}",)
+    return best, (
+        f"{describe_model(best)} was read, and {', '.join(descriptions[:MAX_LISTED])}{suffix} {were}: {frames}",
+    )
 
 
 def _better_models(model: Path, cameras: Collection[str], views: Collection[str]) -> tuple[str, ...]:
-    """A warning where another COLMAP model of the scene has cameras of more views than the one that was named."""
+    """Warn if another COLMAP model of the scene has cameras of more views than the one that the caller named."""
     paired = len(cameras_of_views(views, cameras))
     if paired == len(views):
         return ()
-    whole = Path(os.path.abspath(model))
-    scene, found = _scene_of(whole), list[str]()
-    for other in _models_below(scene)[:MOST_MODELS]:
-        if scene / other == whole:
+    folder = Path(os.path.abspath(model))
+    scene, alternatives = _scene_of(folder), list[str]()
+    for other in _models_below(scene)[:MAX_MODELS]:
+        if scene / other == folder:
             continue
         with suppress(InvalidCameras):
             names = read_image_names(scene / other)
-            if (more := len(cameras_of_views(views, names))) > paired:
-                found.append(f"{other} ({len(names)} images) has cameras of {more}")
-    if not found:
+            if (count := len(cameras_of_views(views, names))) > paired:
+                alternatives.append(f"{other} ({len(names)} images) has cameras of {count}")
+    if not alternatives:
         return ()
-    name = whole.relative_to(scene).as_posix()
-    told = f"{name} was read, and has cameras of {paired} of the {len(views)} views; {', '.join(found[:SHOWN])}"
-    return (f"{told}: the splats must be those of the one that is read",)
+    name = folder.relative_to(scene).as_posix()
+    summary = f"{name} was read, and has cameras of {paired} of the {len(views)} views"
+    listing = ", ".join(alternatives[:MAX_LISTED])
+    return (f"{summary}; {listing}: the splats must be those of the one that is read",)
 
 
 def has_nerfstudio_beside(path: Path) -> bool:
-    """Whether poses of nerfstudio's own frame lie beside the COLMAP model that is read from a folder, file or zip."""
+    """Return True if poses in nerfstudio's frame lie beside the COLMAP model read from a folder, file or zip."""
     source = camera_source(path)
     if source.model is not None:
-        beside = (folder / TRANSFORMS for folder in _up_to_scene(source.model))
-        return any(_is_of_nerfstudio(document) for document in beside if document.is_file())
+        candidates = (folder / TRANSFORMS for folder in _up_to_scene(source.model))
+        return any(_is_of_nerfstudio(document) for document in candidates if document.is_file())
     if source.file is None or not zipfile.is_zipfile(source.file):
         return False
     with open_zip(source.file) as archive:
         files = _files(archive)
-        return bool(_whole_models(files) and _named(files, lambda name: name == TRANSFORMS))
+        return bool(_complete_models(files) and _names_matching(files, lambda name: name == TRANSFORMS))
 
 
 def _is_of_nerfstudio(document: Path) -> bool:
-    """Whether a transforms.json reads, and was written by nerfstudio's own converter."""
+    """Return True if a transforms.json parses and was written by nerfstudio's own converter."""
     try:
-        found = read_json(document)
+        content = read_json(document)
     except InvalidCameras:
         return False
-    return isinstance(found, dict) and any(key in found for key in OF_NERFSTUDIO)
+    return isinstance(content, dict) and any(key in content for key in OF_NERFSTUDIO)
 
 
 # ---- folders
@@ -300,86 +309,88 @@ def _is_of_nerfstudio(document: Path) -> bool:
 def _from_folder(folder: Path, *, choosing: bool, views: Collection[str]) -> Cameras:
     source = camera_source(folder, views)
     if source.model is None and source.file is None:
-        others = [folder / model for model in _models_below(folder)] + sorted(folder.glob("transforms*.json"))
-        hint = f"name what is meant, such as {' or '.join(map(str, others[:2]))}" if others else ""
-        got = "a folder without any of them" + (" at the usual places" if others else "")
+        candidates = [folder / model for model in _models_below(folder)] + sorted(folder.glob("transforms*.json"))
+        hint = (
+            f"name one of the models or files, such as {' or '.join(map(str, candidates[:2]))}" if candidates else ""
+        )
+        got = "a folder without any of them" + (" at the usual places" if candidates else "")
         raise InvalidCameras(str(folder), expected=FORMATS, got=got, hint=hint)
     cameras = source.read()
     if source.model is not None and not source.warnings:
         cameras.warnings += _better_models(source.model, cameras, views)
     if choosing and source.model is not None and cameras.distorted:
-        others = [folder / model for model in _models_below(folder) if folder / model != source.model]
-        straight = [str(model) for model in others if _is_undistorted(model)]
+        candidates = [folder / model for model in _models_below(folder) if folder / model != source.model]
+        straight = [str(model) for model in candidates if _is_undistorted(model)]
         _refuse_both(str(folder), str(source.model), straight, "name the one")
     return cameras
 
 
 def _is_undistorted(model: Path) -> bool:
-    """Whether a folder has a model that reads, of pinholes alone."""
+    """Return True if a folder has a valid model whose cameras are all pinholes."""
     try:
         return not read_colmap(model).distorted
     except InvalidCameras:
         return False
 
 
-def _refuse_both(source: str, read: str, undistorted: list[str], choose: str) -> None:
-    """Refuse the distorted model that was read where undistorted ones lie beside it: which is meant is no guess."""
+def _refuse_both(source: str, distorted: str, undistorted: list[str], choose: str) -> None:
+    """Refuse the distorted model that was read if undistorted ones lie beside it: the caller must choose."""
     if undistorted:
-        got = f"distorted ones in {read} and undistorted ones in {undistorted[0]}"
+        got = f"distorted ones in {distorted} and undistorted ones in {undistorted[0]}"
         hint = f"{choose} whose photos the features were made of"
         raise InvalidCameras(source, expected="distorted or undistorted cameras, not both", got=got, hint=hint)
 
 
 def _of_document(path: Path, folder: Path | None = None) -> CameraSource:
-    """The source of a JSON file, or of a zip; of one that nobody named, but its ``folder``, others are told."""
+    """Return the source of a JSON file or zip; if the caller named its ``folder``, warn of others in it."""
     data = path.with_name(TRANSFORMS)
     may_export = path != data and path.name.startswith("transforms") and _begins_a_list(path)
     models = _usual_models(path.parent) if may_export and not data.is_file() else []
     if models:
         data = choose_model(models, path.parent, ())[0]
-    others = (
+    siblings = (
         sorted(other.name for other in folder.glob("transforms*.json") if other not in (path, data)) if folder else []
     )
-    read, *unread = [path.name, *others]
-    told = f"{read} was read, and {', '.join(unread)} not: name a file to read that one" if unread else ""
+    file_name, *unread = [path.name, *siblings]
+    warning = f"{file_name} was read, and {', '.join(unread)} not: name a file to read that one" if unread else ""
     return CameraSource(
         file=path,
         frame=_frame_in(path.parent),
         data=data if may_export and (models or data.is_file()) else None,
-        warnings=(told,) if told and read != TRANSFORMS else (),
+        warnings=(warning,) if warning and file_name != TRANSFORMS else (),
     )
 
 
 def _begins_a_list(path: Path) -> bool:
-    """Whether a file begins as a JSON list, as camera exports do and a transforms.json does not."""
+    """Return True if a file begins as a JSON list, as camera exports do and a transforms.json does not."""
     with suppress(OSError), path.open("rb") as handle:
         return handle.read(64).lstrip(b"\xef\xbb\xbf \t\r\n")[:1] == b"["
     return False
 
 
 def _usual_models(scene: Path) -> list[Path]:
-    """The whole models at the first of the usual places that has one: one, or COLMAP's several, by their numbers."""
+    """Return the complete models at the first of the usual places that has any, in the order of their numbers."""
     for place in MODEL_FOLDERS:
-        numbered = _split_at_number(PurePosixPath(place))
-        if numbered is None:
-            found = [scene / place] if is_whole(scene / place) else []
+        parts = _split_at_number(PurePosixPath(place))
+        if parts is None:
+            models = [scene / place] if is_whole(scene / place) else []
         else:
-            above, inner = numbered
+            above, inner = parts
             folders = _numbered_in(scene / above) if above.parts or is_whole(scene / place) else []
-            found = [folder / inner for folder in folders if is_whole(folder / inner)]
-        if found:
-            return found
+            models = [folder / inner for folder in folders if is_whole(folder / inner)]
+        if models:
+            return models
     return []
 
 
 def _numbered_in(folder: Path) -> list[Path]:
-    """The folders of one whose names are numbers, by these."""
+    """Return the folders in a folder whose names are numbers, sorted by these."""
     inner = [path for path in folder.iterdir() if path.name.isdecimal() and path.is_dir()] if folder.is_dir() else []
     return sorted(inner, key=lambda path: int(path.name))
 
 
 def _split_at_number(model: P) -> tuple[P, P] | None:
-    """The folder with COLMAP's numbered models and where each lies in its number, of one of them; None of others."""
+    """Split the path of a numbered model into the folder of the numbers and the path below; None without a number."""
     parts = model.parts
     for last in (1, 2):  # sparse/0, dense/0/sparse
         if len(parts) >= last and parts[-last].isdecimal() and (last == 1 or parts[-1] == "sparse"):
@@ -388,9 +399,9 @@ def _split_at_number(model: P) -> tuple[P, P] | None:
     return None
 
 
-def _is_part(model: P, read: P) -> bool:
-    """Whether a model is the one that is read, or of the same reconstruction, by its number alone another."""
-    return model == read or (_split_at_number(model) or 0) == (_split_at_number(read) or 1)
+def _is_same_reconstruction(model: P, reference: P) -> bool:
+    """Return True if two models are equal, or of one reconstruction: their paths differ by COLMAP's number alone."""
+    return model == reference or (_split_at_number(model) or 0) == (_split_at_number(reference) or 1)
 
 
 def _of_model(model: Path) -> CameraSource:
@@ -399,55 +410,55 @@ def _of_model(model: Path) -> CameraSource:
 
 
 def _up_to_scene(model: Path) -> list[Path]:
-    """The folders from a model's up to its scene's."""
-    folder = Path(os.path.abspath(model))  # links stay: files lie where somebody put them
+    """Return the folders from a model's up to its scene's."""
+    folder = Path(os.path.abspath(model))  # links are not resolved: files beside the link count
     return [folder, *(parent for parent in folder.parents if parent.is_relative_to(_scene_of(folder)))]
 
 
 def _frame_in(folder: Path) -> Path | None:
-    """The frame's file in a folder, if there is one.
+    """Return the ``FRAME_FILE`` in a folder; None if there is none.
 
     Raises:
-        InvalidCameras: there is something else of that name, such as a link that leads nowhere.
+        InvalidCameras: there is something else of that name, such as a broken link.
     """
     path = folder / FRAME_FILE
     if path.is_file():
         return path
     if os.path.lexists(path):
-        got = "a link that leads to none" if path.is_symlink() else "none"
-        raise InvalidCameras(str(path), expected="a file", got=got, hint="copy the file itself, or take it away")
+        got = "a broken link" if path.is_symlink() else "no regular file"
+        raise InvalidCameras(str(path), expected="a file", got=got, hint="copy the file itself, or remove it")
     return None
 
 
 def _models_below(folder: Path) -> list[PurePosixPath]:
-    """Folders with whole models below one, relative to it, in the order of ``_preference``.
+    """Return folders with complete models below one, relative to it, in the order of ``_preference``.
 
-    Hidden folders, links and what lies deep down are left out, so that a folder of many scenes costs little.
+    Hidden folders, links and deep levels are left out, so that a folder of many scenes is searched fast.
     """
     names: list[str] = []
     for parent, inner, files in islice(os.walk(folder), MAX_FOLDERS):
-        here = Path(parent).relative_to(folder)
-        names += [(here / name).as_posix() for name in files if name in MODEL_FILES]
-        inner[:] = [name for name in sorted(inner) if len(here.parts) < DEPTH and not is_system_file(Path(name))]
-    return _whole_models(names)
+        relative = Path(parent).relative_to(folder)
+        names += [(relative / name).as_posix() for name in files if name in MODEL_FILES]
+        inner[:] = [name for name in sorted(inner) if len(relative.parts) < DEPTH and not is_system_file(Path(name))]
+    return _complete_models(names)
 
 
-def _whole_models(names: Iterable[str]) -> list[PurePosixPath]:
-    """The folders with both files of a model among such names, the preferred first."""
-    known = {PurePosixPath(name) for name in names}
-    found = {
+def _complete_models(names: Iterable[str]) -> list[PurePosixPath]:
+    """Return the folders with both files of a model among names of files, the preferred first."""
+    paths = {PurePosixPath(name) for name in names}
+    folders = {
         path.parent
-        for path in known
-        if path.stem == "cameras" and path.with_stem("images") in known and path.name in MODEL_FILES
+        for path in paths
+        if path.stem == "cameras" and path.with_stem("images") in paths and path.name in MODEL_FILES
     }
-    return sorted(found, key=_preference)
+    return sorted(folders, key=_preference)
 
 
 def _preference(model: PurePosixPath) -> tuple[bool, int, str, int, int]:
-    """What models are sorted by: as if folders were opened as scenes one by one, the outermost first.
+    """Return the sort key of models: as if folders were opened as scenes one by one, the outermost first.
 
-    So the first model of a zip is the one that is read from the same files in a folder. What lies in a folder
-    ``distorted`` comes last: 3DGS's ``convert.py`` keeps there what it has undistorted.
+    So the first model of a zip is the one that is read from the same files in a folder. Models in a folder
+    ``distorted`` come last: 3DGS's ``convert.py`` keeps the input of its undistortion there.
     """
     scene = _scene_of(model)
     place = MODEL_FOLDERS.index(str(_at_nought(model).relative_to(scene)))
@@ -456,14 +467,14 @@ def _preference(model: PurePosixPath) -> tuple[bool, int, str, int, int]:
 
 
 def _scene_of(model: P) -> P:
-    """The outermost folder in which a model has one of the usual places; its own folder at least."""
-    places, usual = [PurePosixPath(place).parts for place in MODEL_FOLDERS], _at_nought(model).parts
-    cut = max(len(place) for place in places if usual[len(usual) - len(place) :] == place)
+    """Return the outermost folder in which a model has one of the usual places; its own folder at least."""
+    places, parts = [PurePosixPath(place).parts for place in MODEL_FOLDERS], _at_nought(model).parts
+    cut = max(len(place) for place in places if parts[len(parts) - len(place) :] == place)
     return type(model)(*model.parts[: len(model.parts) - cut])
 
 
 def _at_nought(model: P) -> P:
-    """The same with the number of one of COLMAP's several models as 0; a folder that is a mere number stays."""
+    """Return the path with COLMAP's number of the model replaced by 0; a folder that is a mere number stays."""
     above, inner = _split_at_number(model) or (None, None)
     if above is None or inner is None or (above.name != "sparse" and not inner.parts):
         return model
@@ -473,8 +484,8 @@ def _at_nought(model: P) -> P:
 # ---- zips
 
 
-def _from_zip(path: Path, beside: Path | None, *, choosing: bool, views: Collection[str]) -> Cameras:
-    """The cameras of the preferred model in a zip; with a frame's file in it or ``beside`` it, a transforms first."""
+def _from_zip(path: Path, frame_file: Path | None, *, choosing: bool, views: Collection[str]) -> Cameras:
+    """Read the cameras of the preferred model in a zip; with a ``FRAME_FILE`` in or beside it, a transforms.json."""
     try:
         archive = open_zip(path)
     except BROKEN_ZIP as error:
@@ -482,7 +493,7 @@ def _from_zip(path: Path, beside: Path | None, *, choosing: bool, views: Collect
     with archive, scratch_folder("splatlift-") as root:
         names = _unzip(archive, path, root)
         try:
-            source = _source_in_zip(names, root, path, beside, views)
+            source = _source_in_zip(names, root, path, frame_file, views)
             if source.file is not None:
                 inner = source.file.parent.relative_to(root).as_posix()
                 source = replace(source, photos=zipfile.Path(archive, "" if inner == "." else f"{inner}/"))
@@ -493,31 +504,31 @@ def _from_zip(path: Path, beside: Path | None, *, choosing: bool, views: Collect
             )
             raise InvalidCameras(argument, expected=error.expected, got=got, hint=hint) from None
         if choosing and source.model is not None and cameras.distorted:
-            read = source.model.relative_to(root)
-            others = [model for model in _whole_models(names)[:MOST_MODELS] if root / model != source.model]
-            straight = [str(model) for model in others if _is_undistorted(root / model)]
-            _refuse_both(str(path), str(read), straight, "zip the one alone")
+            model_folder = source.model.relative_to(root)
+            candidates = [model for model in _complete_models(names)[:MAX_MODELS] if root / model != source.model]
+            straight = [str(model) for model in candidates if _is_undistorted(root / model)]
+            _refuse_both(str(path), str(model_folder), straight, "zip the one alone")
     return cameras
 
 
 def _source_in_zip(
-    names: list[str], root: Path, path: Path, beside: Path | None, views: Collection[str]
+    names: list[str], root: Path, path: Path, frame_file: Path | None, views: Collection[str]
 ) -> CameraSource:
-    """What is read of a zip whose camera files lie unzipped in ``root``, wherever they are there."""
-    models, frames = _whole_models(names), _named(names, lambda name: name == FRAME_FILE)
-    written = _named(names, _is_transforms)
-    exports = [name for name in written if _begins_a_list(root / name)]
+    """Return the source of a zip whose camera files lie unzipped in ``root``, at any depth."""
+    models, frames = _complete_models(names), _names_matching(names, lambda name: name == FRAME_FILE)
+    transforms = _names_matching(names, _is_transforms)
+    exports = [name for name in transforms if _begins_a_list(root / name)]
     if exports:
         return _of_document(root / _train_first(exports), folder=root / PurePosixPath(exports[0]).parent)
-    documents = [name for name in written if PurePosixPath(name).name == TRANSFORMS] or written
-    if documents and (frames or beside):
-        frame = root / _only(frames, FRAME_FILE, path) if frames else beside
-        return CameraSource(file=root / _only(documents, TRANSFORMS, path), frame=frame)
+    documents = [name for name in transforms if PurePosixPath(name).name == TRANSFORMS] or transforms
+    if documents and (frames or frame_file):
+        frame = root / _require_one(frames, FRAME_FILE, path) if frames else frame_file
+        return CameraSource(file=root / _require_one(documents, TRANSFORMS, path), frame=frame)
     if not models and documents:
         first = _train_first(documents)
-        alike = [name for name in documents if PurePosixPath(name).parent == PurePosixPath(first).parent]
-        if len(alike) < len(documents):
-            _only(documents, TRANSFORMS, path)
+        siblings = [name for name in documents if PurePosixPath(name).parent == PurePosixPath(first).parent]
+        if len(siblings) < len(documents):
+            _require_one(documents, TRANSFORMS, path)
         return _of_document(root / first, folder=(root / first).parent)
     if not models:
         got, hint = _what_else(names)
@@ -528,21 +539,21 @@ def _source_in_zip(
         got = f"one of {PurePosixPath(frames[0]).parent} and the model {models[0]}"
         raise InvalidCameras(str(path), expected=f"the {FRAME_FILE} of the model", got=got, hint=ONE_RUN)
     frames = above[-1:] or frames
-    frame = root / _only(frames, FRAME_FILE, path) if frames else beside
-    parts = [root / model for model in models if _is_part(model, models[0])]
+    frame = root / _require_one(frames, FRAME_FILE, path) if frames else frame_file
+    parts = [root / model for model in models if _is_same_reconstruction(model, models[0])]
     model, warnings = choose_model(parts, root, views)
     return CameraSource(model=model, frame=frame, warnings=warnings)
 
 
 def _train_first(documents: list[str]) -> str:
-    """The one of several documents of cameras that trainers train on."""
+    """Return the one of several documents of cameras that trainers train on."""
     return next((name for name in documents if PurePosixPath(name).name == TRAINED_ON), documents[0])
 
 
 def _files(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    """The files by their names in a folder of the zip's own, with slashes: some programs write backslashes or ``./``.
+    """Return the files by their normalised names, with slashes: some programs write backslashes or ``./``.
 
-    What is hidden, or below a hidden folder, is left out, as it is of folders.
+    Hidden files and folders are left out, as in folders.
     """
     files = {}
     for member in archive.infolist():
@@ -556,7 +567,7 @@ def _files(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
 
 
 def _unzip(archive: zipfile.ZipFile, path: Path, folder: Path) -> list[str]:
-    """Unzip what cameras may be read from, each file at its place; the names of all files in the zip."""
+    """Unzip the camera files to ``folder``, and return the names of all files in the zip."""
     count, budget = len(archive.infolist()), MAX_UNZIPPED_BYTES
     if count > MAX_ZIP_MEMBERS:
         raise InvalidCameras(str(path), expected=f"at most {MAX_ZIP_MEMBERS} files", got=str(count))
@@ -573,49 +584,51 @@ def _unzip(archive: zipfile.ZipFile, path: Path, folder: Path) -> list[str]:
 
 
 def _broken_zip(path: Path, error: Exception) -> InvalidCameras | Unavailable:
-    """The error of a zip that does not open, or does not fit on the disk."""
+    """Return the error of a zip that does not open, or does not fit on the disk."""
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        expected, hint = f"room in {tempfile.gettempdir()} for what is in the zip", "make room, or set TMPDIR"
+        expected, hint = f"free space in {tempfile.gettempdir()} for the zip's files", "free some, or set TMPDIR"
         return Unavailable(str(path), expected=expected, got="a full disk", hint=hint)
     got = f"one that does not open ({str(error)[:120]})"
     return InvalidCameras(str(path), expected="a zip of a COLMAP sparse model", got=got)
 
 
 def _unzip_one(archive: zipfile.ZipFile, member: zipfile.ZipInfo, target: Path, budget: int) -> int:
-    written = 0
+    size = 0
     with archive.open(member) as source, target.open("wb") as sink:
-        while block := source.read(min(1 << 20, budget - written + 1)):
-            written += len(block)
-            if written > budget:
+        while block := source.read(min(1 << 20, budget - size + 1)):
+            size += len(block)
+            if size > budget:
                 limit = f"at most {MAX_UNZIPPED_BYTES} bytes unzipped"
-                raise InvalidCameras(member.filename, expected=limit, got="more", hint="leave points out of the zip")
+                raise InvalidCameras(
+                    member.filename, expected=limit, got="more", hint="leave the points out of the zip"
+                )
             sink.write(block)
-    return written
+    return size
 
 
-def _named(names: Iterable[str], fits: Callable[[str], bool]) -> list[str]:
-    """Those whose last part fits, the outermost first."""
-    found = [name for name in names if fits(PurePosixPath(name).name)]
-    return sorted(found, key=lambda name: (name.count("/"), name))
+def _names_matching(names: Iterable[str], fits: Callable[[str], bool]) -> list[str]:
+    """Return the names whose last part fits, the outermost first."""
+    matches = [name for name in names if fits(PurePosixPath(name).name)]
+    return sorted(matches, key=lambda name: (name.count("/"), name))
 
 
 def _is_transforms(name: str) -> bool:
     return name.startswith("transforms") and name.endswith(".json")
 
 
-def _only(found: list[str], name: str, path: Path) -> str:
-    """The one file of these.
+def _require_one(matches: list[str], name: str, path: Path) -> str:
+    """Return the only one of these files.
 
     Raises:
         InvalidCameras: there are several.
     """
-    if len(found) > 1:
-        raise InvalidCameras(str(path), expected=f"one {name}", got=" and ".join(found[:2]), hint=ONE_RUN)
-    return found[0]
+    if len(matches) > 1:
+        raise InvalidCameras(str(path), expected=f"one {name}", got=" and ".join(matches[:2]), hint=ONE_RUN)
+    return matches[0]
 
 
 def _what_else(names: Iterable[str]) -> tuple[str, str]:
-    """What a zip without a whole model has, and what to do."""
+    """Describe a zip without a complete model, and advise what to do."""
     for name in sorted(names):
         file = PurePosixPath(name).name
         if file in MODEL_FILES:

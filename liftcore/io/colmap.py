@@ -46,7 +46,7 @@ class Intrinsics(NamedTuple):
 
 
 class CameraModel(NamedTuple):
-    """A model: its name, how many of its parameters are focal lengths, and what those behind the centre are."""
+    """A camera model: its name, how many parameters are focal lengths, and which follow the principal point."""
 
     name: str
     parameters: int
@@ -100,23 +100,23 @@ class _Image:
 
 
 def has_model(folder: Path) -> bool:
-    """Whether the folder itself holds a file of a sparse model."""
+    """Return True if the folder itself has a file of a sparse model."""
     return any((folder / name).is_file() for name in MODEL_FILES)
 
 
 def is_whole(folder: Path) -> bool:
-    """Whether the folder itself holds both files of a sparse model."""
+    """Return True if the folder itself has both files of a sparse model."""
     return all(path.is_file() for path in model_files(folder))
 
 
 def model_files(folder: Path) -> list[Path]:
-    """Its cameras and its images: of a whole model, and binary files before text, as in COLMAP, if there are any."""
+    """Return the files of cameras and images: a complete pair if there is one, binary before text, as in COLMAP."""
     kinds = [[folder / f"cameras.{kind}", folder / f"images.{kind}"] for kind in ("bin", "txt")]
     return max(kinds, key=lambda files: sum(path.is_file() for path in files))
 
 
 def read_colmap(folder: Path) -> Cameras:
-    """The cameras of a sparse model, by image name.
+    """Read the cameras of a sparse model, by image name.
 
     Raises:
         InvalidCameras: a file is missing or malformed, or a camera is distorted in a way that is not read.
@@ -128,8 +128,8 @@ def read_colmap(folder: Path) -> Cameras:
     if camera_file.suffix == ".bin":
         sensors, images = _read_binary(camera_file, image_file)
     else:
-        sensors = dict(_counted(_text_sensors(camera_file), camera_file))
-        images = list(_counted(_text_images(image_file), image_file))
+        sensors = dict(_check_counts(_text_sensors(camera_file), camera_file))
+        images = list(_check_counts(_text_images(image_file), image_file))
     with cameras_from(str(folder)):
         names = view_names([image.name for image in images])
         files = camera_file, image_file
@@ -137,13 +137,13 @@ def read_colmap(folder: Path) -> Cameras:
         cameras, warnings = read_views(pairs, lambda name, image: _cameras(name, image, sensors, files))
         broken = [name for name in names if REPLACED in name]
         if broken:
-            what = "views pair with none of them: rename the photos, and their names in the model"
-            warnings.append(f"the names of {len(broken)} images are not UTF-8, such as {broken[0]!r}; {what}")
+            advice = "views pair with none of them: rename the photos, and their names in the model"
+            warnings.append(f"the names of {len(broken)} images are not UTF-8, such as {broken[0]!r}; {advice}")
         return Cameras(cameras, warnings=warnings)
 
 
 def read_image_names(folder: Path) -> list[str]:
-    """The views of a sparse model by name; its cameras are not read.
+    """Read the names of a sparse model's views, without their cameras.
 
     Raises:
         InvalidCameras: the file of its images is missing or malformed.
@@ -152,12 +152,12 @@ def read_image_names(folder: Path) -> list[str]:
     if path.suffix == ".bin":
         images: list[_Image] = _binary_images(path)
     else:
-        images = list(_counted(_text_images(path), path))
+        images = list(_check_counts(_text_images(path), path))
     return view_names([image.name for image in images])
 
 
 def _cameras(name: str, image: _Image, sensors: Mapping[int, _Sensor], files: tuple[Path, Path]) -> list[Camera]:
-    """The view of an image, or the six of a panorama; only what images use has to be of a model that is read."""
+    """Return the view of an image, or the six of a panorama; cameras that no image uses may be of any model."""
     sensor, source = sensors.get(image.camera), str(files[1])
     if sensor is None:
         raise InvalidCameras(source, expected="images of known cameras", got=f"{name!r} of camera {image.camera}")
@@ -175,7 +175,7 @@ def _cameras(name: str, image: _Image, sensors: Mapping[int, _Sensor], files: tu
 
 
 class _Bytes:
-    """A mapped binary file, read forward; every read is checked against its end."""
+    """A memory-mapped binary file, read forward; every read is checked against its end."""
 
     def __init__(self, path: Path) -> None:
         self.source = str(path)
@@ -191,20 +191,20 @@ class _Bytes:
         self.skip(struct.calcsize(layout))
         return struct.unpack_from(layout, self.data, start)
 
-    def views(self, what: str, least_bytes: int) -> range:
-        """As many views or their cameras as the file announces, which a scene may have."""
-        count = self.count(what, least_bytes)
+    def views(self, noun: str, least_bytes: int) -> range:
+        """Return a range over the announced views or cameras, whose number is checked against a scene's limit."""
+        count = self.count(noun, least_bytes)
         check_count(count, self.source)
         return range(count)
 
-    def count(self, what: str, least_bytes: int) -> int:
-        """A number of records, which the rest of the file must have room for."""
+    def count(self, noun: str, least_bytes: int) -> int:
+        """Read a number of records, which is checked against the rest of the file."""
         (count,) = self.take("<Q")
         if count * least_bytes > len(self.data) - self.offset:
             rest = len(self.data) - self.offset
             raise InvalidCameras(
                 self.source,
-                expected=f"{count} {what}",
+                expected=f"{count} {noun}",
                 got=f"a file that ends {rest} bytes after their number",
                 hint=RE_EXPORT,
             )
@@ -290,14 +290,14 @@ def _text_images(path: Path) -> Iterator[_Image]:
             yield _Image(name, int(camera), pose[:4], pose[4:])
         except ValueError:
             raise _bad_line(path, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", line) from None
-        points = next(lines, "").split()  # of the image before: X Y POINT3D_ID, any number of times
+        points = next(lines, "").split()  # of the previous image: X Y POINT3D_ID, any number of times
         if len(points) % 3 or (points and not points[-1].lstrip("-").isdigit()):
             expected = "X Y POINT3D_ID of each point of an image after its line, or an empty line"
             raise InvalidCameras(str(path), expected=expected, got=repr(" ".join(points)[:80]), hint=RE_EXPORT)
 
 
-def _counted(records: Iterator[T], path: Path) -> Iterator[T]:
-    """The records of a text, which announces no number, as long as a scene may have so many."""
+def _check_counts(records: Iterator[T], path: Path) -> Iterator[T]:
+    """Yield the records of a text, which announces no number, and check their number against a scene's limit."""
     for count, record in enumerate(records, start=1):
         check_count(count, str(path))
         yield record
@@ -308,7 +308,7 @@ def _bad_line(path: Path, expected: str, line: str) -> InvalidCameras:
 
 
 def calibration(model: CameraModel, parameters: Sequence[float], source: str) -> tuple[Intrinsics, Distortion | None]:
-    """The intrinsics of a camera of this model, and how it is distorted; None where it is not.
+    """Return the intrinsics of a camera of this model, and its distortion; None without distortion.
 
     Raises:
         InvalidCameras: a parameter is missing, too many or not finite, or the model is one that is not read.
@@ -324,12 +324,12 @@ def calibration(model: CameraModel, parameters: Sequence[float], source: str) ->
         got = " ".join(f"{value:g}" for value in parameters[centre:])
         raise InvalidCameras(source, expected=f"finite {', '.join(model.distortion)}", got=got)
     intrinsics = Intrinsics(parameters[0], parameters[model.focals - 1], *parameters[model.focals : centre])
-    named = dict(zip(model.distortion, parameters[centre:], strict=True))
-    return intrinsics, distortion_of(named, fisheye=model.fisheye)
+    coefficients = dict(zip(model.distortion, parameters[centre:], strict=True))
+    return intrinsics, distortion_of(coefficients, fisheye=model.fisheye)
 
 
-def distortion_of(named: Mapping[str, float], *, fisheye: bool) -> Distortion | None:
-    """The distortion of parameters by name, those that are missing zero; None for a perspective without any."""
+def distortion_of(coefficients: Mapping[str, float], *, fisheye: bool) -> Distortion | None:
+    """Return the distortion of coefficients by name, 0 if missing; None for a perspective camera without any."""
     if fisheye:
-        return Fisheye(**named)
-    return Brown(**named) if any(named.values()) else None
+        return Fisheye(**coefficients)
+    return Brown(**coefficients) if any(coefficients.values()) else None

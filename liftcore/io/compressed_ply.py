@@ -24,7 +24,7 @@ SH_RANGE = 8.0  # of a higher harmonic, from -4 to 4
 
 
 def read_compressed_ply(path: Path, *, colour: bool = True) -> Fields:
-    """The fields of a compressed PLY.
+    """Read the fields of a compressed PLY.
 
     Raises:
         InvalidSplats: an element or a column is missing or of another type, or the file's size is another.
@@ -37,33 +37,33 @@ def read_compressed_ply(path: Path, *, colour: bool = True) -> Fields:
     if total > size or any(element.list_column for element in elements):
         raise InvalidSplats(
             str(path), expected=f"{total} bytes, as its header says", got=f"{size}",
-            hint="the file is truncated, or none of this format: export it again",
+            hint="the file is truncated, or not of this format: export it again",
         )  # fmt: skip
     tail = size - total - padding_bytes(path, size, size - total)
     for element in elements:
         table = np.memmap(path, np.uint8, "r", 0)[offset : offset + element.count * element.dtype.itemsize]
         tables[element.name] = table.view(element.dtype)
         offset += element.count * element.dtype.itemsize
-    chunks, vertices, harmonics = _checked(tables, path)
+    chunks, vertices, harmonics = _check_tables(tables, path)
     higher = 0 if harmonics is None or not colour else len(harmonics.dtype.names or ()) // 3
 
     def decode(rows: slice) -> Fields:
-        read = vertices[rows]
+        block = vertices[rows]
         chunk = chunks[np.arange(rows.start, rows.stop) // CHUNK_ROWS]
-        rotation = read["packed_rotation"]
+        rotation = block["packed_rotation"]
         parts = (np.stack([_unit(rotation, shift, 10) for shift in (20, 10, 0)], axis=1) - 0.5) * np.sqrt(2)
-        rgba = np.stack([_unit(read["packed_color"], shift, 8) for shift in (24, 16, 8, 0)], axis=1)
+        rgba = np.stack([_unit(block["packed_color"], shift, 8) for shift in (24, 16, 8, 0)], axis=1)
         fields = {
-            "means": _in_range(_three(read["packed_position"]), chunk, AXES),
-            "log_scales": _in_range(_three(read["packed_scale"]), chunk, [f"scale_{axis}" for axis in AXES]),
+            "means": _in_range(_three(block["packed_position"]), chunk, AXES),
+            "log_scales": _in_range(_three(block["packed_scale"]), chunk, [f"scale_{axis}" for axis in AXES]),
             "quats": smallest_three(parts, (rotation >> 30).astype(np.int64)),
             "opacity_logits": logits(rgba[:, 3]),
         }
         if not colour:
             return fields
-        shown = _in_range(rgba[:, :3], chunk, "rgb") if "min_r" in (chunks.dtype.names or ()) else rgba[:, :3]
-        fields["sh"] = np.empty((len(read), 1 + higher, 3))
-        fields["sh"][:, 0] = constant_terms(shown)
+        colours = _in_range(rgba[:, :3], chunk, "rgb") if "min_r" in (chunks.dtype.names or ()) else rgba[:, :3]
+        fields["sh"] = np.empty((len(block), 1 + higher, 3))
+        fields["sh"][:, 0] = constant_terms(colours)
         if harmonics is not None and higher:
             levels = np.stack([harmonics[f"f_rest_{i}"][rows] for i in range(3 * higher)], axis=1).astype(np.float64)
             unit = np.where(levels == 0, 0.0, np.where(levels == 255, 1.0, (levels + 0.5) / 256))
@@ -74,17 +74,17 @@ def read_compressed_ply(path: Path, *, colour: bool = True) -> Fields:
     return fields | {"render_mode": mode, "warnings": (*warnings, *tail_warnings(tail))}
 
 
-def _checked(tables: dict[str, np.ndarray], path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """The tables of chunks, vertices and harmonics, with the columns of the format."""
+def _check_tables(tables: dict[str, np.ndarray], path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Check the columns of the format, and return the tables of chunks, vertices and harmonics."""
     ends = [f"{end}_{name}" for end in ("min", "max") for name in (*AXES, *(f"scale_{axis}" for axis in AXES))]
     colours = [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
     chunks, vertices, harmonics = (tables.get(name) for name in ("chunk", "vertex", "sh"))
     if chunks is None or vertices is None or not len(vertices):
         raise InvalidSplats(str(path), expected="at least one splat in chunks", got="an empty scene", hint=EXPORT)
     names = set(chunks.dtype.names or ())
-    wanted = {"chunk": [*ends, *(colours if names.intersection(colours) else [])], "vertex": PACKED}
+    required = {"chunk": [*ends, *(colours if names.intersection(colours) else [])], "vertex": PACKED}
     for element, code in (("chunk", "<f4"), ("vertex", "<u4")):
-        for name in wanted[element]:
+        for name in required[element]:
             if name not in (tables[element].dtype.names or ()) or tables[element].dtype[name] != code:
                 kind = "float" if code == "<f4" else "uint"
                 raise InvalidSplats(str(path), expected=f"the {kind} {name!r} of the element {element!r}", got="none")
@@ -93,24 +93,24 @@ def _checked(tables: dict[str, np.ndarray], path: Path) -> tuple[np.ndarray, np.
         raise InvalidSplats(str(path), expected=expected, got=got)
     if harmonics is not None:
         columns = harmonics.dtype.names or ()
-        known = {f"f_rest_{i}" for i in range(len(columns))} == set(columns) and len(columns) in SH_COLUMNS
-        if not known or len(harmonics) != len(vertices) or any(harmonics.dtype[name] != "u1" for name in columns):
+        complete = {f"f_rest_{i}" for i in range(len(columns))} == set(columns) and len(columns) in SH_COLUMNS
+        if not complete or len(harmonics) != len(vertices) or any(harmonics.dtype[name] != "u1" for name in columns):
             expected = f"{' or '.join(map(str, SH_COLUMNS))} uchar f_rest_* of each splat in the element 'sh'"
             raise InvalidSplats(str(path), expected=expected, got=f"{len(columns)} of {len(harmonics)} splats")
     return chunks, vertices, harmonics
 
 
 def _unit(values: np.ndarray, shift: int, bits: int) -> np.ndarray:
-    most = (1 << bits) - 1
-    return ((values >> shift) & most) / most
+    maximum = (1 << bits) - 1
+    return ((values >> shift) & maximum) / maximum
 
 
 def _three(values: np.ndarray) -> np.ndarray:
-    """[n, 3] in 0..1, of 11, 10 and 11 bits."""
+    """Unpack values [n] of 11, 10 and 11 bits to [n, 3] in 0..1."""
     return np.stack([_unit(values, 21, 11), _unit(values, 11, 10), _unit(values, 0, 11)], axis=1)
 
 
 def _in_range(units: np.ndarray, chunk: np.ndarray, names: "list[str] | tuple[str, ...] | str") -> np.ndarray:
-    """Values in 0..1 [n, 3] between the ends that each row's chunk has of these columns."""
+    """Scale values [n, 3] in 0..1 to the range that each row's chunk has of these columns."""
     low, high = (np.stack([chunk[f"{end}_{name}"] for name in names], axis=1).astype(float) for end in ("min", "max"))
     return low * (1 - units) + high * units

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, what systems put beside files, and pointers of Git LFS."""
+"""Atomic writes of files, files of the operating system beside others, and pointers of Git LFS."""
 
 import errno
 import lzma
@@ -18,17 +18,17 @@ from typing import IO
 from liftcore.errors import InvalidCameras, InvalidInput, Unavailable
 
 LFS_POINTER = b"version https://git-lfs.github.com/spec/"
-# What zipfile and its decompressors raise of a broken or foreign file.
+# Errors that zipfile and its decompressors raise for a damaged file.
 BROKEN_ZIP = (
     *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError),
     *(NotImplementedError, OSError, RuntimeError, ValueError),
 )
-# What Windows, macOS and Synology put beside files, in lower case; all else that is theirs begins with a dot.
+# Files of Windows, macOS and Synology, in lower case; their other files begin with a dot.
 SYSTEM_FILES = frozenset((
     "thumbs.db", "ehthumbs.db", "desktop.ini", "__macosx", "@eadir", "$recycle.bin", "#recycle", "@recycle",
     "lost+found", "system volume information",
 ))  # fmt: skip
-MAX_DIRECTORY_BYTES = 16 << 20  # of a zip's list of files, of which zipfile makes an object each
+MAX_DIRECTORY_BYTES = 16 << 20  # of a zip's list of files; zipfile makes an object of each
 _END = struct.Struct("<4s4H2LH")  # of a zip: its list's size is the sixth field
 _END64_LOCATOR = struct.Struct("<4sLQL")
 _END64 = struct.Struct("<4sQ2H2L4Q")
@@ -36,26 +36,26 @@ LFS_HINT = "run 'git lfs pull' in the repository where it lies"
 
 
 def is_system_file(path: PurePath) -> bool:
-    """Return whether a path, relative to a folder, is hidden (``._IMG.png``) or what a system put there.
+    """Return True if a path, relative to a folder, or a folder on the way is hidden or of the operating system.
 
-    It is too where a folder on the way is (``__MACOSX/IMG.png``).
+    Examples are ``._IMG.png`` and ``__MACOSX/IMG.png``.
     """
     inner = (part for part in path.parts if part not in (".", ".."))
     return any(part.startswith((".", "~$")) or part.lower() in SYSTEM_FILES for part in inner)
 
 
 def visible_files(folder: Path | str, pattern: str = "*") -> list[Path]:
-    """The files of a folder that match a pattern, sorted, without those of `is_system_file`."""
+    """Return the files of a folder that match a pattern, sorted, without those of `is_system_file`."""
     folder = Path(folder)
     files = (path for path in sorted(folder.glob(pattern)) if path.is_file())
     return [path for path in files if not is_system_file(path.relative_to(folder))]
 
 
 def refuse_pointer(source: str, head: bytes) -> None:
-    """Refuse a Git LFS pointer in a camera file's place.
+    """Refuse a Git LFS pointer in place of a camera file.
 
     Raises:
-        InvalidCameras: the first bytes are one's.
+        InvalidCameras: the first bytes are those of a pointer.
     """
     if head.startswith(LFS_POINTER):
         got = "a Git LFS pointer, which stands for the file"
@@ -63,12 +63,12 @@ def refuse_pointer(source: str, head: bytes) -> None:
 
 
 def open_regular(path: Path) -> BufferedReader:
-    """Open a regular file to read: devices may have no end, and pipes may wait for ever.
+    """Open a regular file to read: devices may have no end, and pipes may block forever.
 
     Raises:
-        OSError: it does not open, or is none.
+        OSError: it does not open, or is not a regular file.
     """
-    handle = open(path, "rb", opener=_open_without_waiting)  # noqa: SIM115 - the caller's to close
+    handle = open(path, "rb", opener=_open_without_waiting)  # noqa: SIM115 - the caller closes it
     if stat.S_ISREG(os.fstat(handle.fileno()).st_mode):
         return handle
     handle.close()
@@ -80,10 +80,10 @@ def _open_without_waiting(path: str, flags: int) -> int:
 
 
 def open_zip(path: Path) -> zipfile.ZipFile:
-    """Open a zip whose list of files is bounded, before zipfile reads it whole.
+    """Open a zip, whose list of files is checked against a limit before zipfile reads it.
 
     Raises:
-        zipfile.BadZipFile: it is none, or its list is larger. OSError: it does not open, or is no regular file.
+        zipfile.BadZipFile: it is no zip, or its list is too large. OSError: it does not open, or is no regular file.
     """
     with open_regular(path) as handle:
         size = _directory_bytes(handle)
@@ -93,7 +93,7 @@ def open_zip(path: Path) -> zipfile.ZipFile:
 
 
 def _directory_bytes(handle: IO[bytes]) -> int:
-    """The size of a zip's list of files, as the record at its end says; 0 where there is none."""
+    """Read the size of a zip's list of files from the record at its end; 0 if there is none."""
     end = handle.seek(0, 2)
     handle.seek(max(0, end - _END.size - 0xFFFF))
     tail = handle.read()
@@ -104,7 +104,7 @@ def _directory_bytes(handle: IO[bytes]) -> int:
     locator = place - _END64_LOCATOR.size
     if locator >= 0 and tail[locator : locator + 4] == b"PK\6\7":
         before = end - len(tail) + locator - _END64.size
-        for record_at in (before, _END64_LOCATOR.unpack_from(tail, locator)[2]):  # readers look at either
+        for record_at in (before, _END64_LOCATOR.unpack_from(tail, locator)[2]):  # readers use either
             handle.seek(max(0, min(end, record_at)))
             record = handle.read(_END64.size)
             if len(record) == _END64.size and record[:4] == b"PK\6\6":
@@ -114,10 +114,10 @@ def _directory_bytes(handle: IO[bytes]) -> int:
 
 @contextmanager
 def whole_file(path: Path | str) -> Iterator[IO[bytes]]:
-    """Write ``path`` through a draft beside it: synced and renamed at the end, removed after an error.
+    """Write ``path`` atomically, through a draft beside it: synced and renamed at the end, removed after an error.
 
     Raises:
-        InvalidInput: a folder lies there.
+        InvalidInput: ``path`` is a folder.
         Unavailable: the file is open or mapped, which Windows does not replace.
     """
     path = Path(path)

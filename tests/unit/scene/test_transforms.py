@@ -276,7 +276,7 @@ def test_inria_cameras_are_in_the_frame_of_their_splats(run: Path, tmp_path: Pat
     (run / "transforms.json").unlink()
     write_inria_cameras(Cameras((camera,)), run / "cameras.json")
     for path in (run, run / "cameras.json"):
-        with pytest.raises(InvalidCameras, match=r"cameras that are still to be moved, got Inria's.*; take .* away"):
+        with pytest.raises(InvalidCameras, match=r"cameras in another frame, got Inria's.*; remove "):
             read_cameras(path)
 
 
@@ -341,7 +341,7 @@ def test_link_counts_where_it_lies_in_the_lift_and_after(run: Path, expected: Ca
     assert camera_input(Path(remembered.path)).sha256 != remembered.sha256
 
 
-@pytest.mark.parametrize(("kind", "said"), [("link", "a link that leads to none"), ("folder", "none")])
+@pytest.mark.parametrize(("kind", "said"), [("link", "a broken link"), ("folder", "no regular file")])
 def test_frame_that_is_no_file_is_told(kind: str, said: str, run: Path, model: Path) -> None:
     (run / FRAME_FILE).unlink()
     if kind == "link":
@@ -371,7 +371,7 @@ def test_full_disk_is_no_broken_zip(run: Path, monkeypatch: pytest.MonkeyPatch) 
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(cameras, "_unzip_one", full)
-    with pytest.raises(Unavailable, match=r"expected room in .* for what is in the zip, got a full disk; make room"):
+    with pytest.raises(Unavailable, match=r"expected free space in .* for the zip's files, got a full disk"):
         read_cameras(zipped(run))
 
 
