@@ -6,6 +6,7 @@ import inspect
 import io
 import json
 import re
+import runpy
 import shlex
 import shutil
 import sys
@@ -21,7 +22,9 @@ import torch
 from fastapi.routing import APIRoute
 from matplotlib import pyplot
 from PIL import Image
+from plyfile import PlyData
 from pydantic import BaseModel
+from safetensors.numpy import load_file
 from scipy.spatial.transform import Rotation
 
 import liftcore as lc
@@ -84,7 +87,7 @@ def test_sams_masks_make_a_lift_that_knows_the_words(scene_folder: Path, monkeyp
         Image.fromarray((80 * clusters[0] + 40).astype(np.uint8)).save(scene_folder / "photos" / f"{view}.jpg")
     for name, module in stand_ins().items():
         monkeypatch.setitem(sys.modules, name, module)
-    run_example(GUIDE, "from segment_anything import")
+    run_script("segment_photos.py", "photos", "masks")
     table = TableEncoder.open(scene_folder / "words.safetensors")
     (scene_folder / "words.safetensors").unlink()
     monkeypatch.setattr("liftcore.open_encoder", lambda spec: table)  # whose weights are not here
@@ -94,6 +97,7 @@ def test_sams_masks_make_a_lift_that_knows_the_words(scene_folder: Path, monkeyp
     monkeypatch.setattr(CropEncoder, "open", GreyEncoder)  # nor are these
     commands = commands_between(GUIDE, "### From SAM's masks", "\n### ", scene_folder)
     assert [command[0] for command in commands] == ["pack", "lift"]
+    assert "python examples/segment_photos.py photos masks" in text(GUIDE)
     question = ["query", "scene.lift.safetensors", "apple", "--table", "words.safetensors", "--view", "middle"]
     assert [main(command) for command in [*commands, [*question, "--mask", "apple.png"]]] == [0, 0, 0]
     with Image.open(scene_folder / "apple.png") as mask:
@@ -113,7 +117,7 @@ def test_langsplats_files_become_a_pack(scene_folder: Path) -> None:
 
 
 def test_pack_of_ones_own_program_makes_a_lift_that_python_reads(
-    scene_folder: Path, capsys: pytest.CaptureFixture[str]
+    scene_folder: Path,
 ) -> None:
     for name in ("labels", "vectors"):
         (scene_folder / name).mkdir()
@@ -121,16 +125,16 @@ def test_pack_of_ones_own_program_makes_a_lift_that_python_reads(
         np.save(scene_folder / "labels" / f"{view}.npy", clusters[0])
         np.save(scene_folder / "vectors" / f"{view}.npy", codebook())
     (scene_folder / "features.safetensors").unlink()
-    run_example(GUIDE, 'Path("labels")')
+    run_script("write_pack.py", "labels", "vectors", "features.safetensors")
     sources = [str(scene_folder / name) for name in ("scene.ply", "cameras.json", "features.safetensors")]
     assert main(["lift", *sources, "-o", "scene.lift.safetensors"]) == 0
-    capsys.readouterr()
-    names = run_example(GUIDE, 'load_file("scene.lift.safetensors")')
-    assert len(capsys.readouterr().out.splitlines()) >= 3
-    places, features, sure = names["places"], names["lift"]["features"], names["sure"]
-    assert np.array_equal(places, read_splats(scene_folder / "scene.ply").means.numpy())
-    clusters = np.digitize(places[sure, 0], [-0.6, 0.6])  # 0 apple, 1 book, 2 lamp
-    assert len(set(clusters)) == 3 and np.array_equal(features[sure].argmax(axis=1), clusters)
+    lift = load_file("scene.lift.safetensors")  # row j is row j of the PLY
+    vertices = PlyData.read("scene.ply")["vertex"]
+    positions = np.stack([vertices[axis] for axis in "xyz"], axis=1)
+    assert np.array_equal(positions, read_splats(scene_folder / "scene.ply").means.numpy())
+    mask = lift["seen"] & (lift["evidence"] > 0.5)
+    clusters = np.digitize(positions[mask, 0], [-0.6, 0.6])  # 0 apple, 1 book, 2 lamp
+    assert len(set(clusters)) == 3 and np.array_equal(lift["features"][mask].argmax(axis=1), clusters)
 
 
 def commands_between(page: str, begin: str, end: str, folder: Path) -> list[list[str]]:
@@ -149,6 +153,11 @@ def run_example(page: str, start: str) -> dict[str, Any]:
     names: dict[str, Any] = {}
     exec(compile(example, page, "exec"), names)
     return names
+
+
+def run_script(name: str, *arguments: str) -> None:
+    """Call the main function of an example in this process, where modules may be replaced."""
+    runpy.run_path(str(ROOT / "examples" / name))["main"](*arguments)
 
 
 def stand_ins() -> dict[str, ModuleType]:
@@ -181,7 +190,7 @@ class GreyEncoder:
 
 def test_command_line_example_writes_its_files(scene_folder: Path) -> None:
     main(["lift", "scene.ply", "cameras.json", "features.safetensors", "-o", "scene.lift.safetensors"])
-    section = text(GUIDE).partition("## Asking")[2].partition("###")[0]
+    section = text(GUIDE).partition("## Queries")[2].partition("###")[0]
     commands = [line.split()[1:] for line in section.splitlines() if line.startswith("splatlift ")]
     assert [command[0] for command in commands] == ["query"] * 4
     assert [main(command) for command in commands] == [0] * len(commands)
@@ -214,10 +223,10 @@ def test_the_way_from_own_maps_to_a_mask_leads_there(scene_folder: Path) -> None
 def test_questions_of_the_guide_are_answered(scene_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files = ["scene.ply", "cameras.json", "features.safetensors"]
     assert main(["lift", *files, "-o", "scene.lift.safetensors"]) == 0
-    check = text(GUIDE).partition("## Before the work")[2].partition("\n## ")[0]
+    check = text(GUIDE).partition("## Check the inputs")[2].partition("\n## ")[0]
     assert main(shlex.split(f"check {' '.join(files)}")) == 0 and "splatlift check scene.ply sparse/0 photos" in check
     shutil.copy("features.safetensors", "kept")
-    commands = commands_between(GUIDE, "## Asking", "### Text encoders", scene_folder)
+    commands = commands_between(GUIDE, "## Queries", "### Text encoders", scene_folder)
     shutil.copy("kept", "features.safetensors")
     capsys.readouterr()
     assert [command[0] for command in commands] == ["query"] * 4 + ["segment"] * 2 + ["objects", "export", "objects"]
@@ -334,8 +343,7 @@ def test_transform_of_gsplat_is_written_and_read(folder: Path, monkeypatch: pyte
     vars(module)["Parser"] = lambda path, factor, normalize: SimpleNamespace(transform=similarity())
     monkeypatch.setitem(sys.modules, "datasets", ModuleType("datasets"))
     monkeypatch.setitem(sys.modules, "datasets.colmap", module)
-    (example,) = (block for block in blocks(GUIDE, "python") if "datasets.colmap" in block)
-    exec(compile(example, GUIDE, "exec"), {})
+    run_script("gsplat_transform.py", "data/garden", "4")
     after = read_cameras(folder / "data/garden")
     for old, new in zip(before.values(), after.values(), strict=True):
         assert np.allclose(new.centre, (similarity() @ [*old.centre, 1])[:3])
