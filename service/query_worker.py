@@ -304,7 +304,7 @@ class Answers:
         labels = {number: {"name": name, "hidden": is_hidden} for number, (name, is_hidden) in request["things"]}
         objects = (
             item.model_dump(mode="json") | {"hidden": False} | _given(labels.get(item.id))
-            for item in catalogue.listed(first, last, features=request["means"])
+            for item in catalogue.iterate_objects(first, last, features=request["means"])
         )
         after = last if last < len(catalogue.objects) else None
         document = {"explanation": catalogue.explanation, "count": len(catalogue.objects), "next": after}

@@ -1,11 +1,11 @@
-"""The feature that an area of a camera's image shows: of a pixel, a box or a stroke.
+"""The feature of an area of a camera's image: a pixel, a box or a stroke.
 
-A pixel shows ``sum_j A_ij x_j``. Of a box or a stroke evenly chosen pixels are taken. A box around a thing holds some
-of what is behind it, and so does the band around the box, of about the same area: a pixel i of the box counts by
-``w_i = (1 - r_i)^2``, where r_i is its cosine to the pixels of the band, but for the nearest REACH of them. Pixels of
-a stroke count alike. The feature is ``sum_k w_k u_k`` of the unit features u_k that are like that of the pixel i for
-which ``sum_k w_k cos(u_i, u_k)`` is largest: what else is in the area does not count. Cosines are those of examples,
-as seen from the scene's mean.
+A pixel has the feature ``sum_j A_ij x_j``. A box or a stroke is sampled by evenly spaced pixels. A box around an
+object also contains background, as does the band around the box, of about the same area. So a pixel i of the box has
+the weight ``w_i = (1 - r_i)^2``, where r_i is its cosine to the pixels of the band without the nearest REACH of them.
+All pixels of a stroke have the same weight. The feature is ``sum_k w_k u_k`` over the unit features u_k similar to
+that of the pixel i with the largest ``sum_k w_k cos(u_i, u_k)``: all else in the area is left out. Cosines are taken
+about the scene's mean, as for examples.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from liftcore.query.terms import AREAS, NOTATIONS, Area, Pixel, PixelBox, Stroke
 if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera
 
-MINIMUM_ROW_SUM = 0.5  # below it a ray mostly misses the scene: no histogram, no mask and no example takes it
-AREA_PIXELS = 256  # of an area that are looked at
+MINIMUM_ROW_SUM = 0.5  # below it a ray mostly misses the scene: histograms, masks and examples leave it out
+AREA_PIXELS = 256  # most pixels that sample an area
 BAND = 0.2  # of a box's side, on each side of it: 1.4 x 1.4 is twice the area
-REACH = 0.15  # of the band, into which the thing may reach out of a box that is drawn too small
+REACH = 0.15  # of the band, into which the object may extend if the box is drawn too small
 
 
 def feature_shown(scene: OpenedLift, area: Area) -> np.ndarray:
-    """What a camera of the scene shows in an area of its image, [F] f64; of a pixel as scores are rendered.
+    """Return the feature of an area of a camera's image, [F] f64; of a pixel as scores are rendered.
 
     Raises:
         NotFound: no camera has this name.
@@ -47,7 +47,7 @@ def feature_shown(scene: OpenedLift, area: Area) -> np.ndarray:
 
 
 def _camera(scene: OpenedLift, area: Area) -> Camera:
-    """The camera of an area. Where no view is named "VIEW:box", `VIEW:box:x,y` is a box without all its corners."""
+    """Return the camera of an area; if no view is called "VIEW:box", `VIEW:box:x,y` is a box that lacks corners."""
     try:
         return scene.cameras[area.view]
     except NotFound:
@@ -57,7 +57,7 @@ def _camera(scene: OpenedLift, area: Area) -> Camera:
 
 
 def _pixels(area: Area, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """[n, 2] and [m, 2] i64 (x, y), pixels of an area and of the band around it."""
+    """Return pixels of an area and of the band around it, [n, 2] and [m, 2] i64 (x, y)."""
     none = np.zeros((0, 2), np.int64)
     if isinstance(area, PixelBox):
         if not (0 <= area.x0 < area.x1 <= width and 0 <= area.y0 < area.y1 <= height):
@@ -78,18 +78,18 @@ def _pixels(area: Area, width: int, height: int) -> tuple[np.ndarray, np.ndarray
     return (_line(corners) if isinstance(area, Stroke) else corners), none
 
 
-def _grid(left: int, top: int, right: int, bottom: int, most: int) -> np.ndarray:
-    """[n, 2] i64, evenly spaced pixels of a box, about as far apart across as down."""
+def _grid(left: int, top: int, right: int, bottom: int, limit: int) -> np.ndarray:
+    """Return at most ``limit`` evenly spaced pixels of a box, [n, 2] i64, with about equal spacing in x and y."""
     width, height = right - left, bottom - top
-    across = min(width, most, max(1, round(math.sqrt(most * width / height))))
-    down = min(height, max(1, most // across))
+    across = min(width, limit, max(1, round(math.sqrt(limit * width / height))))
+    down = min(height, max(1, limit // across))
     columns = left + (np.arange(across) * 2 + 1) * width // (2 * across)
     rows = top + (np.arange(down) * 2 + 1) * height // (2 * down)
     return np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
 
 
 def _line(corners: np.ndarray) -> np.ndarray:
-    """[n, 2] i64, evenly spaced pixels, each once, of the line through corners [k, 2]."""
+    """Return evenly spaced pixels of the line through corners [k, 2], each once, [n, 2] i64."""
     lengths = np.append(0, np.abs(np.diff(corners, axis=0)).max(axis=1).cumsum())
     steps = np.linspace(0, lengths[-1], min(int(lengths[-1]) + 1, AREA_PIXELS))
     pixels = np.rint([np.interp(steps, lengths, axis) for axis in corners.T]).astype(np.int64)
@@ -97,10 +97,10 @@ def _line(corners: np.ndarray) -> np.ndarray:
 
 
 def _rendered(scene: OpenedLift, camera: Camera, area: Area | None, pixels: np.ndarray) -> np.ndarray:
-    """``sum_j A_ij x_j`` of the rays of pixels [n, 2] that meet the scene, [m, F] f64.
+    """Compute ``sum_j A_ij x_j`` of the rays of pixels [n, 2] that hit the scene, [m, F] f64.
 
     Args:
-        area: whose pixels these are; where none of them meets the scene it is to blame. None: there may be none.
+        area: of these pixels, named in the error if none hits the scene. None: that is no error.
     """
     rays = _rays(scene, camera, area, pixels)
     features = [weights.astype(np.float64) @ scene.features[splats].astype(np.float64) for splats, weights in rays]
@@ -108,7 +108,7 @@ def _rendered(scene: OpenedLift, camera: Camera, area: Area | None, pixels: np.n
 
 
 def splats_shown(scene: OpenedLift, area: Area) -> tuple[np.ndarray, np.ndarray]:
-    """The splats on the rays of an area's pixels, [n] i32, and their weights there, [n] f32; some several times.
+    """Return the splats on the rays of an area's pixels, [n] i32 with repeats, and their weights there, [n] f32.
 
     Raises:
         NotFound, InvalidQuery, InvalidLift: as `feature_shown`.
@@ -122,38 +122,44 @@ def splats_shown(scene: OpenedLift, area: Area) -> tuple[np.ndarray, np.ndarray]
 def _rays(
     scene: OpenedLift, camera: Camera, area: Area | None, pixels: np.ndarray
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The splats and their weights on each of the rays of `_rendered`, whose arguments these are."""
+    """Return the splats and their weights on each ray that hits the scene; arguments as of `_rendered`."""
     import torch
 
     from liftcore.scene.cameras import drawn_by, pixel_of
 
-    what = "a pixel" if isinstance(area, Pixel) else "an area"
-    drawn = [place for x, y in pixels.tolist() if (place := pixel_of(camera, x, y)) is not None]
-    if not drawn:
+    noun = "a pixel" if isinstance(area, Pixel) else "an area"
+    pinhole_pixels = [place for x, y in pixels.tolist() if (place := pixel_of(camera, x, y)) is not None]
+    if not pinhole_pixels:
         if area is None:
             return []
         hint, got = "pick one nearer to the middle", "one at the rim of a wide lens"
-        raise InvalidQuery(str(area), expected=f"{what} that a pinhole sees", got=got, hint=hint)
-    found = scene.raster.ray_rows(drawn_by(camera), torch.tensor(drawn, dtype=torch.int32), scene.compositing)
-    ends, splats, weights = map(as_numpy, (found.indptr, found.splats, found.weights))
+        raise InvalidQuery(str(area), expected=f"{noun} within the pinhole's image", got=got, hint=hint)
+    ray_rows = scene.raster.ray_rows(
+        drawn_by(camera), torch.tensor(pinhole_pixels, dtype=torch.int32), scene.compositing
+    )
+    ends, splats, weights = map(as_numpy, (ray_rows.indptr, ray_rows.splats, ray_rows.weights))
     rays = [slice(first, last) for first, last in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True)]
-    met = [float(weights[ray].sum()) for ray in rays]
-    if area is not None and max(met) < MINIMUM_ROW_SUM:
-        got = f"{'a ray' if len(rays) == 1 else 'rays'} that splats fill by {max(met):.1%}"
-        raise InvalidQuery(str(area), expected=f"{what} that shows the scene", got=got, hint="pick one on a surface")
-    return [(splats[ray], weights[ray]) for ray, share in zip(rays, met, strict=True) if share >= MINIMUM_ROW_SUM]
+    row_sums = [float(weights[ray].sum()) for ray in rays]
+    if area is not None and max(row_sums) < MINIMUM_ROW_SUM:
+        got = f"{'a ray' if len(rays) == 1 else 'rays'} with an opacity of {max(row_sums):.1%}"
+        raise InvalidQuery(str(area), expected=f"{noun} that shows the scene", got=got, hint="pick one on a surface")
+    return [
+        (splats[ray], weights[ray]) for ray, share in zip(rays, row_sums, strict=True) if share >= MINIMUM_ROW_SUM
+    ]
 
 
 def _common(scene: OpenedLift, rows: np.ndarray, around: np.ndarray) -> np.ndarray:
-    """[F] f64, the common feature of those [n, F] of an area, which is not that of those [m, F] around it."""
+    """Return the common feature [F] f64 of the pixels [n, F] of an area, other than that of the band [m, F]."""
     lengths = np.linalg.norm(rows, axis=1, keepdims=True)
     units = (rows / np.maximum(lengths, np.finfo(np.float64).tiny)).astype(np.float32)
     everywhere = np.concatenate([rows, around]).astype(np.float32)
-    alike = cosines_about(everywhere, norms_of(everywhere), scene.mean, units)  # [n + m, n], as an example scores
-    among, weights = alike[: len(rows)], np.ones(len(rows))
+    similarities = cosines_about(
+        everywhere, norms_of(everywhere), scene.mean, units
+    )  # [n + m, n], as an example scores
+    among, weights = similarities[: len(rows)], np.ones(len(rows))
     if len(around):
-        weights = (1 - np.quantile(alike[len(rows) :], 1 - REACH, axis=0)) ** 2
+        weights = (1 - np.quantile(similarities[len(rows) :], 1 - REACH, axis=0)) ** 2
     likeness = (weights[:, None] * among).sum(axis=0)
-    chosen = int(np.argmax(np.where(lengths[:, 0] > 0, likeness, -np.inf)))
-    like = among[:, chosen] >= min(LEAST_LIKENESS, among[chosen, chosen])
+    best = int(np.argmax(np.where(lengths[:, 0] > 0, likeness, -np.inf)))
+    like = among[:, best] >= min(LEAST_LIKENESS, among[best, best])
     return ((weights if weights[like].any() else np.ones(len(rows))) * like) @ units.astype(np.float64)

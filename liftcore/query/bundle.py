@@ -1,4 +1,4 @@
-"""All that is known of some labels in one ZIP: splats with their numbers, names, boxes and counts; masks of views."""
+"""Labels as one ZIP: splats with their numbers; names, boxes and counts of classes and instances; masks of views."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from liftcore.query.opened import OpenedLift
 if TYPE_CHECKING:
     from liftcore.io.labels import Labels
 
-MOST_TRUTH = 1 << 25  # pixels of masks that are kept for the one file of them: of more there is none
-IN_MEMORY = 16 << 20  # bytes of the masks' JSON, before they go to a file
-MASK_CHARACTERS = str.maketrans('/\\:*?"<>|', "_________")  # that names of files do not take
+MOST_TRUTH = 1 << 25  # pixels of masks that are collected for ``truth.safetensors``; with more it is left out
+IN_MEMORY = 16 << 20  # bytes of the masks' JSON in memory, before they go to a temporary file
+MASK_CHARACTERS = str.maketrans('/\\:*?"<>|', "_________")  # characters that file names cannot have
 SIZE = 18  # pixels of a line of the legend
 
 
 def bundle(scene: OpenedLift, labels: Labels, view: str | None = None) -> Iterator[bytes]:
-    """A ZIP, in blocks: ``labels.ply``, ``labels.json``, ``instances.csv``, ``legend.png``, and masks of the views.
+    """Write a ZIP, in blocks: ``labels.ply``, ``labels.json``, ``instances.csv``, ``legend.png``, and masks of views.
 
     ``masks/VIEW.png`` has the number of the instance with the most weight on each pixel, as a palette in the legend's
-    colours, and ``masks.json`` has the same as COCO. ``truth.safetensors`` has the classes from 0, and -1 for none:
-    masks that a trade-off judges lifts by. Of very many pixels it is left out.
+    colours; ``masks.json`` has the same as COCO. ``truth.safetensors`` has the classes from 0, and -1 for none: masks
+    with which a trade-off evaluates lifts. It is left out above MOST_TRUTH pixels.
 
     Args:
-        view: whose masks alone are made; None: of all that were lifted.
+        view: the only view with masks; None: all lifted views.
 
     Raises:
         InvalidQuery: the labels have no instances.
-        NotFound, InvalidLift: the view is not there; splats or cameras moved or changed since the lift.
+        NotFound, InvalidLift: no such view; splats or cameras moved or changed since the lift.
     """
     instances = labels.document["instances"]
     if not instances:
@@ -54,19 +54,19 @@ def _entries(scene: OpenedLift, labels: Labels, view: str | None) -> Iterator[tu
     instances = labels.document["instances"]
     yield "labels.json", document_bytes(labels)
     yield "instances.csv", _table(instances)
-    yield "legend.png", legend_png([(_title(one), tuple(one["colour"])) for one in instances])
+    yield "legend.png", legend_png([(_title(instance), tuple(instance["colour"])) for instance in instances])
     yield "labels.ply", iter(labelled(scene.splat_file, labels, ".ply"))
-    most = max(one["instance_id"] for one in instances)
-    names, colours, kinds = [""] * most, np.zeros((most + 1, 3), np.uint8), np.full(most + 1, -1, np.int16)
-    for one in instances:
-        names[one["instance_id"] - 1], colours[one["instance_id"]] = _title(one), one["colour"]
-        kinds[one["instance_id"]] = one["class_id"] - 1  # the first of a trade-off's classes is 0
+    highest = max(instance["instance_id"] for instance in instances)
+    names, colours, kinds = [""] * highest, np.zeros((highest + 1, 3), np.uint8), np.full(highest + 1, -1, np.int16)
+    for instance in instances:
+        names[instance["instance_id"] - 1], colours[instance["instance_id"]] = _title(instance), instance["colour"]
+        kinds[instance["instance_id"]] = instance["class_id"] - 1  # the first of a trade-off's classes is 0
     pictures, truth = dict[str, bytes](), dict[str, np.ndarray]()
 
-    def keep(name: str, shown: np.ndarray) -> None:
-        pictures[name] = palette_png(shown, names, colours)
+    def keep(name: str, numbers: np.ndarray) -> None:
+        pictures[name] = palette_png(numbers, names, colours)
         if sum(map(np.size, truth.values())) < MOST_TRUTH:
-            truth[f"{name}/mask"] = kinds[shown]
+            truth[f"{name}/mask"] = kinds[numbers]
 
     views = scene.metadata.views if view is None else (view,)
     with SpooledTemporaryFile(IN_MEMORY) as coco:
@@ -81,26 +81,26 @@ def _entries(scene: OpenedLift, labels: Labels, view: str | None) -> Iterator[tu
 
 
 def _zipped(entries: Iterator[tuple[str, Iterator[bytes] | bytes]]) -> Iterator[bytes]:
-    """A ZIP of files by their names; a file that repeats a name gets a number."""
-    sink, seen = _Sink(), set[str]()
+    """Write files by their names to a ZIP; a file that repeats a name gets a number."""
+    sink, unique_names = _Sink(), set[str]()
     with zipfile.ZipFile(sink, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for name, content in entries:
             stem, dot, suffix = name.rpartition(".")
-            own, number = name, 1
-            while own in seen:
+            unique, number = name, 1
+            while unique in unique_names:
                 number += 1
-                own = f"{stem}-{number}{dot}{suffix}"
-            seen.add(own)
-            with archive.open(zipfile.ZipInfo(own, (1980, 1, 1, 0, 0, 0)), "w", force_zip64=True) as file:
+                unique = f"{stem}-{number}{dot}{suffix}"
+            unique_names.add(unique)
+            with archive.open(zipfile.ZipInfo(unique, (1980, 1, 1, 0, 0, 0)), "w", force_zip64=True) as file:
                 for block in [content] if isinstance(content, bytes) else content:
                     file.write(block)
-                    yield from sink.taken()
-            yield from sink.taken()
-    yield from sink.taken()
+                    yield from sink.take_blocks()
+            yield from sink.take_blocks()
+    yield from sink.take_blocks()
 
 
 class _Sink(io.RawIOBase):
-    """What is written to it, to be taken away."""
+    """Buffer of a ZIP's bytes, whose blocks are taken as they are written."""
 
     def __init__(self) -> None:
         self._blocks: list[bytes] = []
@@ -112,31 +112,37 @@ class _Sink(io.RawIOBase):
         self._blocks.append(bytes(block))
         return len(self._blocks[-1])
 
-    def taken(self) -> list[bytes]:
-        """The blocks since the last time."""
+    def take_blocks(self) -> list[bytes]:
+        """Return the blocks written since the last call."""
         blocks, self._blocks = self._blocks, []
         return blocks
 
 
-def _title(one: dict[str, Any]) -> str:
-    return f"{one.get('name') or 'thing'} {one['instance_id']}"
+def _title(instance: dict[str, Any]) -> str:
+    return f"{instance.get('name') or 'thing'} {instance['instance_id']}"
 
 
 def _table(instances: list[dict[str, Any]]) -> bytes:
-    """A line an instance: its numbers, name, colour, splats, score and box."""
+    """Write a CSV table of instances: numbers, name, colour, splats, score and box."""
     content = io.StringIO(newline="")
     writer = csv.writer(content)
     corners = [f"{end}_{axis}" for end in ("low", "high") for axis in "xyz"]
     writer.writerow(["instance_id", "class_id", "name", "red", "green", "blue", "splats", "score", *corners])
-    for one in instances:
-        box, score = one["box"], one.get("score")
-        head = [one["instance_id"], one["class_id"], one.get("name") or "", *one["colour"], one["splats"]]
+    for instance in instances:
+        box, score = instance["box"], instance.get("score")
+        head = [
+            instance["instance_id"],
+            instance["class_id"],
+            instance.get("name") or "",
+            *instance["colour"],
+            instance["splats"],
+        ]
         writer.writerow([*head, "" if score is None else f"{score:.6g}", *box["low"], *box["high"]])
     return content.getvalue().encode()
 
 
 def legend_png(rows: list[tuple[str, tuple[int, ...]]]) -> bytes:
-    """Names beside their colours, a line each, as a PNG."""
+    """Draw names with their colours, a line each, as a PNG."""
     from PIL import Image, ImageDraw, ImageFont
 
     font = ImageFont.load_default(SIZE)

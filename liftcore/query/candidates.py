@@ -1,11 +1,11 @@
-"""What a click may mean: the nested nodes of the lift's tree that hold what is shown there, the smallest first.
+"""Candidates for the target of a click: the nested nodes of the lift's tree at this place, the smallest first.
 
-A pixel shows splats by their weights on its ray, an area by those on the rays of its pixels, a splat itself. From the
-largest node down, the one with most of that weight is taken, a root where it has ROOT_SHARE of it, a part where it
-has half of what its whole has. One with more than TWIN_SHARE of the splats of its whole looks like that, and is left
-out. Of several examples a node must hold each, and none that an example against is in.
+A pixel has splats with their weights on its ray, an area those on the rays of its pixels, a splat only itself. From
+the largest node down, the node with most of this weight is taken: a root if it has ROOT_SHARE of it, a part if it has
+half of the weight of its whole. A part with more than TWIN_SHARE of the splats of its whole looks the same, and is
+left out. With several examples, a node must contain each, and no negative example.
 
-A text that names a part for which there is no word may mean any part of its thing (`parts_of`).
+A text that names a part for which there is no word may mean any part of its object (`parts_of`).
 """
 
 from __future__ import annotations
@@ -17,51 +17,55 @@ from liftcore.query.opened import OpenedLift
 from liftcore.query.question import Candidate, Query
 from liftcore.query.terms import Area, SplatSet, SplatTerm, Term
 
-MOST_PARTS = 8  # that are offered for a word: the largest
-TWIN_SHARE = 0.75  # of the splats of a whole: mistakes of masks leave such parts, and to the eye they are the whole
-ROOT_SHARE = 0.25  # of what is shown: less is what shines through, or lies beside the thing
+MOST_PARTS = 8  # candidates for a word, the largest
+TWIN_SHARE = 0.75  # of the splats of a whole: mistakes of masks leave such parts, which look like the whole
+ROOT_SHARE = 0.25  # of the weight at the click: less is visible through the object, or lies next to it
 
 
 def candidates(scene: OpenedLift, query: Query) -> tuple[Candidate, ...]:
-    """The nodes that examples of places may mean, nested, the smallest first; none for words and vectors.
+    """Return the nested nodes that examples of places may mean, the smallest first; () for words and vectors.
 
     Raises:
         InvalidQuery, NotFound, InvalidLift: as `liftcore.query.areas.feature_shown`.
     """
-    wanted, unwanted = query.positives, query.terms[len(query.positives) :]
-    if not wanted or scene.object_views is None or not all(isinstance(one, Area | SplatTerm) for one in wanted):
+    positives, negatives = query.positives, query.terms[len(query.positives) :]
+    if (
+        not positives
+        or scene.object_views is None
+        or not all(isinstance(term, Area | SplatTerm) for term in positives)
+    ):
         return ()
-    paths = [_path(scene, one) for one in wanted]
-    against = [set(_path(scene, one)) for one in unwanted if isinstance(one, Area | SplatTerm)]
-    kept = [
+    paths = [_path(scene, term) for term in positives]
+    against = [set(_path(scene, term)) for term in negatives if isinstance(term, Area | SplatTerm)]
+    shared = [
         node
         for node in paths[0]
         if all(node in path for path in paths) and not any(node in other for other in against)
     ]
     nodes = list[Candidate]()
-    for node in kept:
+    for node in shared:
         candidate = _candidate(scene, node, min(path[node] for path in paths))
         if not nodes or candidate.splats <= TWIN_SHARE * nodes[-1].splats:
             nodes.append(candidate)
     return tuple(reversed(nodes))
 
 
-def parts_of(scene: OpenedLift, things: np.ndarray) -> tuple[Candidate, ...]:
-    """The parts of some objects [N] bool, with the largest first, `MOST_PARTS` at most, and their shares of these."""
+def parts_of(scene: OpenedLift, objects: np.ndarray) -> tuple[Candidate, ...]:
+    """Return at most `MOST_PARTS` parts of some objects [N] bool, the largest first, with their shares of these."""
     if scene.node_parents is None or scene.object is None:
         return ()
-    whole = scene.evidence[np.append(things, False)[scene.object]].sum() or 1.0
+    total = scene.evidence[np.append(objects, False)[scene.object]].sum() or 1.0
     nodes = np.flatnonzero(
-        np.append(things, np.zeros(len(scene.node_parents) - len(things) + 1, np.bool_))[scene.node_parents]
+        np.append(objects, np.zeros(len(scene.node_parents) - len(objects) + 1, np.bool_))[scene.node_parents]
     )
-    found = [
-        _candidate(scene, node, float(scene.evidence[scene.members(node)].sum() / whole)) for node in nodes.tolist()
+    parts = [
+        _candidate(scene, node, float(scene.evidence[scene.members(node)].sum() / total)) for node in nodes.tolist()
     ]
-    return tuple(sorted(found, key=lambda one: (-one.share, one.id))[:MOST_PARTS])
+    return tuple(sorted(parts, key=lambda c: (-c.share, c.id))[:MOST_PARTS])
 
 
 def _path(scene: OpenedLift, example: Term) -> dict[int, float]:
-    """The nodes that hold what an example shows, the largest first, and what share of it each holds."""
+    """Return the nodes at an example's place, the largest first, and the share of its weight in each."""
     if isinstance(example, SplatTerm):
         rows, weights = np.array([example.splat]), np.ones(1)
     else:
@@ -77,18 +81,18 @@ def _path(scene: OpenedLift, example: Term) -> dict[int, float]:
         for node, weight in zip(above.tolist(), part.tolist(), strict=True):
             shares[node] = shares.get(node, 0.0) + weight
         above = parents[above]
-    path, whole, least = dict[int, float](), -1, ROOT_SHARE
-    while parts := [node for node in shares if parents[node] == whole]:
+    path, parent, least = dict[int, float](), -1, ROOT_SHARE
+    while parts := [node for node in shares if parents[node] == parent]:
         best = max(parts, key=lambda node: (shares[node], -node))
         if shares[best] < least:
             break
-        path[best], whole, least = shares[best], best, shares[best] / 2
+        path[best], parent, least = shares[best], best, shares[best] / 2
     return path
 
 
 def _candidate(scene: OpenedLift, node: int, share: float) -> Candidate:
-    named = SplatSet("object", str(node))
+    node_set = SplatSet("object", str(node))
     confidence = None if scene.node_confidence is None else float(scene.node_confidence[node])
     splats = int(scene.members(node).sum())
     kind = scene.node_kind(node)
-    return Candidate(id=node, set=str(named), kind=kind, splats=splats, share=share, confidence=confidence)
+    return Candidate(id=node, set=str(node_set), kind=kind, splats=splats, share=share, confidence=confidence)

@@ -1,11 +1,11 @@
-"""The objects of a lift and their parts, one by one: where each lies, how large it is, what shows it, and its name.
+"""Objects and parts of a lift: position, size, views and name of each.
 
-Objects are found at lift time by masks alone (`liftcore.solve.objects`); the lift keeps one number a splat. They are
+Objects are found at lift time by masks alone (`liftcore.solve.objects`); the lift stores one number a splat. They are
 numbered from 0, the one with the most evidence first, the same for the same lift. An object's feature is the mean of
-its splats' unit features by evidence. Its name is the nearest word, however far that is; the cosine says how far.
+its splats' unit features by evidence. Its name is the nearest word, even if that is far; its score is the cosine.
 
-Parts and groups are numbered after the objects. Their features are what their own masks say, without those of their
-parts (`liftcore.solve.objects.NodeVectors`): a splat's feature is the sum of what all levels say.
+Parts and groups are numbered after the objects. Their features are those of their own masks, without their parts
+(`liftcore.solve.objects.NodeVectors`), as a splat's feature is the sum over all levels.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any, Literal
 import numpy as np
 
 from liftcore.errors import InvalidQuery
-from liftcore.query.objects import size_of, thing_box
+from liftcore.query.objects import object_box, size_of
 from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.question import ListedObjects, Point, SceneNode, SceneObject, SceneTree
 from liftcore.query.relations import relations as related
@@ -34,7 +34,7 @@ from liftcore.text import check_texts
 MOST_WORDS = 65_536  # of a vocabulary: their vectors take 130 MB at 512 channels
 NO_TREE = "this lift holds no tree: it was made before lifts had one; lift again"
 NONE_FOUND = "no object: masks of three views never keep the same splats together"
-_BLOCK = 1 << 14  # rows of features widened at once
+_BLOCK = 1 << 14  # rows of features converted to f32 at once
 
 
 @dataclass(frozen=True)
@@ -43,30 +43,32 @@ class Catalogue:
 
     objects: tuple[SceneObject, ...]
     explanation: str
-    """why there are as many as there are"""
+    """the number of objects and its reason, in a sentence"""
     features: np.ndarray
     """[N, F] f32, unit means; zero where no splat has a feature"""
     world: WorldFrame = UNKNOWN
-    """which way is up and how long a unit is, by which sizes are told"""
+    """up axis and length unit, in which sizes are given"""
 
     def __repr__(self) -> str:
-        some = ", ".join(f"{one.name or one.id}: {one.splats}" for one in self.objects)
-        return one_line(self, f"{len(self.objects)} objects", f"features={list(self.features.shape)}", some or "none")
+        text = ", ".join(f"{obj.name or obj.id}: {obj.splats}" for obj in self.objects)
+        return one_line(self, f"{len(self.objects)} objects", f"features={list(self.features.shape)}", text or "none")
 
-    def listed(self, first: int = 0, last: int | None = None, *, features: bool = False) -> Iterator[SceneObject]:
-        """The objects from a place to another; with ``features`` each has its mean feature."""
+    def iterate_objects(
+        self, first: int = 0, last: int | None = None, *, features: bool = False
+    ) -> Iterator[SceneObject]:
+        """Iterate over the objects ``first:last``; with ``features`` each has its mean feature."""
         rows = zip(self.objects[first:last], self.features[first:last], strict=True)
-        return (one.model_copy(update={"feature": tuple(row.tolist())}) if features else one for one, row in rows)
+        return (obj.model_copy(update={"feature": tuple(row.tolist())}) if features else obj for obj, row in rows)
 
     def summary(self, *, features: bool = False) -> ListedObjects:
-        """All of them, as JSON has them."""
-        things = tuple(self.listed(features=features))
-        facts = {"explanation": self.explanation, "count": len(things), "objects": things}
+        """Return all objects as the model that is written as JSON."""
+        objects = tuple(self.iterate_objects(features=features))
+        facts = {"explanation": self.explanation, "count": len(objects), "objects": objects}
         return ListedObjects(**facts, world=self.world, unit=self.world.unit)
 
 
 def catalogue(scene: OpenedLift, words: Sequence[str] = (), vectors: Any = None) -> Catalogue:
-    """The objects of a lift, named by the nearest of some words.
+    """List the objects of a lift, named by the nearest of some words.
 
     Args:
         scene: an opened lift. words: n. vectors: [n, F], torch or numpy, their text vectors.
@@ -79,12 +81,12 @@ def catalogue(scene: OpenedLift, words: Sequence[str] = (), vectors: Any = None)
         return Catalogue((), scene.lack_of_objects(), np.zeros((0, scene.channels), np.float32), scene.world)
     number = len(scene.object_views)
     features = object_features(scene)
-    named, ids = _named(features, words, vectors), np.arange(number)
-    facts = _described(scene, ids, scene.object, ids, scene.object_views, named)
+    naming, ids = _name_objects(features, words, vectors), np.arange(number)
+    facts = _describe_nodes(scene, ids, scene.object, ids, scene.object_views, naming)
     count = "1 object" if len(facts) == 1 else f"{len(facts)} objects"
-    told = f"{count}, which masks of three or more views keep together" if facts else NONE_FOUND
-    things = tuple(SceneObject(**one) for one in facts)
-    return Catalogue(things, told, features[[one["id"] for one in facts]], scene.world)
+    explanation = f"{count}, which masks of three or more views keep together" if facts else NONE_FOUND
+    objects = tuple(SceneObject(**fields) for fields in facts)
+    return Catalogue(objects, explanation, features[[fields["id"] for fields in facts]], scene.world)
 
 
 def tree(
@@ -95,7 +97,7 @@ def tree(
     relations: bool = False,
     up: Point | Literal["cameras"] | None = None,
 ) -> SceneTree:
-    """The objects of a lift with their parts and groups, named by the nearest of some words.
+    """List the objects of a lift with their parts and groups, named by the nearest of some words.
 
     Args:
         scene, words, vectors: as of `catalogue`. relations, up: as of `Scene.tree`.
@@ -116,52 +118,52 @@ def tree(
     place = np.empty(len(parents) + 1, np.int64)
     place[order], place[-1] = np.arange(len(parents)), -1
     splats, above = place[scene.node], place[parents[order]]
-    named = _named(features[order], words, vectors)
-    facts = _described(scene, order, splats, above, scene.node_views[order], named)
-    nodes, listed = [], {int(order[one["id"]]): one for one in facts}
-    for node, one in sorted(listed.items()):
+    naming = _name_objects(features[order], words, vectors)
+    facts = _describe_nodes(scene, order, splats, above, scene.node_views[order], naming)
+    nodes, by_node = [], {int(order[fields["id"]]): fields for fields in facts}
+    for node, fields in sorted(by_node.items()):
         path = scene.node_path(node)
-        under = [part for part in np.flatnonzero(parents == node).tolist() if part in listed]
-        more = {"id": node, "kind": scene.node_kind(node), "path": path, "parts": tuple(under)}
+        under = [part for part in np.flatnonzero(parents == node).tolist() if part in by_node]
+        tree_fields = {"id": node, "kind": scene.node_kind(node), "path": path, "parts": tuple(under)}
         parent = int(parents[node]) if parents[node] >= 0 else None
         confidence = float(scene.node_confidence[node])
-        nodes.append(SceneNode(**one | more, parent=parent, confidence=confidence))
+        nodes.append(SceneNode(**fields | tree_fields, parent=parent, confidence=confidence))
     explanation = _counts(nodes) if nodes else NONE_FOUND
     answer = SceneTree(explanation=explanation, count=len(nodes), nodes=tuple(nodes), **measured)
     if not relations:
         return answer
-    own = upright(scene.cameras.values()) if up == "cameras" else up
-    world = WorldFrame(up=own).known_or(scene.world)
+    up_axis = upright(scene.cameras.values()) if up == "cameras" else up
+    world = WorldFrame(up=up_axis).known_or(scene.world)
     members = [np.flatnonzero(scene.members(node)) for node in range(objects)]
-    found = related(scene.splats, members, scene.evidence, world)
-    return answer.model_copy(update={"world": world, "relations": found})
+    node_relations = related(scene.splats, members, scene.evidence, world)
+    return answer.model_copy(update={"world": world, "relations": node_relations})
 
 
 def _counts(nodes: Sequence[SceneNode]) -> str:
-    """How many objects, parts and groups there are, such as ``1 object with 2 parts, in 1 group``."""
-    counts = {kind: sum(one.kind == kind for one in nodes) for kind in ("object", "part", "group")}
+    """Count objects, parts and groups in words, such as ``1 object with 2 parts, in 1 group``."""
+    counts = {kind: sum(node.kind == kind for node in nodes) for kind in ("object", "part", "group")}
     objects, parts, groups = (f"{count} {kind}{'s' * (count != 1)}" for kind, count in counts.items())
     parts = f" with {parts if counts['part'] else 'no parts'}"
     return objects + parts + (f", in {groups}" if counts["group"] else "")
 
 
-def _described(
+def _describe_nodes(
     scene: OpenedLift,
     nodes: np.ndarray,
     labels: np.ndarray,
     above: np.ndarray,
     views: np.ndarray,
-    named: tuple[list[str | None], list[float | None]],
+    naming: tuple[list[str | None], list[float | None]],
 ) -> list[dict[str, Any]]:
-    """The fields of a `SceneObject` of each of some nodes, whose splats are also those of the nodes above them.
+    """Return the fields of a `SceneObject` for each node; the splats of a node belong to all nodes above it, too.
 
-    Nodes without splats, which lifts of other programs may have, are left out. Boxes are kept with the scene: they
-    take nearly all the time, and words change none.
+    Nodes without splats, which lifts of other programs may have, are left out. Boxes are cached in the scene: they
+    take most of the time, and do not depend on words.
 
     Args:
-        nodes: [N], their ids. labels: [P] i32, the place of the smallest node of each splat, -1 for none.
-        above: [N], the place of the node above each, which comes before it; -1 or itself: none.
-        views: [N, V] i32. named: name and score of each.
+        nodes: [N], their ids. labels: [P] i32, the index of the smallest node of each splat, -1 for none.
+        above: [N], the index of the node above each, which comes before it; -1 or its own index: none.
+        views: [N, V] i32. naming: name and score of each.
     """
     order = np.argsort(labels, kind="stable")
     ends = np.searchsorted(labels[order], np.arange(len(views) + 1))
@@ -170,44 +172,44 @@ def _described(
         if 0 <= above[node] < node:
             rows_of[above[node]] = np.concatenate([rows_of[above[node]], rows_of[node]])
     evidence = scene.evidence.astype(np.float64)
-    whole, known = evidence.sum() or 1.0, scene.metadata.views
-    found = []
-    for one, (name, score, mixed) in enumerate(zip(*named, rows_of, strict=True)):
-        if not mixed.size:
+    total, view_names = evidence.sum() or 1.0, scene.metadata.views
+    entries = []
+    for index, (name, score, unsorted_rows) in enumerate(zip(*naming, rows_of, strict=True)):
+        if not unsorted_rows.size:
             continue
-        rows = np.sort(mixed)
+        rows = np.sort(unsorted_rows)
         weights = evidence[rows] if evidence[rows].any() else np.ones(rows.size)
-        key = int(nodes[one]), rows.size
+        key = int(nodes[index]), rows.size
         if key not in scene.node_boxes:
-            scene.node_boxes[key] = thing_box(scene.splats, rows, weights)
+            scene.node_boxes[key] = object_box(scene.splats, rows, weights)
         box = scene.node_boxes[key]
         x, y, z = np.mean(box, axis=0).tolist()
-        shown = tuple(known[view] for view in views[one] if 0 <= view < len(known))
-        share = float(evidence[rows].sum() / whole)
-        found.append(
-            {"id": one, "name": name, "score": score, "splats": int(rows.size), "share": share, "centre": (x, y, z)}
-            | {"box": box, "size": size_of(scene.world, box), "views": shown}
+        visible_views = tuple(view_names[view] for view in views[index] if 0 <= view < len(view_names))
+        share = float(evidence[rows].sum() / total)
+        entries.append(
+            {"id": index, "name": name, "score": score, "splats": int(rows.size), "share": share, "centre": (x, y, z)}
+            | {"box": box, "size": size_of(scene.world, box), "views": visible_views}
         )
-    return found
+    return entries
 
 
 def object_features(scene: OpenedLift) -> np.ndarray:
-    """[N, F] f32: the unit mean of each object's unit features, by evidence; zeros where none has a feature."""
+    """Return the unit mean [N, F] f32 of each object's unit features by evidence; zeros if no splat has a feature."""
     if scene.object_features is None:
-        scene.object_features = _object_means(scene)
+        scene.object_features = _compute_object_features(scene)
     return scene.object_features
 
 
-def _object_means(scene: OpenedLift) -> np.ndarray:
+def _compute_object_features(scene: OpenedLift) -> np.ndarray:
     from scipy.sparse import csr_array
 
     assert scene.object is not None and scene.object_views is not None
     number = len(scene.object_views)
     sums = np.zeros((number, scene.channels))
     weights = np.where(scene.seen, scene.evidence / np.where(scene.seen, scene.norms, 1.0), 0.0)
-    chosen = np.flatnonzero((scene.object >= 0) & (weights > 0))
-    for first in range(0, chosen.size, _BLOCK):
-        rows = chosen[first : first + _BLOCK]
+    indices = np.flatnonzero((scene.object >= 0) & (weights > 0))
+    for first in range(0, indices.size, _BLOCK):
+        rows = indices[first : first + _BLOCK]
         places = scene.object[rows], np.arange(rows.size)
         shares = csr_array((weights[rows].astype(np.float64), places), shape=(number, rows.size))
         sums += shares @ scene.features[rows].astype(np.float32)
@@ -215,8 +217,10 @@ def _object_means(scene: OpenedLift) -> np.ndarray:
     return np.divide(sums, lengths, out=np.zeros_like(sums), where=lengths > 0).astype(np.float32)
 
 
-def _named(features: np.ndarray, words: Sequence[str], vectors: Any) -> tuple[list[str | None], list[float | None]]:
-    """Name and cosine of each object; None without words, and for an object without a feature."""
+def _name_objects(
+    features: np.ndarray, words: Sequence[str], vectors: Any
+) -> tuple[list[str | None], list[float | None]]:
+    """Return name and cosine of each object; None without words, and for an object without a feature."""
     number = len(features)
     check_texts(words, "words")
     if not words:
@@ -235,30 +239,30 @@ def _named(features: np.ndarray, words: Sequence[str], vectors: Any) -> tuple[li
         place = scores.argmax(axis=1)
         higher = scores[np.arange(number), place] > best
         nearest[higher], best[higher] = first + place[higher], scores[np.arange(number), place][higher]
-    known = norms > 0
-    names = [words[row] if has else None for row, has in zip(nearest.tolist(), known, strict=True)]
-    return names, [score if has else None for score, has in zip(best.tolist(), known, strict=True)]
+    has_feature = norms > 0
+    names = [words[row] if has else None for row, has in zip(nearest.tolist(), has_feature, strict=True)]
+    return names, [score if has else None for score, has in zip(best.tolist(), has_feature, strict=True)]
 
 
-def table_csv(found: Catalogue) -> bytes:
-    """The catalogue as a table: a line an object."""
+def table_csv(source: Catalogue) -> bytes:
+    """Write the catalogue as a CSV table, a line an object."""
     content = io.StringIO(newline="")
     writer = csv.writer(content)
     corners = [f"{end}_{axis}" for end in ("low", "high") for axis in "xyz"]
     sides = [f"size_{axis}" for axis in "xyz"]
     writer.writerow(["id", "name", "score", "splats", "share", "x", "y", "z", *corners, "views", *sides, "unit"])
-    for one in found.objects:
-        low, high = one.box
-        named = "" if one.name is None else one.name, "" if one.score is None else f"{one.score:.6g}"
+    for obj in source.objects:
+        low, high = obj.box
+        label = "" if obj.name is None else obj.name, "" if obj.score is None else f"{obj.score:.6g}"
         digits = 9 if max(map(abs, (*low, *high))) < MAP_REACH else 15  # as many as the boxes' numbers have
-        numbers = (f"{value:.{digits}g}" for value in (one.share, *one.centre, *low, *high))
-        size = (f"{side:.6g}" for side in one.size)
-        writer.writerow([one.id, *named, one.splats, *numbers, " ".join(one.views), *size, found.world.unit])
+        numbers = (f"{value:.{digits}g}" for value in (obj.share, *obj.centre, *low, *high))
+        size = (f"{side:.6g}" for side in obj.size)
+        writer.writerow([obj.id, *label, obj.splats, *numbers, " ".join(obj.views), *size, source.world.unit])
     return content.getvalue().encode()
 
 
 def one_object_splats(scene: OpenedLift, number: int, suffix: str = ".ply") -> Iterable[bytes]:
-    """The splats of one object, or another node, as a file in blocks; of a PLY every property of theirs to the byte.
+    """Write the splats of an object or another node as a file, in blocks; a PLY has all their properties unchanged.
 
     Raises:
         NotFound: the lift has no such object.

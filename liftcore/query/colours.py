@@ -1,4 +1,4 @@
-"""Colours of scores and clusters, as people read them: arcs through OKLab (Ottosson 2020)."""
+"""Colours of scores and clusters: perceptually even arcs through OKLab (Ottosson 2020)."""
 
 import functools
 import math
@@ -14,7 +14,7 @@ _MAP_STEPS = 256
 _MAP_LIGHTNESS = (0.18, 0.93)
 _MAP_HUE = (math.radians(300), math.radians(105))
 _MAP_CHROMA = (0.10, 0.17)
-_HEAT_RANGE = (0.01, 0.999)  # quantiles that the map spans: one hot pixel dims no picture
+_HEAT_RANGE = (0.01, 0.999)  # quantiles that the map spans: one high outlier does not darken the picture
 
 _CLUSTER_LIGHTNESS = (0.72, 0.86, 0.58)
 _CLUSTER_CHROMA = 0.13
@@ -30,40 +30,40 @@ def colour_map() -> np.ndarray:
     return _srgb(lightness, chroma * np.cos(hue), chroma * np.sin(hue))
 
 
-def heat_colours(values: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Scores through the colour map, which spans the known ones from their 1st to their 99.9th percentile.
+def heat_colours(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Colour scores by the map, which spans the valid ones from their 1st to their 99.9th percentile.
 
     Args:
-        values: [...] f32. known: [...] bool.
+        values: [...] f32. valid: [...] bool, True where there is a score.
 
     Returns:
-        [..., 3] u8 sRGB, black where not known.
+        [..., 3] u8 sRGB, black where not valid.
     """
-    if not known.any():
+    if not valid.any():
         return np.zeros((*values.shape, 3), dtype=np.uint8)
-    low, high = np.quantile(values[known], _HEAT_RANGE)
-    return map_colours((values - low) / (high - low) if high > low else np.zeros_like(values), known)
+    low, high = np.quantile(values[valid], _HEAT_RANGE)
+    return map_colours((values - low) / (high - low) if high > low else np.zeros_like(values), valid)
 
 
-def map_colours(level: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Levels [...] from 0 to 1 through the colour map, [..., 3] u8 sRGB; black where not known."""
+def map_colours(level: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Colour levels [...] from 0 to 1 by the map, [..., 3] u8 sRGB; black where not valid."""
     colours = colour_map()
     picture = colours[np.round(level.clip(0.0, 1.0) * (len(colours) - 1)).astype(np.int64)]
-    picture[~known] = 0
+    picture[~valid] = 0
     return picture
 
 
 def cluster_colours(count: int) -> np.ndarray:
-    """[count + 1, 3] u8 sRGB: a colour a cluster, and grey last, where label -1 points; beyond 216 they repeat."""
-    colours = _apart()[np.arange(count) % len(_apart())]
+    """Return a colour a cluster, and grey last for label -1, [count + 1, 3] u8 sRGB; beyond 216 they repeat."""
+    colours = _distinct_colours()[np.arange(count) % len(_distinct_colours())]
     return np.concatenate([colours, np.array([NO_CLUSTER_COLOUR], dtype=np.uint8)])
 
 
 @functools.cache
-def _apart() -> np.ndarray:
-    """[216, 3] u8 sRGB, each as far as can be from all before it (Gonzalez 1985), hue before lightness.
+def _distinct_colours() -> np.ndarray:
+    """Return colours [216, 3] u8 sRGB, each as far as possible from all before it (Gonzalez 1985).
 
-    A scene's own shading changes the lightness of what is painted over it, so that counts less.
+    Lightness counts half, as the shading of a scene changes the lightness of the colours painted over it.
     """
     hue, lightness = np.meshgrid(np.linspace(0, 2 * np.pi, _HUES, endpoint=False), _CLUSTER_LIGHTNESS)
     hue, lightness = hue.ravel(), lightness.ravel()

@@ -1,7 +1,7 @@
-"""What every splat is, for other programs: numbers a splat, and a document of what they mean.
+"""Labels of all splats for other programs: class and instance numbers per splat, and a document that explains them.
 
-Every source gives the same: a segmentation has words as classes and groups of splats that touch as instances, an
-answer its texts as the one class and its objects as instances, a catalogue the things of the lift.
+All sources give the same format. A segmentation has words as classes, and groups of touching splats as instances. An
+answer has its texts as the one class, and its objects as instances. A catalogue has the objects of the lift.
 """
 
 from __future__ import annotations
@@ -33,40 +33,40 @@ FRAMES = {
 
 
 def labels(scene: OpenedLift, source: Segmentation | Answer | Mapping[str, Answer] | Catalogue | SceneTree) -> Labels:
-    """The labels of a segmentation, of answers, or of the objects of a lift, with their parts where it is its tree.
+    """Return the labels of a segmentation, of answers, or of a lift's objects, of a tree with their parts.
 
-    Of a segmentation ``class_id`` is the value of a splat's word (`Segmentation.values`), ``instance_id`` counts
-    groups of splats of one word that touch (`liftcore.scene.touching`), with the most evidence first; groups with
-    less than a twentieth of the evidence of their word's largest have a class alone. Of an answer every selected
-    splat has class 1, and the instances are its objects. Of several answers, by names, each is a class; a splat that
-    several select is of the one whose threshold it passes by most. Of a catalogue the instances are its objects, and
-    the classes their names; without names there are none. Of a tree they are those of its objects, and ``node_id`` is
-    the smallest node of a splat, an object, a part or a group: its id and one more. 0 is none of all. ``score`` is
-    the cosine to the word, or the answer's score. ``confidence`` is the lift's, where it was reweighted; other lifts
-    have none.
+    Of a segmentation, ``class_id`` is the value of a splat's word (`Segmentation.values`), and ``instance_id``
+    numbers the groups of touching splats of one word (`liftcore.scene.touching`), the one with the most evidence
+    first; groups with less than a twentieth of the evidence of their word's largest have only a class. Of an answer,
+    every selected splat has class 1, and the instances are its objects. Of several answers by name, each is a class;
+    a splat that several select belongs to the one whose threshold it exceeds most. Of a catalogue, the instances are
+    its objects and the classes their names; without names there are no classes. Of a tree, instances and classes are
+    those of its objects, and ``node_id`` is 1 + the id of the smallest node of a splat: object, part or group. 0
+    means none in all columns. ``score`` is the cosine to the word, or the answer's score. ``confidence`` is that of
+    a reweighted lift; other lifts have none.
 
     Raises:
-        InvalidQuery: nothing was found, or more splats than objects are made of.
+        InvalidQuery: no splat has a label, or more splats are selected than are grouped to objects.
         InvalidLift: the splats moved or changed since the lift.
     """
-    parts = dict(source) if isinstance(source, Mapping) else {None: source}  # a copy: theirs may change
+    parts = dict(source) if isinstance(source, Mapping) else {None: source}  # a copy: the caller's may change
     if (
         scene.labelled is None
         or not _are_same(scene.labelled[0], parts)
         or scene.labelled[1].document["world"] != scene.world.model_dump(mode="json")
     ):
         if isinstance(source, Answer | Mapping):
-            made = _of_answers(scene, {_name(source): source} if isinstance(source, Answer) else source)
+            result = _of_answers(scene, {_name(source): source} if isinstance(source, Answer) else source)
         else:
             of_objects = isinstance(source, Catalogue | SceneTree)
-            made = _of_objects(scene, source) if of_objects else _of_words(scene, source)
-        scene.labelled = parts, made
+            result = _of_objects(scene, source) if of_objects else _of_words(scene, source)
+        scene.labelled = parts, result
     columns: Labels = scene.labelled[1]
     return columns
 
 
-def _are_same(parts: Mapping[Any, Any], others: Mapping[Any, Any]) -> bool:
-    return list(parts) == list(others) and all(part is others[name] for name, part in parts.items())
+def _are_same(parts: Mapping[Any, Any], cached: Mapping[Any, Any]) -> bool:
+    return list(parts) == list(cached) and all(part is cached[name] for name, part in parts.items())
 
 
 def _name(answer: Answer) -> str:
@@ -75,106 +75,106 @@ def _name(answer: Answer) -> str:
 
 def _of_words(scene: OpenedLift, segmentation: Segmentation) -> Labels:
     values, colours = segmentation.values, segmentation.colours.tolist()
-    instances, told = np.zeros(len(values), np.int32), list[dict[str, Any]]()
-    for value, named in enumerate(segmentation.found, 1):
+    instances, entries = np.zeros(len(values), np.int32), list[dict[str, Any]]()
+    for value, label in enumerate(segmentation.found, 1):
         rows = np.flatnonzero(values == value)
         weights = _weights(scene, rows)
         groups = touching(scene.splats, rows)
         sums = np.bincount(groups, weights)
         for group in np.argsort(-sums, kind="stable")[: int((sums >= LEAST_EVIDENCE * sums.max()).sum())].tolist():
-            own = rows[groups == group]
-            instances[own] = len(told) + 1
-            one = {"instance_id": len(told) + 1, "class_id": value, "name": named.word, "question": named.word}
-            told.append(one | {"colour": colours[value]} | _facts(scene, own, segmentation.score))
+            members = rows[groups == group]
+            instances[members] = len(entries) + 1
+            entry = {"instance_id": len(entries) + 1, "class_id": value, "name": label.word, "question": label.word}
+            entries.append(entry | {"colour": colours[value]} | _facts(scene, members, segmentation.score))
     classes = [
         {
             "class_id": value,
-            "name": named.word,
+            "name": label.word,
             "colour": colours[value],
-            "splats": named.splats,
-            "score": named.score,
-            "margin": named.margin,
-            "box": {"low": named.box[0], "high": named.box[1]},
+            "splats": label.splats,
+            "score": label.score,
+            "margin": label.margin,
+            "box": {"low": label.box[0], "high": label.box[1]},
         }
-        for value, named in enumerate(segmentation.found, 1)
+        for value, label in enumerate(segmentation.found, 1)
     ]
-    return _labels(scene, values, instances, segmentation.score, classes, told)
+    return _labels(scene, values, instances, segmentation.score, classes, entries)
 
 
 def _of_answers(scene: OpenedLift, answers: Mapping[str, Answer]) -> Labels:
-    found = {name: (one, objects(scene, one)) for name, one in answers.items() if one.count and not one.dropped}
-    if not found:
+    selections = {name: (a, objects(scene, a)) for name, a in answers.items() if a.count and not a.dropped}
+    if not selections:
         first = next(iter(answers.values()))
         got = first.why.rstrip(".") if first.dropped else "none above the threshold"
-        raise InvalidQuery("source", expected="an answer that found splats", got=got, hint="ask in other words")
+        raise InvalidQuery("source", expected="an answer with selected splats", got=got, hint="ask in other words")
     count = len(scene.features)
-    chosen, best = np.zeros(count, np.int32), np.full(count, -np.inf)
+    class_ids, best = np.zeros(count, np.int32), np.full(count, -np.inf)
     scores, instances = np.zeros(count, np.float32), np.zeros(count, np.int32)
-    for value, (answer, _) in enumerate(found.values(), 1):
+    for value, (answer, _) in enumerate(selections.values(), 1):
         cut = answer.threshold.value
         over = (answer.scores - cut) / max(float(answer.scores.max()) - cut, 1e-9)  # as the page colours them
-        better = answer.selected & ((over > best) | (chosen == 0))
-        chosen[better], best[better], scores[better] = value, over[better], answer.scores[better]
-    colours = cluster_colours(sum(len(things.objects) for _, things in found.values())).tolist()
-    told, classes = list[dict[str, Any]](), list[dict[str, Any]]()
-    for value, (name, (answer, things)) in enumerate(found.items(), 1):
-        classes.append({"class_id": value, "name": name, "splats": int((chosen == value).sum()), "question": name})
-        for number in range(len(things.objects)):
-            rows = np.flatnonzero((things.numbers == number) & (chosen == value))
+        better = answer.selected & ((over > best) | (class_ids == 0))
+        class_ids[better], best[better], scores[better] = value, over[better], answer.scores[better]
+    colours = cluster_colours(sum(len(groups.objects) for _, groups in selections.values())).tolist()
+    entries, classes = list[dict[str, Any]](), list[dict[str, Any]]()
+    for value, (name, (answer, groups)) in enumerate(selections.items(), 1):
+        classes.append({"class_id": value, "name": name, "splats": int((class_ids == value).sum()), "question": name})
+        for number in range(len(groups.objects)):
+            rows = np.flatnonzero((groups.numbers == number) & (class_ids == value))
             if not rows.size:
                 continue
-            instances[rows] = len(told) + 1
-            one = {"instance_id": len(told) + 1, "class_id": value, "name": name, "question": name}
-            told.append(one | {"colour": colours[len(told)]} | _facts(scene, rows, answer.scores))
-    return _labels(scene, chosen, instances, scores, classes, told)
+            instances[rows] = len(entries) + 1
+            entry = {"instance_id": len(entries) + 1, "class_id": value, "name": name, "question": name}
+            entries.append(entry | {"colour": colours[len(entries)]} | _facts(scene, rows, answer.scores))
+    return _labels(scene, class_ids, instances, scores, classes, entries)
 
 
 def _of_objects(scene: OpenedLift, source: Catalogue | SceneTree) -> Labels:
     objects: Sequence[SceneObject]
     if isinstance(source, SceneTree):
-        objects = [one for one in source.nodes if one.kind == "object"]
+        objects = [obj for obj in source.nodes if obj.kind == "object"]
     else:
         objects = source.objects
     if not objects or scene.object is None or scene.object_views is None:
         raise InvalidQuery("source", expected="a lift with objects", got=source.explanation, hint="export words")
-    names = list(dict.fromkeys(one.name for one in objects if one.name is not None))
+    names = list(dict.fromkeys(obj.name for obj in objects if obj.name is not None))
     class_of = {name: value for value, name in enumerate(names, 1)}
     colours = cluster_colours(len(scene.object_views if scene.node_parents is None else scene.node_parents)).tolist()
-    numbers, told = np.zeros(len(scene.object_views) + 1, np.int32), []  # the last is of -1
+    numbers, entries = np.zeros(len(scene.object_views) + 1, np.int32), []  # the last is of -1
     scores = np.zeros(len(scene.object_views) + 1, np.float32)
-    for one in objects:
-        numbers[one.id] = class_of.get(one.name or "", 0)
-        scores[one.id] = one.score or 0.0
-        entry: dict[str, Any] = {"instance_id": one.id + 1, "class_id": int(numbers[one.id]), "name": one.name}
-        told.append(entry | _described(scene, one, colours[one.id]))
+    for obj in objects:
+        numbers[obj.id] = class_of.get(obj.name or "", 0)
+        scores[obj.id] = obj.score or 0.0
+        entry: dict[str, Any] = {"instance_id": obj.id + 1, "class_id": int(numbers[obj.id]), "name": obj.name}
+        entries.append(entry | _entry_of(scene, obj, colours[obj.id]))
     values = numbers[scene.object]
     classes = [
         {"class_id": value, "name": name, "splats": int((values == value).sum())}
         for value, name in enumerate(names, 1)
     ]
-    made = _labels(scene, values, scene.object + 1, scores[scene.object] if names else None, classes, told)
+    result = _labels(scene, values, scene.object + 1, scores[scene.object] if names else None, classes, entries)
     if scene.node is None or not isinstance(source, SceneTree):
-        return made
-    listed = [_path(one) | _described(scene, one, colours[one.id]) for one in source.nodes]
+        return result
+    node_entries = [_path(obj) | _entry_of(scene, obj, colours[obj.id]) for obj in source.nodes]
     for entry, node in zip(
-        made.document["instances"], (one for one in source.nodes if one.kind == "object"), strict=True
+        result.document["instances"], (obj for obj in source.nodes if obj.kind == "object"), strict=True
     ):
         entry.update(_path(node))
-    columns = made.columns | {"node_id": scene.node + 1}
-    return Labels(columns, made.document | {"columns": list(columns), "nodes": listed})
+    columns = result.columns | {"node_id": scene.node + 1}
+    return Labels(columns, result.document | {"columns": list(columns), "nodes": node_entries})
 
 
-def _path(one: SceneNode) -> dict[str, Any]:
-    """Where a node is in the tree, by the numbers of the column ``node_id``."""
-    path = [node + 1 for node in one.path]
-    facts = {"node_id": one.id + 1, "kind": one.kind, "name": one.name, "parent": path[-2] if len(path) > 1 else 0}
-    return facts | {"depth": len(path) - 1, "path": path, "parts": [node + 1 for node in one.parts]}
+def _path(node: SceneNode) -> dict[str, Any]:
+    """Return the position of a node in the tree, by the numbers of the column ``node_id``."""
+    path = [number + 1 for number in node.path]
+    facts = {"node_id": node.id + 1, "kind": node.kind, "name": node.name, "parent": path[-2] if len(path) > 1 else 0}
+    return facts | {"depth": len(path) - 1, "path": path, "parts": [number + 1 for number in node.parts]}
 
 
-def _described(scene: OpenedLift, one: SceneObject, colour: list[int]) -> dict[str, Any]:
-    facts = _facts(scene, np.flatnonzero(scene.members(one.id)), None)
-    entry = {"colour": colour, "score": one.score, "share": one.share, "views": list(one.views)} | facts
-    return entry | {"box": {"low": one.box[0], "high": one.box[1]}}
+def _entry_of(scene: OpenedLift, obj: SceneObject, colour: list[int]) -> dict[str, Any]:
+    facts = _facts(scene, np.flatnonzero(scene.members(obj.id)), None)
+    entry = {"colour": colour, "score": obj.score, "share": obj.share, "views": list(obj.views)} | facts
+    return entry | {"box": {"low": obj.box[0], "high": obj.box[1]}}
 
 
 def _labels(
@@ -193,11 +193,13 @@ def _labels(
         confidence = np.where((classes > 0) | (instances > 0), as_numpy(scene.confidence), 0)
         columns["confidence"] = confidence.astype(np.float32)
     frame, source = _frame(scene), f"splatlift {__version__}"
-    told = scene.metadata
-    provenance = ", ".join(filter(None, (source, told.encoder, told.text_space, f"{len(told.views)} views")))
+    metadata = scene.metadata
+    provenance = ", ".join(
+        filter(None, (source, metadata.encoder, metadata.text_space, f"{len(metadata.views)} views"))
+    )
     members: dict[int, list[int]] = {}
-    for one in instance_rows:
-        members.setdefault(one["class_id"], []).append(one["instance_id"])
+    for row in instance_rows:
+        members.setdefault(row["class_id"], []).append(row["instance_id"])
     document = {
         "format": FORMAT,
         "made_by": source,
@@ -207,8 +209,8 @@ def _labels(
         "frame_is": FRAMES[frame],
         "world": scene.world.model_dump(mode="json"),
         "unit": scene.world.unit,
-        "classes": [one | {"instances": members.get(one["class_id"], [])} for one in class_rows],
-        "instances": [one | {"provenance": provenance} for one in instance_rows],
+        "classes": [row | {"instances": members.get(row["class_id"], [])} for row in class_rows],
+        "instances": [row | {"provenance": provenance} for row in instance_rows],
     }
     return Labels(columns, document)
 
@@ -219,7 +221,7 @@ def _weights(scene: OpenedLift, rows: np.ndarray) -> np.ndarray:
 
 
 def _facts(scene: OpenedLift, rows: np.ndarray, scores: np.ndarray | None) -> dict[str, Any]:
-    """How many splats, their means of scores and confidence by evidence, and their boxes."""
+    """Summarise splats: their number, their means of scores and confidence by evidence, and their boxes."""
     weights = _weights(scene, rows)
     facts: dict[str, Any] = {"splats": len(rows)}
     if scores is not None:
@@ -231,9 +233,9 @@ def _facts(scene: OpenedLift, rows: np.ndarray, scores: np.ndarray | None) -> di
 
 
 def _boxes(means: np.ndarray, weights: np.ndarray) -> dict[str, Any]:
-    """The axis-aligned box of some splats' centres, and one along their principal axes.
+    """Compute the axis-aligned box of splat centres, and the box along their principal axes.
 
-    Both leave a thousandth of the evidence out at each end of each axis.
+    Both leave out a thousandth of the evidence at each end of each axis.
     """
     low, high = trimmed_box(means, weights)
     middle = np.average(means, axis=0, weights=weights)
@@ -252,15 +254,15 @@ def _boxes(means: np.ndarray, weights: np.ndarray) -> dict[str, Any]:
 
 
 def _frame(scene: OpenedLift) -> str:
-    """Whose frame boxes and splats are in, as far as the lift's files tell."""
+    """Return the key in FRAMES of the frame of boxes and splats, as far as the lift's files have it."""
     from liftcore.io.cameras import camera_source
 
     try:
         cameras, path = scene.cameras, Path(scene.metadata.cameras.path)
     except InvalidLift:
         return "file"
-    moved = cameras.frame is not None or cameras.of_nerfstudio
+    is_transformed = cameras.frame is not None or cameras.of_nerfstudio
     is_colmap = bool(path.name) and (
         camera_source(path, scene.metadata.views).model is not None or zipfile.is_zipfile(path)
     )
-    return "colmap" if is_colmap and not moved else "file"
+    return "colmap" if is_colmap and not is_transformed else "file"

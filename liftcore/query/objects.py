@@ -65,7 +65,7 @@ def objects(scene: OpenedLift, answer: Answer) -> Objects:
         inside = numbers[rows] == number
         own, mine = rows[inside], weights[inside]
         mine = mine if mine.any() else np.ones(len(own))
-        box = thing_box(scene.splats, own, mine) if sets else trimmed_box(scene.splats.positions(own), mine)
+        box = object_box(scene.splats, own, mine) if sets else trimmed_box(scene.splats.positions(own), mine)
         found.append(
             FoundObject(
                 splats=int(inside.sum()),
@@ -121,7 +121,7 @@ def _set_numbers(scene: OpenedLift, sets: Sequence[SplatSet]) -> np.ndarray:
     return numbers
 
 
-def thing_box(splats: "Splats", rows: np.ndarray, weights: np.ndarray) -> Box:
+def object_box(splats: "Splats", rows: np.ndarray, weights: np.ndarray) -> Box:
     """The box of one thing without its strays: `trimmed_box` of its large groups of touching splats.
 
     A group is large with a quarter of the weight of the largest one, as each side of two things that were joined.

@@ -13,7 +13,7 @@ import numpy as np
 
 from liftcore.errors import InvalidQuery, NotFound
 from liftcore.query.edits import Edit
-from liftcore.query.objects import MOST_SPLATS, objects, thing_box
+from liftcore.query.objects import MOST_SPLATS, object_box, objects
 from liftcore.query.opened import MOST_PIXELS, OpenedLift
 from liftcore.query.question import Answer, Box, Query
 from liftcore.query.terms import PixelBox, SplatSet, Stroke
@@ -75,7 +75,7 @@ class Selection:
     def box(self) -> Box | None:
         """The box of its large groups of splats that touch (`thing_box`); None of no splats."""
         rows = np.flatnonzero(self.splats)
-        return thing_box(self._scene.splats, rows, _weights(self._scene, rows)) if rows.size else None
+        return object_box(self._scene.splats, rows, _weights(self._scene, rows)) if rows.size else None
 
     @property
     def history(self) -> tuple[dict[str, Any], ...]:

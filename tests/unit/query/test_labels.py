@@ -42,7 +42,7 @@ def test_every_source_gives_instances_that_lie_in_their_boxes(scene: Scene) -> N
             places = scene.splats.positions()[inside]
             low, high = one["box"]["low"], one["box"]["high"]
             assert (places >= np.array(low) - 1e-6).all() and (places <= np.array(high) + 1e-6).all()
-    with pytest.raises(InvalidQuery, match="an answer that found splats"):
+    with pytest.raises(InvalidQuery, match="an answer with selected splats"):
         scene.labels(scene.ask(Query.of((Vector((1.0,) * CHANNELS),), threshold=1.0)))
 
 

@@ -68,12 +68,12 @@ def test_single_splats_elsewhere_are_strays_and_stretch_no_box(scene: Scene) -> 
     assert with_stray.found[0].box == alone.found[0].box
     assert with_stray.found[0].share < alone.found[0].share == 1.0
     cluster = np.arange(SPLATS_A_CLUSTER)  # likewise of a thing that is given
-    box = module.thing_box(scene.splats, cluster, np.ones(len(cluster)))
+    box = module.object_box(scene.splats, cluster, np.ones(len(cluster)))
     strayed = np.append(cluster, 2 * SPLATS_A_CLUSTER)
-    assert module.thing_box(scene.splats, strayed, np.ones(len(strayed))) == box
+    assert module.object_box(scene.splats, strayed, np.ones(len(strayed))) == box
     assert module.trimmed_box(scene.splats.means.numpy()[strayed], np.ones(len(strayed))) != box
     joined = np.concatenate([cluster, 2 * SPLATS_A_CLUSTER + cluster])  # of two things that were joined it holds both
-    assert module.thing_box(scene.splats, joined, np.ones(len(joined))) == module.trimmed_box(
+    assert module.object_box(scene.splats, joined, np.ones(len(joined))) == module.trimmed_box(
         scene.splats.means.numpy()[joined], np.ones(len(joined))
     )
 
