@@ -27,7 +27,7 @@ from liftcore.scene.cameras import Cameras, distortion_warning
 from liftcore.scene.compositing import ALPHA_FLOOR
 from liftcore.scene.splats import Kernel, Splats
 from liftcore.solve.diagnostics import UNSEEN
-from liftcore.text.table import plain
+from liftcore.text.table import normalize_text
 from liftcore.values.pack import read_features
 from liftcore.values.views import NO_LABEL, Regions
 
@@ -373,7 +373,7 @@ def describe_table(path: Path) -> dict[str, Any]:
     warnings = [] if len(words) == len(embeddings) else [f"{len(words)} words for {len(embeddings)} rows"]
     if int((norms == 0).sum()):
         warnings.append(f"{int((norms == 0).sum())} rows are zero")
-    if twice := len(words) - len(set(map(plain, words))):
+    if twice := len(words) - len(set(map(normalize_text, words))):
         warnings.append(f"{twice} of {len(words)} words come again, and only their first row is read")
     return {
         "rows": len(embeddings),

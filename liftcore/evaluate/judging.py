@@ -10,7 +10,7 @@ from liftcore.evaluate.protocols import SEGMENTERS, EvaluationProtocol, Predicti
 from liftcore.query.scene import Scene
 from liftcore.query.scores import DEFAULT_NEGATIVES
 from liftcore.runtime.progress import Progress, silent
-from liftcore.text import RememberingEncoder, TextEncoder
+from liftcore.text import CachingEncoder, TextEncoder
 
 
 @dataclass(frozen=True)
@@ -198,8 +198,8 @@ def evaluate_scene(
         warnings.append(f"{labels.name}: {_named(lifted)} were lifted, though the list holds them out")
     elif lifted:
         warnings.append(f"{labels.name}: {len(lifted)} of {len(truth)} judged frames were lifted: {_named(lifted)}")
-    if not isinstance(encoder, RememberingEncoder):  # each protocol asks for the same words
-        encoder = RememberingEncoder(encoder)
+    if not isinstance(encoder, CachingEncoder):  # each protocol asks for the same words
+        encoder = CachingEncoder(encoder)
     protocols, unmeasured = _measurable(settings, encoder)
     warnings += [f"{labels.name}: {text}" for text in unmeasured]
     texts, unknown = _readable(truth, encoder)

@@ -31,7 +31,7 @@ from liftcore.features.mask_files import (
     read_mask_json,
 )
 from liftcore.scene.views import composed, without_image_suffix
-from liftcore.text.table import plain
+from liftcore.text.table import normalize_text
 
 PHRASE_KEYS = (
     *("phrase", "prompt", "text", "label", "class_name", "category_name", "text_input", "noun_phrase"),
@@ -232,7 +232,7 @@ def _add_record(
     document.boxes += 1
     box = _box(record.get("points") if is_box else record.get("bbox"), corners=is_box)
     if box is None or size is None:
-        found.undecided.add(plain(phrase))
+        found.undecided.add(normalize_text(phrase))
     else:
         check_size(size, where)
         found.masks.append((VOID, PolygonMask(size, (box,))))
@@ -273,18 +273,20 @@ def _data_set(content: Mapping[str, Any], document: MaskDocument, *, unannotated
     named = {other: one["name"] for other, one in categories.items() if isinstance(one.get("name"), str)}
     questions = {number: image["text_input"] for number, image in images.items() if _asks(image)}
     masked = [phrase for one in found.values() for phrase in one.phrases]
-    phrases = {plain(phrase) for phrase in [*masked, *questions.values(), *([] if questions else named.values())]}
+    phrases = {
+        normalize_text(phrase) for phrase in [*masked, *questions.values(), *([] if questions else named.values())]
+    }
     negatives = any(isinstance(image.get("neg_category_ids"), list) for image in images.values())
     for number, one in found.items():
         told = images[number]
         if number in questions:
-            one.decided = {plain(questions[number])} - one.undecided
+            one.decided = {normalize_text(questions[number])} - one.undecided
         elif negatives:
             absent, partial = (
-                {plain(named[other]) for other in _numbers(told, key) if other in named}
+                {normalize_text(named[other]) for other in _numbers(told, key) if other in named}
                 for key in ("neg_category_ids", "not_exhaustive_category_ids")
             )
-            one.decided = (absent | {plain(phrase) for phrase in one.phrases}) - partial - one.undecided
+            one.decided = (absent | {normalize_text(phrase) for phrase in one.phrases}) - partial - one.undecided
             one.annotated = bool(one.phrases or absent)
         else:
             one.annotated = bool(one.phrases) or unannotated_negative

@@ -45,7 +45,7 @@ from liftcore.features.mask_json import (
 from liftcore.io.files import visible_files
 from liftcore.io.npy import ARRAYS, NUMBERS, open_array, without_unit_axes
 from liftcore.scene.views import composed, require_name, without_image_suffix
-from liftcore.text.table import TableEncoder, plain
+from liftcore.text.table import TableEncoder, normalize_text
 from liftcore.values.views import NO_LABEL, Regions, label_levels
 
 MOST_PHRASES = 4_096
@@ -144,7 +144,7 @@ class _MaskIndex:
 
     def name(self, view: str, phrase: str) -> str:
         """The plain form of a phrase of a view, which is known from then on."""
-        if not (key := plain(phrase)):
+        if not (key := normalize_text(phrase)):
             raise InvalidFeatures(f"view {view!r}", expected="a phrase for each mask", got="an empty one")
         require_name(phrase, f"a phrase of the view {view!r}", InvalidFeatures)
         self.phrases.setdefault(key, " ".join(composed(phrase).replace("_", " ").split()))
@@ -289,7 +289,7 @@ def _regions(name: str, view: _View, rows: Mapping[str, int], vectors: np.ndarra
             raise InvalidFeatures(f"view {name!r}", expected="masks of one size", got=got, hint="those of one photo")
         if phrase is None:
             void = mask if void is None else void | mask
-        elif (key := plain(phrase)) in view.phrases:
+        elif (key := normalize_text(phrase)) in view.phrases:
             masks[key] = masks[key] | mask if key in masks else mask
     if masks:
         labels = label_levels(list(masks.values()), str(view.file))
@@ -510,7 +510,7 @@ def _add_documents(
             index.name(name, phrase)
         if image.masks:
             view.sources.append(_Records(image.masks))
-            view.phrases.update(plain(phrase) for phrase, _ in image.masks if phrase is not None)
+            view.phrases.update(normalize_text(phrase) for phrase, _ in image.masks if phrase is not None)
             view.has_void = view.has_void or any(phrase is None for phrase, _ in image.masks)
         if id_file is not None and image.ids is not None:
             _add_named_ids(index, view, name, id_file, image.ids)

@@ -58,7 +58,7 @@ from liftcore.query.threshold import find_threshold, nothing_alike
 from liftcore.runtime.cores import cores
 from liftcore.runtime.one_thread import one_thread
 from liftcore.text import TextEncoder, check_texts
-from liftcore.text.wording import PartPhrase, Wording, base_of, plain
+from liftcore.text.wording import PartPhrase, Wording, base_of, normalize_text
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -221,7 +221,7 @@ def question(scene: OpenedLift, query: Query, encoder: TextEncoder | None, names
     phrase = part_phrase(scene, query, encoder)
     if phrase is None:
         return replace(_question(scene, query, encoder, names), unknown_part=unknown_part(scene, query, encoder))
-    thing = _question(scene, Query(text=[phrase.thing], weigh=query.weigh, absent=query.absent), encoder)
+    thing = _question(scene, Query(text=[phrase.object_phrase], weigh=query.weigh, absent=query.absent), encoder)
     asked = _question(scene, query, encoder, names) if not phrase.sure else replace(thing, query=query)
     return replace(asked, part=PartQuestion(phrase, thing, _question(scene, query, encoder, names, phrase)))
 
@@ -275,15 +275,19 @@ def _part_answer(scene: OpenedLift, asked: Question) -> Answer:
         inside = add_objects(scene, thing.selected)
         (found,) = answers(scene.within(inside), [part])
         nothing = "" if found.count or found.present is False else " Nothing stands out there."
-        told = f"{asked.part.phrase.thing!r} has {thing.count:,} splats. Within it: {found.why}{nothing}"
+        told = f"{asked.part.phrase.object_phrase!r} has {thing.count:,} splats. Within it: {found.why}{nothing}"
         if found.count >= WHOLE * inside.sum() and asked.query.absent == "drop":
             told = (
-                f"{asked.part.phrase.thing!r} is there, but {part.query.text[0]!r} tells no part of it from the rest."
+                f"{asked.part.phrase.object_phrase!r} is there, but {part.query.text[0]!r} tells no part of it from "
+                "the rest."
             )
             fields = {name: getattr(found, name) for name in _OF_ANSWER} | {"clear": False, "present": False}
             found = Answer.of(found.query, found.scores, found.seen, np.zeros_like(inside), **fields)
     else:
-        found, nothing = thing, "it" if thing.present is False else f"{asked.part.phrase.thing!r} is not found, and"
+        found, nothing = (
+            thing,
+            "it" if thing.present is False else f"{asked.part.phrase.object_phrase!r} is not found, and",
+        )
         told = f"{thing.why} So {nothing} has no parts."
     if not found.count and not sure:
         return answers(scene, [replace(asked, part=None)])[0]
@@ -359,7 +363,7 @@ def _answer(scene: OpenedLift, asked: Question, similarities: np.ndarray) -> Ans
     if asked.unknown_part is not None and selected.any():
         meant = parts_of(scene, objects_within(scene, selected))
         thing = presence.why.replace(
-            repr(query.text[0]), repr(asked.unknown_part.thing)
+            repr(query.text[0]), repr(asked.unknown_part.object_phrase)
         )  # what is there is the thing
         presence = presence.model_copy(update={"why": f"{thing} {_without_word(asked.unknown_part, len(meant))}"})
     wording = tuple(AskedAs(**word._asdict()) for word in asked.asked_as.values() if word.how)
@@ -374,8 +378,8 @@ def _without_word(phrase: PartPhrase, parts: int) -> str:
     """Two sentences on a part that no word stands for, and how it can be asked."""
     ask = "ask one of its candidates, click the part" if parts else "click the part"
     return (
-        f"No word stands for {phrase.part!r}, so this is all of {phrase.thing!r}. To have the part, {ask}, or take "
-        "an encoder that reads any text."
+        f"No word stands for {phrase.part!r}, so this is all of {phrase.object_phrase!r}. To have the part, {ask}, "
+        "or take an encoder that reads any text."
     )
 
 
@@ -390,7 +394,9 @@ def _nearer_words(
     rows, weights = best_splats(scene, np.where(selected, scores, np.float32(-1.0)) if selected.any() else scores)
     if not len(rows):
         return ()
-    names = {plain(base_of(word.word)) for word in asked.asked_as.values()}  # "fish" and "fish (food)" are one
+    names = {
+        normalize_text(base_of(word.word)) for word in asked.asked_as.values()
+    }  # "fish" and "fish (food)" are one
     same = (references.vectors @ own.T >= SAME_WORD).any(axis=1)
     same |= np.array([word in names for word in references.plain_words])
     near, others = products(scene.features[rows], scene.norms[rows], own, references.vectors)

@@ -19,7 +19,7 @@ from liftcore.query.question import AskableWord, AskableWords, Query
 from liftcore.query.regions import codebook_row, regions_of
 from liftcore.query.selections import set_members
 from liftcore.query.terms import Area, Example, Region, SplatSet, SplatTerm, Term, Vector, parse_example
-from liftcore.text import RememberingEncoder, TextEncoder, check_texts
+from liftcore.text import CachingEncoder, TextEncoder, check_texts
 from liftcore.text.table import TableEncoder
 from liftcore.text.wording import PartPhrase, Wording, part_phrases, shipped_words
 
@@ -52,7 +52,7 @@ def wordings(
 
 def table_of(encoder: TextEncoder | None) -> TableEncoder | None:
     """An encoder that is a table of words; None for any other."""
-    source = encoder.source if isinstance(encoder, RememberingEncoder) else encoder
+    source = encoder.source if isinstance(encoder, CachingEncoder) else encoder
     return source if isinstance(source, TableEncoder) else None
 
 

@@ -140,7 +140,7 @@ class OpenedLift:
             InvalidQuery: it is something else, or the lift's text space names none.
             Unavailable: its weights are not on this machine.
         """
-        from liftcore.text import RememberingEncoder, encoder_of_space, open_encoder
+        from liftcore.text import CachingEncoder, encoder_of_space, open_encoder
 
         if encoder is not None and not isinstance(encoder, str | Path):
             if not all(hasattr(encoder, name) for name in ("encode", "channels", "name")):
@@ -153,7 +153,7 @@ class OpenedLift:
         if key not in self._encoders:
             space = self.metadata.text_space
             opened = encoder_of_space(space, hint, stand_in=stand_in) if key is None else open_encoder(key)
-            self._encoders[key] = RememberingEncoder(opened)
+            self._encoders[key] = CachingEncoder(opened)
         return self._encoders[key]
 
     @cached_property

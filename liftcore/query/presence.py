@@ -40,9 +40,9 @@ from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.question import Presence
 from liftcore.query.threshold import LEAST_SHARE
 from liftcore.runtime.folders import cache_folder
-from liftcore.text import LVIS_TABLE, RememberingEncoder, TextEncoder
+from liftcore.text import LVIS_TABLE, CachingEncoder, TextEncoder
 from liftcore.text.table import TableEncoder
-from liftcore.text.wording import base_of, plain
+from liftcore.text.wording import base_of, normalize_text
 
 LEAST_WORDS = 200  # of a table, to be references
 WORD_STEP = 4  # an encoder without references encodes each 4th of the shipped words: 301 take seconds
@@ -93,7 +93,7 @@ class References:
     @cached_property
     def plain_words(self) -> tuple[str, ...]:
         """The words in plain spelling, without the suffixes that distinguish their meanings."""
-        return tuple(plain(base_of(word)) for word in self.words)
+        return tuple(normalize_text(base_of(word)) for word in self.words)
 
     def against(self, direction: np.ndarray) -> tuple[np.ndarray, int]:
         """Return the references to compare a unit vector [F] of the same space with.
@@ -221,7 +221,7 @@ def references_of(encoder: TextEncoder, text_space: str) -> References | str:
     Args:
         encoder: of the words' vectors. text_space: of the lift, "" for none.
     """
-    source = encoder.source if isinstance(encoder, RememberingEncoder) else encoder
+    source = encoder.source if isinstance(encoder, CachingEncoder) else encoder
     if isinstance(source, TableEncoder):
         if len(source.words) >= LEAST_WORDS:
             return _of_table(source)
@@ -262,7 +262,7 @@ def pack_of(encoder: TextEncoder) -> np.ndarray | None:
 
     They compete with each other: the table's author distinguishes these words and no others.
     """
-    source = encoder.source if isinstance(encoder, RememberingEncoder) else encoder
+    source = encoder.source if isinstance(encoder, CachingEncoder) else encoder
     if isinstance(source, TableEncoder) and 1 < len(source.words) < LEAST_WORDS:
         return _unit(np.asarray(source.embeddings, np.float32))
     return None

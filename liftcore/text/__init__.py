@@ -1,4 +1,4 @@
-"""Public: text encoders behind one protocol, words in, unit vectors out. Importing this loads no torch."""
+"""Public: text encoders behind one protocol, from words to unit vectors. Importing this loads no torch."""
 
 import logging
 from collections import OrderedDict
@@ -20,49 +20,49 @@ ENCODER_SPECS = (
     "open_clip:MODEL@WEIGHTS_FILE",
     "open_clip:...#7 or #80, templates",
 )
-# Encoders that need no file of the user's, and the text space of each: what answers when nobody chose an encoder.
+# Encoders that need no file from the user, and the text space of each: the defaults where no encoder was chosen.
 BUILT_IN = {"lvis": "open_clip:ViT-B-32/openai", "minilm": "minilm"}
 LVIS_TABLE = Path(__file__).with_name("lvis_clip_vit_b_32.safetensors")  # its licences: service/commands/tabletop
 PLUGINS = "splatlift.text_encoders"  # the entry points of other packages' encoders
-TEMPLATES = (1, 7, 80)  # sentences that open_clip's encoders put a word into: the word alone, or CLIP's for ImageNet
+TEMPLATES = (1, 7, 80)  # numbers of sentences that a word is put into: 1 is the word alone, 7 and 80 are CLIP's
 NO_WORDS = "none"  # the text space of features that no text encoder shares
-OWN_WORDS = "prompts"  # of features whose packs bring their words
-REMEMBERED = 1_024  # texts; two megabytes at 512 channels
+OWN_WORDS = "prompts"  # the text space of features whose packs contain their words
+CACHE_SIZE = 1_024  # texts; two megabytes at 512 channels
 log = logging.getLogger(__name__)
 
 
 class TextEncoder(Protocol):
-    """Maps texts into the space of the lifted features."""
+    """A map from texts into the space of the lifted features."""
 
     @property
     def name(self) -> str:
-        """What the encoder is, for messages and metadata."""
+        """Name of the encoder, for messages and metadata."""
         ...
 
     @property
     def channels(self) -> int:
-        """F, the length of its vectors."""
+        """Length F of its vectors."""
         ...
 
     def encode(self, texts: Sequence[str]) -> np.ndarray:
-        """n texts -> [n, F] f32 with unit rows.
+        """Encode n texts as [n, F] f32 with unit rows.
 
         Raises:
-            InvalidQuery: a text that the encoder cannot read (a word that a table lacks, an empty text), or no list
-                of texts.
+            InvalidQuery: a text that the encoder cannot read (a word that is not in a table, an empty text), or
+                ``texts`` is not a list of texts.
         """
         ...
 
 
 def without_templates(spec: str) -> tuple[str, int]:
-    """A specification without its ``#7`` or ``#80``, and how many templates it asks for."""
+    """Split a specification into the part before ``#7`` or ``#80`` and the number of templates."""
     bare, mark, count = spec.rpartition("#")
-    known = mark and spec.startswith("open_clip:") and count in map(str, TEMPLATES)
-    return (bare, int(count)) if known else (spec, 1)
+    has_templates = mark and spec.startswith("open_clip:") and count in map(str, TEMPLATES)
+    return (bare, int(count)) if has_templates else (spec, 1)
 
 
 def encoder_file(spec: str) -> Path | None:
-    """The file that an encoder specification names, None when it names none."""
+    """Return the file of an encoder specification, None if it has no file."""
     if spec.startswith("table:"):
         return Path(spec.removeprefix("table:"))
     if spec.startswith("open_clip:") and "@" in spec:
@@ -71,12 +71,12 @@ def encoder_file(spec: str) -> Path | None:
 
 
 def check_encoder(spec: str) -> None:
-    """See that a specification is one of an encoder, that its file opens, and that a table looks like one.
+    """Check that a specification is valid, that its file opens, and that a table has a valid header.
 
-    Values are read, and judged, where the encoder is opened.
+    Values are read and checked when the encoder is opened.
 
     Raises:
-        InvalidInput: there is no such encoder, its file is missing or does not open, or a table is none.
+        InvalidInput: an unknown encoder, a file that is missing or does not open, or a file that is not a table.
     """
     file = encoder_file(spec)
     if file is None:
@@ -86,8 +86,8 @@ def check_encoder(spec: str) -> None:
     try:
         file.open("rb").close()
     except OSError as error:
-        got, hint = f"{file} ({error.strerror})", "name one that is there"
-        raise InvalidInput("encoder", expected="a file that opens", got=got, hint=hint) from None
+        got, hint = f"{file} ({error.strerror})", "check the path and its permissions"
+        raise InvalidInput("encoder", expected="a readable file", got=got, hint=hint) from None
     if not spec.startswith("open_clip:"):
         from liftcore.text.table import check_table
 
@@ -95,25 +95,25 @@ def check_encoder(spec: str) -> None:
 
 
 def open_encoder(spec: str | Path, *, remembers: bool = False) -> TextEncoder:
-    """Open a text encoder by its specification: ``open_encoder("lvis").encode(["mug"])`` is what lifts are asked by.
+    """Open a text encoder by its specification, such as ``open_encoder("lvis").encode(["mug"])``.
 
     Args:
         spec: ``table:FILE`` or a path ending in ``.safetensors`` (precomputed embeddings); ``lvis`` (a table of the
             1,203 words of LVIS by CLIP ViT-B/32, shipped); ``minilm`` (a small sentence encoder, offline);
-            ``open_clip:MODEL/TAG`` or ``open_clip:MODEL@FILE``, with ``#7`` or ``#80`` behind for the mean over as
-            many of CLIP's sentences for ImageNet ("a photo of the small mug."); or ``NAME`` or ``NAME:REST`` of a
-            plugin (`liftcore.runtime.plugins`), which is called with the rest.
-        remembers: whether the vectors of the last texts are kept.
+            ``open_clip:MODEL/TAG`` or ``open_clip:MODEL@FILE``, with the suffix ``#7`` or ``#80`` for the mean over
+            that many of CLIP's sentences for ImageNet ("a photo of the small mug."); or ``NAME`` or ``NAME:REST`` of
+            a plugin (`liftcore.runtime.plugins`), which is called with ``REST``.
+        remembers: cache the vectors of the last texts.
 
     Raises:
-        InvalidQuery: the specification is none of these, or a table is malformed.
+        InvalidQuery: the specification is not one of these, or a table is malformed.
         Unavailable: the encoder's weights are not on this machine, or a plugin fails.
     """
     if remembers:
-        return RememberingEncoder(open_encoder(spec))
+        return CachingEncoder(open_encoder(spec))
     spec, templates = without_templates(str(spec))
     kind, _, rest = spec.partition(":")
-    # A bare path may hold a colon itself, so the suffix is asked first.
+    # A path may contain a colon, so the suffix is compared first.
     if kind != "table" and spec.endswith(".safetensors") and not spec.startswith("open_clip:"):
         kind, rest = "table", spec
     if spec == "lvis" or (kind == "table" and rest):
@@ -135,74 +135,75 @@ def open_encoder(spec: str | Path, *, remembers: bool = False) -> TextEncoder:
 
 
 def encoder_of_space(text_space: str, hint: str = "", *, stand_in: bool = False) -> TextEncoder:
-    """The encoder of a lift's text space.
+    """Open the encoder of a lift's text space.
 
     Args:
-        hint: what else can be done.
-        stand_in: where its weights cannot be had, take the table of it that ships, which knows its own words alone.
+        hint: the advice of an error.
+        stand_in: where the weights are not available, use the shipped table of this encoder, which encodes only its
+            own words.
 
     Raises:
-        InvalidQuery: the space has no name, or no words, or is no encoder's.
-        Unavailable: the encoder's weights are not on this machine, and no table stands in.
+        InvalidQuery: the space has no name, has no words, or does not belong to a known encoder.
+        Unavailable: the encoder's weights are not on this machine, and no shipped table is used.
     """
     if text_space in ("", NO_WORDS):
-        space = f"is {NO_WORDS!r}: its features share no space with words" if text_space else "is not named"
+        space = f"is {NO_WORDS!r}: its features share no space with words" if text_space else "is not recorded"
         got = f"none, and the lift's text space {space}"
         raise InvalidQuery("encoder", expected="a text encoder, or a table of words", got=got, hint=hint)
     try:
         return open_encoder(text_space)
     except InvalidQuery as error:
-        got = f"none, and the lift's text space {text_space!r} is not one that opens by its name ({error})"
+        got = f"none, and the lift's text space {text_space!r} is not the name of an available encoder ({error})"
         raise InvalidQuery("encoder", expected="a text encoder, or a table of words", got=got, hint=hint) from None
     except Unavailable:
         ships = next((name for name, space in BUILT_IN.items() if space == text_space != name), None)
         if ships is None or not stand_in:
             raise
-        log.warning("%s: its weights are not here; the table %s answers, with its own words alone", text_space, ships)
+        log.warning("%s: weights not available; using the table %s, which has only its own words", text_space, ships)
         return open_encoder(ships)
 
 
 def check_texts(texts: Sequence[str], argument: str = "texts") -> None:
-    """Refuse what is no list of texts, and texts that say nothing.
+    """Check that ``texts`` is a list of non-empty texts.
 
     Raises:
-        InvalidQuery: a text alone, something else than texts, or an empty one.
+        InvalidQuery: a single text, items that are not texts, or an empty text.
     """
-    listed = isinstance(texts, Collection) and not isinstance(texts, str)
-    if not listed or not all(isinstance(text, str) for text in texts):
+    is_list = isinstance(texts, Collection) and not isinstance(texts, str)
+    if not is_list or not all(isinstance(text, str) for text in texts):
         raise InvalidQuery(argument, expected="a list of texts", got=repr(texts)[:80], hint='such as ["a mug"]')
     if not all(text.strip() for text in texts):
         raise InvalidQuery("text", expected="a word or a sentence", got="an empty text")
 
 
-class RememberingEncoder:
-    """Another encoder, asked only for texts that are not among the last ones (``TextEncoder``).
+class CachingEncoder:
+    """A `TextEncoder` that caches the vectors of the last texts of another encoder.
 
-    People ask for a mask after they asked for the words.
+    The same words are often queried several times in a row, first for scores, then for a mask.
     """
 
-    def __init__(self, encoder: TextEncoder, size: int = REMEMBERED) -> None:
+    def __init__(self, encoder: TextEncoder, size: int = CACHE_SIZE) -> None:
         self.source = encoder
         self._size = size
         self._rows: OrderedDict[str, np.ndarray] = OrderedDict()
 
     @property
     def name(self) -> str:
-        """The other encoder's."""
+        """Name of the other encoder."""
         return self.source.name
 
     @property
     def channels(self) -> int:
-        """The other encoder's."""
+        """Length F of the other encoder's vectors."""
         return self.source.channels
 
     @property
     def words(self) -> Sequence[str]:
-        """Those that the other encoder is limited to; none where it reads any text."""
+        """Words that the other encoder is limited to; empty if it encodes any text."""
         return getattr(self.source, "words", ())
 
     def encode(self, texts: Sequence[str]) -> np.ndarray:
-        """n texts -> [n, F] f32 unit rows; errors are the other encoder's, and are not remembered."""
+        """Encode n texts as [n, F] f32 unit rows. Errors of the other encoder are raised and not cached."""
         new = [text for text in dict.fromkeys(texts) if text not in self._rows]
         rows = dict(zip(new, self.source.encode(new), strict=True)) if new else {}
         for text in texts:

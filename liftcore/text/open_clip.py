@@ -1,4 +1,4 @@
-"""CLIP models of open_clip, with weights by name or from a local file, and their text towers as encoders.
+"""Models of open_clip, with weights by name or from a local file, and their text towers as encoders.
 
 The image towers are used by `liftcore.features.encoders.clip`.
 """
@@ -18,7 +18,7 @@ from liftcore.errors import InvalidQuery, Unavailable
 from liftcore.runtime.nearest import nearest
 from liftcore.text import BUILT_IN, check_texts
 from liftcore.text.torchvision_ops import import_torchvision
-from liftcore.text.weights import fetched
+from liftcore.text.weights import fetch_weights
 
 # open_clip and timm read these with weights_only; the loader of big_vision .npz files has no such switch.
 WEIGHT_SUFFIXES = (".safetensors", ".pt", ".pth", ".bin", ".ckpt")
@@ -36,15 +36,15 @@ class OpenedModel:
 def open_model(kind: str, spec: str) -> OpenedModel:
     """Load ``MODEL/PRETRAINED_TAG`` (cached or downloaded by open_clip) or ``MODEL@WEIGHTS_FILE``.
 
-    Local files are read with ``weights_only``: a pickle that holds more than tensors is refused.
+    Local files are read with ``weights_only``: a pickle that contains more than tensors is an error.
 
     Args:
-        kind: what the user wrote before the colon, for messages.
-        spec: what stood behind it.
+        kind: the user's text before the colon, for messages.
+        spec: the text after the colon.
 
     Raises:
-        InvalidQuery: an unknown model or tag, or a file that is not weights of this model.
-        Unavailable: no weights were named, or they cannot be had here.
+        InvalidQuery: an unknown model or tag, or a file without weights of this model.
+        Unavailable: the specification has no weights, or they are not available here.
     """
     model_name, at, file = spec.partition("@")
     model_name, _, tag = (model_name, "", "") if at else spec.partition("/")
@@ -56,7 +56,7 @@ def open_model(kind: str, spec: str) -> OpenedModel:
 
 
 def create_model(model_name: str, pretrained: str | None) -> Any:
-    """A model with the weights of a tag or a file; None = random ones, for tests of plumbing only."""
+    """Create a model with the weights of a tag or a file; None = random weights, for tests only."""
     with _quiet():
         return library().create_model(
             model_name,
@@ -68,23 +68,23 @@ def create_model(model_name: str, pretrained: str | None) -> Any:
 
 
 def tokenizer_of(model_name: str) -> Callable[[list[str]], Any]:
-    """The model's tokenizer.
+    """Return the model's tokenizer.
 
     Raises:
-        Unavailable: it is one of transformers', which is not installed.
+        Unavailable: it needs the package transformers, which is not installed.
     """
     with _quiet():
         try:
             return library().get_tokenizer(model_name)
         except ImportError as error:
-            expected = "the package transformers, which has its tokenizer"
+            expected = "the package transformers, which has the tokenizer of this model"
             raise Unavailable(
                 f"encoder open_clip:{model_name}", expected=expected, got=str(error), hint="pip install transformers"
             ) from None
 
 
 def library() -> Any:
-    """The module open_clip.
+    """Import and return the module open_clip.
 
     Raises:
         Unavailable: it is not installed.
@@ -100,13 +100,13 @@ def library() -> Any:
 
 
 def _check_model(label: str, model_name: str) -> None:
-    known = library().list_models()
-    if model_name not in known:
+    model_names = library().list_models()
+    if model_name not in model_names:
         raise InvalidQuery(
             label,
-            expected="a model that open_clip knows",
+            expected="a model of open_clip",
             got=repr(model_name),
-            hint=nearest(model_name, known, 3),
+            hint=nearest(model_name, model_names, 3),
         )
 
 
@@ -114,18 +114,18 @@ def _from_tag(kind: str, model_name: str, tag: str) -> Any:
     label = f"encoder {kind}:{model_name}/{tag}" if tag else f"encoder {kind}:{model_name}"
     tags = library().list_pretrained_tags_by_model(model_name)
     if not tag:
-        known = ", ".join(tags) or "none"
+        tag_names = ", ".join(tags) or "none"
         raise Unavailable(
             label,
             expected="weights: a tag or a file",
             got="none",
-            hint=f"{kind}:{model_name}/TAG or {kind}:{model_name}@FILE; tags: {known}",
+            hint=f"{kind}:{model_name}/TAG or {kind}:{model_name}@FILE; tags: {tag_names}",
         )
     if tag not in tags:
         raise InvalidQuery(label, expected=f"one of the tags {', '.join(tags) or '(none)'}", got=repr(tag))
-    words = "; the encoder lvis has 1,203 words of it" if label == f"encoder {BUILT_IN['lvis']}" else ""
-    hint = f"download them elsewhere and use {kind}:{model_name}@FILE{words}"
-    return fetched(label, lambda: create_model(model_name, tag), hint)
+    words = "; the encoder lvis has 1,203 words of this model" if label == f"encoder {BUILT_IN['lvis']}" else ""
+    hint = f"download the weights on another machine and use {kind}:{model_name}@FILE{words}"
+    return fetch_weights(label, lambda: create_model(model_name, tag), hint)
 
 
 def _from_file(label: str, model_name: str, path: Path) -> Any:
@@ -135,15 +135,15 @@ def _from_file(label: str, model_name: str, path: Path) -> Any:
         raise InvalidQuery(label, expected=f"a file ending in {', '.join(WEIGHT_SUFFIXES)}", got=path.name)
     try:
         return create_model(model_name, str(path))
-    except Exception as error:  # unpickling and state dicts fail in many kinds; all mean "not these weights"
+    except Exception as error:  # readers of pickles and state dicts raise many types for files of other content
         raise InvalidQuery(
-            label, expected=f"tensors of {model_name} and nothing else in {path.name}", got=str(error)[:200]
+            label, expected=f"only tensors of {model_name} in {path.name}", got=str(error)[:200]
         ) from None
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """open_clip logs to the root logger and warns of activations: what matters is raised as an error."""
+    """Disable open_clip's logs, which go to the root logger, and its warnings; failures raise errors anyway."""
     before = logging.root.manager.disable
     logging.disable(logging.ERROR)
     try:
@@ -155,9 +155,9 @@ def _quiet() -> Iterator[None]:
 
 
 class OpenClipEncoder:
-    """Texts to the space that a CLIP model shares with its images.
+    """Encoder of texts into the space that a CLIP model shares with its images.
 
-    Build it with `open`: a model never runs with random weights unless a test asks for them.
+    Create it with `open`. Random weights are used in tests only.
     """
 
     def __init__(self, name: str, model: Any, tokenizer: Callable[[list[str]], Any], templates: int = 1) -> None:
@@ -171,23 +171,23 @@ class OpenClipEncoder:
     def open(cls, spec: str, templates: int = 1) -> Self:
         """Load ``MODEL/PRETRAINED_TAG`` (cached or downloaded by open_clip) or ``MODEL@WEIGHTS_FILE``.
 
-        Local files are read with ``weights_only``: a pickle that holds more than tensors is refused.
+        Local files are read with ``weights_only``: a pickle that contains more than tensors is an error.
 
         Raises:
-            InvalidQuery: an unknown model or tag, or a file that is not weights of this model.
-            Unavailable: no weights were named, or they cannot be had here.
+            InvalidQuery: an unknown model or tag, or a file without weights of this model.
+            Unavailable: the specification has no weights, or they are not available here.
         """
-        opened = open_model("open_clip", spec)
-        return cls(opened.name, _without_images(opened.model), tokenizer_of(opened.model_name), templates)
+        model = open_model("open_clip", spec)
+        return cls(model.name, _without_images(model.model), tokenizer_of(model.model_name), templates)
 
     @classmethod
     def _with_random_weights(cls, model_name: str, templates: int = 1) -> Self:
-        """A model of the right shape that knows nothing: tests of plumbing only."""
+        """Create an encoder with random weights of the right shapes, for tests only."""
         model = _without_images(create_model(model_name, None))
         return cls(f"open_clip:{model_name} (random)", model, tokenizer_of(model_name), templates)
 
     def encode(self, texts: Sequence[str]) -> np.ndarray:
-        """n texts -> [n, F] f32 unit rows.
+        """Encode n texts as [n, F] f32 unit rows.
 
         Raises:
             InvalidQuery: an empty text.
@@ -197,7 +197,7 @@ class OpenClipEncoder:
             return np.empty((0, self.channels), np.float32)
         if not self._templates:
             return self._encode(list(texts))
-        means = [self._encode([said(text) for said in self._templates]).mean(axis=0) for text in texts]
+        means = [self._encode([template(text) for template in self._templates]).mean(axis=0) for text in texts]
         return np.stack([mean / np.linalg.norm(mean) for mean in means])
 
     def _encode(self, texts: list[str]) -> np.ndarray:
@@ -207,16 +207,16 @@ class OpenClipEncoder:
 
 
 def _templates(count: int) -> Sequence[Callable[[str], str]]:
-    """CLIP's sentences for ImageNet, all 80 or the 7 that its notebook of prompts chose; none of the word alone."""
+    """Return CLIP's sentences for ImageNet: all 80, or the 7 of its prompt notebook; none for any other count."""
     library()
     from open_clip import zero_shot_metadata
 
-    known = {7: zero_shot_metadata.SIMPLE_IMAGENET_TEMPLATES, 80: zero_shot_metadata.OPENAI_IMAGENET_TEMPLATES}
-    return known.get(count, ())
+    templates = {7: zero_shot_metadata.SIMPLE_IMAGENET_TEMPLATES, 80: zero_shot_metadata.OPENAI_IMAGENET_TEMPLATES}
+    return templates.get(count, ())
 
 
 def _without_images(model: Any) -> Any:
-    # The image tower is most of the memory, and texts never pass through it.
+    # The image tower takes most of the memory and is not used for texts.
     if hasattr(model, "visual"):
         model.visual = None
     return model

@@ -13,20 +13,20 @@ from liftcore.errors import InvalidInput, InvalidQuery, InvalidTable
 from liftcore.io.safetensors_file import check_header, map_tensors
 from liftcore.runtime.one_line import one_line
 from liftcore.text import check_texts
-from liftcore.text.wording import SUGGESTED, Vocabulary, plain
+from liftcore.text.wording import SUGGESTED, Vocabulary, normalize_text
 
 __all__ = ["TableEncoder", "Vocabulary"]
 _HALF = re.compile("[\ud800-\udfff]")  # half a surrogate pair, which UTF-8 cannot carry
 TABLE = "a text table: safetensors with embeddings [n, F] and metadata words, a JSON list of n strings"
-_SHOWN = 200  # characters of a word that a table lacks, in the error
+_ERROR_CHARACTERS = 200  # of an unknown word in an error
 EXPECTED = "a safetensors file with embeddings and words"
 
 
 def check_table(path: Path) -> None:
-    """Look at the header of a table, and at nothing else of it.
+    """Check the header of a table, without reading its values.
 
     Raises:
-        InvalidInput: it is none.
+        InvalidInput: the file is not a table.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -50,15 +50,15 @@ def check_table(path: Path) -> None:
 
 
 class TableEncoder:
-    """Looks words up; cases, ``_`` for a space and a leading article make no difference.
+    """Encoder that looks words up, without regard to case, ``_`` for a space and a leading article.
 
     Args:
-        name: what to call the table in messages.
+        name: name of the table in messages.
         words: n words, one a row.
         embeddings: [n, F] f16 or f32, finite rows of any length above zero.
 
     Raises:
-        InvalidTable: shapes that do not fit, rows that are zero or not finite, no words.
+        InvalidTable: shapes that do not match, rows that are zero or not finite, or no words.
     """
 
     def __init__(self, name: str, words: Sequence[str], embeddings: np.ndarray) -> None:
@@ -69,14 +69,14 @@ class TableEncoder:
         lengths = np.linalg.norm(wide, axis=1, keepdims=True)
         bad = np.flatnonzero(~np.isfinite(lengths) | (lengths == 0))
         if len(bad):
-            got = f"row {bad[0]} ({words[bad[0]][:80]!r}) has none"
-            raise InvalidTable(name, expected="finite rows with a direction", got=got)
+            got = f"row {bad[0]} ({words[bad[0]][:80]!r}), which is zero or not finite"
+            raise InvalidTable(name, expected="finite rows above zero length", got=got)
         self.name = name
         self.words = tuple(words)
         self.channels = int(embeddings.shape[1])
         self._unit = (wide / lengths).astype(np.float32)
-        # The first of two equal words wins: reversed, so that it is written last.
-        self._rows = {plain(word): row for row, word in reversed(list(enumerate(words)))}
+        # Of two equal words the first one counts, so the order is reversed and the first is written last.
+        self._rows = {normalize_text(word): row for row, word in reversed(list(enumerate(words)))}
 
     def __repr__(self) -> str:
         return one_line(self, repr(self.name), f"{len(self.words)} words", f"{self.channels} channels")
@@ -86,9 +86,9 @@ class TableEncoder:
         """Open ``embeddings`` [n, F] f16 or f32 with metadata ``words`` (a JSON list of n strings).
 
         Raises:
-            InvalidTable: no such file, or not a table.
+            InvalidTable: the file does not exist, or is not a table.
         """
-        from liftcore.io.kinds import wrong_kind  # here: most tables are ones, and this loads readers of all kinds
+        from liftcore.io.kinds import wrong_kind  # imported late: it loads readers of all kinds, for errors alone
 
         name = f"text table {path.name}"
         if not path.is_file():
@@ -113,63 +113,63 @@ class TableEncoder:
 
     @classmethod
     def of(cls, name: str, words: str, embeddings: np.ndarray) -> Self:
-        """A table as files hold it: ``words`` is a JSON list of n strings, ``embeddings`` [n, F] f16 or f32.
+        """Create a table from the words of a file, a JSON list of n strings, and its embeddings [n, F] f16 or f32.
 
         Raises:
-            InvalidTable: the words are no such list, or the embeddings do not fit them.
+            InvalidTable: the words are not such a list, or the embeddings do not match them.
         """
         try:
-            listed = json.loads(words)
+            word_list = json.loads(words)
         except (ValueError, RecursionError) as error:
             raise InvalidTable(name, expected="metadata words, a JSON list", got=str(error)[:120]) from None
-        if not isinstance(listed, list) or not all(
-            isinstance(word, str) and not _HALF.search(word) for word in listed
+        if not isinstance(word_list, list) or not all(
+            isinstance(word, str) and not _HALF.search(word) for word in word_list
         ):
-            raise InvalidTable(name, expected="metadata words, a JSON list of strings", got="none")
+            raise InvalidTable(name, expected="metadata words, a JSON list of strings", got=repr(words[:80]))
         if embeddings.dtype not in (np.float16, np.float32):
             raise InvalidTable(name, expected="float16 or float32", got=str(embeddings.dtype))
-        return cls(name, listed, embeddings)
+        return cls(name, word_list, embeddings)
 
     @property
     def embeddings(self) -> np.ndarray:
-        """[n, F] f32, the unit rows of the words."""
+        """Unit rows of the words, [n, F] f32."""
         return self._unit
 
     def encode(self, texts: Sequence[str]) -> np.ndarray:
-        """n words -> [n, F] f32 unit rows.
+        """Encode n words as [n, F] f32 unit rows.
 
         Raises:
-            InvalidQuery: a word that the table lacks; the error names the nearest ones.
+            InvalidQuery: a word that is not in the table; the error lists the nearest ones.
         """
         check_texts(texts)
         return self._unit[[self._row(text) for text in texts]]
 
     def _row(self, text: str) -> int:
-        row = self._rows.get(plain(text))
+        row = self._rows.get(normalize_text(text))
         if row is None:
             raise self.refusal(text)
         return row
 
     @cached_property
     def vocabulary(self) -> Vocabulary:
-        """The words as people may type them."""
+        """Vocabulary that finds these words in typed text."""
         return Vocabulary(self.words)
 
-    def refusal(self, text: str, here: Sequence[str] = ()) -> InvalidQuery:
-        """The error of a word that the table lacks, with words to ask for in its place.
+    def refusal(self, text: str, scene_words: Sequence[str] = ()) -> InvalidQuery:
+        """Return the error for a word that is not in the table, with suggestions.
 
         Args:
-            here: words of what is in the scene, which come first of their kind, and alone where none is near.
+            scene_words: words of objects in the scene, which come first among suggestions of their kind, and are the
+                only suggestions if no word is near.
         """
-        near = self.vocabulary.nearest(text, first=here)
-        some = list(here[:SUGGESTED])
-        hint = f"nearest: {', '.join(near)}" if near else f"in this scene: {', '.join(some)}" if some else ""
-        return InvalidQuery(
-            "text", expected=f"one of the {len(self.words)} words of {self.name}", got=repr(text[:_SHOWN]), hint=hint,
-            nearest=near or some,
-        )  # fmt: skip
+        near = self.vocabulary.nearest(text, first=scene_words)
+        suggestions = list(scene_words[:SUGGESTED])
+        in_scene = f"in this scene: {', '.join(suggestions)}" if suggestions else ""
+        hint = f"nearest: {', '.join(near)}" if near else in_scene
+        expected, got = f"one of the {len(self.words)} words of {self.name}", repr(text[:_ERROR_CHARACTERS])
+        return InvalidQuery("text", expected=expected, got=got, hint=hint, nearest=near or suggestions)
 
 
 def own_words(words: Sequence[str], embeddings: np.ndarray | None) -> TableEncoder | None:
-    """The table that a lift brings; None where it has none."""
+    """Return the table that is stored in a lift, None if there is no such table."""
     return None if embeddings is None or not words else TableEncoder("the lift's own words", words, embeddings)

@@ -1,33 +1,33 @@
-"""Declares two operators that torchvision's Python half expects, where its compiled half did not load.
+"""Declarations of two operators that torchvision's Python code needs where its compiled library did not load.
 
-The PyPI build of torchvision is linked against the CUDA build of torch. Beside the CPU build of torch its
-compiled library does not load, and its import then fails on ``operator torchvision::nms does not exist``
-while it registers shape functions. open_clip and sentence-transformers import torchvision, yet a text tower
-never calls these operators: declaring their signatures lets the import pass, and a call would still fail.
+The PyPI build of torchvision is linked against the CUDA build of torch. With the CPU build of torch its compiled
+library does not load, and its import fails with ``operator torchvision::nms does not exist`` while it registers shape
+functions. open_clip and sentence-transformers import torchvision, but a text tower never calls these operators. With
+their signatures declared, the import succeeds, and a call of them would still fail.
 """
 
 import importlib
 
 import torch
 
-# A library's operators live as long as the object that declared them.
-_declared: list[torch.library.Library] = []
+# Operators exist as long as the library object that declared them.
+_libraries: list[torch.library.Library] = []
 
 
 def import_torchvision() -> None:
-    """Import torchvision, declaring the missing operators only where the plain import fails for their lack.
+    """Import torchvision, declaring the missing operators only if the import fails without them.
 
-    Where the compiled half loads, it declares the operators itself and a second declaration would be an
-    error: so the plain import is tried first.
+    A compiled library that loads declares the operators itself, and a second declaration would be an error, so the
+    import is tried first.
     """
     try:
         importlib.import_module("torchvision")
     except RuntimeError as error:
-        if "torchvision::" not in str(error) or _declared:
+        if "torchvision::" not in str(error) or _libraries:
             raise
         library = torch.library.Library("torchvision", "DEF")
         for name in ("nms", "qnms"):
             if not hasattr(torch.ops.torchvision, name):
                 library.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
-        _declared.append(library)
+        _libraries.append(library)
         importlib.import_module("torchvision")

@@ -1,6 +1,6 @@
-"""Weights by name, for encoders: from the cache of the library that knows them, else from the network, tried once.
+"""Weights of encoders by name, from the cache of their library or else from the network, in one attempt.
 
-Libraries ask the network first and try again for most of a minute where there is none.
+The libraries themselves contact the network first and retry for most of a minute if there is none.
 """
 
 import logging
@@ -15,39 +15,39 @@ from urllib.parse import urlsplit
 from liftcore.errors import Unavailable
 
 T = TypeVar("T")
-SECONDS = 5.0  # that the network has to answer
+SECONDS = 5.0  # timeout of the first response
 EXPECTED = "weights in the cache or a network to fetch them"
 
 log = logging.getLogger(__name__)
 
 
-def fetched(label: str, make: Callable[[], T], hint: str) -> T:
-    """What ``make`` makes of weights of Hugging Face's hub; a line in the log says where they are fetched.
+def fetch_weights(label: str, load: Callable[[], T], hint: str) -> T:
+    """Call ``load``, which reads weights of the Hugging Face Hub, and return its result. A download is logged.
 
     Raises:
-        Unavailable: they are not in the cache, and the network does not answer or does not have them.
+        Unavailable: the weights are not in the cache, and the network is not reachable or does not have them.
     """
     from huggingface_hub import constants
 
-    with _cache_alone(), suppress(Exception):  # each library raises its own kinds
-        return make()
+    with _cache_alone(), suppress(Exception):  # each library raises its own types
+        return load()
     host = urlsplit(constants.ENDPOINT).netloc
     if constants.HF_HUB_OFFLINE:
         raise Unavailable(label, expected=EXPECTED, got="none, and HF_HUB_OFFLINE is set", hint=hint)
-    if not _answers(constants.ENDPOINT):
-        got = f"neither: {host} does not answer within {SECONDS:g} s"
+    if not _is_reachable(constants.ENDPOINT):
+        got = f"neither: {host} did not respond within {SECONDS:g} s"
         raise Unavailable(label, expected=EXPECTED, got=got, hint=hint)
-    log.warning("%s: fetching its weights from %s", label, host)
+    log.warning("%s: downloading weights from %s", label, host)
     try:
-        return make()
-    except Exception as error:  # the hub's clients raise their own, urllib's and OSError's kinds
+        return load()
+    except Exception as error:  # clients of the hub raise their own types, those of urllib and OSErrors
         got = " ".join(str(error).split())
         raise Unavailable(label, expected=EXPECTED, got=got[:200], hint=hint) from None
 
 
 @contextmanager
 def _cache_alone() -> Iterator[None]:
-    """No request of the hub's client leaves this machine: each is refused at once."""
+    """Make the hub's client refuse every request at once, so that only its cache is read."""
     from huggingface_hub import constants
 
     before = constants.HF_HUB_OFFLINE
@@ -58,17 +58,17 @@ def _cache_alone() -> Iterator[None]:
         constants.HF_HUB_OFFLINE = before
 
 
-def _answers(url: str) -> bool:
-    """Whether anything answers there in time; a thread of its own, as no timeout holds for the look-up of names."""
-    found: list[bool] = []
+def _is_reachable(url: str) -> bool:
+    """Return True if the host responds in time. A thread waits for it, as name resolution has no timeout."""
+    answers: list[bool] = []
 
-    def ask() -> None:
+    def request_head() -> None:
         with suppress(OSError, ValueError):
-            with suppress(urllib.error.HTTPError):  # an answer like any other
+            with suppress(urllib.error.HTTPError):  # an error status is a response too
                 urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=SECONDS).close()
-            found.append(True)
+            answers.append(True)
 
-    asking = threading.Thread(target=ask, daemon=True)
-    asking.start()
-    asking.join(SECONDS)
-    return bool(found)
+    thread = threading.Thread(target=request_head, daemon=True)
+    thread.start()
+    thread.join(SECONDS)
+    return bool(answers)

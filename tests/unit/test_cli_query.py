@@ -73,8 +73,8 @@ def test_what_a_query_has_no_place_for_is_told(
     ("space", "told"),
     [
         ("none", "text space is 'none': its"),
-        ("", "text space is not named"),
-        ("mine", "text space 'mine' is not one"),
+        ("", "text space is not recorded"),
+        ("mine", "text space 'mine' is not the name"),
     ],
 )
 def test_words_to_a_lift_without_a_text_encoder_are_refused_with_its_text_space(
@@ -109,7 +109,7 @@ def test_the_table_that_ships_answers_where_weights_of_its_space_cannot_be_had(
     status, out, _ = run(capsys, "query", scene / "clip.safetensors", "cat", "--json")
     document, name = json.loads(out), open_encoder("lvis").name
     assert (status, document["encoder"], document["statistics"]["max"]) == (0, name, pytest.approx(1.0, abs=1e-3))
-    assert "its weights are not here; the table lvis answers" in caplog.text
+    assert "using the table lvis" in caplog.text
     assert (
         run(capsys, "segment", scene / "clip.safetensors")[0] == 2
     )  # by all words that happen to be here: not asked

@@ -15,7 +15,7 @@ from liftcore.features.encoders import Pixels
 from liftcore.runtime.nearest import nearest
 from liftcore.text.open_clip import WEIGHT_SUFFIXES
 from liftcore.text.torchvision_ops import import_torchvision
-from liftcore.text.weights import fetched
+from liftcore.text.weights import fetch_weights
 
 # What checkpoints hold beside the backbone: classifiers, and what only the training needed.
 _LEFT_OVER = ("mask_token",)
@@ -116,7 +116,9 @@ def _by_name(label: str, name: str) -> Any:
         raise Unavailable(
             label, expected="weights: a name that timm has them for, or a file", got="none", hint=f"timm:{name}@FILE"
         )
-    return fetched(label, lambda: _create(name, pretrained=True), f"download them elsewhere and use timm:{name}@FILE")
+    return fetch_weights(
+        label, lambda: _create(name, pretrained=True), f"download them elsewhere and use timm:{name}@FILE"
+    )
 
 
 def _from_file(label: str, name: str, path: Path) -> Any:

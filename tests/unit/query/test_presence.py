@@ -20,7 +20,7 @@ from liftcore.query.result import LiftResult
 from liftcore.query.scene import Scene
 from liftcore.query.segment import segment
 from liftcore.query.terms import SplatTerm
-from liftcore.text import LVIS_TABLE, RememberingEncoder
+from liftcore.text import LVIS_TABLE, CachingEncoder
 from liftcore.text.table import TableEncoder
 from tests.api.tiny_scene import SPLATS_A_CLUSTER
 
@@ -136,7 +136,7 @@ def test_an_encoder_makes_its_references_once(tmp_path: Path, monkeypatch: pytes
     first, again, other = Asked(0), Asked(0), Asked(1)
     made = references_of(first, "")
     assert isinstance(made, References) and 200 <= len(made.words) <= len(first.texts)
-    kept = references_of(RememberingEncoder(again), "")
+    kept = references_of(CachingEncoder(again), "")
     assert isinstance(kept, References) and kept.words == made.words and len(again.texts) == 1
     np.testing.assert_allclose(kept.vectors, made.vectors, atol=1e-3)
     anew = references_of(other, "")  # of the same name, but it says something else

@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import save_file
 
 from liftcore.errors import InvalidQuery, Unavailable
-from liftcore.text import RememberingEncoder, open_encoder, without_templates
+from liftcore.text import CachingEncoder, open_encoder, without_templates
 from liftcore.text.open_clip import OpenClipEncoder, tokenizer_of
 
 pytestmark = pytest.mark.slow
@@ -134,7 +134,7 @@ def test_templates_give_the_mean_over_their_sentences(clip: OpenClipEncoder, mon
         ("ViT-B-32@/no/such/file.pt", Unavailable, "nothing at"),
         ("ViT-B-33/openai", InvalidQuery, "ViT-B-32"),
         ("ViT-B-32/none", InvalidQuery, "openai"),
-        ("ViT-S-32-alt@{code}", InvalidQuery, "nothing else"),
+        ("ViT-S-32-alt@{code}", InvalidQuery, "only tensors of"),
         (f"ViT-B-32@{__file__}", InvalidQuery, "ending in"),
     ],
 )
@@ -156,7 +156,7 @@ def test_a_remembered_text_is_read_once_and_the_oldest_is_forgotten() -> None:
             asked.extend(texts)
             return np.array([[float(len(text)), 1.0] for text in texts])
 
-    encoder = RememberingEncoder(Counting(), size=2)
+    encoder = CachingEncoder(Counting(), size=2)
     first = encoder.encode(["a", "bb", "a"])
     assert first[:, 0].tolist() == [1.0, 2.0, 1.0] and asked == ["a", "bb"]
     encoder.encode(["a", "ccc"])

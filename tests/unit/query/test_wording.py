@@ -89,7 +89,7 @@ def test_what_is_like_nothing_has_no_words_near_to_it(text: str) -> None:
 )  # fmt: skip
 def test_part_and_thing_of_a_phrase_are_found(text: str, thing: str | None, part: str | None) -> None:
     found = lvis().find_part(text)
-    assert (found.thing, found.part) == (thing, part) if found else thing is None
+    assert (found.object_phrase, found.part) == (thing, part) if found else thing is None
 
 
 @pytest.mark.parametrize("text", ["men's shoes", "children\u2019s toys", "babies' bottles"])
