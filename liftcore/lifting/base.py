@@ -1,7 +1,7 @@
-"""The steps of a lift as a protocol: who holds W and X, and where a block of them is worked on.
+"""The steps of a lift as a protocol, with two implementations that store W and X differently.
 
-`liftcore.lifting.pipeline` has their order. In one process's memory they are `liftcore.lifting.in_memory`; an engine
-takes them in blocks of views and of splats (`liftcore.lifting.engines.lift`).
+`liftcore.lifting.pipeline` has their order. `liftcore.lifting.in_memory` runs them in the memory of one process,
+`liftcore.lifting.engines.lift` in blocks of views and of splats.
 """
 
 from __future__ import annotations
@@ -22,91 +22,91 @@ if TYPE_CHECKING:
     from liftcore.solve.objects import NodeVectors, RegionObjects
     from liftcore.values.lift_views import LiftViews
 
-Weights = TypeVar("Weights")  # W of all views, wherever it lies; a value that no step changes
+Weights = TypeVar("Weights")  # W of all views, in memory or in files; immutable
 
 
 @dataclass(frozen=True)
 class WeightStatistics:
-    """W in numbers, as the views were weighed."""
+    """Facts about W before any reweighting."""
 
-    plan: Plan  # as the first views correct it
+    plan: Plan  # with the warnings and the time that the first views gave
     levels: np.ndarray  # [M] i8, of each region in its view; -1: a cell of a grid, or regions that are tuples
     entries: int  # of W
     blind: tuple[str, ...]  # views that meet no splat
 
     @property
     def masks(self) -> bool:
-        """Whether any view has masks."""
+        """True if any view has masks."""
         return bool((self.levels >= 0).any())
 
 
 @dataclass(frozen=True)
 class SplatSupport:
-    """What supports X, a value a splat."""
+    """Weights and confidence behind X, a value a splat."""
 
-    sums: np.ndarray  # [P] f64, of rows of W as it was weighed
+    sums: np.ndarray  # [P] f64, of rows of W before any reweighting
     evidence: Tensor  # [P] f32, sums of plain weights over all views, each ray once
     agreement: Tensor  # [P] f32, norm of the weighted mean of unit codebook rows
     confidence: Tensor | None  # [P] f32; None where W was not reweighted
 
 
 class LiftSteps(Protocol[Weights]):
-    """The steps of a lift. Each returns what it finds; an X that a step takes is given up to it."""
+    """The steps of a lift. A step may overwrite the X that it receives, and returns the new one."""
 
     def plan(self, views: LiftViews, device: Device) -> Plan:
-        """Plan the lift of these views, which may leave some out and take another device."""
+        """Plan the lift of these views; the plan may leave views out, or choose another device."""
         ...
 
     def weigh(
         self, views: LiftViews, plan: Plan, on_plan: Callable[[Plan], None]
     ) -> tuple[Weights, WeightStatistics]:
-        """W of the views that the plan leaves; ``on_plan`` is called once, as early as contradictions are known."""
+        """Compute W of the plan's views; call ``on_plan`` once, as soon as contradictions of the inputs are known."""
         ...
 
     def find_objects(self, W: Weights) -> RegionObjects:
-        """Find what masks of many views keep together, and the parts of it."""
+        """Group splats into objects that the masks of many views agree on, and objects into parts."""
         ...
 
     def node_vectors(self, W: Weights, objects: RegionObjects) -> NodeVectors:
-        """What the masks of each node say, before W is reweighted."""
+        """Return the mean feature of each node's masks, before W is reweighted."""
         ...
 
     def compare_masks(self, W: Weights) -> Weights:
-        """W with the consensus of masks, for `reweight`."""
+        """Add the consensus of masks to W, for `reweight`."""
         ...
 
     def reweight(self, W: Weights, levels_apart: bool) -> tuple[Weights, float | None]:
-        """W after the robust steps, and the median reliability of regions; None where it is not asked for.
+        """Reweight W by the robust steps; return the median reliability of regions too, None if settings want none.
 
         Args:
-            levels_apart: whether regions are compared with those of their own level alone.
+            levels_apart: True if regions are compared with those of their own level alone.
         """
         ...
 
     def discount_distance(self, W: Weights) -> Weights:
-        """W with the factors of Huber's loss."""
+        """Multiply W by the factors of Huber's loss."""
         ...
 
     def solve(self, W: Weights, clusters: RegionObjects | None) -> tuple[Tensor, SplatSupport]:
-        """X [P, F] in closed form, and what supports it; `aggregate` may take the clusters' features."""
+        """Solve for X [P, F] in closed form; given clusters, prepare their features for `aggregate`."""
         ...
 
-    def refine(self, W: Weights, X: Tensor, seen: np.ndarray) -> tuple[Tensor, dict[str, Any]]:
-        """X after the least squares of the settings, for the splats seen [P] bool; and what is known of it."""
+    def refine(self, W: Weights, X: Tensor, visible: np.ndarray) -> tuple[Tensor, dict[str, Any]]:
+        """Refine X of the ``visible`` [P] bool splats by the settings' least squares; return its facts too."""
         ...
 
     def smooth(self, W: Weights, X: Tensor, support: SplatSupport) -> tuple[Tensor, dict[str, Any]]:
-        """X after the smoothness of the settings, for all splats; and what is known of it."""
+        """Smooth X over neighbouring splats as the settings say; return facts of the smoothing too."""
         ...
 
     def aggregate(self, W: Weights, X: Tensor, clusters: RegionObjects | None) -> tuple[Tensor, Aggregation]:
-        """X with the features of clusters; those of features where no masks make them."""
+        """Give splats the features of their clusters: of these objects, or of similar features if None."""
         ...
 
     def measure(self, W: Weights, X: Tensor) -> ViewMeasures:
-        """The measures of all views' sampled rays."""
+        """Measure X on the sampled rays of all views."""
         ...
 
     def deliver(self, W: Weights, lift: LiftResult) -> LiftResult:
-        """The lift where its owner expects it."""
+        """Move the lift to where the caller expects it."""
         ...

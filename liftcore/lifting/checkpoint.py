@@ -1,13 +1,13 @@
-"""Checkpoints: what the raster found of views outlives the process, so a killed lift goes on from there.
+"""Checkpoints: the raster's results of views are stored on disk, so that a killed lift resumes from them.
 
-The geometry phase asks the raster for the same views whenever it lifts the same inputs with the same settings. So a
-checkpoint is a folder of the raster's answers, one file a view, and nothing but the raster knows of it: sums over
-views are formed anew from the same numbers in the same order, and a resumed lift is identical to the bit. A file is
-whole or not there; the views in work when a lift ends are rasterized again.
+The geometry phase requests the same views from the raster whenever inputs and settings are the same. So
+a checkpoint is a folder of the raster's answers, one file a view. Sums over views are computed again from the same
+numbers in the same order: a resumed lift is bitwise identical. A file is complete or absent; views in progress when a
+lift ends are rasterized again.
 
-An answer is named by what was asked: the splats, and of a view its camera, its regions, its rays and how they meet
-splats. No feature is among that (``A^T B = W E``), so a lift goes on from the answers of another where only features
-differ (another encoder's of the same regions), where others of the views are taken, or what is made of W afterwards.
+An answer is named by the digest of its request: the splats, and of a view its camera, its regions, its rays and the
+compositing parameters. Features are not part of it (``A^T B = W E``). So a lift resumes from the answers of another
+one that differs in features alone (another encoder, the same regions), in the choice of views, or in later steps.
 """
 
 from __future__ import annotations
@@ -41,21 +41,21 @@ if TYPE_CHECKING:
     from liftcore.raster.base import Raster, ViewRequest
     from liftcore.scene.splats import Splats
 
-_ANSWER = re.compile(r"\.?([0-9a-f]{64}|\d{6,})\.safetensors(\.[0-9a-f]+\.part)?")  # by name, and its drafts
+_ANSWER = re.compile(r"\.?([0-9a-f]{64}|\d{6,})\.safetensors(\.[0-9a-f]+\.part)?")  # and its unfinished files
 _ROWS = {"indptr": "rows/indptr", "splats": "rows/splats", "weights": "rows/weights"}  # of RayRows, beside W
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Where a lift keeps what it found of views, and of what.
+    """A folder of the raster's answers.
 
-    The folder is for one lift at a time. It is made when there is something to keep, and is its owner's to remove. Of
-    what lies in it, files that are named as answers are taken for them, and go when a lift did not ask for them.
+    The folder is for one lift at a time. It is created with the first answer, and the caller removes it. Files in it
+    that are named as answers count as such; a lift deletes those that it did not request.
     """
 
     folder: Path
-    seconds: float = 2.0  # between writes, of work that is lost with the process; views in work may be lost too
-    identity: str = ""  # of the splats, the code and the device that all answers are of (`of`)
+    seconds: float = 2.0  # between writes: the work that a killed process loses, besides views in progress
+    identity: str = ""  # digest of the splats, the code and the device of all answers (`of`)
 
     def __post_init__(self) -> None:
         check_path(self.folder, "folder")
@@ -64,11 +64,11 @@ class Checkpoint:
     def of(
         self, splats: Splats, device: Mapping[str, Any], packages: Iterable[str] = ("raster", "scene")
     ) -> Checkpoint:
-        """The same for answers about these splats.
+        """Return the checkpoint for answers about these splats.
 
         Args:
-            device: the facts of the device that answers: devices agree within rounding only.
-            packages: of `liftcore`, whose code answers.
+            device: the facts of the device that computes: devices agree within rounding only.
+            packages: of `liftcore`, whose code computes.
         """
         digest = hashlib.sha256(json.dumps([FORMAT, __version__, get_host_cpu_name(), device]).encode())
         for package in packages:
@@ -81,94 +81,94 @@ class Checkpoint:
         return replace(self, identity=digest.hexdigest())
 
     def answers(self, raster: Raster, requests: Iterable[ViewRequest]) -> Generator[ViewWeights]:
-        """What the raster answers, in the order of the requests: from the folder what it answered before.
+        """Yield an answer a request, in their order: from the folder where it has it, else from the raster.
 
-        Without room for more the lift goes on, and keeps no more.
+        If the disk is full, the lift continues without storing more.
         """
-        asked = deque[tuple[Path, ViewWeights | None]]()  # not answered yet, with what is known of them
-        named, fresh, requests = set[str](), _Fresh(self.seconds), iter(requests)
+        pending = deque[tuple[Path, ViewWeights | None]]()  # requests without a reply yet, with their stored answer
+        names, unwritten, requests = set[str](), _UnwrittenAnswers(self.seconds), iter(requests)
 
         def look_up(request: ViewRequest) -> ViewWeights | None:
-            path = self.folder / f"{question(request, self.identity)}.safetensors"
-            named.add(path.name)
-            asked.append((path, _read(path)))
-            return asked[-1][1]
+            path = self.folder / f"{request_digest(request, self.identity)}.safetensors"
+            names.add(path.name)
+            pending.append((path, _read(path)))
+            return pending[-1][1]
 
-        def known() -> Iterator[ViewWeights]:
-            while asked and (answer := asked[0][1]) is not None:
-                asked.popleft()
+        def cached_answers() -> Iterator[ViewWeights]:
+            while pending and (answer := pending[0][1]) is not None:
+                pending.popleft()
                 yield answer
 
         first: list[ViewRequest] = []
-        for request in requests:  # the raster takes requests ahead, and works for them before it answers the first
+        for request in requests:  # the raster reads requests ahead, and computes before it yields the first answer
             if look_up(request) is None:
                 first.append(request)
                 break
-            yield from known()
+            yield from cached_answers()
         rest = (request for request in requests if look_up(request) is None)
-        with closing(raster.iterate_views(chain(first, rest))) as found:
-            for answer in found:
-                yield from known()
-                fresh.keep(asked.popleft()[0], answer)
+        with closing(raster.iterate_views(chain(first, rest))) as computed:
+            for answer in computed:
+                yield from cached_answers()
+                unwritten.keep(pending.popleft()[0], answer)
                 yield answer
-                del answer  # before the next one is made beside it
-        fresh.write()
-        yield from known()
+                del answer  # frees its memory before the raster computes the next one
+        unwritten.write()
+        yield from cached_answers()
         for path in self.folder.glob("*"):
-            if path.name not in named and _ANSWER.fullmatch(path.name):
+            if path.name not in names and _ANSWER.fullmatch(path.name):
                 with suppress(OSError):
                     path.unlink()
 
 
-def question(request: ViewRequest, identity: str) -> str:
-    """What is asked of one view, in hex: all that its answer depends on."""
+def request_digest(request: ViewRequest, identity: str) -> str:
+    """Return the digest, in hex, of all that the answer to a request depends on."""
     camera, observed = request.camera, request.observation
-    told: list[Any] = [identity, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
-    told += [asdict(request.params), asdict(request.weighting), observed.codebook.shape[0]]
+    parameters: list[Any] = [identity, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
+    parameters += [asdict(request.params), asdict(request.weighting), observed.codebook.shape[0]]
     parts = [torch.from_numpy(camera.viewmat.copy()), request.pixels]
     if isinstance(observed, Regions):
         parts.append(observed.labels)
     else:
-        told.append(observed.grid.shape[:2])
-    told += [(str(part.dtype), tuple(part.shape)) for part in parts]
-    digest = hashlib.sha256(json.dumps(told).encode())
+        parameters.append(observed.grid.shape[:2])
+    parameters += [(str(part.dtype), tuple(part.shape)) for part in parts]
+    digest = hashlib.sha256(json.dumps(parameters).encode())
     for part in parts:
         digest.update(tensor_bytes(part))
     return digest.hexdigest()
 
 
-class _Fresh:
-    """Answers that are not on the disk yet. Without room there they are dropped, and so are all that follow."""
+class _UnwrittenAnswers:
+    """Answers that are not on disk yet. If the disk is full, these and all later ones are dropped."""
 
     def __init__(self, seconds: float) -> None:
         self._answers: list[tuple[Path, ViewWeights]] = []
-        self._seconds, self._since, self._room = seconds, time.monotonic(), True
+        self._seconds, self._since, self._has_space = seconds, time.monotonic(), True
 
     def keep(self, path: Path, answer: ViewWeights) -> None:
-        """Keep an answer, which goes to the disk when it is time, or with too many others."""
+        """Add an answer; write all of them after ``seconds``, or when they fill MEMORY_LIMIT."""
         self._answers.append((path, replace(answer, weights=answer.weights.cpu())))
         size = sum(answer.weights.nbytes for _, answer in self._answers)
         if time.monotonic() - self._since >= self._seconds or size >= MEMORY_LIMIT:
             self.write()
 
     def write(self) -> None:
-        """Write them, a file each."""
+        """Write the answers, a file each."""
         try:
-            for path, answer in self._answers if self._room else ():
+            for path, answer in self._answers if self._has_space else ():
                 path.parent.mkdir(parents=True, exist_ok=True)
                 answer.weights.save(path, {key: getattr(answer.rows, name) for name, key in _ROWS.items()})
         except OSError:
-            self._room = False
+            self._has_space = False
         self._answers.clear()
         self._since = time.monotonic()
 
 
 def _read(path: Path) -> ViewWeights | None:
-    """The answer that lies there; None where there is none, or no whole one."""
+    """Return the answer in a file; None if it is absent or incomplete."""
     if not path.is_file():
         return None
     try:
-        weights, others = RegionWeights.load_with_others(path)
-        return ViewWeights(weights, RayRows(**{name: others[key] for name, key in _ROWS.items()}))
+        weights, rows = RegionWeights.load_with_others(path)
+        return ViewWeights(weights, RayRows(**{name: rows[key] for name, key in _ROWS.items()}))
     except (InvalidInput, KeyError):
         return None

@@ -1,4 +1,4 @@
-"""A lift of files: they are read, lifted as values, and remembered with their digests."""
+"""Lifts of files: read them, lift their values, and store their paths and digests in the lift."""
 
 from __future__ import annotations
 
@@ -36,31 +36,32 @@ def lift_files(
     checkpoint: Checkpoint | Path | str | None = None,
     engine: Engine | None = None,
 ) -> LiftResult:
-    """Lift the features of packs onto the splats of a file, as `liftcore.lift` does; the lift remembers the files.
+    """Lift the features of packs onto the splats of a file, as `liftcore.lift` does, and store the files' digests.
 
     Args:
-        splats: of any format that `read_splats` knows. cameras: likewise of `read_cameras`. features: feature packs.
-            All may lie elsewhere (`io.remote`).
-        settings: None: the default ones. The others are as `liftcore.lift` has them.
+        splats: of any format that `read_splats` reads. cameras: likewise of `read_cameras`. features: feature packs.
+            All may be remote (`io.remote`).
+        settings: None: the defaults. The other arguments are those of `liftcore.lift`.
 
     Raises:
-        InvalidInput: a file is malformed, or the packs do not fit the cameras. InvalidSettings: settings are none.
-        Unavailable: there is no such device as asked for.
+        InvalidInput: a file is malformed, or the packs do not fit the cameras.
+        InvalidSettings: settings are of another type.
+        Unavailable: the device does not exist.
     """
     settings = LiftSettings.or_default(settings)
-    choose_device(settings.device)  # told before gigabytes are read
-    paths = local_path(splats), local_path(cameras), _checked(features)
+    choose_device(settings.device)  # raises before gigabytes are read
+    paths = local_path(splats), local_path(cameras), _pack_paths(features)
     with shown_progress(progress) as reporter:
         timings = Timings(reporter)
         with timings.step("read"):
             sources = open_files(*paths, settings)
         with timings.step("digest"):
             inputs = input_files(*paths, views=sources[2].views)
-        given = {"threads": threads, "on_plan": on_plan, "checkpoint": checkpoint, "engine": engine}
-        made = lift(*sources, settings, progress=reporter, **given)
-    own = {"splats": inputs[0], "cameras": inputs[1], "features": tuple(inputs[2:])}
-    own["timings"] = timings.seconds | made.metadata.timings
-    return replace(made, metadata=made.metadata.model_copy(update=own))
+        keywords = {"threads": threads, "on_plan": on_plan, "checkpoint": checkpoint, "engine": engine}
+        result = lift(*sources, settings, progress=reporter, **keywords)
+    facts = {"splats": inputs[0], "cameras": inputs[1], "features": tuple(inputs[2:])}
+    facts["timings"] = timings.seconds | result.metadata.timings
+    return replace(result, metadata=result.metadata.model_copy(update=facts))
 
 
 def plan_files(
@@ -72,7 +73,7 @@ def plan_files(
     threads: int | None = None,
     in_blocks: bool = False,
 ) -> Plan:
-    """What `lift_files` with the same arguments would do, as `liftcore.plan` has it."""
+    """Plan the lift of `lift_files` with the same arguments, as `liftcore.plan` does."""
     settings = LiftSettings.or_default(settings)
     sources = open_files(local_path(splats), local_path(cameras), features, settings)
     return plan(*sources, settings, threads=threads, in_blocks=in_blocks)
@@ -81,9 +82,9 @@ def plan_files(
 def open_files(
     splats: Path, cameras: Path, features: Sequence[Path | str], settings: LiftSettings
 ) -> tuple[Splats, Cameras, Views]:
-    """What a lift with these settings takes: splats, cameras, and packs whose headers are read.
+    """Open the inputs of a lift with these settings: splats, cameras, and packs, of which headers alone are read.
 
-    The splats come without their colours; with ``smoothness`` they have those of degree 0.
+    The splats have no colours; with ``smoothness`` they have those of degree 0.
 
     Raises:
         InvalidInput: a file is malformed.
@@ -92,12 +93,12 @@ def open_files(
     if scene.sh is not None:
         base = {"sh": scene.sh[:, :1].clone(), "sb_params": None, "extras": {}, "layout": (), "header": ()}
         scene = replace(scene, **base)
-    settings.for_splats(scene)  # refuses what does not suit them before gigabytes are read
-    packs = read_features(*_checked(features))
+    settings.for_splats(scene)  # raises if they do not suit the splats, before gigabytes are read
+    packs = read_features(*_pack_paths(features))
     return scene, read_cameras(cameras, views=packs.views), packs
 
 
-def _checked(features: Sequence[Path | str]) -> list[Path]:
-    if isinstance(features, str | Path):  # a text is a sequence too, of letters
+def _pack_paths(features: Sequence[Path | str]) -> list[Path]:
+    if isinstance(features, str | Path):  # a str is a sequence too
         raise InvalidFeatures("features", expected="a list of feature packs", got=f"{str(features)!r} alone")
     return [local_path(pack) for pack in features]

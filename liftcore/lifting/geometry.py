@@ -1,4 +1,4 @@
-"""The geometry phase: each view meets the raster once, which finds its W, and no feature channel is touched."""
+"""The geometry phase: the raster computes W of each view once, without reading any feature channel."""
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -28,54 +28,54 @@ from liftcore.values.views import FeatureGrid, Regions, ViewFeatures
 
 @dataclass(frozen=True)
 class Geometry:
-    """What all views together say about the splats."""
+    """W of all views, and the codebook of its regions."""
 
     weights: RegionWeights  # of all views, with a row for every splat
-    codebook: Codebook  # what its regions stand for
+    codebook: Codebook  # the features of its regions
     samples: tuple[SampledRays, ...]  # for the diagnostics, one a view
     blind: tuple[str, ...]  # views that meet no splat
     levels: np.ndarray  # [M] i8, of each region in its view; -1: a cell of a grid, or regions that are tuples
 
     @property
     def books(self) -> list[Tensor]:
-        """E [M, F] of every view, as its observation was read."""
+        """The codebook E [M, F] of every view."""
         return [view.rows for view in self.codebook.views]
 
     def evidence(self) -> Tensor:
-        """[P] f32 on the CPU: sums of plain weights over all views, each ray once."""
-        found = torch.zeros(self.weights.splats.shape[0], dtype=torch.float32)
-        found[self.weights.evidence_splats.cpu().long()] = self.weights.evidence.cpu()
-        return found
+        """Return [P] f32 on the CPU: sums of unweighted A over all views, each ray once."""
+        sums = torch.zeros(self.weights.splats.shape[0], dtype=torch.float32)
+        sums[self.weights.evidence_splats.cpu().long()] = self.weights.evidence.cpu()
+        return sums
 
 
 @dataclass(frozen=True)
 class WeightRequest:
-    """What the raster is asked of one view, and what its answer will mean."""
+    """A request to the raster for the weights of one view, and what is needed to read its answer."""
 
     request: ViewRequest
     readout: Readout  # of the request's pixels
     codebook: ViewCodebook
     levels: np.ndarray  # [M] i8, as `Geometry` has them
 
-    def weights(self, found: ViewWeights) -> RegionWeights:
-        """W of the view by rays of the photo: a stride's stand for those between them."""
-        part = self.codebook.counted(found.weights)
+    def weights(self, answer: ViewWeights) -> RegionWeights:
+        """Return W of the view, with evidence scaled by the stride to all rays of the photo."""
+        part = self.codebook.counted(answer.weights)
         rays = float(self.request.params.stride**2)
         return replace(part, views=(self.request.camera.name,), evidence=part.evidence * rays)
 
 
 def weight_request(views: LiftViews, number: int, settings: LiftSettings, by_rows: bool) -> WeightRequest:
-    """What a lift asks of the view of that number, which is read for it.
+    """Read the view of that number, and return the request for its weights.
 
     Args:
-        by_rows: whether a region is a row of a codebook in any case, or may be a tuple of labels (`as_regions`).
+        by_rows: True if each region must be a row of a codebook, False if it may be a tuple of labels (`as_regions`).
     """
-    camera, given = views[number]
-    observation = as_read(given, settings, camera.name)
+    camera, features = views[number]
+    observation = as_read(features, settings, camera.name)
     params = strided(settings.lift_params, settings, camera, number)
     pixels = sample_pixels(camera, -(-settings.certificate_rays // len(views)), (settings.seed, number), params)
     regions, codebook = as_regions(observation, by_rows)
-    if isinstance(given, Regions) and isinstance(observation, Regions) and codebook.tuples is None:
+    if isinstance(features, Regions) and isinstance(observation, Regions) and codebook.tuples is None:
         levels = region_levels(observation)
     else:
         levels = np.full(codebook.regions, -1, np.int8)
@@ -98,18 +98,19 @@ def weigh_views(
     first: Sequence[int] = (),
     on_first: Callable[[Geometry], None] | None = None,
 ) -> Geometry:
-    """W of all views, and sampled rows of A.
+    """Compute W of all views, and sampled rows of A.
 
     Args:
         splats: P. views: in the order of the sums.
-        by_rows: whether a region is a row of a codebook in any case, or may be a tuple of labels (`as_regions`).
-        checkpoint: what the raster found of views before, and is to keep.
-        device_bytes: of W that may stay on the device that found it.
-        first: numbers of views that are weighed before the others. The result is the same for any.
-        on_first: called with what these alone say, as soon as it is known. An exception from it stops the work.
+        by_rows: True if each region must be a row of a codebook, False if it may be a tuple of labels (`as_regions`).
+        checkpoint: the raster's stored answers, to which new ones are added.
+        device_bytes: of W that may stay on the device that computed it.
+        first: numbers of the views to begin with. The result is bitwise identical for any.
+        on_first: called with the geometry of these views alone, as soon as they are done. An exception from it stops
+            the work.
     """
     order = [*first, *sorted({*range(len(views))} - {*first})]
-    weighed = dict[int, _WeighedView]()
+    by_number = dict[int, _ViewBlock]()
     waiting = deque[WeightRequest]()
 
     def requests() -> Iterator[ViewRequest]:
@@ -121,25 +122,25 @@ def weigh_views(
     on_device = in_memory = 0
     with closing(answers):
         for number, answer in zip(order, answers, strict=True):
-            question = waiting.popleft()
-            part = question.weights(answer)
+            request = waiting.popleft()
+            part = request.weights(answer)
             if part.region.is_cuda and on_device + part.nbytes <= device_bytes:
                 on_device += part.nbytes
             else:
                 part = part.cpu()
                 in_memory += part.nbytes
                 part = part if in_memory <= MEMORY_LIMIT else part.in_files()
-            sample = SampledRays(answer.rows, question.readout)
-            weighed[number] = _WeighedView(part, sample, question.codebook, question.levels)
-            del answer, part, question  # before the next one is made beside it
-            progress("geometry", len(weighed), len(views), "views")
-            if on_first and len(weighed) == len(first):
-                on_first(_stacked_views([weighed[one] for one in first], splats, threads))
-    return _stacked_views([weighed.pop(number) for number in range(len(views))], splats, threads)
+            sample = SampledRays(answer.rows, request.readout)
+            by_number[number] = _ViewBlock(part, sample, request.codebook, request.levels)
+            del answer, part, request  # frees their memory before the raster computes the next one
+            progress("geometry", len(by_number), len(views), "views")
+            if on_first and len(by_number) == len(first):
+                on_first(_stacked_views([by_number[one] for one in first], splats, threads))
+    return _stacked_views([by_number.pop(number) for number in range(len(views))], splats, threads)
 
 
-class _WeighedView(NamedTuple):
-    """What the raster found of a view, without what the view observes."""
+class _ViewBlock(NamedTuple):
+    """W of one view with its samples and codebook, without the observation itself."""
 
     weights: RegionWeights
     sample: SampledRays
@@ -147,8 +148,8 @@ class _WeighedView(NamedTuple):
     levels: np.ndarray  # [M] i8
 
 
-def _stacked_views(views: list[_WeighedView], splats: int, threads: int | None) -> Geometry:
-    """W of some views, which are dropped from the list."""
+def _stacked_views(views: list[_ViewBlock], splats: int, threads: int | None) -> Geometry:
+    """Stack W of some views, and empty the list, so that memory is freed early."""
     samples, codebook = tuple(view.sample for view in views), Codebook(tuple(view.codebook for view in views))
     blind = tuple(view.weights.views[0] for view in views if not view.weights.evidence.numel())
     levels = np.concatenate([view.levels for view in views])
@@ -161,17 +162,17 @@ def _stacked_views(views: list[_WeighedView], splats: int, threads: int | None) 
 
 
 def strided(params: CompositingParams, settings: LiftSettings, camera: Camera, number: int) -> CompositingParams:
-    """The parameters with the stride, its first pixel drawn for view ``number``: none is left out in all views."""
+    """Return the parameters with the stride, its first pixel drawn per view: no pixel is skipped in all views."""
     rng = np.random.default_rng((settings.seed, number, settings.stride))
     left, top = (int(rng.integers(min(settings.stride, side))) for side in (camera.width, camera.height))
     return replace(params, stride=settings.stride, offset=(left, top))
 
 
 def as_read(observation: ViewFeatures, settings: LiftSettings, view: str) -> ViewFeatures:
-    """The observation as the settings read it: its levels, and with ``nearest`` a grid as regions of one cell each.
+    """Return the observation as the settings read it: its levels, and with ``nearest`` a grid as one region a cell.
 
     Raises:
-        InvalidFeatures: the view lacks the level that the settings ask for.
+        InvalidFeatures: the view lacks the level of the settings.
     """
     observation = at_levels(observation, settings.levels, view)
     if not isinstance(observation, FeatureGrid) or settings.grid_reading == "bilinear":

@@ -1,4 +1,4 @@
-"""The steps of a lift in one process's memory: W is a matrix of a row a splat, and X a tensor."""
+"""The steps of a lift in the memory of one process: W is a sparse matrix with a row a splat, and X a tensor."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ from liftcore.values.views import ViewFeatures
 
 @dataclass(frozen=True)
 class SceneWeights:
-    """W of all views, with what it is made of, and what reweighting found."""
+    """W of all views, with its inputs and the results of reweighting."""
 
     raster: Raster
     device: Device
-    memory: int | None  # bytes that X may take before it lies in a mapped file; None for no limit
+    memory: int | None  # bytes of X, beyond which it is a mapped file; None for no limit
     views: LiftViews
-    geometry: Geometry  # its W as it is solved
-    sums: np.ndarray | None = None  # [P] f64, of the rows of W as it was weighed; None: W is that
+    geometry: Geometry  # its W is that of the solve
+    sums: np.ndarray | None = None  # [P] f64, of the rows of W before reweighting; None: W is not reweighted
     threads: int | None = None  # None: the cores that this process may use
     consensus: Tensor | None = None  # [nnz] f32, until W is reweighted
     agreement: Agreement | None = None
@@ -70,16 +70,16 @@ class SceneWeights:
 
     @cached_property
     def members(self) -> Memberships:
-        """The memberships of W, which objects and consensus ask alike."""
+        """The memberships of W, which objects and consensus share."""
         groups = RegionGroups.of(self.weights.offsets.numpy(), self.geometry.levels)
         return memberships(self.on_processor, groups, self.threads)
 
     def row_sums(self) -> np.ndarray:
-        """[P] f64, of W as it was weighed."""
+        """Return the sums of rows [P] f64 of W before reweighting."""
         return self.weights.row_sums().cpu().numpy() if self.sums is None else self.sums
 
     def with_factors(self, W: RegionWeights, factors: Tensor) -> SceneWeights:
-        """The same with each entry of W times its factor [nnz] f32.
+        """Multiply each entry of W by its factor [nnz] f32.
 
         Args:
             W: this W on the CPU.
@@ -90,7 +90,7 @@ class SceneWeights:
 
 @dataclass(frozen=True)
 class InMemory(LiftSteps[SceneWeights]):
-    """Steps of which one process holds all; see the protocol."""
+    """The steps in one process; see the protocol."""
 
     splats: Splats
     settings: LiftSettings
@@ -99,7 +99,7 @@ class InMemory(LiftSteps[SceneWeights]):
     checkpoint: Checkpoint | None = None
 
     def plan(self, views: LiftViews, device: Device) -> Plan:
-        """See the protocol. Contradictions are told by the views that the lift begins with."""
+        """See the protocol. `weigh` reports contradictions, by the views that the lift begins with."""
         return plan_lift(self.splats, views, self.settings, device, self.threads)
 
     def weigh(
@@ -109,20 +109,20 @@ class InMemory(LiftSteps[SceneWeights]):
         first, begin = probe_views(len(views)), time.perf_counter()
         plans = [plan]
 
-        def look(geometry: Geometry) -> None:
-            took = time.perf_counter() - begin
+        def check_first(geometry: Geometry) -> None:
+            seconds = time.perf_counter() - begin
             if views.features.paths:
-                wrong = contradictions(raster, views, self.settings, plan.seen_share, geometry)
-                plans.append(replace(plan, told=(*plan.told, *wrong)))
+                warnings = contradictions(raster, views, self.settings, plan.seen_share, geometry)
+                plans.append(replace(plan, told=(*plan.told, *warnings)))
             if len(views) >= TIMED_VIEWS:
-                plans.append(replace(plans[-1], seconds=took * len(views) / len(first)))
+                plans.append(replace(plans[-1], seconds=seconds * len(views) / len(first)))
             on_plan(plans[-1])
 
         geometry = weigh_views(
             raster, self.splats.count, views, self.settings, self.timings.progress,
             by_rows=self.settings.weighs_rows, device_bytes=plan.kept_on_card, threads=self.threads,
             checkpoint=self.checkpoint.of(self.splats, plan.device.facts()) if self.checkpoint else None,
-            first=first, on_first=look,
+            first=first, on_first=check_first,
         )  # fmt: skip
         W = SceneWeights(raster, plan.device, plan.features_room, views, geometry, threads=self.threads)
         return W, WeightStatistics(plans[-1], geometry.levels, W.weights.region.shape[0], geometry.blind)
@@ -159,12 +159,12 @@ class InMemory(LiftSteps[SceneWeights]):
         except RuntimeError as error:
             if not out_of_memory(error):
                 raise
-        give_back_memory()  # out here the error holds nothing any more
+        give_back_memory()  # after the except block, where the error no longer references tensors
         return apply_agreement(W.on_processor, False)
 
     def discount_distance(self, W: SceneWeights) -> SceneWeights:
-        weights, how = W.on_processor, {"means": self.splats.means, "threads": self.threads}
-        return W.with_factors(weights, huber_factors(weights, W.geometry.codebook, self.timings.progress, **how))
+        weights, keywords = W.on_processor, {"means": self.splats.means, "threads": self.threads}
+        return W.with_factors(weights, huber_factors(weights, W.geometry.codebook, self.timings.progress, **keywords))
 
     def solve(self, W: SceneWeights, clusters: RegionObjects | None) -> tuple[Tensor, SplatSupport]:
         solution = solve(
@@ -174,7 +174,7 @@ class InMemory(LiftSteps[SceneWeights]):
         confidence = W.agreement.confidence if W.agreement else None
         return solution.features, SplatSupport(W.row_sums(), W.geometry.evidence(), solution.agreement, confidence)
 
-    def refine(self, W: SceneWeights, X: Tensor, seen: np.ndarray) -> tuple[Tensor, dict[str, Any]]:
+    def refine(self, W: SceneWeights, X: Tensor, visible: np.ndarray) -> tuple[Tensor, dict[str, Any]]:
         settings, progress, books, facts = self.settings, self.timings.progress, W.geometry.books, dict[str, Any]()
         views = W.views
 
@@ -184,52 +184,52 @@ class InMemory(LiftSteps[SceneWeights]):
         rays = AllRays(W.raster, self.splats.count, views.lifted, observed, settings.lift_params, progress)
         if settings.cg_steps:
             with self.timings.stage("refine"):
-                refinement = refine(rays, X, seen, books, settings, progress)
+                refinement = refine(rays, X, visible, books, settings, progress)
             X, facts["refinement"] = refinement.features, refinement.stats
         if settings.reference_channels:
             with self.timings.stage("reference"):
-                facts["reference"] = reference(rays, X, seen, W.geometry.samples, books, settings, progress)
+                facts["reference"] = reference(rays, X, visible, W.geometry.samples, books, settings, progress)
         return X, facts
 
     def smooth(self, W: SceneWeights, X: Tensor, support: SplatSupport) -> tuple[Tensor, dict[str, Any]]:
         weights, strength, choice = W.on_processor, self.settings.smoothness, dict[str, Any]()
-        graph, parted = weaken_edges(
+        graph, weakened_edges = weaken_edges(
             SplatGraph.of(self.splats, self.threads), weights, W.geometry.levels, self.threads
         )  # fmt: skip
         if strength == "auto":
             with self.timings.stage("halves"):
-                chosen = choose_smoothness(
+                best = choose_smoothness(
                     weights, W.geometry.codebook, graph, support.confidence, seed=self.settings.seed,
                     progress=self.timings.progress, threads=self.threads,
                 )  # fmt: skip
-            strength, choice = chosen.smoothness, {"candidates": chosen.facts()}
-        seen = torch.from_numpy(support.sums > 0)
+            strength, choice = best.smoothness, {"candidates": best.facts()}
+        visible = torch.from_numpy(support.sums > 0)
         X, facts = smooth(
-            X, graph, support.evidence, support.confidence, seen, strength, self.timings.progress, self.threads,
+            X, graph, support.evidence, support.confidence, visible, strength, self.timings.progress, self.threads,
             device=W.device,
         )  # fmt: skip
-        return X, facts | {"parted": parted} | choice
+        return X, facts | {"parted": weakened_edges} | choice
 
     def aggregate(self, W: SceneWeights, X: Tensor, clusters: RegionObjects | None) -> tuple[Tensor, Aggregation]:
-        settings, agreement, judged = self.settings, W.agreement, None
+        settings, agreement, consistency = self.settings, W.agreement, None
         if settings.aggregation_guard and agreement and agreement.explained is not None:
-            judged = W.on_processor, agreement.directions, agreement.explained
-        X, found = aggregate(
+            consistency = W.on_processor, agreement.directions, agreement.explained
+        X, aggregation = aggregate(
             X, W.geometry.evidence().numpy(), self.splats, W.raster, W.views, settings, self.timings.progress,
-            self.threads, things=clusters, judged=judged,
+            self.threads, things=clusters, judged=consistency,
         )  # fmt: skip
         if not settings.aggregation_resolve:
-            return X, found
+            return X, aggregation
         with self.timings.stage("resolve"):
             X, facts = solve_from_kept_regions(
-                X, found, W.on_processor, W.geometry.codebook, W.row_sums(), self.timings.progress,
+                X, aggregation, W.on_processor, W.geometry.codebook, W.row_sums(), self.timings.progress,
                 means=self.splats.means, threads=self.threads,
             )  # fmt: skip
-        return X, replace(found, facts=found.facts | facts)
+        return X, replace(aggregation, facts=aggregation.facts | facts)
 
     def measure(self, W: SceneWeights, X: Tensor) -> ViewMeasures:
         return measure_samples(W.geometry.samples, X, W.geometry.books, self.threads)
 
     def deliver(self, W: SceneWeights, lift: LiftResult) -> LiftResult:
-        """See the protocol: on the device that lifted, but for an X in a mapped file, which stays there."""
+        """See the protocol: the device of the lift; an X in a mapped file stays there."""
         return lift if W.memory is not None and lift.features.nbytes > W.memory else lift.to(W.device.place)

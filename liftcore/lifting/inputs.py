@@ -1,4 +1,4 @@
-"""The inputs of a lift, checked and paired."""
+"""The inputs of a lift: checked, and features paired with cameras."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from liftcore.values.settings import LiftSettings, Preset
 
 @dataclass(frozen=True)
 class LiftInputs:
-    """Splats, views and settings that suit each other."""
+    """Splats, views and settings that fit each other."""
 
     splats: Splats
-    source_views: Views  # as the caller has them
+    source_views: Views  # as the caller passed them
     views: LiftViews  # paired with cameras
     settings: LiftSettings
 
@@ -36,11 +36,11 @@ class LiftInputs:
         threads: int | None = None,
     ) -> LiftInputs:
         """Check the arguments of `liftcore.lift`, and raise as it does."""
-        chosen = LiftSettings.chosen(preset, settings)
+        lift_settings = LiftSettings.chosen(preset, settings)
         splats = check_given(splats, threads)
-        chosen, given = chosen.for_splats(splats), as_views(views)
-        lifted = LiftViews.of(given, cameras, chosen)
-        masks = chosen.aggregation and any(lifted.features.is_regions(name) for name in lifted.names)
-        if chosen.aggregation and not (masks and chosen.clusters_by_masks):
+        lift_settings, source_views = lift_settings.for_splats(splats), as_views(views)
+        lifted = LiftViews.of(source_views, cameras, lift_settings)
+        masks = lift_settings.aggregation and any(lifted.features.is_regions(name) for name in lifted.names)
+        if lift_settings.aggregation and not (masks and lift_settings.clusters_by_masks):
             require_hdbscan()
-        return cls(splats, given, lifted, chosen)
+        return cls(splats, source_views, lifted, lift_settings)

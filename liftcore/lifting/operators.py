@@ -1,4 +1,4 @@
-"""A alone, for whoever needs more than a lift: region weights ``A^T S`` and renders ``A X``."""
+"""The weights A without a lift: region weights ``A^T S``, and renders ``A X``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from liftcore.errors import InvalidCameras, InvalidSettings
 from liftcore.lifting.geometry import weigh_views
 from liftcore.lifting.in_memory import InMemory, SceneWeights
 from liftcore.lifting.inputs import LiftInputs
-from liftcore.lifting.pipeline import find_objects, judges_apart, reweigh
+from liftcore.lifting.pipeline import find_objects, needs_separate_levels, reweigh
 from liftcore.raster import check_given, open_raster
 from liftcore.runtime.device import choose_device
 from liftcore.runtime.progress import Progress, Timings, shown_progress
@@ -65,20 +65,20 @@ def render(
     Args:
         camera: the camera, or several by their names, such as all of a scene.
         values: [P] or [P, F] of any numbers or booleans, a row a splat, in the splats' order; without gradients.
-        params: how rays meet splats; None: as they were trained (`Splats.antialiased`), with the field's other
-            constants. The scale of the opacity logits is 1; the background is zero.
-        normalise: whether pixels are divided by the sum of their weights, where that is not zero.
-        device: ``auto``, ``cpu`` or ``cuda``; also ``cuda:0``, if that card is current. threads: of the CPU; the
-            result is bitwise identical for any number.
+        params: of compositing; None: those of the splats' training (`Splats.antialiased`), with the usual constants.
+            The scale of the opacity logits is 1; the background is zero.
+        normalise: True divides pixels by the sum of their weights, where it is not zero.
+        device: ``auto``, ``cpu`` or ``cuda``; also ``cuda:0``, if that GPU is the current device. threads: of the
+            CPU; the result is bitwise identical for any number.
 
     Returns:
-        [H, W] or [H, W, F] f32, on the CPU; of several cameras such an image each, by their names.
+        [H, W] or [H, W, F] f32, on the CPU; for several cameras a dict of such images by their names.
 
     Raises:
-        InvalidSplats, InvalidCameras: splats or camera are something else, such as a path or a name.
+        InvalidSplats, InvalidCameras: splats or camera are of another type, such as a path or a name.
         InvalidSettings: values have another number of rows than there are splats, or a gradient, or threads are no
             number.
-        Unavailable: there is no such device.
+        Unavailable: the device does not exist.
     """
     splats = check_given(splats, threads)
     params = CompositingParams(antialiased=splats.antialiased) if params is None else params
@@ -86,9 +86,9 @@ def render(
         raise InvalidSettings("params", expected="CompositingParams, or None", got=repr(params)[:80])
     check_antialiased(splats.kernel, params.antialiased)
     cameras = camera if isinstance(camera, Mapping) else {"": camera}
-    for one in cameras.values():
-        if not isinstance(one, Camera):
-            got, hint = repr(one)[:80], "cameras[name] is the camera of a view"
+    for view_camera in cameras.values():
+        if not isinstance(view_camera, Camera):
+            got, hint = repr(view_camera)[:80], "cameras[name] is the camera of a view"
             raise InvalidCameras("camera", expected="a Camera", got=got, hint=hint)
     rows = _rows(splats, values)
     raster = open_raster(splats, choose_device(device), threads)
@@ -100,26 +100,30 @@ def render(
             image = torch.where(sums > 0, image / sums.clamp_min(torch.finfo(torch.float32).tiny), 0.0)
         return (image if rows.ndim == 2 else image[:, :, 0]).cpu()
 
-    return image_of(camera) if isinstance(camera, Camera) else {name: image_of(one) for name, one in cameras.items()}
+    return (
+        image_of(camera)
+        if isinstance(camera, Camera)
+        else {name: image_of(view_camera) for name, view_camera in cameras.items()}
+    )
 
 
 def _rows(splats: Splats, values: Tensor | np.ndarray) -> Tensor:
-    """Values as f32 on the CPU, a row a splat.
+    """Return values as f32 on the CPU, a row a splat.
 
     Raises:
-        InvalidSettings: they are no numbers, of another number of rows, or a gradient is recorded.
+        InvalidSettings: they are not numeric, have another number of rows, or would record a gradient.
     """
     _refuse_gradients(values)
     try:
-        given = shared_tensor(values).cpu()
+        rows = shared_tensor(values).cpu()
     except (TypeError, ValueError) as error:
         got = f"{type(values).__name__} ({error})"[:120]
         raise InvalidSettings("values", expected="numbers or booleans of splats", got=got) from None
-    if given.ndim not in (1, 2) or given.shape[0] != splats.count or given.is_complex():
+    if rows.ndim not in (1, 2) or rows.shape[0] != splats.count or rows.is_complex():
         expected = f"real numbers [{splats.count}] or [{splats.count}, F], a row a splat"
-        got = f"{str(given.dtype).removeprefix('torch.')} {list(given.shape)}"
+        got = f"{str(rows.dtype).removeprefix('torch.')} {list(rows.shape)}"
         raise InvalidSettings("values", expected=expected, got=got)
-    return given.float()
+    return rows.float()
 
 
 def _refuse_gradients(values: Tensor | np.ndarray) -> None:
@@ -145,25 +149,25 @@ def region_weights(
     threads: int | None = None,
     **settings: Unpack[LiftOptions],
 ) -> RegionWeights:
-    """The weight of each region, or cell of a grid, of each view at each splat: ``W = A^T S``.
+    """Compute the weight of each region, or cell of a grid, of each view at each splat: ``W = A^T S``.
 
-    Where each pixel of a view has a label of its own, S is the identity and W is A itself, transposed: a column of W
+    Where each pixel of a view has a label of its own, S is the identity and W is the transpose of A: a column of W
     holds the weight of each splat on the ray of one pixel.
 
     Args:
-        splats, cameras, views, preset, progress, threads, settings: as `lift` has them. All views are weighed,
-            whatever the settings' coverage. A label on several levels is a region each time.
-        reweight: False: W by geometry alone, which reads no feature. True: W as `lift` solves with it, reweighted by
-            what features of other views say (``robust_steps``, ``consensus``, ``reliability``, ``loss``); sums of
-            rows stay the same but for ``loss=huber``.
+        splats, cameras, views, preset, progress, threads, settings: as in `lift`. All views count, whatever the
+            settings' coverage. A label on several levels is one region a level.
+        reweight: False: W by geometry alone, which reads no feature. True: W of the solve of `lift`, reweighted by
+            the features of other views (``robust_steps``, ``consensus``, ``reliability``, ``loss``); sums of rows
+            stay the same except with ``loss=huber``.
 
     Returns:
-        W on the CPU, a row a splat: in memory, or in mapped files where it is large. Rows of ``W E``, of the views'
-        codebooks E, over the sums of rows of W are the features that `lift` finds with the same settings where it is
-        reweighted, before least squares (``cg_steps``) and aggregation; else those of ``row-sum``.
+        W on the CPU, a row a splat: in memory, or in mapped files if it is large. With E the views' codebooks,
+        ``W E`` over the sums of rows of W are features: with ``reweight`` those of `lift` with the same settings,
+        before least squares (``cg_steps``) and aggregation; without it those of ``row-sum``.
 
     Raises:
-        InvalidFeatures, InvalidSettings, Unavailable: as `lift` has it.
+        InvalidFeatures, InvalidSettings, Unavailable: as in `lift`.
     """
     inputs = LiftInputs.of(splats, cameras, views, preset, {**settings, "certificate_rays": 0}, threads)
     device = choose_device(inputs.settings.device)
@@ -177,6 +181,6 @@ def region_weights(
             masks, levels_apart = bool((geometry.levels >= 0).any()), False
             if inputs.settings.robust_steps and np.unique(geometry.levels).size > 1:
                 _, node_vectors = find_objects(steps, W, masks, inputs.settings, steps.timings)
-                levels_apart = judges_apart(node_vectors, len(inputs.views.names))
+                levels_apart = needs_separate_levels(node_vectors, len(inputs.views.names))
             W, _ = reweigh(steps, W, masks, levels_apart, inputs.settings, steps.timings)
     return W.weights.cpu()

@@ -1,4 +1,4 @@
-"""The pipeline, as the paper reads: A from the scene, B from the views, X in closed form, and what is known of it."""
+"""The lift from start to end: weights A of the scene, features B of the views, X in closed form, diagnostics."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from liftcore.values.settings import LiftSettings, Preset
 
 log = logging.getLogger(__name__)
 
-LEAST_WITNESSES = 6  # views: with 4, levels apart lost a word of a small scene; with 8 they gain; between: not tried
+MIN_LEVEL_VIEWS = 6  # for separate levels: 4 views lost a word of a small scene, 8 gained; 5 to 7 are untested
 
 
 @usual_modes()
@@ -53,62 +53,63 @@ def lift(
     engine: Engine | None = None,
     **settings: Unpack[LiftOptions],
 ) -> LiftResult:
-    """Lift the features of views onto splats: ``X = D^-1 A^T B`` A the weights of splats on rays.
+    """Lift the features of views onto splats: ``X = D^-1 A^T B``, with A the weights of splats on rays.
 
     Args:
         splats: P trained splats.
-        cameras: by name. views: what each sees, by the same names: ``Regions`` or a ``FeatureGrid``, in a dict, a
-            feature pack (`read_features`), or an iterator of (name, view) pairs, which is gone through once and kept
-            on the disk, so that no more than a few maps are in memory.
+        cameras: by name. views: the features of each view, by the same names: ``Regions`` or a ``FeatureGrid``, in a
+            dict, a feature pack (`read_features`), or an iterator of (name, view) pairs. An iterator is read once and
+            stored on disk, so that no more than a few maps are in memory.
         preset: a published choice of weights (`Preset`), or `LiftSettings` in place of preset and settings.
-        progress: called ``progress(stage, done, total, unit)``; an exception from it stops the work. None: bars where
+        progress: called ``progress(stage, done, total, unit)``; an exception from it stops the lift. None: bars where
             stderr is a terminal. True: bars there and lines elsewhere. False: nothing.
-        on_plan: called with the plan before the first view, and shows its warnings. None: they are logged, and at
-            the end those of the diagnostics.
-        threads: None takes the cores that this process may use. The number changes no bit of the result.
-        checkpoint: a folder that keeps the weights of finished views. The same lift goes on from there, identical to
-            the bit, and so does one that differs in features alone (another encoder's of the same regions).
-        engine: who works on the lift in blocks of views and of splats, for scenes whose W or X is more than a machine
-            should hold: `LocalEngine` or `RayEngine`, with the same bits and threads of its own; the checkpoint is
-            then the folder of the blocks, which all workers share, and from which the same lift of feature packs goes
-            on. None: the whole lift in this process's memory.
+        on_plan: called with the plan before the first view; it is to show the plan's warnings. None: the warnings of
+            the plan are logged, and at the end those of the diagnostics.
+        threads: None uses the cores that this process may use. The result is bitwise identical for any value.
+        checkpoint: a folder that stores the weights of finished views. The same lift resumes from it with a bitwise
+            identical result; so does a lift that differs in features alone (another encoder, the same regions).
+        engine: runs the lift in blocks of views and of splats, for scenes whose W or X does not fit one machine:
+            `LocalEngine` or `RayEngine`, with threads of its own; the result is bitwise identical. The checkpoint is
+            then the folder of the blocks, which all workers share and from which the same lift of feature packs
+            resumes. None: the whole lift in the memory of this process.
         settings: fields of `LiftSettings` that differ from the preset's.
 
     Returns:
-        Features [P, F] f16 (or f32) with evidence, agreement and diagnostics, on the device that did the work, or on
-        the CPU where that has no room for them.
+        Features [P, F] f16 (or f32) with evidence, agreement and diagnostics, on the device that computed them, or on
+        the CPU where that device has too little memory.
 
     Raises:
-        InvalidSplats, InvalidCameras: splats or cameras are something else, such as a path.
+        InvalidSplats, InvalidCameras: splats or cameras are of another type, such as a path.
         InvalidFeatures: views are malformed, or none has a camera.
         InvalidSettings: a setting is unknown or out of range, or does not suit the splats' kernel or the views.
-        Unavailable: neither memory nor disk can hold what the lift needs, or there is no such device as asked for.
+        Unavailable: neither memory nor disk can hold what the lift needs, or the device does not exist.
 
     Source: Splat Feature Solver, Eq. 3 and 6.
     """
     inputs = LiftInputs.of(splats, cameras, views, preset, settings, threads)
     if on_plan is not None and not callable(on_plan):
         raise InvalidSettings("on_plan", expected="a function of the plan, or None", got=repr(on_plan)[:80])
-    checkpoint, warn = _checkpoint(checkpoint), _WarnOnce()
-    tell_plan = on_plan or (lambda plan: warn((*plan.warnings, *plan.told)))
+    checkpoint = _open_checkpoint(checkpoint)
+    log_once = WarningLog()
+    show_plan = on_plan or (lambda plan: log_once((*plan.warnings, *plan.told)))
     with shown_progress(progress) as reporter:
         timings = Timings(reporter)
         if engine is None:
             steps = InMemory(inputs.splats, inputs.settings, timings, threads, checkpoint)
             with one_thread():
-                result = run(steps, inputs, timings, tell_plan)
+                result = run(steps, inputs, timings, show_plan)
         else:
             folder = checkpoint.folder if checkpoint else None
             with steps_in_blocks(engine, inputs, timings, folder, threads=threads) as steps:
-                result = run(steps, inputs, timings, tell_plan)
-    warn(result.diagnostics["warnings"] if on_plan is None else ())
+                result = run(steps, inputs, timings, show_plan)
+    log_once(result.diagnostics["warnings"] if on_plan is None else ())
     return result
 
 
 def run(
     steps: LiftSteps[Weights], inputs: LiftInputs, timings: Timings, on_plan: Callable[[Plan], None]
 ) -> LiftResult:
-    """Take the steps of a lift, whoever holds W and X."""
+    """Run all steps of a lift; the same for W and X in memory and in blocks."""
     splats, views, settings = inputs.splats, inputs.views, inputs.settings
     device = choose_device(settings.device)
     with timings.step("compile"):
@@ -125,14 +126,14 @@ def run(
 def _run(
     steps: LiftSteps[Weights], inputs: LiftInputs, plan: Plan, timings: Timings, on_plan: Callable[[Plan], None]
 ) -> LiftResult:
-    """Take the steps after the plan."""
+    """Run the steps after the plan."""
     settings, views = inputs.settings, inputs.views
     with timings.stage("geometry"):
-        W, weighed = steps.weigh(views, plan, on_plan)
+        W, statistics = steps.weigh(views, plan, on_plan)
     aggregation = None
-    objects, node_vectors = find_objects(steps, W, weighed.masks, settings, timings)
-    levels_apart = judges_apart(node_vectors, len(plan.views))
-    W, reliability = reweigh(steps, W, weighed.masks, levels_apart, settings, timings)
+    objects, node_vectors = find_objects(steps, W, statistics.masks, settings, timings)
+    levels_apart = needs_separate_levels(node_vectors, len(plan.views))
+    W, reliability = reweigh(steps, W, statistics.masks, levels_apart, settings, timings)
     clusters = objects if settings.clusters_by_masks else None
     with timings.stage("solve"):
         X, support = steps.solve(W, clusters)
@@ -149,12 +150,12 @@ def _run(
             X, aggregation = steps.aggregate(W, X, clusters)
         facts["aggregation"] = aggregation.facts
     if settings.robust_steps:
-        facts["reweighting"] = agreement_facts(weighed.levels, reliability, support.confidence, levels_apart)
+        facts["reweighting"] = agreement_facts(statistics.levels, reliability, support.confidence, levels_apart)
     if objects and node_vectors and settings.objects:
         facts["objects"] = object_facts(objects, node_vectors)
     with timings.step("certify"):
         measures = steps.measure(W, X)
-        diagnostics = diagnose(inputs, weighed, X.dtype, support, measures, facts)
+        diagnostics = diagnose(inputs, statistics, X.dtype, support, measures, facts)
     table = views.features.table
     lift = LiftResult(
         features=X,
@@ -171,21 +172,21 @@ def _run(
     return steps.deliver(W, lift)
 
 
-def object_tensors(objects: RegionObjects, said: NodeVectors) -> dict[str, torch.Tensor]:
-    """What a lift holds of objects and their parts."""
+def object_tensors(objects: RegionObjects, node_vectors: NodeVectors) -> dict[str, torch.Tensor]:
+    """Return the tensors of objects and their parts as a lift stores them, by name."""
     columns = {"object": objects.labels, "object_views": objects.views, "node": objects.node}
     columns |= {"node_parents": objects.tree.parents, "node_views": objects.node_views}
-    columns |= {"node_confidence": objects.tree.confidence, "node_features": said.vectors.astype(np.float16)}
+    columns |= {"node_confidence": objects.tree.confidence, "node_features": node_vectors.vectors.astype(np.float16)}
     return {name: torch.from_numpy(column) for name, column in columns.items()}
 
 
 def find_objects(
     steps: LiftSteps[Weights], W: Weights, masks: bool, settings: LiftSettings, timings: Timings
 ) -> tuple[RegionObjects | None, NodeVectors | None]:
-    """Objects and what the masks of their nodes say, where the settings ask for objects; else None.
+    """Find objects and the mean features of their nodes; None and None where the settings want no objects.
 
     Args:
-        masks: whether any view has masks.
+        masks: True if any view has masks.
     """
     if not settings.finds_objects(masks):
         return None, None
@@ -194,24 +195,24 @@ def find_objects(
         return objects, steps.node_vectors(W, objects)
 
 
-def judges_apart(node_vectors: NodeVectors | None, views: int) -> bool:
-    """True where each level of masks is judged by itself: levels disagree, and enough views can witness each."""
-    return node_vectors is not None and node_vectors.levels_disagree and views >= LEAST_WITNESSES
+def needs_separate_levels(node_vectors: NodeVectors | None, views: int) -> bool:
+    """Return True if each level of masks is compared separately: levels disagree, and there are enough views."""
+    return node_vectors is not None and node_vectors.levels_disagree and views >= MIN_LEVEL_VIEWS
 
 
 def reweigh(
     steps: LiftSteps[Weights], W: Weights, masks: bool, levels_apart: bool, settings: LiftSettings, timings: Timings
 ) -> tuple[Weights, float | None]:
-    """W as it is solved, and the median reliability of regions, where that is asked for.
+    """Reweight W for the solve; return it with the median reliability of regions, None where settings want none.
 
-    Steps give factors of W's entries, and so does a loss that is not of squares.
+    Consensus, the robust steps and Huber's loss each multiply the entries of W by factors.
 
     Args:
-        masks: whether any view has masks.
-        levels_apart: whether regions are compared with those of their own level alone.
+        masks: True if any view has masks.
+        levels_apart: True if regions are compared with those of their own level alone.
 
     Raises:
-        InvalidSettings: consensus is asked for, and no view has masks.
+        InvalidSettings: the settings require consensus, and no view has masks.
     """
     reliability = None
     if settings.asks_consensus(masks):
@@ -228,26 +229,26 @@ def reweigh(
 
 def diagnose(
     inputs: LiftInputs,
-    weighed: WeightStatistics,
-    stored: torch.dtype,
+    statistics: WeightStatistics,
+    dtype: torch.dtype,
     support: SplatSupport,
     measures: ViewMeasures,
     steps: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, Any]:
-    """What the lift measured of itself.
+    """Return the diagnostics of the lift, ready for JSON.
 
     Args:
-        stored: the type of X. steps: what steps that the settings ask for tell of themselves, by their names.
+        dtype: of X. steps: the facts of optional steps, by their names.
     """
-    plan, settings = weighed.plan, inputs.settings
+    plan, settings = statistics.plan, inputs.settings
     facts: dict[str, Any] = {
         "device": plan.device.facts(),
-        "weights_entries": weighed.entries,
+        "weights_entries": statistics.entries,
         "views_without_camera": inputs.views.unpaired,
         "plan": plan.facts(),
-        "views_without_splats": list(weighed.blind),
+        "views_without_splats": list(statistics.blind),
     }
-    warnings = lift_warnings(inputs.splats, inputs.views.lifted, support.sums, settings.dtype, stored, facts)
+    warnings = lift_warnings(inputs.splats, inputs.views.lifted, support.sums, settings.dtype, dtype, facts)
     warnings += [part["warning"] for part in steps.values() if "warning" in part]
     facts["warnings"] = [*warnings, *plan.told]
     return certify(measures, support.sums, support.evidence, settings) | dict(steps) | facts
@@ -264,51 +265,45 @@ def plan(
     in_blocks: bool = False,
     **settings: Unpack[LiftOptions],
 ) -> Plan:
-    """What `lift` with the same arguments would do, and what it would take: views, memory, warnings.
+    """Plan the lift of the same arguments: the views that it takes, its memory, its warnings.
 
-    A few views are weighed to see whether splats, cameras and features contradict each other, as `lift` itself does
-    with views that lie in files.
+    The weights of a few views show whether splats, cameras and features contradict each other. `lift` checks this
+    too where views lie in files.
 
     Args:
-        splats, cameras, views, preset, threads, settings: as `lift` has them.
+        splats, cameras, views, preset, threads, settings: as in `lift`.
         in_blocks: plan the lift of an engine, whose memory is that of one worker.
 
     Raises:
-        InvalidFeatures, InvalidSettings, Unavailable: as `lift` has it.
+        InvalidFeatures, InvalidSettings, Unavailable: as in `lift`.
     """
     inputs = LiftInputs.of(splats, cameras, views, preset, settings, threads)
     device = choose_device(inputs.settings.device)
-    found = plan_lift(inputs.splats, inputs.views, inputs.settings, device, threads, apart=in_blocks, look=True)
-    return plan_of_a_worker(found) if in_blocks else found
+    lift_plan = plan_lift(inputs.splats, inputs.views, inputs.settings, device, threads, apart=in_blocks, look=True)
+    return plan_of_a_worker(lift_plan) if in_blocks else lift_plan
 
 
-def log_warnings(plan: Plan) -> None:
-    """Log what the plan has to say of this machine, which no certificate keeps: equal inputs give equal lifts."""
-    for warning in plan.warnings:
-        log.warning(warning)
-
-
-class _WarnOnce:
-    """Logs what a lift warns of, once, where nobody shows its plan: a program would not look into diagnostics."""
+class WarningLog:
+    """A logger of each warning once, for lifts without ``on_plan``: few programs read the diagnostics."""
 
     def __init__(self) -> None:
-        self._said = set[str]()
+        self._previous = set[str]()
 
     def __call__(self, warnings: Iterable[str]) -> None:
         for warning in dict.fromkeys(warnings):
-            if warning not in self._said:
+            if warning not in self._previous:
                 log.warning(warning)
-        self._said |= set(warnings)
+        self._previous |= set(warnings)
 
 
-def _checkpoint(given: object) -> Checkpoint | None:
-    """The checkpoint, or that of a folder.
+def _open_checkpoint(value: object) -> Checkpoint | None:
+    """Return the checkpoint, or that of a folder.
 
     Raises:
-        InvalidSettings: it is something else.
+        InvalidSettings: the value is of another type.
     """
-    if given is None or isinstance(given, Checkpoint):
-        return given
-    if isinstance(given, Path | str) and str(given):
-        return Checkpoint(Path(given))
-    raise InvalidSettings("checkpoint", expected="the path of a folder, or None", got=repr(given)[:80])
+    if value is None or isinstance(value, Checkpoint):
+        return value
+    if isinstance(value, Path | str) and str(value):
+        return Checkpoint(Path(value))
+    raise InvalidSettings("checkpoint", expected="the path of a folder, or None", got=repr(value)[:80])

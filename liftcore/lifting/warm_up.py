@@ -1,4 +1,4 @@
-"""Everything that a lift compiles, before its time is taken."""
+"""Compilation of all kernels of a lift, outside its timings."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
 
 def warm_up_lift(kernel: Kernel, device: Device, settings: LiftSettings) -> None:
-    """Compile what a lift with these settings runs, or load it from the disk cache; its diagnostics excepted."""
+    """Compile the kernels of a lift with these settings, or load them from the disk cache; diagnostics excepted."""
     warm_up(kernel, device, settings.lift_params, settings.weighting)
-    first, one = torch.zeros(1, dtype=torch.int32), torch.ones(1, dtype=torch.float32)
-    W = one_view(first, torch.tensor([0, 1]), first, one, first, one, regions=1)
-    book = Codebook((ViewCodebook(one[None]),))
+    first, unit = torch.zeros(1, dtype=torch.int32), torch.ones(1, dtype=torch.float32)
+    W = one_view(first, torch.tensor([0, 1]), first, unit, first, unit, regions=1)
+    book = Codebook((ViewCodebook(unit[None]),))
     solve(W, book, torch.float32, threads=1)
     if settings.objects or settings.aggregation:
         region_objects(W, np.zeros(1, np.int8), np.ones(1), 1)
@@ -43,4 +43,4 @@ def warm_up_lift(kernel: Kernel, device: Device, settings: LiftSettings) -> None
     if settings.smoothness:
         warm_up_smoothing()
     if settings.aggregation:
-        explained_by(W, RegionDirections.of_weights(W, book, 1), first, one[None], 1)
+        explained_by(W, RegionDirections.of_weights(W, book, 1), first, unit[None], 1)

@@ -32,7 +32,7 @@ import torch
 
 import liftcore as lc
 from liftcore.io.shards import ROWS
-from liftcore.lifting.engines.blocks import WEIGHED
+from liftcore.lifting.engines.blocks import PIECE_VIEWS
 from liftcore.values.views import ViewFeatures
 from tests.benchmarks.base import read_pack, read_scene
 
@@ -153,11 +153,11 @@ def tell_large(splats: int, channels: int, views: int, preset: str) -> None:
     goal_views, goal_channels, goal_splats = 10_000, 512, 50_000_000
     walk, solve = view * goal_views, entry * cost.entries / views * goal_views * goal_channels
     traffic = 2 * cost.blocks / views * goal_views + 2 * goal_splats * goal_channels
-    parts, blocks = -(-goal_views // WEIGHED), -(-goal_splats // ROWS)
+    parts, blocks = -(-goal_views // PIECE_VIEWS), -(-goal_splats // ROWS)
     print(f"model: {goal_splats} splats, {goal_views} such views, {goal_channels} channels "
           "(this machine as one worker)")  # fmt: skip
     for workers in (1, 4, 16, 64, 256):
-        rounds = -(-parts // workers) * WEIGHED * view + -(-blocks // workers) * solve / blocks
+        rounds = -(-parts // workers) * PIECE_VIEWS * view + -(-blocks // workers) * solve / blocks
         sent = traffic / workers / GIB
         print(f"  {workers:>3} workers: {rounds / 3600:.2f} h, {sent:.1f} GiB read and written by each")
     opened = OPENED * parts * blocks

@@ -1,4 +1,4 @@
-"""Where a lift's blocks of views and of splats are worked on: in this process, or by the workers of a Ray cluster."""
+"""Engines run a lift in blocks of views and of splats: in this process, or by the workers of a Ray cluster."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ ENGINES = ("local", "ray")
 
 
 def open_engine(name: str | None, address: str | None = None, threads: int | None = None) -> Engine | None:
-    """The engine of a name, which `liftcore.lift` takes; None for none.
+    """Open the engine of a name, as `liftcore.lift` takes it; return None for None.
 
     Args:
         name: local or ray. address: of the Ray cluster, ``HOST:PORT`` or ``auto``; None starts one here. threads: of
             the local engine.
 
     Raises:
-        InvalidSettings: there is none, or an address without Ray. Unavailable: as `RayEngine` has it.
+        InvalidSettings: the name is unknown, or an address is given without Ray. Unavailable: as in `RayEngine`.
     """
     if name is not None and name not in ENGINES:
         raise InvalidSettings("engine", expected=" or ".join(ENGINES), got=repr(name)[:80])

@@ -1,4 +1,4 @@
-"""What an engine is: somebody who does numbered pieces of work that do not know of one another."""
+"""The protocol of an engine, which runs numbered and independent pieces of work, and the local engine."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ if TYPE_CHECKING:
 
 
 class Engine(Protocol):
-    """Does pieces of a job, each at least once. A piece reads files and writes others, whole or not at all.
+    """A runner of the pieces of a job, each at least once. A piece reads files and writes others atomically.
 
-    So it does no harm that one is begun again elsewhere: no bit of a lift depends on who did what, nor when.
+    So a piece may be repeated elsewhere: the lift is bitwise identical for any assignment and order of pieces.
     """
 
     @property
     def scratch(self) -> Path | None:
-        """A folder that all workers share, for lifts that were given none; None: the system's temporary one."""
+        """A folder that all workers share, for lifts without a checkpoint; None: the system's temporary folder."""
         ...
 
     def run(self, work: Work, job: Job, pieces: int) -> Iterator[int]:
-        """Do ``work(job, piece, threads)`` for all pieces below that number; give each when it is done, in any order.
+        """Run ``work(job, piece, threads)`` for all pieces below ``pieces``; yield each finished one, in any order.
 
         Raises:
-            SplatliftError, OSError: what a piece raised. Unavailable: there is nobody who can do a piece.
+            SplatliftError, OSError: an error of a piece. Unavailable: no worker can run a piece.
         """
         ...
 
 
 class LocalEngine:
-    """This process does one piece after the other, with threads.
+    """An engine that runs one piece after the other in this process, with threads.
 
-    It bounds the memory of a lift by its blocks, whatever the number of views and splats.
+    The memory of a lift is bounded by the size of a block, for any number of views and splats.
 
     Args:
-        threads: None takes the cores that this process may use. The number changes no bit.
+        threads: None uses the cores that this process may use. The result is bitwise identical for any value.
     """
 
     scratch: Path | None = None

@@ -1,10 +1,11 @@
-"""A lift in blocks: the job that all workers know, and its first step, W of a few views. Files in, files out.
+"""A lift in blocks: the job that all workers receive, and its first step, W of a few views. All in files.
 
-**Weighing** (`weigh`) reads WEIGHED views and writes a file each, of the codebook E of its regions and its sampled
-rays, and one of all of them, of their ``W = A'^T S``, whose rows are splats: a block of splats lies in one place of
-it, so that later steps open one file for WEIGHED views. It holds the splats that its views can see, and no others.
+**Weighing** (`weigh`) reads PIECE_VIEWS views. For each it writes a file of the codebook E of its regions and its
+sampled rays, and for all of them one file of ``W = A'^T S``. The rows of W are splats: a block of splats is
+contiguous, so that later steps open one file for PIECE_VIEWS views. A worker loads only the splats that these views
+can see.
 
-What follows on these files are the steps of `lifting.engines.steps`, whose pieces are views or blocks of splats.
+The later steps, `lifting.engines.steps`, read these files; their pieces are views or blocks of splats.
 """
 
 from __future__ import annotations
@@ -41,17 +42,17 @@ from liftcore.values.pack import Views, pair, read_features
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import LiftSettings
 
-WEIGHED = 8  # views of a piece: some seconds of work, which is what a worker that dies loses
-SELECTED = 1 << 22  # splats beyond which a worker holds only those that its views see: 1 GB as the raster has them
-STEP = 1 << 18  # splats that are looked at together for it
+PIECE_VIEWS = 8  # some seconds of work, which is what is lost with a worker
+SELECTED = 1 << 22  # splats beyond which a worker loads only those that its views see: 1 GB in the raster
+STEP = 1 << 18  # splats that are tested together for it
 SCENE = "scene.safetensors"
 
 
 @dataclass(frozen=True)
 class Job:
-    """A lift in blocks, as every worker knows it. Paths lead to the same files for all of them."""
+    """A lift in blocks, as every worker receives it. Paths are valid on all workers."""
 
-    folder: Path  # where pieces are written
+    folder: Path  # of the pieces
     packs: tuple[Path, ...]  # of the features
     cameras: Cameras
     names: tuple[str, ...]  # of the views, in the order of the sums
@@ -62,66 +63,66 @@ class Job:
     dtype: torch.dtype = torch.float16  # of X
     selected: int = SELECTED
     rows: int = ROWS  # of a block of splats: pieces of sums, and whole pages of X
-    step: int = 0  # of those that are taken several times
-    related: bool = False  # whether tuples of masks are needed
+    step: int = 0  # of steps that run several times
+    related: bool = False  # True if tuples of masks are needed
     usual_share: float | None = None  # the mean share of mask consensus; None where there is none
-    by_region: bool = False  # whether regions are weighted as a whole
-    levels_apart: bool = False  # whether regions are compared with those of their own level alone
+    by_region: bool = False  # True if each region has one weight
+    levels_apart: bool = False  # True if regions are compared with those of their own level alone
     delta: float | None = None  # of Huber's loss
     clusters: int = 0  # whose features splats may take
-    guarded: bool = False  # whether they do where it explains them
+    has_guard: bool = False  # True if they do only where it explains them
 
     @property
-    def weighings(self) -> int:
+    def view_pieces(self) -> int:
         """Pieces of views."""
-        return -(-len(self.names) // WEIGHED)
+        return -(-len(self.names) // PIECE_VIEWS)
 
     @property
-    def solutions(self) -> int:
+    def splat_pieces(self) -> int:
         """Pieces of splats."""
         return -(-self.splats // self.rows)
 
     def view_file(self, number: int) -> Path:
-        """What was found of the view of that number, beside its W."""
+        """The file of a view's codebook and sampled rays; ``number`` is of the view."""
         return self.folder / f"view-{number:05}.safetensors"
 
     def weights_file(self, piece: int) -> Path:
-        """W of a piece of views."""
+        """The file of W of a piece of views."""
         return self.piece_file("weights", piece)
 
     def views_of(self, piece: int) -> range:
         """The numbers of the views of a piece."""
-        return range(WEIGHED * piece, min(WEIGHED * (piece + 1), len(self.names)))
+        return range(PIECE_VIEWS * piece, min(PIECE_VIEWS * (piece + 1), len(self.names)))
 
     def piece_file(self, step: str, number: int) -> Path:
-        """What a step wrote of a piece."""
+        """The file of a step of that piece."""
         return self.folder / f"{step}-{number:05}.safetensors"
 
     def solved_file(self, number: int) -> Path:
-        """X of a range of splats as it is solved; splats may take other features then."""
+        """The file of X of a block of splats from the solve, before splats take features of clusters."""
         return self.piece_file("solved", number) if self.clusters else self.features_file(number)
 
     def features_file(self, number: int) -> Path:
-        """X of a range of splats."""
+        """The file of the final X of a block of splats."""
         return self.folder / "lift" / features_file(number)
 
     def columns_file(self, number: int) -> Path:
-        """What else is known of these splats."""
+        """The file of the other columns of these splats."""
         return self.folder / f"columns-{number:05}.safetensors"
 
 
 class ViewFiles(NamedTuple):
-    """What a weighing wrote of a view, beside its W."""
+    """The file of a view: its codebook and sampled rays; W is in the file of its piece."""
 
     codebook: ViewCodebook
     sample: SampledRays
     levels: np.ndarray  # [M] i8, as `Geometry` has them
     entries: int  # of its W
-    blind: bool  # whether it meets no splat
+    blind: bool  # True if it meets no splat
 
 
 class WeightBlock(NamedTuple):
-    """W of a piece of views: rows of splats, in each the entries of one view after the other's."""
+    """W of a piece of views: a row a splat, with the entries of its views in order."""
 
     splats: np.ndarray  # [n] i32 ascending
     starts: np.ndarray  # [n + 1] i64
@@ -137,7 +138,7 @@ class WeightBlock(NamedTuple):
 
 @one_thread()
 def weigh(job: Job, piece: int, threads: int | None) -> None:
-    """Write W, E and sampled rays of a few views; those that lie there already are left as they are.
+    """Write W, E and sampled rays of a few views; existing files stay.
 
     Raises:
         InvalidFeatures: a view is malformed.
@@ -149,7 +150,7 @@ def weigh(job: Job, piece: int, threads: int | None) -> None:
         try:
             _write_weights(job, piece)
         except InvalidInput:
-            if not job.weights_file(piece).exists():  # else another worker, with the same piece, was done before
+            if not job.weights_file(piece).exists():  # else another worker has finished the same piece
                 raise
     for number in job.views_of(piece):
         _entries_file(job, number).unlink(missing_ok=True)
@@ -160,7 +161,7 @@ def _weigh_views(job: Job, numbers: list[int], threads: int | None) -> None:
     packs = packs_at(job.packs, tuple(map(file_version, job.packs)))
     views = LiftViews(job.cameras, pair(packs, job.cameras)[0], job.names, [])
     cameras = [views.camera(number) for number in numbers]
-    splats, ids = seen_splats(job, cameras, threads)
+    splats, ids = visible_splats(job, cameras, threads)
     warm_up_lift(job.kernel, device, job.settings)
     raster = open_raster(splats, device, threads)
     waiting = deque[WeightRequest]()
@@ -170,68 +171,68 @@ def _weigh_views(job: Job, numbers: list[int], threads: int | None) -> None:
             waiting.append(weight_request(views, number, job.settings, by_rows=job.settings.weighs_rows))
             yield waiting[-1].request
 
-    with closing(raster.iterate_views(requests())) as found:
-        for number, view in zip(numbers, found, strict=True):
-            asked = waiting.popleft()
-            weights = asked.weights(_renumbered(view, ids)).cpu()
+    with closing(raster.iterate_views(requests())) as answers:
+        for number, view in zip(numbers, answers, strict=True):
+            request = waiting.popleft()
+            weights = request.weights(_renumbered(view, ids)).cpu()
             weights.save(_entries_file(job, number))
             _write_view(
-                job.view_file(number), weights, asked, replace(view.rows, splats=ids[view.rows.splats.long()])
+                job.view_file(number), weights, request, replace(view.rows, splats=ids[view.rows.splats.long()])
             )
 
 
 def _entries_file(job: Job, number: int) -> Path:
-    """W of a view, until that of its piece is written."""
+    """The file of W of a view, until W of its piece is written."""
     return job.piece_file("entries", number)
 
 
-def seen_splats(job: Job, cameras: list[Camera], threads: int | None) -> tuple[Splats, Tensor]:
-    """The splats that any of the cameras may show, as the raster's own projection decides, and their numbers [n] i32.
+def visible_splats(job: Job, cameras: list[Camera], threads: int | None) -> tuple[Splats, Tensor]:
+    """Select the splats that the raster's projection puts into any of the images, with their numbers [n] i32.
 
-    All of them where they are few, and the first alone where none is in sight. Their order stays, so rays meet the
-    same splats one after the other as in the whole scene.
+    All splats where they are few; the first one alone where none is visible. The order stays, so that rays meet the
+    same splats in the same order as in the full scene.
     """
     scene = scene_of(job)
     if job.splats <= job.selected:
         return scene, torch.arange(job.splats, dtype=torch.int32)
-    params, seen = job.settings.lift_params, np.zeros(job.splats, bool)
+    params, visible = job.settings.lift_params, np.zeros(job.splats, bool)
     device = choose_device(job.settings.device)
     for first in range(0, job.splats, STEP):
         last = min(first + STEP, job.splats)
         raster = open_raster(_rows(scene, slice(first, last)), device, threads)
         for camera in cameras:
-            seen[first:last] |= raster.footprints(camera, params).numpy() > 0
-    ids = np.flatnonzero(seen).astype(np.int32)
+            visible[first:last] |= raster.footprints(camera, params).numpy() > 0
+    ids = np.flatnonzero(visible).astype(np.int32)
     ids = ids if ids.size else np.zeros(1, np.int32)
     return _rows(scene, torch.from_numpy(ids).long()), torch.from_numpy(ids)
 
 
 def write_scene(splats: Splats, path: Path) -> None:
-    """Write the geometry of splats for workers to map."""
+    """Write the geometry of splats as a file that workers map."""
     tensors = {name: getattr(splats, name) for name in ("means", "quats", "log_scales", "opacity_logits", "beta")}
     tensors["origin"] = torch.tensor(splats.origin, dtype=torch.float64)
     write_tensors(path, {name: tensor.cpu() for name, tensor in tensors.items() if tensor is not None}, {})
 
 
 def scene_of(job: Job) -> Splats:
-    """The geometry of all splats, mapped."""
+    """Map the geometry of all splats."""
     path = job.folder / SCENE
     return mapped_scene(path, file_version(path), job.kernel)
 
 
 def file_version(path: Path) -> tuple[int, int]:
-    """What tells a file from one that was in its place before."""
-    found = path.stat()
-    return found.st_mtime_ns, found.st_ino
+    """Return a version of the file, which differs after the file is replaced: modification time [ns] and inode."""
+    status = path.stat()
+    return status.st_mtime_ns, status.st_ino
 
 
 @lru_cache(maxsize=1)
 def mapped_scene(path: Path, version: tuple[int, int], kernel: Kernel) -> Splats:
-    """The geometry of splats that `write_scene` wrote; ``version`` is of the file."""
-    found = {name: torch.from_numpy(array) for name, array in map_tensors(path)[0].items()}
-    means, quats, log_scales, logits = (found[name] for name in ("means", "quats", "log_scales", "opacity_logits"))
-    origin = found["origin"].tolist()
-    return Splats(means, quats, log_scales, logits, kernel, beta=found.get("beta"), origin=origin)
+    """Map the geometry of splats that `write_scene` wrote; ``version`` is of the file."""
+    tensors = {name: torch.from_numpy(array) for name, array in map_tensors(path)[0].items()}
+    means, quats, log_scales, logits = (tensors[name] for name in ("means", "quats", "log_scales", "opacity_logits"))
+    origin = tensors["origin"].tolist()
+    return Splats(means, quats, log_scales, logits, kernel, beta=tensors.get("beta"), origin=origin)
 
 
 def _rows(splats: Splats, rows: slice | Tensor) -> Splats:
@@ -242,49 +243,49 @@ def _rows(splats: Splats, rows: slice | Tensor) -> Splats:
 
 @lru_cache(maxsize=1)
 def packs_at(paths: tuple[Path, ...], versions: tuple[tuple[int, int], ...]) -> Views:
-    """The views of packs, whose headers are read once a worker; anew where a file has taken another's place."""
+    """Open packs; headers are read once a worker, and again after a file is replaced."""
     return read_features(*paths)
 
 
 def _renumbered(view: ViewWeights, ids: Tensor) -> ViewWeights:
-    """The same with the scene's numbers of its splats."""
+    """Replace the numbers of a view's splats by those of the scene."""
     weights = view.weights
     numbers = ids.to(weights.device)
-    own = {name: numbers[getattr(weights, name).long()] for name in ("splats", "evidence_splats")}
-    return replace(view, weights=replace(weights, **own))
+    scene_numbers = {name: numbers[getattr(weights, name).long()] for name in ("splats", "evidence_splats")}
+    return replace(view, weights=replace(weights, **scene_numbers))
 
 
-# A view's file: the codebook and the sampled rays, and how much there is of its W.
+# A view's file: the codebook, the sampled rays, and the number of entries of its W.
 
 
-def _write_view(path: Path, weights: RegionWeights, asked: WeightRequest, rows: RayRows) -> None:
-    readout, tuples = asked.readout, asked.codebook.tuples
+def _write_view(path: Path, weights: RegionWeights, request: WeightRequest, rows: RayRows) -> None:
+    readout, tuples = request.readout, request.codebook.tuples
     tensors = {f"rays/{name}": getattr(rows, name) for name in ("indptr", "splats", "weights")}
     tensors |= {f"read/{name}": torch.from_numpy(getattr(readout, name)) for name in ("rays", "columns", "shares")}
-    tensors |= {"codebook": asked.codebook.rows, "levels": torch.from_numpy(asked.levels)}
+    tensors |= {"codebook": request.codebook.rows, "levels": torch.from_numpy(request.levels)}
     tensors["counts"] = torch.tensor([weights.region.shape[0], weights.evidence.shape[0]])
     write_tensors(path, tensors | ({} if tuples is None else {"tuples": tuples}), {})
 
 
 def read_view(path: Path) -> ViewFiles:
-    """What a weighing wrote of a view, mapped."""
+    """Map the file of a view."""
     arrays = map_tensors(path)[0]
-    found = {name: torch.from_numpy(array) for name, array in arrays.items()}
-    rows = RayRows(**{name: found[f"rays/{name}"] for name in ("indptr", "splats", "weights")})
+    tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
+    rows = RayRows(**{name: tensors[f"rays/{name}"] for name in ("indptr", "splats", "weights")})
     readout = Readout(**{name: arrays[f"read/{name}"] for name in ("rays", "columns", "shares")})
-    codebook, sample = ViewCodebook(found["codebook"], found.get("tuples")), SampledRays(rows, readout)
-    entries, met = arrays["counts"].tolist()
-    return ViewFiles(codebook, sample, arrays["levels"], entries, blind=not met)
+    codebook, sample = ViewCodebook(tensors["codebook"], tensors.get("tuples")), SampledRays(rows, readout)
+    entries, hits = arrays["counts"].tolist()
+    return ViewFiles(codebook, sample, arrays["levels"], entries, blind=not hits)
 
 
-# The file of a piece of views: their W, put together by splats.
+# The file of a piece of views: their W, gathered by splats.
 
 
 def _write_weights(job: Job, piece: int) -> None:
     parts = [RegionWeights.load(_entries_file(job, number)) for number in job.views_of(piece)]
     bases = np.cumsum([0, *(int(part.offsets[-1]) for part in parts[:-1])]).astype(np.int32)
     splats = _union([part.splats for part in parts], job.splats)
-    met = _union([part.evidence_splats for part in parts], job.splats)
+    hit_splats = _union([part.evidence_splats for part in parts], job.splats)
 
     def entries() -> Iterator[SomeRows]:
         for part, base in zip(parts, bases, strict=True):
@@ -293,24 +294,24 @@ def _write_weights(job: Job, piece: int) -> None:
 
     def evidence() -> Iterator[SomeRows]:
         for part in parts:
-            rows = np.searchsorted(met, part.evidence_splats.numpy())
+            rows = np.searchsorted(hit_splats, part.evidence_splats.numpy())
             yield SomeRows(rows, np.arange(rows.size + 1), [part.evidence.numpy()])
 
     starts, (region, weight) = gather_rows(entries, splats.size, [torch.int32, torch.float32])
-    met_starts, (sums,) = gather_rows(evidence, met.size, [torch.float32])
-    tensors = {"splats": splats, "starts": starts, "evidence_splats": met, "evidence_starts": met_starts}
+    evidence_starts, (sums,) = gather_rows(evidence, hit_splats.size, [torch.float32])
+    tensors = {"splats": splats, "starts": starts, "evidence_splats": hit_splats, "evidence_starts": evidence_starts}
     tensors = {name: torch.from_numpy(array) for name, array in tensors.items()}
     write_tensors(job.weights_file(piece), tensors | {"region": region, "weight": weight, "evidence": sums}, {})
 
 
 def _union(parts: list[Tensor], count: int) -> np.ndarray:
-    """[n] i32 ascending, the splats of so many that any of the parts has."""
-    found = np.zeros(count, np.bool_)
+    """Return [n] i32 ascending: the splats, of ``count``, that any of the parts has."""
+    present = np.zeros(count, np.bool_)
     for part in parts:
-        found[part.numpy()] = True
-    return np.flatnonzero(found).astype(np.int32)
+        present[part.numpy()] = True
+    return np.flatnonzero(present).astype(np.int32)
 
 
 def read_weights(job: Job, piece: int) -> WeightBlock:
-    """W of a piece of views, mapped."""
+    """Map W of a piece of views."""
     return WeightBlock(**map_tensors(job.weights_file(piece))[0])

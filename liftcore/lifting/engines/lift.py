@@ -1,8 +1,8 @@
-"""A lift in blocks, of scenes whose W, or X, is more than one machine should hold: what the driver does.
+"""The driver of a lift in blocks, for scenes whose W or X does not fit one machine.
 
-It has the steps done by an engine (`lifting.engines.steps`), adds up what they found of the scene, and shares it. It
-holds tables of the size of M, a column or two of the splats, and the graph of objects; codebooks it hands on, a view
-at a time.
+An engine runs the steps (`lifting.engines.steps`). The driver adds up their sums over the scene, and writes the
+totals for all workers. It holds tables of size M, a few columns of the splats, and the graph of objects; it copies codebooks
+a view at a time.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from liftcore.lifting.base import LiftSteps, SplatSupport, WeightStatistics
 from liftcore.lifting.checkpoint import Checkpoint
 from liftcore.lifting.engines import steps
 from liftcore.lifting.engines.base import Engine, LocalEngine
-from liftcore.lifting.engines.blocks import SCENE, SELECTED, WEIGHED, Job, read_view, weigh, write_scene
+from liftcore.lifting.engines.blocks import PIECE_VIEWS, SCENE, SELECTED, Job, read_view, weigh, write_scene
 from liftcore.lifting.inputs import LiftInputs
 from liftcore.lifting.planning.plan import Plan, plan_lift
 from liftcore.query.result import LiftResult, load_lift
@@ -65,7 +65,7 @@ if TYPE_CHECKING:
 
 PACKED = 64  # views of a pack
 PIECES = re.compile("blocks-[0-9a-f]{64}")  # the folder of the pieces of one lift
-PACKAGES = ("lifting", "raster", "scene", "solve", "values")  # whose code makes pieces
+PACKAGES = ("lifting", "raster", "scene", "solve", "values")  # whose code computes pieces
 
 
 @contextmanager
@@ -79,24 +79,25 @@ def steps_in_blocks(
     rows: int = ROWS,
     selected: int = SELECTED,
 ) -> Iterator[InBlocks]:
-    """The steps of a lift by an engine: each piece is a file in a folder. What needs all rays or features is refused.
+    """Open the steps of a lift by an engine, where each piece is a file in a folder.
 
     Args:
-        folder: that all workers share. A lift of packs that was cut off goes on from the pieces there; None: one that
-            is gone at the end.
-        threads: of the driver's own work; the engine has those of pieces. None takes the cores that it may use.
-        rows: splats that are solved together, whole pages of X. selected: splats of scenes that workers hold whole.
+        folder: that all workers share. An interrupted lift of packs resumes from the pieces there; None: a temporary
+            folder.
+        threads: of the driver; those of pieces are the engine's. None uses the cores that this process may use.
+        rows: splats of a block, whole pages of X. selected: splats of scenes that workers load as a whole.
 
     Raises:
-        InvalidSettings: it is no engine; or as `LiftSettings.check_blocks` has it.
-        Unavailable: the folder has no room, or workers do not see it.
+        InvalidSettings: engine is of another type; or a step needs all rays or all features, as in
+            `LiftSettings.check_blocks`.
+        Unavailable: the disk of the folder is full, or workers cannot read it.
     """
     if not hasattr(engine, "run"):
         hint = "LocalEngine() or RayEngine(address) makes one"
         raise InvalidSettings("engine", expected="an engine, or None", got=repr(engine)[:80], hint=hint)
     views = inputs.views
     inputs.settings.check_blocks(any(views.features.is_regions(name) for name in views.names))
-    with _folder(folder or engine.scratch, kept=folder is not None) as place, _in_words(place), one_thread():
+    with _folder(folder or engine.scratch, permanent=folder is not None) as place, _in_words(place), one_thread():
         try:
             yield InBlocks(engine, place, inputs, timings, threads, rows, selected)
         finally:
@@ -104,44 +105,44 @@ def steps_in_blocks(
 
 
 def plan_of_a_worker(plan: Plan) -> Plan:
-    """The plan of a lift in one place with what a worker takes: bytes of each part at its peak, about."""
+    """Replace the memory of a plan by the estimate for one worker: bytes of each part at its peak."""
     splats = min(1.0, ROWS / plan.splats)
-    held = min(1.0, max(SELECTED, plan.splats_a_view) / plan.splats)
-    shares = {"splats": held, "scene": held, "weights": min(1.0, WEIGHED / len(plan.views))}
+    splat_share = min(1.0, max(SELECTED, plan.splats_a_view) / plan.splats)
+    shares = {"splats": splat_share, "scene": splat_share, "weights": min(1.0, PIECE_VIEWS / len(plan.views))}
     shares |= {"gathered": splats, "features": splats}
     memory = {name: int(size * shares.get(name, 1.0)) for name, size in plan.memory.items()}
     return replace(plan, memory=memory, weight_bytes=0)
 
 
 @contextmanager
-def _folder(folder: Path | None, *, kept: bool) -> Iterator[Path]:
+def _folder(folder: Path | None, *, permanent: bool) -> Iterator[Path]:
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-    if folder is not None and kept:
+    if folder is not None and permanent:
         yield folder.resolve()
         return
-    with scratch_folder("splatlift-blocks-", folder) as own:
-        yield own.resolve()
+    with scratch_folder("splatlift-blocks-", folder) as scratch:
+        yield scratch.resolve()
 
 
 def _lack_of_disk(folder: Path, plan: Plan) -> list[str]:
-    """What to say where the folder has no room for W by views, W by splats and X: nothing, or a warning."""
+    """Return a warning if the disk is too small for W by views, W by splats and X, else none."""
     size, free = 2 * plan.weight_bytes + plan.memory["features"], shutil.disk_usage(folder).free
     if free >= size:
         return []
-    there = f"blocks of about {size / 2**30:.1f} GiB go to {folder}, and there is {free / 2**30:.1f} GiB of disk"
-    return [f"{there}: give a checkpoint folder with more room"]
+    shortage = f"blocks of about {size / 2**30:.1f} GiB go to {folder}, and there is {free / 2**30:.1f} GiB of disk"
+    return [f"{shortage}: give a checkpoint folder with more room"]
 
 
 @contextmanager
 def _in_words(folder: Path) -> Iterator[None]:
-    """Say what to do about a folder of pieces that is full, or that workers do not see."""
+    """Turn errors of a full disk, or of a folder that workers cannot read, into Unavailable with a hint."""
     try:
         yield
     except OSError as error:
         if error.errno in NO_ROOM:
             expected, got = f"room for blocks in {folder}", error.strerror or str(error)
-            hint = "make room there, and the same lift goes on; or give a checkpoint folder on a larger disk"
+            hint = "free space there, and the same lift resumes; or give a checkpoint folder on a larger disk"
         elif isinstance(error, FileNotFoundError) and str(folder) in str(error):
             expected, got = "a folder that all workers see under one path", f"one without {_missing(error, folder)}"
             hint = f"mount {folder} on all nodes, or give a checkpoint folder that is"
@@ -154,19 +155,19 @@ def _missing(error: FileNotFoundError, folder: Path) -> str:
     return Path(error.filename).name if error.filename else str(error).replace(f"{folder}/", "")
 
 
-def _packs(given: Views, unpaired: set[str], folder: Path) -> list[Path]:
-    """Views that lie in no pack, written into some: whoever works on a view reads it there, and pairs it anew."""
-    names = [name for name in given if name not in unpaired]
+def _packs(views: Views, unpaired: set[str], folder: Path) -> list[Path]:
+    """Write views that are in no pack into packs, from which workers read them."""
+    names = [name for name in views if name not in unpaired]
     packs = []
     for number, begin in enumerate(range(0, len(names), PACKED)):
         packs.append(folder / f"views-{number:05}.safetensors")
-        told = {"encoder": given.encoder, "text_space": given.text_space}
-        write_pack(packs[-1], given.only(names[begin : begin + PACKED]), told)
+        metadata = {"encoder": views.encoder, "text_space": views.text_space}
+        write_pack(packs[-1], views.only(names[begin : begin + PACKED]), metadata)
     return packs
 
 
 def _identity(job: Job, splats: Splats) -> str:
-    """All that the pieces of a lift depend on, in hex. Views that lie in no pack are told from all others."""
+    """Return the digest, in hex, of all that pieces depend on; it is unique if views are in no pack."""
     facts = choose_device(job.settings.device).facts()
     depends = [Checkpoint(job.folder).of(splats, facts, PACKAGES).identity, job.settings.model_dump_json()]
     depends += [job.names, job.rows, job.kernel, [_facts(camera) for camera in job.cameras.values()]]
@@ -175,18 +176,18 @@ def _identity(job: Job, splats: Splats) -> str:
 
 
 def _open_pieces(folder: Path, identity: str) -> Path:
-    """The folder of a lift's pieces, those of the same lift; other lifts' go, and drafts of workers that died.
+    """Open the folder of a lift's pieces; delete those of other lifts, and unfinished files of workers that died.
 
-    Each lift has a folder of its own: what a worker of a killed one still writes lies in no other's way.
+    Each lift has a folder of its own, so that a worker of a killed lift cannot write into another lift's files.
     """
-    own = folder / f"blocks-{identity}"
+    pieces = folder / f"blocks-{identity}"
     for other in folder.glob("blocks-*"):
-        if other != own and PIECES.fullmatch(other.name):
+        if other != pieces and PIECES.fullmatch(other.name):
             shutil.rmtree(other, ignore_errors=True)
-    own.mkdir(exist_ok=True)
-    for draft in own.rglob(".*.part"):
+    pieces.mkdir(exist_ok=True)
+    for draft in pieces.rglob(".*.part"):
         draft.unlink(missing_ok=True)
-    return own
+    return pieces
 
 
 def _facts(camera: Camera) -> list[Any]:
@@ -195,7 +196,7 @@ def _facts(camera: Camera) -> list[Any]:
 
 
 class InBlocks(LiftSteps[Job]):
-    """Steps by an engine; see the protocol. W is a job, whose files have it, and X lies in shards that are mapped."""
+    """The steps by an engine; see the protocol. W is a job, which names its files, and X is mapped from shards."""
 
     def __init__(
         self,
@@ -211,55 +212,57 @@ class InBlocks(LiftSteps[Job]):
         self.threads, self.rows, self.selected = threads, rows, selected
 
     def run(self, stage: str, work: Work, job: Job, pieces: int) -> None:
-        """Have a step done for all pieces."""
-        for done, _ in enumerate(self.engine.run(work, job, pieces), start=1):
-            self.timings.progress(stage, done, pieces, "blocks")
+        """Run a step for all pieces, and report progress."""
+        for completed, _ in enumerate(self.engine.run(work, job, pieces), start=1):
+            self.timings.progress(stage, completed, pieces, "blocks")
 
     def plan(self, views: LiftViews, device: Device) -> Plan:
-        look = bool(views.features.paths)
+        probe = bool(views.features.paths)
         if self.inputs.settings.device == "auto" and not isinstance(self.engine, LocalEngine):
-            device = CPU  # workers elsewhere may have other cards than this machine, or none
-        return plan_lift(self.inputs.splats, views, self.inputs.settings, device, self.threads, apart=True, look=look)
+            device = CPU  # workers may have other GPUs than this machine, or none
+        return plan_lift(
+            self.inputs.splats, views, self.inputs.settings, device, self.threads, apart=True, look=probe
+        )
 
     def weigh(self, views: LiftViews, plan: Plan, on_plan: Callable[[Plan], None]) -> tuple[Job, WeightStatistics]:
-        own = plan_of_a_worker(plan)
-        on_plan(replace(own, warnings=(*own.warnings, *_lack_of_disk(self.folder, plan))))
+        worker_plan = plan_of_a_worker(plan)
+        on_plan(replace(worker_plan, warnings=(*worker_plan.warnings, *_lack_of_disk(self.folder, plan))))
         with self.timings.step("share"):
             job = self._share(views, plan)
-        for done, _ in enumerate(self.engine.run(weigh, job, job.weighings), start=1):
-            self.timings.progress("geometry", min(done * WEIGHED, len(job.names)), len(job.names), "views")
+        for completed, _ in enumerate(self.engine.run(weigh, job, job.view_pieces), start=1):
+            self.timings.progress("geometry", min(completed * PIECE_VIEWS, len(job.names)), len(job.names), "views")
         with self.timings.stage("gather"):
-            weighed, settings = _share_regions(job, plan), job.settings
+            statistics, settings = _share_regions(job, plan), job.settings
             dtype = getattr(torch, settings.dtype)
             if dtype == torch.float16 and not steps.codebook_of(job).fits_float16():
                 dtype = torch.float32
-            related = settings.finds_objects(weighed.masks) or settings.asks_consensus(weighed.masks)
+            related = settings.finds_objects(statistics.masks) or settings.asks_consensus(statistics.masks)
             job = replace(job, dtype=dtype, related=related)
             self._gather(job)
-        return job, weighed
+        return job, statistics
 
     def _share(self, views: LiftViews, plan: Plan) -> Job:
-        """Write what all workers read, who all take the device of the plan."""
-        splats, given = self.inputs.splats, self.inputs.source_views
+        """Write the job's inputs for all workers, which all use the device of the plan."""
+        splats, source = self.inputs.splats, self.inputs.source_views
         settings = self.inputs.settings.model_copy(update={"device": plan.device.kind})
-        packs = tuple(Path(path).resolve() for path in given.paths)
+        packs = tuple(Path(path).resolve() for path in source.paths)
         sizes = splats.count, views.features.channels
         job = Job(self.folder, packs, views.cameras, views.names, settings, splats.kernel, *sizes)
         job = replace(job, rows=self.rows, selected=self.selected)
         job = replace(job, folder=_open_pieces(self.folder, _identity(job, splats)))
         if not (job.folder / SCENE).exists():
             write_scene(splats, job.folder / SCENE)
-        return job if packs else replace(job, packs=tuple(_packs(given, set(views.unpaired), job.folder)))
+        return job if packs else replace(job, packs=tuple(_packs(source, set(views.unpaired), job.folder)))
 
     def _gather(self, job: Job) -> None:
-        """W by blocks of splats, and what places of the curve mean."""
+        """Gather W by blocks of splats, and write the bounds of the curve that orders splats in space."""
         if job.related:
-            self.run("gather", steps.relate, job, job.weighings)
+            self.run("gather", steps.relate, job, job.view_pieces)
             sizes, groups = _share_tuples(job), steps.groups_of(job)
             if job.settings.finds_objects(True):
-                nodes, others = choose_nodes(groups, sizes)
-                steps.write_piece(job.folder / steps.NODES, {"nodes": nodes, "others": others})
-        self.run("gather", steps.gather, job, job.solutions)
+                nodes, other_masks = choose_nodes(groups, sizes)
+                steps.write_piece(job.folder / steps.NODES, {"nodes": nodes, "other_masks": other_masks})
+        self.run("gather", steps.gather, job, job.splat_pieces)
         bounds = np.concatenate([part["bounds"] for part in _pieces(job, "rows")])
         if bounds.size:
             bounds = np.stack([bounds.min(axis=0), bounds.max(axis=0)])
@@ -267,41 +270,43 @@ class InBlocks(LiftSteps[Job]):
 
     def find_objects(self, W: Job) -> RegionObjects:
         groups = steps.groups_of(W)
-        nodes, others = (map_tensors(W.folder / steps.NODES)[0][name] for name in ("nodes", "others"))
-        self.run("objects", steps.contain, W, W.weighings)
-        parts = [map_tensors(W.piece_file("contain", number))[0] for number in range(W.weighings)]
+        nodes, other_masks = (map_tensors(W.folder / steps.NODES)[0][name] for name in ("nodes", "other_masks"))
+        self.run("objects", steps.contain, W, W.view_pieces)
+        parts = [map_tensors(W.piece_file("contain", number))[0] for number in range(W.view_pieces)]
         containers = np.concatenate([part["container"] for part in parts])
         tree = region_tree(nodes, groups, containers, self.threads)
         number = tree.parents.size
-        if number and others.size:
+        if number and other_masks.size:
             self._label(W, 0, tree)
-            tree = with_others(tree, others, (part for file in _pieces(W, "labels-0") for part in unpacked(file)))
+            tree = with_others(
+                tree, other_masks, (part for file in _pieces(W, "labels-0") for part in unpacked(file))
+            )
         self._label(W, 1, tree)
         labels, evidence = _column(W, "labels-1", "labels"), _column(W, "rows", "evidence")
-        shown = _sums(W, "labels-1", (1, number * groups.views))
+        weights = _sums(W, "labels-1", (1, number * groups.views))
         numbers = node_numbering(labels, evidence, tree)
         steps.write_piece(W.folder / steps.OBJECTS, {"object": numbers.object})
-        return numbered(labels, tree, numbers, shown.reshape(number, groups.views))
+        return numbered(labels, tree, numbers, weights.reshape(number, groups.views))
 
     def _label(self, job: Job, step: int, tree: RegionTree) -> None:
         steps.write_piece(job.folder / steps.TREE.format(step), vars(tree))
-        self.run("objects", steps.label, replace(job, step=step), job.solutions)
+        self.run("objects", steps.label, replace(job, step=step), job.splat_pieces)
 
     def node_vectors(self, W: Job, objects: RegionObjects) -> NodeVectors:
         codebook = steps.codebook_of(W)
         return NodeVectors.of(codebook, _sums(W, "rows", (1, codebook.regions))[0], objects)
 
     def compare_masks(self, W: Job) -> Job:
-        self.run("consensus", steps.share, W, W.weighings)
-        parts = [map_tensors(W.piece_file("share", number))[0]["told"] for number in range(W.weighings)]
-        told, asked = np.sum(parts, axis=0)
-        return replace(W, usual_share=mean_share(int(told), int(asked)))
+        self.run("consensus", steps.share, W, W.view_pieces)
+        parts = [map_tensors(W.piece_file("share", number))[0]["shares"] for number in range(W.view_pieces)]
+        share_sum, share_count = np.sum(parts, axis=0)
+        return replace(W, usual_share=mean_share(int(share_sum), int(share_count)))
 
     def reweight(self, W: Job, levels_apart: bool) -> tuple[Job, float | None]:
-        """See the protocol: all but the last step's factors, which blocks take when they are solved."""
+        """See the protocol; the solve of each block applies the factors of the last step."""
         W = replace(W, levels_apart=levels_apart)
         codebook = steps.codebook_of(W)
-        whole = whole_regions(W.settings.reliability, steps.mapped(W.folder / steps.REGIONS)["levels"])
+        region_mask = whole_regions(W.settings.reliability, steps.mapped(W.folder / steps.REGIONS)["levels"])
         totals = _sums(W, "rows", (1, codebook.regions))
         entries = sum(part["region"].size for part in _pieces(W, "rows"))
         principal = W.settings.robust_directions
@@ -309,37 +314,39 @@ class InBlocks(LiftSteps[Job]):
         level, scene = level_numbers(steps.compared_levels(W), codebook.regions), None
         shape = 2, codebook.regions + int(level.max(initial=0)) + 1
         for step in range(W.settings.robust_steps):
-            self.run("robust", steps.compare, replace(W, step=step, by_region=whole is not None), W.solutions)
-            scene = SceneAgreement.of(_sums(W, f"cosines-{step}", shape), whole, level)
+            self.run(
+                "robust", steps.compare, replace(W, step=step, by_region=region_mask is not None), W.splat_pieces
+            )
+            scene = SceneAgreement.of(_sums(W, f"cosines-{step}", shape), region_mask, level)
             steps.write_agreement(W, step, scene)
         return W, scene.reliability if scene else None
 
     def discount_distance(self, W: Job) -> Job:
-        self.run("loss", steps.measure, W, W.solutions)
+        self.run("loss", steps.measure, W, W.splat_pieces)
         return replace(W, delta=mean_distance(_sums(W, "measure", (2, 1))))
 
     def solve(self, W: Job, clusters: RegionObjects | None) -> tuple[Tensor, SplatSupport]:
         job = _with_clusters(W, clusters)
-        self.run("solve", steps.solve, job, job.solutions)
+        self.run("solve", steps.solve, job, job.splat_pieces)
         sums, evidence = _column(job, "rows", "sums"), _column(job, "rows", "evidence")
         agreement, robust = _column(job, "columns", "agreement"), job.settings.robust_steps
         confidence = torch.from_numpy(_column(job, "columns", "confidence")) if robust else None
         support = SplatSupport(sums, torch.from_numpy(evidence), torch.from_numpy(agreement), confidence)
         return _mapped(job, job.solved_file), support
 
-    def refine(self, W: Job, X: Tensor, seen: np.ndarray) -> NoReturn:
-        """See the protocol: `LiftSettings.check_blocks` has refused what asks for it."""
+    def refine(self, W: Job, X: Tensor, visible: np.ndarray) -> NoReturn:
+        """See the protocol; `LiftSettings.check_blocks` rejects settings that need it."""
         raise AssertionError("least squares need all rays in one place")
 
     def smooth(self, W: Job, X: Tensor, support: SplatSupport) -> NoReturn:
-        """See the protocol: `LiftSettings.check_blocks` has refused what asks for it."""
+        """See the protocol; `LiftSettings.check_blocks` rejects settings that need it."""
         raise AssertionError("the graph of neighbours crosses blocks")
 
     def aggregate(self, W: Job, X: Tensor, clusters: RegionObjects | None) -> tuple[Tensor, Aggregation]:
-        """See the protocol: the features of clusters that masks make."""
-        assert clusters is not None, "check_blocks refuses those of features"
+        """See the protocol: clusters of masks alone."""
+        assert clusters is not None, "check_blocks rejects clusters of features"
         job = _with_clusters(W, clusters)
-        merged, taken, guarded = (
+        merged, merged_mask, guard_mask = (
             torch.zeros(0, job.channels, dtype=job.dtype),
             torch.zeros(job.splats, dtype=torch.bool),
             None,
@@ -347,13 +354,13 @@ class InBlocks(LiftSteps[Job]):
         if job.clusters:
             merged = cluster_means(_sums(job, "columns", (job.channels + 1, job.clusters)), job.dtype)
             steps.write_piece(job.folder / steps.MERGED, {"merged": merged})
-            self.run("aggregate", steps.spread, job, job.solutions)
-            taken = torch.from_numpy(_column(job, "taken", "taken"))
-            guarded = torch.from_numpy(_column(job, "taken", "guarded")) if job.guarded else None
+            self.run("aggregate", steps.spread, job, job.splat_pieces)
+            merged_mask = torch.from_numpy(_column(job, "merged", "merged_mask"))
+            guard_mask = torch.from_numpy(_column(job, "merged", "guard_mask")) if job.has_guard else None
             X = _mapped(job, job.features_file)
         clustering = Clustering(torch.from_numpy(clusters.labels), job.clusters, {"clustered_by": "graph"})
-        facts = (MASKS_MADE if job.clusters else {}) | aggregation_facts(clustering, merged, taken, guarded)
-        return X, Aggregation(clustering.labels, merged, facts, ~taken, (None,) * len(job.names))
+        facts = (MASKS_MADE if job.clusters else {}) | aggregation_facts(clustering, merged, merged_mask, guard_mask)
+        return X, Aggregation(clustering.labels, merged, facts, ~merged_mask, (None,) * len(job.names))
 
     def measure(self, W: Job, X: Tensor) -> ViewMeasures:
         """See the protocol: a view at a time."""
@@ -361,38 +368,38 @@ class InBlocks(LiftSteps[Job]):
         return joined([measure_view(view.sample, X, view.codebook.rows) for view in views])
 
     def deliver(self, W: Job, lift: LiftResult) -> LiftResult:
-        """See the protocol: a lift in shards, mapped, whose files may lose their names."""
+        """See the protocol: a lift mapped from shards; their files may be deleted while it is open."""
         columns = {name: part for name, part in vars(lift).items() if isinstance(part, Tensor) and name != "features"}
-        write_index(W.folder / "lift", columns, W.solutions, lift.metadata.model_dump_json())
+        write_index(W.folder / "lift", columns, W.splat_pieces, lift.metadata.model_dump_json())
         return load_lift(W.folder / "lift")
 
 
 def _with_clusters(job: Job, clusters: RegionObjects | None) -> Job:
-    """The job whose splats may take the features of clusters."""
+    """Return the job in which splats may take the features of clusters."""
     if clusters is None:
         return job
-    guarded = bool(job.settings.aggregation_guard and job.settings.robust_steps)
-    return replace(job, clusters=clusters.count, guarded=guarded)
+    has_guard = bool(job.settings.aggregation_guard and job.settings.robust_steps)
+    return replace(job, clusters=clusters.count, has_guard=has_guard)
 
 
 def _pieces(job: Job, step: str) -> Iterator[dict[str, np.ndarray]]:
-    """What a step wrote of blocks of splats, one mapped at a time."""
-    return (map_tensors(job.piece_file(step, number))[0] for number in range(job.solutions))
+    """Iterate over the files of a step for blocks of splats, one mapped at a time."""
+    return (map_tensors(job.piece_file(step, number))[0] for number in range(job.splat_pieces))
 
 
 def _sums(job: Job, step: str, shape: tuple[int, int]) -> np.ndarray:
-    """The sums that blocks of splats wrote, added up."""
+    """Add up the sums in the files of a step."""
     return added((part for arrays in _pieces(job, step) for part in unpacked(arrays)), shape)
 
 
 def _column(job: Job, step: str, name: str) -> np.ndarray:
-    """What a step wrote of all splats [P] under that name."""
+    """Concatenate a column of all splats [P] from the files of a step."""
     return np.concatenate([part[name] for part in _pieces(job, step)])
 
 
 def _mapped(job: Job, file: Callable[[int], Path]) -> Tensor:
-    """X [P, F] as it lies in the files of blocks."""
-    return torch.from_numpy(map_rows([shard_at(file(number)) for number in range(job.solutions)]))
+    """Map X [P, F] from the files of blocks."""
+    return torch.from_numpy(map_rows([shard_at(file(number)) for number in range(job.splat_pieces)]))
 
 
 def _share_regions(job: Job, plan: Plan) -> WeightStatistics:
@@ -405,17 +412,17 @@ def _share_regions(job: Job, plan: Plan) -> WeightStatistics:
         entries += view.entries
         if view.blind:
             blind.append(name)
-    together = {"offsets": np.cumsum(counts), "levels": np.concatenate(levels)}
-    if together["offsets"][-1] > MOST_REGIONS:
-        got, hint = f"{together['offsets'][-1]} in {len(job.names)} views", "lift fewer views, or smaller maps"
+    arrays = {"offsets": np.cumsum(counts), "levels": np.concatenate(levels)}
+    if arrays["offsets"][-1] > MOST_REGIONS:
+        got, hint = f"{arrays['offsets'][-1]} in {len(job.names)} views", "lift fewer views, or smaller maps"
         raise Unavailable("features", expected=f"at most {MOST_REGIONS} regions", got=got, hint=hint)
-    steps.write_piece(job.folder / steps.REGIONS, together)
+    steps.write_piece(job.folder / steps.REGIONS, arrays)
     write_tensors(job.folder / steps.CODEBOOK, _Books(job), {})
-    return WeightStatistics(plan, together["levels"], entries, tuple(blind))
+    return WeightStatistics(plan, arrays["levels"], entries, tuple(blind))
 
 
 class _Books(Mapping[str, Tensor]):
-    """The codebooks of all views by names of their tensors, each read when it is asked for."""
+    """The codebooks of all views by names of their tensors, each read on access."""
 
     def __init__(self, job: Job) -> None:
         self._job, self._names = job, list[str]()
@@ -435,15 +442,15 @@ class _Books(Mapping[str, Tensor]):
 
 
 def _share_tuples(job: Job) -> np.ndarray:
-    """Write what the tuples of all views are made of; how many splats belong to each region, [M] i64."""
+    """Write the tables of all views' tuples; return the count of splats in each region, [M] i64."""
     bases, parents, members, sizes = [0], list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
-    for number in range(job.weighings):
+    for number in range(job.view_pieces):
         part = map_tensors(job.piece_file("relate", number))[0]
-        own = part["parents"]
-        parents.append(np.where(own < 0, own, own + np.int32(bases[-1])))
+        piece_parents = part["parents"]
+        parents.append(np.where(piece_parents < 0, piece_parents, piece_parents + np.int32(bases[-1])))
         members.append(part["members"].copy())
         sizes.append(part["sizes"].copy())
-        bases.append(bases[-1] + own.size)
-    together = {"bases": np.array(bases[:-1]), "parents": np.concatenate(parents), "members": np.concatenate(members)}
-    steps.write_piece(job.folder / steps.TUPLES, together)
+        bases.append(bases[-1] + piece_parents.size)
+    arrays = {"bases": np.array(bases[:-1]), "parents": np.concatenate(parents), "members": np.concatenate(members)}
+    steps.write_piece(job.folder / steps.TUPLES, arrays)
     return np.concatenate(sizes)

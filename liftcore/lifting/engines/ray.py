@@ -1,7 +1,7 @@
 """Pieces of a lift by the workers of a Ray cluster (the extra ``splatlift[ray]``).
 
 A worker needs this package, and the folders of the lift under the same paths. Ray sends it the job, of a few
-kilobytes, and gets nothing back: what is found lies in files, so no object store ever holds W or X.
+kilobytes, and receives nothing: results are files, so that no object store ever holds W or X.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ if TYPE_CHECKING:
     from liftcore.lifting.engines.base import Work
     from liftcore.lifting.engines.blocks import Job
 
-AHEAD = 1_000  # pieces that Ray knows of at a time
-RETRIES = 5  # of a piece whose worker or node died; what dies of its own piece so often dies of the piece
+MAX_QUEUED = 1_000  # pieces that are submitted to Ray at a time
+RETRIES = 5  # of a piece whose worker or node died; a piece that fails more often is itself the cause
 
 
 class RayEngine:
-    """The workers of a Ray cluster do the pieces; one whose worker dies is done again by another.
+    """An engine that runs pieces on the workers of a Ray cluster, and repeats a piece whose worker dies.
 
     Args:
         address: ``host:port`` of a cluster, or ``auto`` for the one of RAY_ADDRESS or of this machine; None starts
-            one of this machine's cores, which ends with the process. Ray runs any code that it is sent, so a cluster
-            that other machines can reach must ask for a token (RAY_AUTH_MODE=token).
-        scratch: a folder that all workers share, for lifts without a checkpoint; None: the system's temporary one.
-        cpus: cores of a worker. gpus: cards, or a share of one, of a worker, where the lift's device is cuda.
+            one on this machine's cores, which ends with the process. Ray runs any code that it receives, so a cluster
+            that other machines can reach must require a token (RAY_AUTH_MODE=token).
+        scratch: a folder that all workers share, for lifts without a checkpoint; None: the system's temporary folder.
+        cpus: cores of a worker. gpus: GPUs, or a share of one, of a worker, if the lift's device is cuda.
 
     Raises:
-        Unavailable: Ray is not installed, there is no such cluster, or it is open to others without a token.
+        Unavailable: Ray is not installed, the cluster does not exist, or others can reach it without a token.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class RayEngine:
         if cpus < 1:
             raise InvalidInput("cpus", expected="at least 1 core of a worker", got=str(cpus))
         if not 0 < gpus <= 64:
-            raise InvalidInput("gpus", expected="a share of a card above 0, or whole cards", got=str(gpus))
+            raise InvalidInput("gpus", expected="a share of a GPU above 0, or whole GPUs", got=str(gpus))
         self.scratch = None if scratch is None else Path(scratch)
         self._address, self._cpus, self._gpus = address, cpus, gpus
         self._ray: Any = _connected(address)
@@ -64,30 +64,30 @@ class RayEngine:
         needs: dict[str, float] = {"num_cpus": self._cpus, "max_retries": RETRIES}
         if job.settings.device == "cuda":
             needs["num_gpus"] = self._gpus
-        task, told = ray.remote(**needs)(work), ray.put(job)
+        task, job_ref = ray.remote(**needs)(work), ray.put(job)
         numbers, waiting = iter(range(pieces)), dict[Any, int]()
 
         def send(count: int) -> None:
             for number, _ in zip(numbers, range(count), strict=False):
-                waiting[task.remote(told, number, self._cpus)] = number
+                waiting[task.remote(job_ref, number, self._cpus)] = number
 
         try:
-            send(min(pieces, AHEAD))
+            send(min(pieces, MAX_QUEUED))
             while waiting:
-                (done,), _ = ray.wait(list(waiting), num_returns=1)
-                number = waiting.pop(done)
-                self._check(done)
+                (task_ref,), _ = ray.wait(list(waiting), num_returns=1)
+                number = waiting.pop(task_ref)
+                self._check(task_ref)
                 send(1)
                 yield number
         finally:
             for piece in waiting:
                 ray.cancel(piece, force=True)
 
-    def _check(self, done: Any) -> None:
-        """Raise what the piece raised."""
+    def _check(self, task_ref: Any) -> None:
+        """Raise the error of a piece, if it has one."""
         errors = self._ray.exceptions
         try:
-            self._ray.get(done)
+            self._ray.get(task_ref)
         except errors.RayTaskError as error:
             if isinstance(error.cause, SplatliftError | OSError | MemoryError):
                 raise error.cause from None
@@ -96,14 +96,14 @@ class RayEngine:
             got = str(error).strip().splitlines()[0][:200]
             raise Unavailable(
                 "engine",
-                expected=f"a worker that lives through a piece in {RETRIES + 1} attempts",
+                expected=f"a worker that finishes a piece in {RETRIES + 1} attempts",
                 got=got,
-                hint="see the cluster's log: most often a worker had too little memory",
+                hint="see the cluster's log; most often a worker had too little memory",
             ) from None
 
 
 def _connected(address: str | None) -> Any:
-    """Ray, connected."""
+    """Connect to a Ray cluster, and return the module."""
     try:
         ray: Any = import_module("ray")
     except ImportError:
@@ -115,9 +115,9 @@ def _connected(address: str | None) -> Any:
     if address not in (None, "auto"):
         check_reach(address)
     quiet = {"log_to_driver": False, "configure_logging": False}
-    alone = {"_node_ip_address": "127.0.0.1", "include_dashboard": False} if address is None else {}
+    local = {"_node_ip_address": "127.0.0.1", "include_dashboard": False} if address is None else {}
     try:
-        ray.init(address=address or "local", **quiet, **alone)
+        ray.init(address=address or "local", **quiet, **local)
     except (ConnectionError, RuntimeError, ValueError, OSError) as error:
         got = str(error).strip().splitlines()[0][:200]
         hint = "start one with 'ray start --head', or leave the address out"
@@ -131,24 +131,24 @@ def _connected(address: str | None) -> Any:
 
 
 def check_reach(address: str) -> None:
-    """Refuse a cluster that others can reach and that asks nobody for a token.
+    """Check that a cluster is on loopback, or requires a token.
 
     Args:
         address: ``host:port``, with ``ray://`` before it or not.
 
     Raises:
-        Unavailable: it is one, or there is no such host.
+        Unavailable: others can reach it without a token, or the host is unknown.
     """
     host = address.removeprefix("ray://").rpartition(":")[0].strip("[]")
     try:
-        found = {entry[4][0] for entry in socket.getaddrinfo(host, None)}
+        addresses = {entry[4][0] for entry in socket.getaddrinfo(host, None)}
     except OSError as error:
         raise Unavailable("engine", expected="host:port of a Ray cluster", got=f"{address} ({error})") from None
-    home = all(ipaddress.ip_address(one).is_loopback for one in found)
-    if not home and os.environ.get("RAY_AUTH_MODE") != "token":
+    is_loopback = all(ipaddress.ip_address(address_text).is_loopback for address_text in addresses)
+    if not is_loopback and os.environ.get("RAY_AUTH_MODE") != "token":
         raise Unavailable(
             "engine",
-            expected="a cluster on loopback, or one with tokens: Ray runs whatever code it is sent",
+            expected="a cluster on loopback, or one with tokens, as Ray runs any code that it receives",
             got=f"{address} without RAY_AUTH_MODE=token",
             hint="start all its nodes, and this process, with RAY_AUTH_MODE=token and one RAY_AUTH_TOKEN",
         )

@@ -1,22 +1,22 @@
-"""The steps of a lift in blocks after its views are weighed, of pieces of views or of blocks of splats.
+"""The steps of a lift in blocks after W of its views is computed; a piece is some views, or a block of splats.
 
-A step is a function ``(job, piece, threads)`` that reads what earlier ones wrote, and writes one file, whole or not
-at all. What is summed over the scene is written by pieces of splats (`liftcore.solve.sums`) and added up by the
-driver (`lifting.engines.lift`), which shares what it finds as files too. So the bits are those of a lift in memory.
+A step is a function ``(job, piece, threads)`` that reads the files of earlier steps and writes one file atomically.
+Sums over the scene are written per piece of splats (`liftcore.solve.sums`). The driver (`lifting.engines.lift`) adds
+them up and writes the totals as files too. So the result is bitwise identical to that of a lift in memory.
 
     step      piece of   writes
-    relate    views      which regions their splats belong to, as tuples (`liftcore.solve.consensus`)
+    relate    views      the regions that their splats belong to, as tuples (`liftcore.solve.consensus`)
     gather    splats     W of all views, a row a splat, its sums and evidence; the tuples of all views
-    contain   views      which regions contain theirs (`liftcore.solve.objects`)
-    label     splats     the object of each splat, and what it weighs in other regions and in views
-    share     views      what other views say of the entries of theirs (`liftcore.solve.consensus`)
+    contain   views      the regions that contain theirs (`liftcore.solve.objects`)
+    label     splats     the object of each splat, and its weight in other regions and in views
+    share     views      the consensus of other views about their entries (`liftcore.solve.consensus`)
     compare   splats     cosines of regions with the other views (`liftcore.solve.reweight`)
     measure   splats     distances of regions from features (`liftcore.solve.loss`)
-    solve     splats     X, and what supports it
+    solve     splats     X, agreement and confidence
     spread    splats     X with the features of clusters (`liftcore.solve.aggregate`)
 
-A worker holds one piece: W of some views or of a block, in mapped files where it is large, and tables of the size of
-M, of which those of codebooks and directions are at most TABLE_BYTES.
+A worker holds one piece: W of some views or of a block, in mapped files where it is large, and tables of size M, of
+which those of codebooks and directions take at most TABLE_BYTES.
 """
 
 from __future__ import annotations
@@ -63,20 +63,20 @@ from liftcore.values.region_weights import RegionWeights
 if TYPE_CHECKING:
     from liftcore.lifting.engines.base import Work
 
-# What the driver shares, of the size of M: each under a name of its own, for nodes may see an older file for seconds.
+# Files of the driver, of size M. No name is used twice, as other nodes may see an older file for some seconds.
 REGIONS = "regions.safetensors"  # offsets [V + 1] i64, levels [M] i8
 CODEBOOK = "codebook.safetensors"  # rows/v [M_v, F] and, where regions are tuples of rows, tuples/v [T_v, L] i32
 TUPLES = "tuples.safetensors"  # bases [pieces] i64, parents and members [T] i32
 CURVE = "curve.safetensors"  # bounds [2, 3] f64 of the splats with weight
-NODES = "nodes.safetensors"  # nodes and others, i64
+NODES = "nodes.safetensors"  # nodes and other_masks, i64
 TREE = "tree-{}.safetensors"  # of regions (`RegionTree`), by the step of `label`
 OBJECTS = "objects.safetensors"  # object [N + 1] i32, the object that each node of the tree is of
 MERGED = "merged.safetensors"  # merged [K, F], the features of the aggregation
-AGREEMENT = "agreement-{}.safetensors"  # regions [M] f32, usual and power [K] f64, reliability [1] f64
+AGREEMENT = "agreement-{}.safetensors"  # regions [M] f32, mean_cosine and power [K] f64, reliability [1] f64
 
 
 def mapped(path: Path) -> dict[str, Any]:
-    """The arrays of a file, by name; mapped anew where another has taken its place."""
+    """Map the arrays of a file, by name; again after the file is replaced."""
     return _mapped(path, file_version(path))
 
 
@@ -86,7 +86,7 @@ def _mapped(path: Path, _version: tuple[int, int]) -> dict[str, np.ndarray]:
 
 
 def codebook_of(job: Job) -> Codebook:
-    """E of all views, mapped."""
+    """Map E of all views."""
     path = job.folder / CODEBOOK
     return _codebook(path, file_version(path), len(job.names))
 
@@ -98,18 +98,18 @@ def _codebook(path: Path, _version: tuple[int, int], views: int) -> Codebook:
 
 
 def forget_files() -> None:
-    """Let go of the files of a lift that this process has mapped: a disk is free of what has neither name nor map."""
-    for kept in (_mapped, _codebook, blocks.mapped_scene, blocks.packs_at):
-        kept.cache_clear()
+    """Unmap the files of a lift: the disk frees the space of a deleted file only when nothing maps it."""
+    for cache in (_mapped, _codebook, blocks.mapped_scene, blocks.packs_at):
+        cache.cache_clear()
 
 
 def offsets_of(job: Job) -> np.ndarray:
-    """[V + 1] i64, the first region of each view."""
+    """Return [V + 1] i64: the first region of each view."""
     return mapped(job.folder / REGIONS)["offsets"]
 
 
 def groups_of(job: Job) -> RegionGroups:
-    """The view and the level of each region."""
+    """Return the view and the level of each region."""
     return RegionGroups.of(offsets_of(job), mapped(job.folder / REGIONS)["levels"])
 
 
@@ -123,9 +123,9 @@ Piece = tuple[dict[str, Any], Sequence[PieceSums]]  # arrays by name, and sums o
 
 
 def piece_of(step: str) -> Callable[[Callable[[Job, int, int | None], Piece]], Work]:
-    """A step that writes what it finds of a piece under that name, unless that lies there already."""
+    """Decorate a step: write its arrays to the piece's file, unless that exists."""
 
-    def written(find: Callable[[Job, int, int | None], Piece]) -> Work:
+    def decorate(find: Callable[[Job, int, int | None], Piece]) -> Work:
         @wraps(find)
         @one_thread()
         def work(job: Job, number: int, threads: int | None) -> None:
@@ -135,7 +135,7 @@ def piece_of(step: str) -> Callable[[Callable[[Job, int, int | None], Piece]], W
 
         return work
 
-    return written
+    return decorate
 
 
 # ---- blocks of views
@@ -146,39 +146,41 @@ class ViewBlock(NamedTuple):
 
     base: int  # the first of their regions
     splats: np.ndarray  # [n] i32 ascending
-    W: RegionWeights  # a row for each, regions with the numbers that they have in all views
+    W: RegionWeights  # a row for each; regions are numbered over all views
 
 
 def _view_block(job: Job, piece: int) -> ViewBlock:
-    found, numbers, offsets = read_weights(job, piece), job.views_of(piece), offsets_of(job)
+    block, numbers, offsets = read_weights(job, piece), job.views_of(piece), offsets_of(job)
     base = int(offsets[numbers.start])
-    region = values_of(found.region.size, torch.int32)
-    np.add(found.region, np.int32(base), out=region.numpy())
-    own = offsets[numbers.start : numbers.stop + 1] - base
-    return ViewBlock(base, found.splats, _weights(found.starts, region, torch.from_numpy(found.weight), own))
+    region = values_of(block.region.size, torch.int32)
+    np.add(block.region, np.int32(base), out=region.numpy())
+    local_offsets = offsets[numbers.start : numbers.stop + 1] - base
+    return ViewBlock(
+        base, block.splats, _weights(block.starts, region, torch.from_numpy(block.weight), local_offsets)
+    )
 
 
 def _weights(starts: np.ndarray, region: Tensor, weight: Tensor, offsets: np.ndarray) -> RegionWeights:
-    """W of as many splats as rows begin, without their evidence."""
-    every, begins = torch.arange(starts.size - 1, dtype=torch.int32), torch.from_numpy(starts)
-    return RegionWeights(every, begins, region, weight, every[:0], weight[:0], torch.from_numpy(offsets))
+    """Make W, a row for each of ``starts``, without evidence."""
+    rows, begins = torch.arange(starts.size - 1, dtype=torch.int32), torch.from_numpy(starts)
+    return RegionWeights(rows, begins, region, weight, rows[:0], weight[:0], torch.from_numpy(offsets))
 
 
 @piece_of("relate")
 def relate(job: Job, piece: int, threads: int | None) -> Piece:
-    """Write the tuples of the splats of some views, and how many splats belong to each of their regions."""
+    """Write the tuples of the splats of some views, and the count of splats in each of their regions."""
     block, groups = _view_block(job, piece), groups_of(job)
-    own = memberships(block.W, groups, threads).own
-    tuples = splat_tuples(block.W, own, groups, np.arange(block.splats.size), threads)
-    sizes = np.bincount(block.W.region.numpy()[own] - block.base, minlength=int(block.W.offsets[-1]))
+    own_region = memberships(block.W, groups, threads).own
+    tuples = splat_tuples(block.W, own_region, groups, np.arange(block.splats.size), threads)
+    sizes = np.bincount(block.W.region.numpy()[own_region] - block.base, minlength=int(block.W.offsets[-1]))
     arrays = {"splats": block.splats, "sizes": sizes}
     arrays |= {name: getattr(tuples, name) for name in ("starts", "tuples", "parents", "members")}
     return arrays, ()
 
 
 def _tuples_of(job: Job, splats: np.ndarray) -> tuple[SplatTuples, np.ndarray]:
-    """The tuples of some splats [n] ascending, in all views, and their t_j [n] f64."""
-    ends = np.searchsorted(splats, np.arange(job.solutions + 1) * job.rows)
+    """Read the tuples of some splats [n] ascending in all views, and their totals t_j [n] f64."""
+    ends = np.searchsorted(splats, np.arange(job.splat_pieces + 1) * job.rows)
     starts, totals = np.zeros(splats.size + 1, np.int64), np.zeros(splats.size)
     for target in (None, "filled"):
         tuples = values_of(int(starts[-1]) if target else 0, torch.int32).numpy()
@@ -193,23 +195,23 @@ def _tuples_of(job: Job, splats: np.ndarray) -> tuple[SplatTuples, np.ndarray]:
                 tuples[starts[first] : starts[last]] = take_rows(arrays["starts"], rows, arrays["tuples"])[1]
         if target is None:
             np.cumsum(starts, out=starts)
-    named = mapped(job.folder / TUPLES)
-    return SplatTuples(starts, tuples, named["parents"], named["members"]), totals
+    tables = mapped(job.folder / TUPLES)
+    return SplatTuples(starts, tuples, tables["parents"], tables["members"]), totals
 
 
-def _taken(tuples: SplatTuples, rows: np.ndarray) -> SplatTuples:
+def _take_tuples(tuples: SplatTuples, rows: np.ndarray) -> SplatTuples:
     return SplatTuples(*take_rows(tuples.starts, rows, tuples.tuples), tuples.parents, tuples.members)
 
 
 @piece_of("contain")
 def contain(job: Job, piece: int, threads: int | None) -> Piece:
-    """Write which nodes contain those of some views."""
+    """Write the nodes that contain those of some views."""
     block, groups, nodes = _view_block(job, piece), groups_of(job), mapped(job.folder / NODES)["nodes"]
-    own = memberships(block.W, groups, threads).own
-    begins, rows = sampled_splats(block.W, own, nodes, block.base)
-    chosen = np.zeros(block.splats.size, np.bool_)
-    chosen[rows] = True
-    local, numbers = np.flatnonzero(chosen), (np.cumsum(chosen) - 1)[rows]
+    own_region = memberships(block.W, groups, threads).own
+    begins, rows = sampled_splats(block.W, own_region, nodes, block.base)
+    sampled = np.zeros(block.splats.size, np.bool_)
+    sampled[rows] = True
+    local, numbers = np.flatnonzero(sampled), (np.cumsum(sampled) - 1)[rows]
     tuples, totals = _tuples_of(job, block.splats[local])
     table = sampled_nodes(begins, numbers, tuples, totals, nodes, groups.view.size)
     return {"container": node_containers(table, nodes, groups, threads)}, ()
@@ -217,16 +219,16 @@ def contain(job: Job, piece: int, threads: int | None) -> Piece:
 
 @piece_of("share")
 def share(job: Job, piece: int, threads: int | None) -> Piece:
-    """Write what other views say of the entries of some views."""
+    """Write the consensus of other views about the entries of some views."""
     block, groups = _view_block(job, piece), groups_of(job)
-    own, splats = memberships(block.W, groups, threads).own, torch.from_numpy(block.splats).long()
+    own_region, splats = memberships(block.W, groups, threads).own, torch.from_numpy(block.splats).long()
     bounds = torch.from_numpy(mapped(job.folder / CURVE)["bounds"])
     rows = along_curve(scene_of(job).means[splats], bounds)
     tuples, totals = _tuples_of(job, block.splats)
-    tuples = _taken(tuples, rows)
-    found = region_shares(block.W, own, groups, rows, totals[rows], tuples, base=block.base, threads=threads)
-    arrays = {"splats": block.splats, "starts": block.W.indptr, "sums": found.sums, "views": found.views}
-    return arrays | {"told": np.array([found.told, found.asked])}, ()
+    tuples = _take_tuples(tuples, rows)
+    shares = region_shares(block.W, own_region, groups, rows, totals[rows], tuples, base=block.base, threads=threads)
+    arrays = {"splats": block.splats, "starts": block.W.indptr, "sums": shares.sums, "views": shares.views}
+    return arrays | {"shares": np.array([shares.told, shares.asked])}, ()
 
 
 # ---- blocks of splats
@@ -237,36 +239,36 @@ def _bounds(job: Job, piece: int) -> tuple[int, int]:
 
 
 def _part(splats: np.ndarray, starts: np.ndarray, values: Iterable[np.ndarray], ends: tuple[int, int]) -> SomeRows:
-    """The rows of a part that are in a block, without the others' values."""
+    """Select the rows of a part that are in a block, and their values."""
     first, last = np.searchsorted(splats, ends)
-    own = slice(int(starts[first]), int(starts[last]))
+    span = slice(int(starts[first]), int(starts[last]))
     return SomeRows(
-        splats[first:last] - ends[0], starts[first : last + 1] - own.start, [part[own] for part in values]
+        splats[first:last] - ends[0], starts[first : last + 1] - span.start, [part[span] for part in values]
     )
 
 
 def _weight_rows(job: Job, ends: tuple[int, int]) -> Iterator[SomeRows]:
-    """The rows of W of a block in each piece of views, of which one's file is open at a time."""
+    """Iterate over the rows of W of a block in each piece of views, with one file open at a time."""
     offsets = offsets_of(job)
-    for piece in range(job.weighings):
-        own, base = read_weights(job, piece), np.int32(offsets[job.views_of(piece).start])
-        part = _part(own.splats, own.starts, (own.region, own.weight), ends)
+    for piece in range(job.view_pieces):
+        block, base = read_weights(job, piece), np.int32(offsets[job.views_of(piece).start])
+        part = _part(block.splats, block.starts, (block.region, block.weight), ends)
         yield SomeRows(part.rows, part.starts, [part.values[0] + base, part.values[1]])
 
 
 def _evidence(job: Job, ends: tuple[int, int]) -> Tensor:
-    """The evidence of a block [n] f32: sums over views, in their order."""
+    """Sum the evidence of a block [n] f32 over views, in their order."""
     sums = np.zeros(ends[1] - ends[0])
-    for piece in range(job.weighings):
-        own = read_weights(job, piece)
-        part = _part(own.evidence_splats, own.evidence_starts, (own.evidence,), ends)
+    for piece in range(job.view_pieces):
+        block = read_weights(job, piece)
+        part = _part(block.evidence_splats, block.evidence_starts, (block.evidence,), ends)
         np.add.at(sums, np.repeat(part.rows, np.diff(part.starts)), part.values[0].astype(np.float64))
     return torch.from_numpy(sums).float()
 
 
 @piece_of("rows")
 def gather(job: Job, piece: int, threads: int | None) -> Piece:
-    """Write W of a range of splats in all views, what supports them, and their tuples."""
+    """Write W of a block of splats in all views, its sums, evidence and tuples."""
     ends = first, last = _bounds(job, piece)
     starts, values = gather_rows(lambda: _weight_rows(job, ends), last - first, (torch.int32, torch.float32))
     W = _weights(starts, values[0], values[1], offsets_of(job))
@@ -277,8 +279,8 @@ def gather(job: Job, piece: int, threads: int | None) -> Piece:
     none = torch.zeros(0, 3, dtype=torch.float64)
     bounds = torch.stack([means.amin(dim=0), means.amax(dim=0)]) if means.numel() else none
     arrays = {"indptr": W.indptr, "region": W.region, "weight": W.weight, "sums": sums}
-    summed = job.settings.robust_steps or job.settings.objects  # who reads the weight of each region
-    totals = list(region_totals(W, threads)) if summed else []
+    needs_totals = job.settings.robust_steps or job.settings.objects  # these read the weight of each region
+    totals = list(region_totals(W, threads)) if needs_totals else []
     return arrays | {"evidence": _evidence(job, ends), "bounds": bounds}, totals
 
 
@@ -287,8 +289,8 @@ def _gather_tuples(job: Job, piece: int, ends: tuple[int, int], totals: Tensor) 
 
     def parts() -> Iterator[SomeRows]:
         for number, base in enumerate(bases):
-            own = map_tensors(job.piece_file("relate", number))[0]
-            part = _part(own["splats"], own["starts"], [own["tuples"]], ends)
+            arrays = map_tensors(job.piece_file("relate", number))[0]
+            part = _part(arrays["splats"], arrays["starts"], [arrays["tuples"]], ends)
             yield SomeRows(part.rows, part.starts, [part.values[0] + np.int32(base)])
 
     starts, (tuples,) = gather_rows(parts, ends[1] - ends[0], (torch.int32,))
@@ -297,13 +299,13 @@ def _gather_tuples(job: Job, piece: int, ends: tuple[int, int], totals: Tensor) 
 
 @dataclass(frozen=True)
 class SplatBlock:
-    """A range of splats, and W of these in all views."""
+    """A block of splats, and W of these in all views."""
 
     first: int
     last: int
     W: RegionWeights
     means: Tensor  # [n, 3]
-    arrays: dict[str, np.ndarray]  # what else `gather` wrote
+    arrays: dict[str, np.ndarray]  # of the file of `gather`
 
 
 def _splat_block(job: Job, piece: int) -> SplatBlock:
@@ -316,35 +318,35 @@ def _splat_block(job: Job, piece: int) -> SplatBlock:
 
 @piece_of("labels-{step}")
 def label(job: Job, piece: int, threads: int | None) -> Piece:
-    """Write the smallest node of each splat, and what nodes weigh: in step 0 in other regions, then in views."""
+    """Write the smallest node of each splat, and the weight of nodes: in step 0 in other regions, then in views."""
     block, tree = _splat_block(job, piece), RegionTree(**mapped(job.folder / TREE.format(job.step)))
     groups, number = groups_of(job), tree.parents.size
     labels = node_labels(block.W, groups, tree, threads)
     if job.step == 0:
-        others = mapped(job.folder / NODES)["others"]
-        sums = node_shares(block.W, labels, number, others, threads)
+        other_masks = mapped(job.folder / NODES)["other_masks"]
+        sums = node_shares(block.W, labels, number, other_masks, threads)
     else:
         sums = view_shares(block.W, groups, labels, number, threads)
     return {"labels": labels}, list(sums)
 
 
 def labels_of(job: Job, piece: int) -> np.ndarray:
-    """[n] i32: the object of each splat of a block, as the driver numbers them; -1 for none."""
+    """Return [n] i32: the object of each splat of a block, as the driver numbers them; -1 for none."""
     labels = map_tensors(job.piece_file("labels-1", piece))[0]["labels"]
     return mapped(job.folder / OBJECTS)["object"][labels]
 
 
 def _consensus(job: Job, block: SplatBlock, threads: int | None) -> Tensor | None:
-    """c_jm of the entries of a block [nnz] f32, where views have masks."""
+    """Compute c_jm of the entries of a block [nnz] f32; None if no view has masks."""
     if job.usual_share is None:
         return None
     sums, views = values_of(block.W.region.shape[0], torch.float32), values_of(block.W.region.shape[0], torch.uint8)
     ends = block.first, block.last
 
     def parts() -> Iterator[SomeRows]:
-        for number in range(job.weighings):
-            own = map_tensors(job.piece_file("share", number))[0]
-            yield _part(own["splats"], own["starts"], (own["sums"], own["views"]), ends)
+        for number in range(job.view_pieces):
+            arrays = map_tensors(job.piece_file("share", number))[0]
+            yield _part(arrays["splats"], arrays["starts"], (arrays["sums"], arrays["views"]), ends)
 
     fill_rows(parts(), block.W.indptr.numpy(), [sums.numpy(), views.numpy()])
     with_mean(sums.numpy(), views.numpy(), job.usual_share, threads)
@@ -352,43 +354,43 @@ def _consensus(job: Job, block: SplatBlock, threads: int | None) -> Tensor | Non
 
 
 def scene_agreement(job: Job, step: int) -> SceneAgreement:
-    """What the driver found in a step."""
+    """Read the driver's totals of a robust step."""
     arrays = map_tensors(job.folder / AGREEMENT.format(step))[0]
-    usual, regions, power = (torch.from_numpy(arrays[name]) for name in ("usual", "regions", "power"))
+    mean_cosine, regions, power = (torch.from_numpy(arrays[name]) for name in ("mean_cosine", "regions", "power"))
     reliability = float(arrays["reliability"][0])
-    return SceneAgreement(usual, regions, power, None if np.isnan(reliability) else reliability)
+    return SceneAgreement(mean_cosine, regions, power, None if np.isnan(reliability) else reliability)
 
 
 def write_agreement(job: Job, step: int, scene: SceneAgreement) -> None:
-    """Share what the driver found in a step."""
+    """Write the driver's totals of a robust step."""
     reliability = np.nan if scene.reliability is None else scene.reliability
-    arrays = {"regions": scene.regions, "usual": scene.usual, "power": scene.power}
+    arrays = {"regions": scene.regions, "mean_cosine": scene.usual, "power": scene.power}
     arrays["reliability"] = torch.tensor([reliability], dtype=torch.float64)
     write_tensors(job.folder / AGREEMENT.format(step), arrays, {})
 
 
-def _judge(job: Job, block: SplatBlock, threads: int | None) -> ViewConsistency:
+def _view_consistency(job: Job, block: SplatBlock, threads: int | None) -> ViewConsistency:
     return ViewConsistency(block.W, block.means, threads, compared_levels(job))
 
 
 def compared_levels(job: Job) -> np.ndarray | None:
-    """[M] i8: the level of each region where levels are judged apart; else None."""
+    """Return [M] i8: the level of each region if levels are compared separately, else None."""
     return mapped(job.folder / REGIONS)["levels"] if job.levels_apart else None
 
 
-def _weighed(
-    job: Job, piece: int, block: SplatBlock, judge: ViewConsistency, step: int, threads: int | None
+def _factors_after(
+    job: Job, piece: int, block: SplatBlock, consistency: ViewConsistency, step: int, threads: int | None
 ) -> tuple[Tensor, Tensor]:
-    """The factors after so many steps, at least one, and the scores of splats."""
+    """Compute the factors after ``step`` steps, at least one, and the scores of splats."""
     cosines = torch.from_numpy(map_tensors(job.piece_file(f"cosines-{step - 1}", piece))[0]["cosines"])
     before = _before(job, piece, step - 1)
     factors = values_of(cosines.shape[0], torch.float32).copy_(cosines)
-    scores = judge.weigh(factors, before, scene_agreement(job, step - 1), _consensus(job, block, threads))
+    scores = consistency.weigh(factors, before, scene_agreement(job, step - 1), _consensus(job, block, threads))
     return factors, scores
 
 
 def _before(job: Job, piece: int, step: int) -> Tensor | None:
-    """The factors that a step begins with, as the step before left them; None for the first one."""
+    """Read the factors of the step before; None for the first step."""
     if step == 0:
         return None
     return torch.from_numpy(map_tensors(job.piece_file(f"factors-{step}", piece))[0]["factors"])
@@ -396,28 +398,28 @@ def _before(job: Job, piece: int, step: int) -> Tensor | None:
 
 @piece_of("cosines-{step}")
 def compare(job: Job, piece: int, threads: int | None) -> Piece:
-    """Write the cosines of a step, and what the scene is to learn of them; and the factors of the step before."""
+    """Write the cosines of a step with their sums over the scene, and the factors of the step before."""
     block = _splat_block(job, piece)
-    judge, sums, before = _judge(job, block, threads), list[PieceSums](), None
+    consistency, sums, before = _view_consistency(job, block, threads), list[PieceSums](), None
     if job.step:
-        before, _ = _weighed(job, piece, block, judge, job.step, threads)
+        before, _ = _factors_after(job, piece, block, consistency, job.step, threads)
         write_piece(job.piece_file(f"factors-{job.step}", piece), {"factors": before})
     directions = StoredDirections(job.folder)
-    return {"cosines": judge.cosines(directions, before, job.by_region, sums.append)}, sums
+    return {"cosines": consistency.cosines(directions, before, job.by_region, sums.append)}, sums
 
 
 def _reweighted(job: Job, piece: int, block: SplatBlock, threads: int | None) -> tuple[RegionWeights, Tensor | None]:
-    """W of a block after all robust steps, and the scores of splats [2, n]; None without a step."""
+    """Compute W of a block after all robust steps, and the scores of splats [2, n]; None without a step."""
     if not job.settings.robust_steps:
         return block.W, None
-    judge = _judge(job, block, threads)
-    factors, scores = _weighed(job, piece, block, judge, job.settings.robust_steps, threads)
+    consistency = _view_consistency(job, block, threads)
+    factors, scores = _factors_after(job, piece, block, consistency, job.settings.robust_steps, threads)
     return reweighted(block.W, factors), scores
 
 
 @piece_of("measure")
 def measure(job: Job, piece: int, threads: int | None) -> Piece:
-    """Write what the distances of regions from the first closed form add up to."""
+    """Write the sums of the distances of regions from the first closed form."""
     block = _splat_block(job, piece)
     W, _ = _reweighted(job, piece, block, threads)
     distances = RegionDistances(W, codebook_of(job), block.means, threads)
@@ -426,7 +428,7 @@ def measure(job: Job, piece: int, threads: int | None) -> Piece:
 
 @one_thread()
 def solve(job: Job, piece: int, threads: int | None) -> None:
-    """Write X of a range of splats, and what supports it: agreement and confidence."""
+    """Write X of a block of splats with agreement and confidence."""
     columns_file, features_file = job.columns_file(piece), job.solved_file(piece)
     if columns_file.exists() and features_file.exists():
         return
@@ -446,27 +448,29 @@ def solve(job: Job, piece: int, threads: int | None) -> None:
         labels = labels_of(job, piece)
         parts = list(cluster_sums(X, block.arrays["evidence"], labels, job.clusters, threads))
         if settings.aggregation_guard and scores is not None:
-            write_piece(job.piece_file("guard", piece), {"weight": W.weight, "explained": scores[1]})
+            write_piece(job.piece_file("guard", piece), {"weight": W.weight, "consistency": scores[1]})
     write_piece(columns_file, columns, parts)
 
 
 @one_thread()
 def spread(job: Job, piece: int, threads: int | None) -> None:
-    """Write X with the features of clusters where splats take them, and which do."""
-    path = job.piece_file("taken", piece)
+    """Write X in which splats take the features of their clusters, and the mask of these splats."""
+    path = job.piece_file("merged", piece)
     if path.exists() and job.features_file(piece).exists():
         return
     block, labels = _splat_block(job, piece), torch.from_numpy(labels_of(job, piece))
     merged = torch.from_numpy(map_tensors(job.folder / MERGED)[0]["merged"])
     shard = shard_at(job.solved_file(piece))
     X = torch.from_numpy(np.fromfile(shard.path, shard.dtype, offset=shard.begin).reshape(shard.shape))
-    taken = with_feature(labels, merged)
+    merged_mask = with_feature(labels, merged)
     columns = dict[str, Tensor]()
-    if job.guarded:
-        own = map_tensors(job.piece_file("guard", piece))[0]
-        weight, explained = torch.from_numpy(own["weight"]), torch.from_numpy(own["explained"])
+    if job.has_guard:
+        arrays = map_tensors(job.piece_file("guard", piece))[0]
+        weight, consistency = torch.from_numpy(arrays["weight"]), torch.from_numpy(arrays["consistency"])
         W = replace(block.W, weight=weight)
-        columns["guarded"] = guard(taken, labels, merged, W, StoredDirections(job.folder), explained, threads)
-        taken = taken & ~columns["guarded"]
-    write_rows(job.features_file(piece), give_features(X, labels, merged, taken))
-    write_piece(path, columns | {"taken": taken})
+        columns["guard_mask"] = guard(
+            merged_mask, labels, merged, W, StoredDirections(job.folder), consistency, threads
+        )
+        merged_mask = merged_mask & ~columns["guard_mask"]
+    write_rows(job.features_file(piece), give_features(X, labels, merged, merged_mask))
+    write_piece(path, columns | {"merged_mask": merged_mask})

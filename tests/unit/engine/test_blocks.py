@@ -137,7 +137,7 @@ def test_worker_holds_the_splats_that_its_views_see(scene: dict[str, Any], tmp_p
     class Watching(LocalEngine):
         def run(self, work: Any, job: Any, pieces: int) -> Iterator[int]:
             cameras = [job.cameras[name] for name in job.names[:2]]
-            splats, ids = blocks.seen_splats(job, cameras, 1)
+            splats, ids = blocks.visible_splats(job, cameras, 1)
             told.append((splats.count, len(ids)))
             yield from super().run(work, job, pieces)
 
