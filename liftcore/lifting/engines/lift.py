@@ -1,8 +1,8 @@
 """The driver of a lift in blocks, for scenes whose W or X does not fit one machine.
 
 An engine runs the steps (`lifting.engines.steps`). The driver adds up their sums over the scene, and writes the
-totals for all workers. It holds tables of size M, a few columns of the splats, and the graph of objects; it copies codebooks
-a view at a time.
+totals for all workers. It holds tables of size M, a few columns of the splats, and the graph of objects; it
+copies codebooks a view at a time.
 """
 
 from __future__ import annotations
