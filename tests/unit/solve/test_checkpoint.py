@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from liftcore.io.cameras import read_cameras
-from liftcore.lifting.checkpoint import Checkpoint, question
+from liftcore.lifting.checkpoint import Checkpoint, request_digest
 from liftcore.lifting.files import lift_files
 from liftcore.query.result import LiftResult
 from liftcore.raster.base import ViewRequest
@@ -178,14 +178,16 @@ def test_an_answer_is_to_one_question_alone(changed: str) -> None:
         "power": replace(look, weighting=Weighting(power=2)),
         "pixels": replace(look, pixels=look.pixels + 1),
     }[changed]
-    assert question(other, "") != question(look, "")
+    assert request_digest(other, "") != request_digest(look, "")
     features = replace(regions, codebook=torch.ones_like(regions.codebook))
-    assert question(replace(look, observation=features), "") == question(look, "")
+    assert request_digest(replace(look, observation=features), "") == request_digest(look, "")
 
 
 def test_regions_and_cells_of_the_same_size_are_other_questions() -> None:
     look = _look()
-    assert question(replace(look, observation=FeatureGrid(torch.zeros(1, 3, 2))), "") != question(look, "")
+    assert request_digest(replace(look, observation=FeatureGrid(torch.zeros(1, 3, 2))), "") != request_digest(
+        look, ""
+    )
 
 
 def test_files_that_are_no_answers_stay_in_the_folder(tmp_path: Path) -> None:
