@@ -37,7 +37,7 @@ from liftcore.lifting.planning.contradictions import (
     unseen,
 )
 from liftcore.lifting.planning.views import visibility
-from liftcore.query.splat_colours import seen_colours
+from liftcore.query.splat_colours import view_colours
 from liftcore.raster import open_raster
 from liftcore.raster.base import Raster
 from liftcore.runtime.arguments import as_list
@@ -222,7 +222,7 @@ def _render(
     raster: Raster, splats: Splats, camera: Camera, params: CompositingParams
 ) -> tuple[np.ndarray, np.ndarray]:
     """A view over black [H, W, 3] f32 in the pixels of its photo, and what splats leave of each ray [H, W, 1] f32."""
-    values = torch.cat([seen_colours(splats, camera), torch.ones(splats.count, 1, dtype=torch.float32)], dim=1)
+    values = torch.cat([view_colours(splats, camera), torch.ones(splats.count, 1, dtype=torch.float32)], dim=1)
     image = in_photo(camera, lambda of: raster.render(of, values, params)).numpy()
     return image[..., :3], 1.0 - image[..., 3:]
 

@@ -29,7 +29,7 @@ BAND = 0.2  # of a box's side, on each side of it: 1.4 x 1.4 is twice the area
 REACH = 0.15  # of the band, into which the object may extend if the box is drawn too small
 
 
-def feature_shown(scene: OpenedLift, area: Area) -> np.ndarray:
+def area_feature(scene: OpenedLift, area: Area) -> np.ndarray:
     """Return the feature of an area of a camera's image, [F] f64; of a pixel as scores are rendered.
 
     Raises:
@@ -107,7 +107,7 @@ def _rendered(scene: OpenedLift, camera: Camera, area: Area | None, pixels: np.n
     return np.stack(features) if features else np.zeros((0, scene.channels))
 
 
-def splats_shown(scene: OpenedLift, area: Area) -> tuple[np.ndarray, np.ndarray]:
+def area_splats(scene: OpenedLift, area: Area) -> tuple[np.ndarray, np.ndarray]:
     """Return the splats on the rays of an area's pixels, [n] i32 with repeats, and their weights there, [n] f32.
 
     Raises:

@@ -54,7 +54,7 @@ from liftcore.query.selection import (
 )
 from liftcore.query.selections import set_members
 from liftcore.query.terms import Vector
-from liftcore.query.threshold import find_threshold, nothing_alike
+from liftcore.query.threshold import explain_no_selection, find_threshold
 from liftcore.runtime.cores import cores
 from liftcore.runtime.one_thread import one_thread
 from liftcore.text import TextEncoder, check_texts
@@ -431,7 +431,7 @@ def _selected(
     """
     query, positives = asked.query, len(asked.query.positives)
     known = scores if scene.all_seen else scores[scene.seen]
-    nothing = nothing_alike(known)
+    nothing = explain_no_selection(known)
     if nothing:
         method = query.threshold if isinstance(query.threshold, str) else "fixed"
         found = Threshold(value=math.inf, method=method, explanation=nothing, clear=False)

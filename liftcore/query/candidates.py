@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from liftcore.query.areas import splats_shown
+from liftcore.query.areas import area_splats
 from liftcore.query.opened import OpenedLift
 from liftcore.query.question import Candidate, Query
 from liftcore.query.terms import Area, SplatSet, SplatTerm, Term
@@ -70,7 +70,7 @@ def _path(scene: OpenedLift, example: Term) -> dict[int, float]:
         rows, weights = np.array([example.splat]), np.ones(1)
     else:
         assert isinstance(example, Area)
-        rows, weights = splats_shown(scene, example)
+        rows, weights = area_splats(scene, example)
     labels = scene.object if scene.node is None else scene.node
     assert labels is not None and scene.object_views is not None
     parents = np.full(len(scene.object_views), -1) if scene.node_parents is None else scene.node_parents

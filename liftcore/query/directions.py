@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from liftcore.errors import InvalidQuery, NotFound
-from liftcore.query.areas import feature_shown
+from liftcore.query.areas import area_feature
 from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.presence import references_of
 from liftcore.query.question import AskableWord, AskableWords, Query
@@ -27,39 +27,39 @@ from liftcore.text.wording import PartPhrase, Wording, part_phrases, shipped_wor
 def wordings(
     scene: OpenedLift, query: Query, encoder: TextEncoder | None, names: Sequence[str] = ()
 ) -> dict[int, Wording]:
-    """What each text among the terms is asked as, by its place: the word of a table, else the text itself.
+    """Return the wording of each text among the terms, by its index: the word of a table, else the text itself.
 
     Args:
-        names: what errors call each of the terms; () = what they are themselves.
+        names: of the terms in errors; () = their own texts.
 
     Raises:
-        InvalidQuery: no word of the table stands for a text; ``nearest`` has those that could be asked.
+        InvalidQuery: no word of the table stands for a text; ``nearest`` has words that do.
     """
     source = table_of(encoder or scene.table)
     texts = {place: term for place, term in enumerate(query.terms) if isinstance(term, str)}
     if source is None:
         return {place: Wording(text, text, "") for place, text in texts.items()}
-    found: dict[int, Wording] = {}
+    by_place: dict[int, Wording] = {}
     for place, text in texts.items():
         with _Names(query.terms, names)(place):
             check_texts([text])
             word = source.vocabulary.find(text)
             if word is None:
-                raise source.refusal(text, named_things(scene, source.words, source.embeddings))
-        found[place] = word
-    return found
+                raise source.refusal(text, object_words(scene, source.words, source.embeddings))
+        by_place[place] = word
+    return by_place
 
 
 def table_of(encoder: TextEncoder | None) -> TableEncoder | None:
-    """An encoder that is a table of words; None for any other."""
+    """Return the table of words of an encoder; None for any other encoder."""
     source = encoder.source if isinstance(encoder, CachingEncoder) else encoder
     return source if isinstance(source, TableEncoder) else None
 
 
 def part_phrase(scene: OpenedLift, query: Query, encoder: TextEncoder | None) -> PartPhrase | None:
-    """The part of a thing that the only positive of a query names; None where it is something else.
+    """Return the part of an object that the only positive of a query names; None if it names no part.
 
-    A table that has the whole text as a word asks that; so does any encoder where the shipped words have it.
+    A text that a table has as a word names no part; nor does one of the shipped words, with any other encoder.
     """
     encoder = encoder or scene.table
     if encoder is None or len(query.positives) != 1 or not query.text:
@@ -67,12 +67,12 @@ def part_phrase(scene: OpenedLift, query: Query, encoder: TextEncoder | None) ->
     source = table_of(encoder)
     if source is not None:
         return source.vocabulary.find_part(query.text[0])
-    known = shipped_words().find_part(query.text[0])
-    return known or next((phrase for phrase in part_phrases(query.text[0]) if phrase.sure), None)
+    part = shipped_words().find_part(query.text[0])
+    return part or next((phrase for phrase in part_phrases(query.text[0]) if phrase.sure), None)
 
 
 def unknown_part(scene: OpenedLift, query: Query, encoder: TextEncoder | None) -> PartPhrase | None:
-    """The part, as typed, that the only positive of a query names and no word of the table stands for; None else."""
+    """Return the part that the only positive of a query names and the table has no word for, as typed; else None."""
     source = table_of(encoder or scene.table)
     if source is None or len(query.positives) != 1 or not query.text:
         return None
@@ -80,34 +80,34 @@ def unknown_part(scene: OpenedLift, query: Query, encoder: TextEncoder | None) -
 
 
 def askable_words(scene: OpenedLift, encoder: TextEncoder, text: str, count: int) -> AskableWords:
-    """What a lift can be asked (`Scene.askable`)."""
+    """Suggest words to query a lift by (`Scene.askable`)."""
     source = table_of(encoder)
     if source is not None:
-        here = named_things(scene, source.words, source.embeddings)
-        words = tuple(AskableWord(**one._asdict()) for one in source.vocabulary.complete(text, count))
-        return AskableWords(any_text=False, words=words, here=here)
-    known = references_of(encoder, scene.metadata.text_space)
-    here = () if isinstance(known, str) else named_things(scene, known.words, known.vectors)
-    return AskableWords(any_text=True, words=(), here=here)
+        scene_words = object_words(scene, source.words, source.embeddings)
+        words = tuple(AskableWord(**suggestion._asdict()) for suggestion in source.vocabulary.complete(text, count))
+        return AskableWords(any_text=False, words=words, here=scene_words)
+    references = references_of(encoder, scene.metadata.text_space)
+    scene_words = () if isinstance(references, str) else object_words(scene, references.words, references.vectors)
+    return AskableWords(any_text=True, words=(), here=scene_words)
 
 
-def named_things(scene: OpenedLift, words: Sequence[str], vectors: np.ndarray) -> tuple[str, ...]:
-    """The words that are nearest to the lift's objects, each once, the object with the most evidence first.
+def object_words(scene: OpenedLift, words: Sequence[str], vectors: np.ndarray) -> tuple[str, ...]:
+    """Return the nearest word of each of the lift's objects, without repeats, the one with the most evidence first.
 
-    An object whose word is not among the nearest hundredth also about the scene's mean is left out: the word may be
-    near to all that the scene shows.
+    An object is left out if its word is not among the nearest hundredth also about the scene's mean: the word may be
+    near to the whole scene.
 
     Args:
         words: n. vectors: [n, F] f32, unit.
     """
     if scene.object is None or vectors.shape[1] != scene.channels or not len(scene.object_means):
         return ()
-    plain = (scene.object_means @ vectors.T).argmax(axis=1)
-    apart = (scene.object_means - scene.rough_mean) @ vectors.T
-    ahead = (apart > np.take_along_axis(apart, plain[:, None], axis=1)).sum(axis=1)
-    sure = (ahead < max(1, len(words) // 100)) & scene.object_means.any(axis=1)
+    nearest = (scene.object_means @ vectors.T).argmax(axis=1)
+    centred = (scene.object_means - scene.rough_mean) @ vectors.T
+    nearer_counts = (centred > np.take_along_axis(centred, nearest[:, None], axis=1)).sum(axis=1)
+    sure = (nearer_counts < max(1, len(words) // 100)) & scene.object_means.any(axis=1)
     rows: list[int] = np.flatnonzero(sure).tolist()
-    return tuple(dict.fromkeys(words[int(plain[row])].replace("_", " ") for row in rows))
+    return tuple(dict.fromkeys(words[int(nearest[row])].replace("_", " ") for row in rows))
 
 
 def directions(
@@ -117,23 +117,23 @@ def directions(
     names: Sequence[str] = (),
     asked_as: Mapping[int, Wording] | None = None,
 ) -> np.ndarray:
-    """The unit vector of every term, [n, F] f32.
+    """Return the unit vector of every term, [n, F] f32.
 
     Args:
-        names: what errors call each of the terms; () = what they are themselves.
-        asked_as: of the texts (`wordings`); None: found here.
+        names: of the terms in errors; () = their own texts.
+        asked_as: of the texts (`wordings`); None: computed here.
 
     Raises:
-        InvalidQuery: a text without an encoder or with one of another space, a text that it cannot read, or an
-            example that has no feature: outside the image, on a ray that misses the scene, of another length.
-        NotFound: an example names a view or a region that is not there.
+        InvalidQuery: a text without an encoder or with one of another space, a text that it cannot encode, or an
+            example without a feature: outside the image, on a ray that misses the scene, of another length.
+        NotFound: an example names a view or a region that does not exist.
         InvalidLift: the splats, the cameras or the packs that an example needs moved or changed.
     """
-    named = _Names(query.terms, names)
-    rows = _encode(scene, query, encoder, named, asked_as) | _regions(scene, query, named)
+    term_names = _Names(query.terms, names)
+    rows = _encode(scene, query, encoder, term_names, asked_as) | _regions(scene, query, term_names)
     for place, term in enumerate(query.terms):
         if not isinstance(term, str | Region):
-            with named(place):
+            with term_names(place):
                 rows[place] = _unit(_feature(scene, term), "vector" if isinstance(term, Vector) else str(term))
     empty = np.zeros((0, scene.channels), np.float32)  # of a query of sets
     return np.stack([rows[place] for place in range(len(query.terms))]) if rows else empty
@@ -141,7 +141,7 @@ def directions(
 
 @dataclass(frozen=True)
 class _Names:
-    """What is wrong with a term is said under its name, if it has one."""
+    """Context that raises the errors of a term again under its name, if it has one."""
 
     terms: Sequence[Term]
     names: Sequence[str]
@@ -163,10 +163,10 @@ def _encode(
     scene: OpenedLift,
     query: Query,
     encoder: TextEncoder | None,
-    named: _Names,
+    term_names: _Names,
     asked_as: Mapping[int, Wording] | None,
 ) -> dict[int, np.ndarray]:
-    """The unit vector of each text, by its place among the terms."""
+    """Return the unit vector of each text, by its index among the terms."""
     texts = {place: term for place, term in enumerate(query.terms) if isinstance(term, str)}
     if not texts:
         return {}
@@ -181,26 +181,26 @@ def _encode(
         expected = f"{scene.channels} channels as the lift has (its text space: {space})"
         hint = "query with the text encoder that belongs to the features' image encoder"
         raise InvalidQuery("encoder", expected=expected, got=f"{encoder.name} with {encoder.channels}", hint=hint)
-    asked_as = wordings(scene, query, encoder, named.names) if asked_as is None else asked_as
+    asked_as = wordings(scene, query, encoder, term_names.names) if asked_as is None else asked_as
     texts = {place: asked_as[place].word for place in texts}
     try:
         rows = encoder.encode(list(texts.values()))
     except InvalidQuery:
-        for place, text in texts.items():  # together they do not tell which of them it is
-            with named(place):
+        for place, text in texts.items():  # one by one, so that the error names the text
+            with term_names(place):
                 encoder.encode([text])
         raise
     return {place: _unit(row, text) for row, (place, text) in zip(as_numpy(rows), texts.items(), strict=True)}
 
 
-def _regions(scene: OpenedLift, query: Query, named: _Names) -> dict[int, np.ndarray]:
-    """The unit row of each region, by its place among the terms; a view is read once for all that are of it."""
-    asked = [(term.view, place, term) for place, term in enumerate(query.terms) if isinstance(term, Region)]
+def _regions(scene: OpenedLift, query: Query, term_names: _Names) -> dict[int, np.ndarray]:
+    """Return the unit row of each region, by its index among the terms; a view is read once for all its regions."""
+    region_terms = [(term.view, place, term) for place, term in enumerate(query.terms) if isinstance(term, Region)]
     rows: dict[int, np.ndarray] = {}
-    for _, of_view in groupby(sorted(asked, key=itemgetter(0, 1)), key=itemgetter(0)):
+    for _, of_view in groupby(sorted(region_terms, key=itemgetter(0, 1)), key=itemgetter(0)):
         regions = None  # one view at a time: maps are large
         for _, place, term in of_view:
-            with named(place):
+            with term_names(place):
                 regions = regions or regions_of(scene, term.view, str(term))
                 rows[place] = _unit(codebook_row(regions, term), str(term))
     return rows
@@ -208,7 +208,7 @@ def _regions(scene: OpenedLift, query: Query, named: _Names) -> dict[int, np.nda
 
 def _feature(scene: OpenedLift, example: Area | SplatTerm | SplatSet | Vector) -> np.ndarray:
     if isinstance(example, Area):
-        return feature_shown(scene, example)
+        return area_feature(scene, example)
     if isinstance(example, Vector):
         if len(example.values) != scene.channels:
             raise InvalidQuery("vector", expected=f"{scene.channels} channels, as the lift has", got=str(example))
@@ -225,7 +225,7 @@ def _feature(scene: OpenedLift, example: Area | SplatTerm | SplatSet | Vector) -
 
 
 def _unit(vector: np.ndarray, name: str) -> np.ndarray:
-    """[F] f32 of length one. Scaled by its largest entry first, so that no square overflows or vanishes."""
+    """Scale a vector to length one, [F] f32; by its largest entry first, so that no square over- or underflows."""
     wide = np.asarray(vector, np.float64)
     largest = np.abs(wide).max()
     if not np.isfinite(largest) or largest == 0:
@@ -236,17 +236,17 @@ def _unit(vector: np.ndarray, name: str) -> np.ndarray:
 
 
 def read_example(notation: str, argument: str = "like") -> Example:
-    """An example by its notation, or the vector of a file that ends in .npy.
+    """Read an example by its notation, or the vector of a file that ends in .npy.
 
     Raises:
-        InvalidQuery: it is none of them (blamed on ``argument``), or an array that is no vector.
+        InvalidQuery: it is none of them (the error names ``argument``), or an array that is no vector.
         InvalidFeatures: no such file, or no array of numbers in it.
     """
     return read_vector(Path(notation)) if notation.endswith(".npy") else parse_example(notation, argument)
 
 
 def read_vector(path: Path) -> Vector:
-    """The vector of a ``.npy`` file, [F] or [1, F] of any number type.
+    """Read the vector of a ``.npy`` file, [F] or [1, F] of any number type.
 
     Raises:
         InvalidFeatures: no such file, or no array of numbers in it; a pickle is never opened.

@@ -1,4 +1,4 @@
-"""How many things an answer found, and where each lies: components of the graph in which splats touch."""
+"""Objects of an answer with their boxes: components of the graph of touching splats."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -17,22 +17,22 @@ if TYPE_CHECKING:
     from liftcore.scene.world import WorldFrame
 
 LEAST_EVIDENCE = 0.05  # of an object, as a share of the largest's
-LEAST_OF_FRAGMENT = 0.25  # the same of a fragment of another thing, where the largest is a thing itself, and in one
+LEAST_OF_FRAGMENT = 0.25  # the same of a fragment of another object, and of a group in the box of one object
 MOST_SPLATS = 1 << 20  # that are grouped: a million take seven seconds of two cores and a gigabyte
 _TAIL = 1e-3  # of an object's evidence that its box leaves out at each end of each axis
 
 
 def objects(scene: OpenedLift, answer: Answer) -> Objects:
-    """Group the selected splats of an answer into the things that they make up.
+    """Group the selected splats of an answer into objects.
 
-    Things are splats that touch (`touching`). What has less than a twentieth of the evidence of the largest is no
-    thing but strays: single splats and specks whose scores happen to reach the threshold, anywhere in the scene. So
-    are groups of fewer splats than the query's ``min_size``. Where the largest is most of a thing of the region
-    graph, a group that is less than a third of another one needs a quarter: features leak from a thing to what stands
-    behind it. A query that knows how many instances there are has so many objects at most, those of the highest
-    scores, and one that keeps the largest has one; all else are strays.
+    An object is a group of touching splats (`touching`). A group with less than a twentieth of the evidence of the
+    largest is unassigned: single splats and small groups anywhere in the scene whose scores happen to reach the
+    threshold. So are groups of fewer splats than the query's ``min_size``. If the largest group is most of an object
+    of the region graph, a group that is less than a third of another one needs a quarter: features leak from an
+    object to what is behind it. A query with a number of instances has at most so many objects, those of the highest
+    scores, and one that keeps the largest has one; all other splats are unassigned.
 
-    Of a query of sets each set is a thing, and none of its splats is a stray; one of several sets is of the first.
+    Of a query of sets, each set is an object, and all of its splats are assigned; one of several sets to the first.
 
     Raises:
         InvalidQuery: more splats were selected than are grouped.
@@ -52,37 +52,41 @@ def objects(scene: OpenedLift, answer: Answer) -> Objects:
     sums = np.bincount(groups, weights)
     order = np.argsort(-sums, kind="stable")
     order = order[np.bincount(groups)[order] >= answer.query.min_size]
-    kept = order if sets else _without_leaks(scene, rows, groups, sums, order)
-    kept = kept[:1] if answer.query.keep == "largest" else kept
-    if answer.query.instances is not None and len(kept) > answer.query.instances:
-        scores = np.bincount(groups, weights * answer.scores[rows])[kept] / sums[kept]
-        kept = kept[np.sort(np.argsort(-scores, kind="stable")[: answer.query.instances])]
+    object_groups = order if sets else _without_leaks(scene, rows, groups, sums, order)
+    object_groups = object_groups[:1] if answer.query.keep == "largest" else object_groups
+    if answer.query.instances is not None and len(object_groups) > answer.query.instances:
+        scores = np.bincount(groups, weights * answer.scores[rows])[object_groups] / sums[object_groups]
+        object_groups = object_groups[np.sort(np.argsort(-scores, kind="stable")[: answer.query.instances])]
     places = np.full(len(sums), -1, np.int32)
-    places[kept] = np.arange(len(kept))
+    places[object_groups] = np.arange(len(object_groups))
     numbers[rows] = places[groups]
-    found = []
-    for number in range(len(kept)):
+    summaries = []
+    for number in range(len(object_groups)):
         inside = numbers[rows] == number
-        own, mine = rows[inside], weights[inside]
-        mine = mine if mine.any() else np.ones(len(own))
-        box = object_box(scene.splats, own, mine) if sets else trimmed_box(scene.splats.positions(own), mine)
-        found.append(
+        members, member_weights = rows[inside], weights[inside]
+        member_weights = member_weights if member_weights.any() else np.ones(len(members))
+        box = (
+            object_box(scene.splats, members, member_weights)
+            if sets
+            else trimmed_box(scene.splats.positions(members), member_weights)
+        )
+        summaries.append(
             FoundObject(
                 splats=int(inside.sum()),
                 share=float(weights[inside].sum() / weights.sum()),
-                score=float(np.average(answer.scores[own], weights=mine)),
+                score=float(np.average(answer.scores[members], weights=member_weights)),
                 centre=_point(np.mean(box, axis=0)),
                 box=box,
                 size=size_of(scene.world, box),
             )
         )
-    return Objects.of(found, numbers, int((numbers[rows] < 0).sum()), scene.world)
+    return Objects.of(summaries, numbers, int((numbers[rows] < 0).sum()), scene.world)
 
 
 def _without_leaks(
     scene: OpenedLift, rows: np.ndarray, groups: np.ndarray, sums: np.ndarray, order: np.ndarray
 ) -> np.ndarray:
-    """The groups that are objects, of those in order of their evidence.
+    """Return the groups that are objects, of groups in order of their evidence.
 
     Args:
         rows: [n] i64, selected splats. groups: [n] i64, the group of each. sums: [g] f64, their evidence.
@@ -92,15 +96,15 @@ def _without_leaks(
     small = sums[large] < LEAST_OF_FRAGMENT * sums.max()
     if scene.object is None or not small.any():
         return large
-    own = scene.object
-    sizes = np.bincount(own + 1)
+    labels = scene.object
+    sizes = np.bincount(labels + 1)
 
     def counts_of(group: int) -> np.ndarray:
-        """[1 + objects] i64, how many splats of a group are of no thing, and of each."""
-        return np.bincount(own[rows[groups == group]] + 1, minlength=len(sizes))
+        """Count the splats of a group of no object and of each, [1 + objects] i64."""
+        return np.bincount(labels[rows[groups == group]] + 1, minlength=len(sizes))
 
     def is_fragment(group: int) -> bool:
-        """True of a group with too little of each thing that it is of; what leaks beside one does not hide it."""
+        """Return True for a group with too small a part of each object that it belongs to."""
         counts = counts_of(group)
         holds = (counts >= PARTLY_SELECTED * counts.sum()) & (counts >= PARTLY_SELECTED * sizes)
         return bool(counts.argmax()) and not holds[1:].any()
@@ -112,22 +116,22 @@ def _without_leaks(
 
 
 def _set_numbers(scene: OpenedLift, sets: Sequence[SplatSet]) -> np.ndarray:
-    """[P] i32, the place of the first set that holds a splat; -1 of none."""
+    """Return the index of the first set that contains a splat, [P] i32; -1 for none."""
     from liftcore.query.selections import set_members
 
     numbers = np.full(len(scene.features), -1, np.int32)
-    for place, one in reversed(list(enumerate(sets))):
-        numbers[set_members(scene, one)] = place
+    for place, members in reversed(list(enumerate(sets))):
+        numbers[set_members(scene, members)] = place
     return numbers
 
 
 def object_box(splats: "Splats", rows: np.ndarray, weights: np.ndarray) -> Box:
-    """The box of one thing without its strays: `trimmed_box` of its large groups of touching splats.
+    """Compute the box of one object without outliers: `trimmed_box` of its large groups of touching splats.
 
-    A group is large with a quarter of the weight of the largest one, as each side of two things that were joined.
+    A group is large with a quarter of the weight of the largest one, such as each of two objects that were merged.
 
     Args:
-        splats: the scene. rows: [n] i64, at least one; more than are grouped have the box of all. weights: [n].
+        splats: the scene. rows: [n] i64, at least one; above MOST_SPLATS of all of them. weights: [n].
     """
     means = splats.positions(rows)
     if len(rows) > MOST_SPLATS:
@@ -139,7 +143,7 @@ def object_box(splats: "Splats", rows: np.ndarray, weights: np.ndarray) -> Box:
 
 
 def trimmed_box(means: np.ndarray, weights: np.ndarray) -> Box:
-    """The corners between which all but a thousandth of the weight at each end lies, axis by axis.
+    """Compute the corners of a box that leaves out a thousandth of the weight at each end of each axis.
 
     Args:
         means: [n, 3] f32 or f64, at least one. weights: [n], at least zero.
@@ -154,7 +158,7 @@ def trimmed_box(means: np.ndarray, weights: np.ndarray) -> Box:
 
 
 def size_of(world: "WorldFrame", box: Box) -> Point:
-    """The sides of a box, in metres where it is known how long these are."""
+    """Return the sides of a box, in metres if the length of a unit is known, else in scene units."""
     return _point(np.array([world.length(high - low) for low, high in zip(*box, strict=True)]))
 
 

@@ -15,7 +15,7 @@ from liftcore.query.colours import cluster_colours, heat_colours, map_colours
 from liftcore.query.objects import objects
 from liftcore.query.opened import OpenedLift
 from liftcore.query.question import Answer, Objects
-from liftcore.query.splat_colours import seen_colours
+from liftcore.query.splat_colours import view_colours
 from liftcore.runtime.one_line import one_line, value_text
 from liftcore.scene.cameras import Camera
 from liftcore.scene.compositing import CompositingParams
@@ -143,7 +143,7 @@ def render(scene: OpenedLift, view: str | Camera, what: str = "rgb") -> np.ndarr
         return _render_clusters(scene, view)
     if what == "confidence":
         return _render_confidence(scene, view)
-    colours = scene.principal if what == "pca" else seen_colours(scene.splats, scene.camera(view))
+    colours = scene.principal if what == "pca" else view_colours(scene.splats, scene.camera(view))
     levels = scene.image(view, lambda camera: scene.raster.render(camera, colours, _as_trained(scene))).numpy()
     np.clip(levels, 0.0, 1.0, out=levels)  # in place: an image of floats is large
     levels *= 255

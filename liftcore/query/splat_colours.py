@@ -27,7 +27,7 @@ COMPONENTS = 3
 _RANGE = (0.02, 0.98)  # weighted-sample quantiles that the colours span
 
 
-def seen_colours(splats: Splats, camera: Camera) -> Tensor:
+def view_colours(splats: Splats, camera: Camera) -> Tensor:
     """The colours of splats from a camera, ``max(0, 0.5 + sum_k SH_k(d) c_k + lobes)`` with d from camera to splat.
 
     Args:

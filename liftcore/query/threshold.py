@@ -1,12 +1,12 @@
-"""Where a score becomes a yes: thresholds from the scores alone.
+"""Thresholds on scores, from the scores alone.
 
-No ground truth and no other phrase enters, and no count of instances unless the user gives one. All sizes are shares
-of the scores, so that the resolution of a view does not matter, and all positions are shares of their range, so that
-thresholds move with the scores: ``threshold(a s + b) = a threshold(s) + b`` for a > 0, up to rounding.
+No ground truth and no other phrase is used, and no count of instances unless the user gives one. All sizes are shares
+of the scores, so that the resolution of a view does not matter. All positions are shares of their range, so that a
+threshold is equivariant: ``threshold(a s + b) = a threshold(s) + b`` for a > 0, up to rounding.
 
 | method | the threshold |
 |---|---|
-| `auto` | where the share found changes least, in log-odds; not below ``least`` |
+| `auto` | where the selected share changes least, in log-odds; not below ``least`` |
 | `valley` | the paper's appendix: from the top, the first local maximum, then the minimum before it |
 | `paper` | the paper's main text, literally: the largest peak, then the adjacent smaller valley |
 | `otsu` | the split with the largest variance between its sides (Otsu 1979) |
@@ -26,38 +26,38 @@ from liftcore.query.question import Threshold
 
 BINS = 300  # a multiple of the sweep's 100 steps
 SMOOTHING = BINS / 64  # bins, standard deviation of the Gaussian that removes a histogram's ripples
-LEAST_SHARE = 3e-4  # of the scores: less than this above a threshold is stray (SAM drops masks this small)
-MOST_SHARE = 0.8  # a question that four fifths of a scene answer is rare; .5 to .9 are alike (docs/method.md)
+LEAST_SHARE = 3e-4  # of the scores: a smaller share above a threshold is noise (SAM drops masks this small)
+MOST_SHARE = 0.8  # queries that select four fifths of a scene are rare; .5 to .9 give equal results (docs/method.md)
 DEPTH = 0.6  # a valley must fall to this share of its peak, else it is a ripple; tuned on one scene's masks
-# The sweep of Occam's LGS: thresholds in steps, the slope of the share found after a median filter, and how long a
-# stretch, of which slopes and shares, is stable.
+# The sweep of Occam's LGS: number of thresholds, length of the median filter of slopes, least length of a stable
+# stretch, its largest slope, and the range of its shares.
 STEPS, FILTER, LEAST_STEPS, MOST_SLOPE, SHARES = 100, 5, 5, 0.4, (0.005, 0.9)
 
 
 @dataclass(frozen=True)
 class Histogram:
-    """Scores counted in equal bins between their least and their greatest."""
+    """Histogram of scores in equal bins between the lowest and the highest."""
 
     mass: np.ndarray  # [BINS] f64, sums to one
     low: float  # the left edge of the first bin
     width: float  # of a bin
 
     def edge(self, position: float) -> float:
-        """The left edge of a bin; position + 0.5 is its middle."""
+        """Return the left edge of a bin; position + 0.5 gives its middle."""
         return self.low + position * self.width
 
     def smoothed(self) -> np.ndarray:
-        """[BINS] f64, the mass after a Gaussian of SMOOTHING bins, mirrored at both ends."""
+        """Return the mass after a Gaussian of SMOOTHING bins, mirrored at both ends, [BINS] f64."""
         reach = math.ceil(4 * SMOOTHING)
         weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / SMOOTHING) ** 2)
         return np.convolve(np.pad(self.mass, reach, mode="symmetric"), weights / weights.sum(), mode="valid")
 
     def above(self) -> np.ndarray:
-        """[BINS] f64, the share of the scores in each bin or above it."""
+        """Return the share of the scores in each bin or above it, [BINS] f64."""
         return np.cumsum(self.mass[::-1])[::-1]
 
 
-Found = tuple[float, str, bool]  # a threshold, a sentence about it, and whether the method found what it looks for
+Result = tuple[float, str, bool]  # a threshold, its explanation, and True if the method has a clear result
 
 
 def check_method(method: str | float) -> None:
@@ -79,20 +79,20 @@ def find_threshold(
     method: str | float = "auto",
     weights: ArrayLike | None = None,
     least: float = -math.inf,
-    counted: str = "evidence",
+    weight_name: str = "evidence",
 ) -> Threshold:
-    """A threshold on scores by one of the methods above.
+    """Find a threshold on scores by one of the methods above.
 
-    Degenerate maps have a defined answer. No scores at all give infinity: nothing is found. Equal scores give
-    that score: all of them answer alike, which a question takes for no answer (`nothing_alike`). Scores without what
-    a method looks for fall back to Otsu's split, and the explanation says so.
+    Degenerate inputs have a defined result. Without scores it is infinity: nothing is selected. Equal scores give
+    that score: a query then selects nothing (`explain_no_selection`). Where a method finds no clear result, Otsu's
+    split is taken, and the explanation says so.
 
     Args:
         scores: [n] f32, finite.
         method: one of ``METHODS``, or a number to use as it is.
-        weights: [n] f32, how much each score counts, at least zero: the evidence of splats; None = equally, as the
-            pixels of a view do.
-        counted: what the weights are, for the explanation.
+        weights: [n] f32, weight of each score, at least zero: the evidence of splats; None: equal ones, as of the
+            pixels of a view.
+        weight_name: of the weights, for the explanation.
         least: ``auto`` takes no lower score, unless too few lie above it.
 
     Raises:
@@ -103,44 +103,44 @@ def find_threshold(
         return Threshold(value=float(method), method="fixed", explanation=f"The threshold {method:.4g} was given.")
     values = np.asarray(scores, np.float32).ravel()
     if values.size == 0:
-        told = "There are no scores: nothing can be found."
-        return Threshold(value=math.inf, method=method, explanation=told, clear=False)
+        sentence = "There are no scores: nothing can be found."
+        return Threshold(value=math.inf, method=method, explanation=sentence, clear=False)
     low, high = float(values.min()), float(values.max())
     if not (math.isfinite(low) and math.isfinite(high)):
         raise InvalidQuery("scores", expected="finite values", got="NaN or infinity")
     histogram = _count(values, low, high, weights)
     if histogram is None:
-        told = f"All scores are {low:.4g}: the histogram has no valley."
-        return Threshold(value=low, method=method, explanation=told, clear=False)
+        sentence = f"All scores are {low:.4g}: the histogram has no valley."
+        return Threshold(value=low, method=method, explanation=sentence, clear=False)
     value, explanation, clear = steady(histogram, least) if method == "auto" else METHODS[method](histogram)
     value = min(max(value, low), high)
     above = np.append(histogram.above(), 0.0)
     share = float(np.interp((value - low) / histogram.width, np.arange(len(above)), above))
-    told = f"{share:.1%} of the {'pixels' if weights is None else counted} at or above {value:.4g}"
-    explanation = f"{explanation.removesuffix('.')}; {told}."
+    sentence = f"{share:.1%} of the {'pixels' if weights is None else weight_name} at or above {value:.4g}"
+    explanation = f"{explanation.removesuffix('.')}; {sentence}."
     return Threshold(value=value, method=method, explanation=explanation, clear=clear)
 
 
-def all_alike(low: float, high: float) -> str:
-    """Why scores from low to high select nothing, where they differ by no more than their last bits; else ""."""
+def explain_equal_scores(low: float, high: float) -> str:
+    """Explain that scores from low to high select nothing as they differ in their last bits alone; "" if not so."""
     if (high - low) / BINS > 4 * np.spacing(np.float32(max(abs(low), abs(high)))):
         return ""
     return f"All scores are {high:.4g}: nothing stands apart, so nothing is selected."
 
 
-def nothing_alike(scores: np.ndarray) -> str:
-    """Why scores [n] f32 of a question select nothing, whatever the threshold, as where all are zero; else ""."""
+def explain_no_selection(scores: np.ndarray) -> str:
+    """Explain that scores [n] f32 of a query select nothing at any threshold, such as all zeros; "" if not so."""
     if not scores.size:
         return "There are no scores: nothing can be found."
     low, high = float(scores.min()), float(scores.max())
     if high == 0 and low < 0:
         return "No score is above zero: nothing is like what was asked for, so nothing is selected."
-    return all_alike(low, high)
+    return explain_equal_scores(low, high)
 
 
 def _count(scores: np.ndarray, low: float, high: float, weights: ArrayLike | None) -> Histogram | None:
-    """The histogram of scores; None where they differ by their last bits, or weigh nothing."""
-    if all_alike(low, high):
+    """Return the histogram of scores; None if they differ in their last bits alone, or all weights are zero."""
+    if explain_equal_scores(low, high):
         return None
     width = (high - low) / BINS
     places = np.minimum(((scores.astype(np.float64) - low) * (1.0 / width)).astype(np.int32), BINS - 1)
@@ -150,55 +150,56 @@ def _count(scores: np.ndarray, low: float, high: float, weights: ArrayLike | Non
     return Histogram(mass / total, low, width) if total > 0 else None
 
 
-def steady(histogram: Histogram, least: float = -math.inf) -> Found:
-    """The score at which the log-odds of the share found fall least, no lower than ``least`` if enough lie above it.
+def steady(histogram: Histogram, least: float = -math.inf) -> Result:
+    """Find the score at which the log-odds of the selected share fall least, at least ``least`` if enough lie above.
 
-    Let ``S(t)`` be the share of the scores at or above t. Raising t past a hill of the histogram loses its scores,
-    between hills it loses hardly any. The valley wanted is not the deepest one: a small object's hill is low on both
-    sides. So the share's log-odds are watched, which count a loss against what is left on either side:
+    Let ``S(t)`` be the share of the scores at or above t. As t rises across a hill of the histogram, S loses the
+    hill's scores; between hills it loses few. The right valley need not be the deepest one: the hill of a small
+    object has low valleys on both sides. So the slope of the share's log-odds is minimised, which measures a loss
+    relative to the rest on either side:
 
         t* = argmin_t  -d/dt log(S / (1 - S)) = argmin_t  p(t) / (S(t) (1 - S(t)))
 
     with p the smoothed density. Inside a hill and in its tails the log-odds fall steeply, whatever the hill's size,
-    and between two hills they lie flat. Nothing is tuned: the smoothing takes away ripples (half of it or twice it
-    changes little), and the least share keeps stray scores from being an object.
+    and between two hills they are flat. Nothing is tuned: the smoothing removes ripples (half or twice of it changes
+    little), and the least share keeps a few noisy scores from being an object.
 
-    The log-odds see a share and its rest alike, so where features are clean the widest gap may be the one that parts
-    a single unlike thing from all the rest. Cuts that leave at most MOST_SHARE come first; the others are looked at
-    where no hill lies above any of these, as when what is asked for fills the scene.
+    The log-odds are symmetric in a share and its rest. So with clean features the widest gap may separate one
+    dissimilar object from all others. Thresholds that select at most MOST_SHARE come first; the others are tried if
+    no hill lies above any of these, as when the target fills the scene.
     """
     density = histogram.smoothed()
     density = density / density.sum()
-    density[density <= LEAST_SHARE / len(density)] = 0.0  # strays all over the range leave it empty
+    density[density <= LEAST_SHARE / len(density)] = 0.0  # a few scores all over the range count as none
     above = np.cumsum(density[::-1])[::-1] - density / 2  # at the middles of the bins
-    counted = np.minimum(above, 1 - above) >= LEAST_SHARE  # some are: no smoothed bin has more than a fifth of all
-    high = counted & (histogram.low + (np.arange(len(density)) + 0.5) * histogram.width >= least)
-    floor = f"Above {least:g} the" if high.any() and not high[counted].all() else "The"
-    counted = high if high.any() else counted
+    valid = np.minimum(above, 1 - above) >= LEAST_SHARE  # never all False: no smoothed bin has a fifth of all
+    high = valid & (histogram.low + (np.arange(len(density)) + 0.5) * histogram.width >= least)
+    floor = f"Above {least:g} the" if high.any() and not high[valid].all() else "The"
+    valid = high if high.any() else valid
     slope = np.full(len(density), np.inf)
-    slope[counted] = density[counted] / (above[counted] * (1 - above[counted]))
-    for among in (counted & (above <= MOST_SHARE), counted):
+    slope[valid] = density[valid] / (above[valid] * (1 - above[valid]))
+    for among in (valid & (above <= MOST_SHARE), valid):
         if not among.any():
             continue
-        # Empty stretches tie at zero: the middle of the widest keeps clear of both its sides.
+        # Empty stretches tie at zero: the middle of the widest is farthest from both its sides.
         run = max(_runs(among & (slope <= slope[among].min() * (1 + 1e-9))), key=len)
         if run[0] > 0 and slope[run[0] - 1] < slope[run[0]]:
-            continue  # it lies on the flank of a hill that reaches below MOST_SHARE
+            continue  # it lies on the slope of a hill that reaches below MOST_SHARE
         place = int(run[0] + run[-1]) // 2
         value = histogram.edge(place + 0.5)
-        found = f"{floor} share found changes least, in log-odds, around {value:.4g}"
+        sentence = f"{floor} share found changes least, in log-odds, around {value:.4g}"
         if density[place] < density[place:].max():
-            return value, f"{found}.", True
-    # Over one hill the log-odds are steadiest near its middle, which means nothing.
+            return value, f"{sentence}.", True
+    # Over a single hill the log-odds are flattest near its middle, which has no meaning.
     lack = "but no hill of the histogram lies above it: take it with care, or name a threshold"
-    return value, f"{found}, {lack}.", False
+    return value, f"{sentence}, {lack}.", False
 
 
-def valley(histogram: Histogram) -> Found:
-    """From the top down, the first hill whose valley is deep and that is large enough, then the valley before it.
+def valley(histogram: Histogram) -> Result:
+    """Find the valley below the first large enough hill from the top whose valley is deep.
 
-    The paper's code goes on to as many hills as the ground truth has instances. Things that are alike share a hill,
-    so here a user's count chooses objects (`liftcore.query.objects`).
+    The paper's code goes on to as many hills as the ground truth has instances. Similar objects share a hill, so here
+    a user's count selects objects (`liftcore.query.objects`).
     """
     smooth, above = histogram.smoothed(), histogram.above()
     peaks, valleys = _extrema(smooth)
@@ -210,11 +211,11 @@ def valley(histogram: Histogram) -> Found:
             value = histogram.edge(place)
             lies = f"lies at {histogram.edge(peak):.4g} and the valley before it at {value:.4g}"
             return value, f"From the top down, the histogram's first hill {lies}.", True
-    return _stand_in(histogram, "no hill with a valley before it")
+    return _otsu_instead(histogram, "no hill with a valley before it")
 
 
-def paper(histogram: Histogram) -> Found:
-    """The largest peak, then the adjacent smaller valley above it."""
+def paper(histogram: Histogram) -> Result:
+    """Find the largest peak, then the adjacent smaller valley above it."""
     smooth = histogram.smoothed()
     peaks, valleys = _extrema(smooth)
     peak = max(peaks, key=lambda place: smooth[place])
@@ -223,61 +224,61 @@ def paper(histogram: Histogram) -> Found:
             value = histogram.edge(place)
             lies = f"lies at {histogram.edge(peak):.4g} and the next valley above it at {value:.4g}"
             return value, f"The histogram's largest peak {lies}.", True
-    return _stand_in(histogram, "no valley above its largest peak")
+    return _otsu_instead(histogram, "no valley above its largest peak")
 
 
-def otsu(histogram: Histogram) -> Found:
-    """The edge that maximises the variance between its sides."""
+def otsu(histogram: Histogram) -> Result:
+    """Find the edge that maximises the variance between its sides."""
     value = histogram.edge(_split(histogram.mass))
     return value, f"Otsu's split at {value:.4g} separates the scores best into two groups.", True
 
 
-def stability(histogram: Histogram) -> Found:
-    """The middle of the sweep's least sensitive stable stretch, after the evaluation of Occam's LGS.
+def stability(histogram: Histogram) -> Result:
+    """Find the middle of the sweep's least sensitive stable stretch, after the evaluation of Occam's LGS.
 
     The released code compares label levels and takes the least sensitive one. We have one map, so its least
     sensitive stable stretch counts.
     """
-    every = len(histogram.mass) // STEPS
-    shares = histogram.above()[every::every]  # at thresholds 0.01..0.99 of the range
+    step = len(histogram.mass) // STEPS
+    shares = histogram.above()[step::step]  # at thresholds 0.01..0.99 of the range
     around = np.pad(np.abs(np.gradient(shares, 1 / STEPS)), FILTER // 2, mode="edge")
     slopes = np.median(np.lib.stride_tricks.sliding_window_view(around, FILTER), axis=1)
     stable = (slopes < MOST_SLOPE) & (shares >= SHARES[0]) & (shares <= SHARES[1])
     stretches = [run for run in _runs(stable) if len(run) >= LEAST_STEPS]
     if not stretches:
-        return _stand_in(histogram, "no stretch over which the share found is stable")
+        return _otsu_instead(histogram, "no stretch over which the share found is stable")
     run = min(stretches, key=lambda run: float(slopes[run].mean()))
-    first, last = (histogram.edge((int(place) + 1) * every) for place in (run[0], run[-1]))
-    told = f"The share found is stable from {first:.4g} to {last:.4g}, and its middle is taken."
-    return (first + last) / 2, told, True
+    first, last = (histogram.edge((int(place) + 1) * step) for place in (run[0], run[-1]))
+    sentence = f"The share found is stable from {first:.4g} to {last:.4g}, and its middle is taken."
+    return (first + last) / 2, sentence, True
 
 
-METHODS: dict[str, Callable[[Histogram], Found]] = {
+METHODS: dict[str, Callable[[Histogram], Result]] = {
     "auto": steady, "valley": valley, "paper": paper, "otsu": otsu, "stability": stability,
 }  # fmt: skip
 
 
-def _stand_in(histogram: Histogram, lack: str) -> Found:
-    """Otsu's split for a method that found ``lack`` (the histogram has ...)."""
+def _otsu_instead(histogram: Histogram, lack: str) -> Result:
+    """Return Otsu's split in place of a method without a result; ``lack`` completes "the histogram has"."""
     value = histogram.edge(_split(histogram.mass))
     return value, f"The histogram has {lack}; Otsu's split at {value:.4g} stands in.", False
 
 
 def _split(mass: np.ndarray) -> int:
-    """The bin k that maximises the variance between bins 0..k-1 and k.., 1 <= k < BINS."""
+    """Return the bin k that maximises the variance between bins 0..k-1 and k.., 1 <= k < BINS."""
     centres = np.arange(len(mass)) + 0.5
     below, first = np.cumsum(mass)[:-1], np.cumsum(mass * centres)[:-1]
     total = float((mass * centres).sum())
     spread = below * (1 - below)
-    # One score among very many leaves a side without mass, up to rounding: no split is there.
+    # One score among very many leaves a side without mass, up to rounding: that is no split.
     between = np.where(spread > 0, (total * below - first) ** 2 / np.where(spread > 0, spread, 1.0), 0.0)
-    # Empty bins between two groups tie: the middle of the best ones keeps clear of both.
+    # Empty bins between two groups tie: the middle of the best ones is farthest from both.
     best = np.flatnonzero(between >= between.max() * (1 - 1e-9))
     return int(best[len(best) // 2]) + 1
 
 
 def _extrema(curve: np.ndarray) -> tuple[list[int], list[int]]:
-    """Local maxima (ends count) and the minima between each two of them; a plateau counts at its middle."""
+    """Find local maxima (ends count) and the minima between each two of them; a plateau counts at its middle."""
     starts = np.flatnonzero(np.concatenate([[True], curve[1:] != curve[:-1]]))
     levels = curve[starts]
     middles = (starts + np.append(starts[1:], len(curve)) - 1) // 2
@@ -287,7 +288,7 @@ def _extrema(curve: np.ndarray) -> tuple[list[int], list[int]]:
     return middles[rises & falls].tolist(), middles[1:-1][inner].tolist()
 
 
-def _runs(chosen: np.ndarray) -> list[np.ndarray]:
-    """The places of each run of True in [n] bool."""
-    runs = np.split(np.arange(len(chosen)), np.flatnonzero(np.diff(chosen)) + 1)
-    return [run for run in runs if chosen[run[0]]]
+def _runs(mask: np.ndarray) -> list[np.ndarray]:
+    """Return the indices of each run of True in [n] bool."""
+    runs = np.split(np.arange(len(mask)), np.flatnonzero(np.diff(mask)) + 1)
+    return [run for run in runs if mask[run[0]]]

@@ -1,16 +1,16 @@
-"""A lift on another set of splats of the same scene: cropped, reordered, compressed, decimated, moved, trained anew.
+"""Transfer of a lift to other splats of the same scene: cropped, reordered, compressed, decimated, moved, retrained.
 
-Each new splat takes from the old ones that it overlaps. With the centres' difference d, covariances S_j and S_k with
-mean S, and base colours in 0..1, the weight of an old splat k at a new one j is the overlap of the two Gaussians
-(Bhattacharyya's coefficient) times their likeness in colour::
+Each new splat takes values of the old ones that it overlaps. With the centres' difference d, covariances S_j and
+S_k with mean S, and base colours in 0..1, the weight of an old splat k at a new one j is the overlap of the two
+Gaussians (Bhattacharyya's coefficient) times their likeness in colour::
 
     w_jk = (|S_j| |S_k|)^(1/4) / |S|^(1/2) exp(-d^T S^-1 d / 8) exp(-(|rgb_j - rgb_k| / 0.1)^2 / 2)
 
-A new splat that is nearly one of the old takes from that one alone, so rows that a file keeps come back as they were.
-Of exact copies among the old, which nothing tells apart, it takes the mean.
-All others take the mean of what is per splat by w^2 over the 16 nearest old ones, and the cluster and object of the
-largest sum. The evidence of an old splat is divided among those that take from it, so that decimated splats have that
-of all that they stand for. What overlaps with none has no feature.
+A new splat that nearly equals an old one takes the values of that one alone, so that unchanged rows keep their
+values. Of exact copies among the old, which cannot be distinguished, it takes the mean. All others take the mean of
+per-splat values by w^2 over the 16 nearest old ones, and the cluster and object of the largest sum. The evidence of
+an old splat is divided among the new ones that it overlaps, so that decimated splats have that of all old ones they
+replace. A new splat that overlaps none has no feature.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ if TYPE_CHECKING:
 
     AnyLift = TypeVar("AnyLift", bound=Lift)
 
-NEIGHBOURS = 16  # old splats that a new one may take from
-SAME = 0.9  # overlap and likeness from which two splats are one
+NEIGHBOURS = 16  # most old splats whose values a new one takes
+SAME_SPLAT = 0.9  # overlap and likeness from which two splats are one
 LEAST_OVERLAP = 0.05  # of a partner
-THINNEST = 0.02  # of a splat's largest scale, as which smaller ones count: flat ones overlap, too
-STILL = 0.9  # share of a sample that has partners where it lies, from which no move is looked for
-UNLIKELY = 0.5  # share below which the scene must have been moved
-GAIN = 0.1  # of that share, by which a move must do better than none
+THINNEST = 0.02  # of a splat's largest scale, the least that scales count: so flat splats overlap, too
+STILL = 0.9  # share of a sample with partners in place, from which no transformation is searched
+UNLIKELY = 0.5  # share below which the scene must have been transformed
+GAIN = 0.1  # least gain of that share by a transformation
 SAMPLE = 4_000
 _BLOCK = 1 << 12  # new splats at once: [n, 16, F] features in f32
 _VALUES = ("agreement", "confidence")
@@ -57,7 +57,7 @@ def transfer(lift: AnyLift, old: Splats, new: Splats, matrix: Any = None, progre
     Args:
         lift: of any engine; it stays as it is. old: that were lifted. new: Q others, in any order and place.
         matrix: [4, 4], the similarity from the old frame to the new one; None: none, or one that is found.
-        progress: told about a stage "transfer".
+        progress: called with the stage "transfer".
 
     Returns:
         The lift of the new splats, whose diagnostics have ``transfer``: how many are rows of the old ones, how many
@@ -70,9 +70,9 @@ def transfer(lift: AnyLift, old: Splats, new: Splats, matrix: Any = None, progre
     lift.require_splats(old)
     move = None if matrix is None else Similarity.of(matrix)
     index = _Index(old)
-    move = _found_move(index, old, new) if move is None else move
+    move = _find_move(index, old, new) if move is None else move
     seen_from = new if move is None else new.transformed(**_inverse(move))
-    fields, counts = _mixed(lift, index, seen_from, progress)
+    fields, counts = _mix_values(lift, index, seen_from, progress)
     facts: dict[str, Any] = {"from_splats": lift.features.shape[0], **counts, "moved": None}
     if move is not None:
         facts["moved"] = {"scale": move.scale, "rotation": move.rotation.tolist()}
@@ -82,16 +82,16 @@ def transfer(lift: AnyLift, old: Splats, new: Splats, matrix: Any = None, progre
         certificate["plan"] = plan | {"kernel": str(new.kernel)}
     changes: dict[str, Any] = {"certificate": certificate, "splats": NO_FILE, "landmarks": landmarks_of(new)}
     changes |= {"origin": new.origin, "settings": lift.settings.model_copy(update={"kernel": str(new.kernel)})}
-    known = new.world.known_or(lift.metadata.world if move is None else lift.metadata.world.transformed(move))
-    changes |= {"world": known} | ({} if move is None else {"cameras": NO_FILE, "poses": ""})
+    world = new.world.known_or(lift.metadata.world if move is None else lift.metadata.world.transformed(move))
+    changes |= {"world": world} | ({} if move is None else {"cameras": NO_FILE, "poses": ""})
     return replace(lift, **fields, metadata=lift.metadata.model_copy(update=changes))
 
 
-def _found_move(index: _Index, old: Splats, new: Splats) -> Similarity | None:
-    """The similarity that brings clearly more new splats to partners than lie beside one; None if none does.
+def _find_move(index: _Index, old: Splats, new: Splats) -> Similarity | None:
+    """Find a similarity after which clearly more new splats have partners than in place; None if there is none.
 
     Raises:
-        InvalidSplats: few have a partner where they lie, and no similarity is clear.
+        InvalidSplats: few have a partner in place, and no similarity is clear.
     """
     share = index.share_of_partners(new)
     if share >= STILL:
@@ -106,12 +106,12 @@ def _found_move(index: _Index, old: Splats, new: Splats) -> Similarity | None:
 
 
 def _inverse(move: Similarity) -> dict[str, Any]:
-    turn = move.rotation.T
-    return {"scale": 1 / move.scale, "rotation": turn, "translation": -(turn @ move.translation) / move.scale}
+    rotation = move.rotation.T
+    return {"scale": 1 / move.scale, "rotation": rotation, "translation": -(rotation @ move.translation) / move.scale}
 
 
 class _Index:
-    """The old splats, searched by place."""
+    """Spatial index of the old splats."""
 
     def __init__(self, old: Splats) -> None:
         from scipy.spatial import KDTree
@@ -121,7 +121,7 @@ class _Index:
         self.shapes, self.colours = _covariances(old), base_colours(old)
 
     def partners(self, new: Splats) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
-        """Blocks of new splats: their rows, their nearest old ones [n, k] and the weights w [n, k] f64."""
+        """Yield blocks of new splats: their rows, their nearest old ones [n, k] and the weights w [n, k] f64."""
         means, colours = new.positions().astype(np.float64), base_colours(new)
         shapes = _covariances(new)
         for first in range(0, len(means), _BLOCK):
@@ -130,19 +130,19 @@ class _Index:
             near = near.reshape(rows.stop - first, -1)
             weights = _overlaps(means[rows, None] - self.means[near], shapes[:, rows, None], self.shapes[:, near])
             if colours is not None and self.colours is not None:
-                apart = ((colours[rows, None] - self.colours[near]) ** 2).sum(axis=2)
-                weights *= np.exp(-0.5 * apart / COLOUR_WIDTH**2)
+                squares = ((colours[rows, None] - self.colours[near]) ** 2).sum(axis=2)
+                weights *= np.exp(-0.5 * squares / COLOUR_WIDTH**2)
             yield rows, near, weights
 
     def share_of_partners(self, new: Splats, move: Similarity | None = None) -> float:
-        """The share of a sample of new splats that overlaps with an old one, where it lies or before it was moved."""
-        some = new[np.linspace(0, new.count - 1, min(SAMPLE, new.count)).astype(int)]
-        some = some if move is None else some.transformed(**_inverse(move))
-        return float(np.mean(np.concatenate([w.max(axis=1) >= LEAST_OVERLAP for _, _, w in self.partners(some)])))
+        """Return the share of a sample of new splats that overlap an old one, in place or moved back by ``move``."""
+        sample = new[np.linspace(0, new.count - 1, min(SAMPLE, new.count)).astype(int)]
+        sample = sample if move is None else sample.transformed(**_inverse(move))
+        return float(np.mean(np.concatenate([w.max(axis=1) >= LEAST_OVERLAP for _, _, w in self.partners(sample)])))
 
 
 def _covariances(splats: Splats) -> np.ndarray:
-    """[6, P] f64, xx xy xz yy yz zz, with scales of at least THINNEST of a splat's largest."""
+    """Compute covariances [6, P] f64, xx xy xz yy yz zz, with scales of at least THINNEST of a splat's largest."""
     logs = splats.log_scales.cpu().numpy().astype(np.float64).clip(-80, 80)
     scales = np.exp(np.pad(logs, ((0, 0), (0, 3 - logs.shape[1])), constant_values=-80))
     scales = np.maximum(scales, THINNEST * scales.max(axis=1, keepdims=True))
@@ -150,17 +150,17 @@ def _covariances(splats: Splats) -> np.ndarray:
     return np.stack([(axes[:, i] * axes[:, j]).sum(axis=1) for i in range(3) for j in range(i, 3)])
 
 
-def _overlaps(apart: np.ndarray, own: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """[n, k] f64 in 0..1, Bhattacharyya's coefficients of Gaussians.
+def _overlaps(offsets: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Compute Bhattacharyya's coefficients of Gaussians, [n, k] f64 in 0..1.
 
     Args:
-        apart: [n, k, 3], differences of centres. own: [6, n, 1] and other: [6, n, k], covariances (`_covariances`).
+        offsets: [n, k, 3], differences of centres. a: [6, n, 1] and b: [6, n, k], covariances (`_covariances`).
     """
-    middle = (own + other) / 2
+    middle = (a + b) / 2
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         determinant = _determinants(middle)
-        sizes = (_determinants(own) * _determinants(other) / determinant**2) ** 0.25
-        squares = (_cofactors(middle) * _products(np.moveaxis(apart, -1, 0))).sum(axis=0) / determinant
+        sizes = (_determinants(a) * _determinants(b) / determinant**2) ** 0.25
+        squares = (_cofactors(middle) * _products(np.moveaxis(offsets, -1, 0))).sum(axis=0) / determinant
         return np.nan_to_num(sizes * np.exp(-squares / 8))
 
 
@@ -169,7 +169,7 @@ def _determinants(shapes: np.ndarray) -> np.ndarray:
 
 
 def _cofactors(shapes: np.ndarray) -> np.ndarray:
-    """[6, ...], of symmetric matrices [6, ...]: their inverses times their determinants."""
+    """Compute the cofactors [6, ...] of symmetric matrices [6, ...]: inverses times determinants."""
     xx, xy, xz, yy, yz, zz = shapes
     sides = (
         yy * zz - yz**2,
@@ -183,13 +183,13 @@ def _cofactors(shapes: np.ndarray) -> np.ndarray:
 
 
 def _products(vectors: np.ndarray) -> np.ndarray:
-    """[6, ...], what symmetric matrices are weighted by in v^T S v, of vectors [3, ...]."""
+    """Compute the factors [6, ...] of a symmetric matrix's entries in v^T S v, of vectors [3, ...]."""
     x, y, z = vectors
     return np.stack([x * x, 2 * x * y, 2 * x * z, y * y, 2 * y * z, z * z])
 
 
-def _mixed(lift: Lift, index: _Index, new: Splats, progress: Progress) -> tuple[dict[str, Any], dict[str, int]]:
-    """The fields of the lift of the new splats, and how many of them are rows, mixed and without a partner."""
+def _mix_values(lift: Lift, index: _Index, new: Splats, progress: Progress) -> tuple[dict[str, Any], dict[str, int]]:
+    """Return the fields of the new splats' lift, and the numbers of rows copied, mixed and without a partner."""
     count = new.count
     features = torch.zeros((count, lift.features.shape[1]), dtype=lift.features.dtype)
     values = {name: np.zeros(count, np.float32) for name in _VALUES if getattr(lift, name) is not None}
@@ -199,60 +199,64 @@ def _mixed(lift: Lift, index: _Index, new: Splats, progress: Progress) -> tuple[
         axis=0,
         return_inverse=True,
     )  # a splat's cluster, object and node go together
-    elected = np.full(count, -1)
-    seen, rows_of, mixed = np.zeros(count, bool), 0, 0
-    taken: list[tuple[np.ndarray, np.ndarray]] = []  # of each block
+    tuple_of = np.full(count, -1)
+    has_feature, copied_count, mixed_count = np.zeros(count, bool), 0, 0
+    partners: list[tuple[np.ndarray, np.ndarray]] = []  # of each block
     old = {name: getattr(lift, name).cpu().numpy() for name in (*values, "seen")}
     own_tuple = own_tuple.reshape(-1)
     old_features = lift.features.cpu()
     for rows, near, overlaps in index.partners(new):
         best = overlaps.argmax(axis=1)
         top = np.take_along_axis(overlaps, best[:, None], axis=1)
-        copies = overlaps >= top  # the best, and what lies, looks and is shaped exactly as it
-        shares = np.where(top >= SAME, copies, overlaps**2 * (overlaps >= LEAST_OVERLAP))
+        copies = overlaps >= top  # the best, and exact copies of it
+        shares = np.where(top >= SAME_SPLAT, copies, overlaps**2 * (overlaps >= LEAST_OVERLAP))
         shares /= np.maximum(shares.sum(axis=1, keepdims=True), 1e-300)
-        taken.append((near.astype(np.int32), shares.astype(np.float32)))
-        known = shares * old["seen"][near]
-        sums = known.sum(axis=1)
-        seen[rows] = sums >= 0.5
-        is_row, is_mixed = top[:, 0] >= SAME, (top[:, 0] < SAME) & (top[:, 0] >= LEAST_OVERLAP)
-        rows_of, mixed = rows_of + int(is_row.sum()), mixed + int(is_mixed.sum())
+        partners.append((near.astype(np.int32), shares.astype(np.float32)))
+        feature_shares = shares * old["seen"][near]
+        sums = feature_shares.sum(axis=1)
+        has_feature[rows] = sums >= 0.5
+        is_row, is_mixed = top[:, 0] >= SAME_SPLAT, (top[:, 0] < SAME_SPLAT) & (top[:, 0] >= LEAST_OVERLAP)
+        copied_count, mixed_count = copied_count + int(is_row.sum()), mixed_count + int(is_mixed.sum())
         is_one = is_row & (copies.sum(axis=1) == 1)
-        own = near[is_one, best[is_one]]
-        features[rows.start + np.flatnonzero(is_one)] = old_features[own]
-        elected[rows][is_one] = own_tuple[own]
+        old_rows = near[is_one, best[is_one]]
+        features[rows.start + np.flatnonzero(is_one)] = old_features[old_rows]
+        tuple_of[rows][is_one] = own_tuple[old_rows]
         is_mean = (is_row | is_mixed) & ~is_one
         several = rows.start + np.flatnonzero(is_mean)
-        known = torch.from_numpy((known[is_mean] / np.maximum(sums[is_mean, None], 1e-300)).astype(np.float32))
-        mixture = torch.einsum("nk,nkf->nf", known, old_features[near[is_mean]].float())
+        feature_shares = torch.from_numpy(
+            (feature_shares[is_mean] / np.maximum(sums[is_mean, None], 1e-300)).astype(np.float32)
+        )
+        mixture = torch.einsum("nk,nkf->nf", feature_shares, old_features[near[is_mean]].float())
         features[several] = mixture.to(features.dtype)
-        elected[several] = _elected(own_tuple[near[is_mean]], shares[is_mean])
+        tuple_of[several] = _strongest_label(own_tuple[near[is_mean]], shares[is_mean])
         for name, column in values.items():
             column[rows] = (shares * old[name][near]).sum(axis=1)
         progress("transfer", rows.stop, count, "splats")
-    features[~torch.from_numpy(seen)] = 0
-    values["evidence"] = _divided(lift.evidence.cpu().numpy(), *map(np.concatenate, zip(*taken, strict=True)))
-    fields: dict[str, Any] = {"features": features, "seen": torch.from_numpy(seen)}
+    features[~torch.from_numpy(has_feature)] = 0
+    values["evidence"] = _divide_evidence(
+        lift.evidence.cpu().numpy(), *map(np.concatenate, zip(*partners, strict=True))
+    )
+    fields: dict[str, Any] = {"features": features, "seen": torch.from_numpy(has_feature)}
     fields |= {name: torch.from_numpy(column) for name, column in values.items()}
-    labels = np.where(elected[:, None] >= 0, tuples[elected], -1).astype(np.int32)
+    labels = np.where(tuple_of[:, None] >= 0, tuples[tuple_of], -1).astype(np.int32)
     fields |= {name: torch.from_numpy(labels[:, place].copy()) for place, name in enumerate(kinds, 1)}
     for name, table in (("cluster", "cluster_features"), ("object", "object_views")):
-        if name in kinds and (whole := getattr(lift, table)) is not None:
-            fields[name], fields[table] = renumbered(fields[name], whole.cpu())
+        if name in kinds and (table_values := getattr(lift, table)) is not None:
+            fields[name], fields[table] = renumbered(fields[name], table_values.cpu())
     if lift.node is not None:
         fields |= cropped_tree({name: getattr(lift, name).cpu() for name in NODE_TENSORS} | {"node": fields["node"]})
-    return fields, {"rows": rows_of, "mixed": mixed, "without_partner": count - rows_of - mixed}
+    return fields, {"rows": copied_count, "mixed": mixed_count, "without_partner": count - copied_count - mixed_count}
 
 
-def _elected(labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """[n] i32, the label of [n, k] with the largest sum of weights; -1 where all weights are zero."""
+def _strongest_label(labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the label of [n, k] with the largest sum of weights, [n] i32; -1 where all weights are zero."""
     votes = (weights[:, :, None] * (labels[:, :, None] == labels[:, None, :])).sum(axis=1)
     best = np.take_along_axis(labels, votes.argmax(axis=1)[:, None], axis=1)[:, 0]
     return np.where(weights.any(axis=1), best, -1).astype(np.int32)
 
 
-def _divided(evidence: np.ndarray, near: np.ndarray, shares: np.ndarray) -> np.ndarray:
-    """[Q] f32: the evidence [P] of each old splat, divided among the new ones by their shares [Q, k] in it."""
-    whole = np.bincount(near.ravel(), shares.ravel().astype(np.float64), len(evidence))
-    each = np.divide(evidence, whole, out=np.zeros(len(evidence)), where=whole > 0)
-    return (shares * each[near]).sum(axis=1).astype(np.float32)
+def _divide_evidence(evidence: np.ndarray, near: np.ndarray, shares: np.ndarray) -> np.ndarray:
+    """Divide the evidence [P] of each old splat among the new ones by their shares [Q, k] in it, [Q] f32."""
+    totals = np.bincount(near.ravel(), shares.ravel().astype(np.float64), len(evidence))
+    per_share = np.divide(evidence, totals, out=np.zeros(len(evidence)), where=totals > 0)
+    return (shares * per_share[near]).sum(axis=1).astype(np.float32)

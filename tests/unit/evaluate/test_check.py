@@ -17,7 +17,7 @@ from liftcore.io.inria import write_inria_cameras
 from liftcore.io.splats import write_splats
 from liftcore.lifting.planning import contradictions
 from liftcore.lifting.planning.contradictions import ViewAgreement
-from liftcore.query.splat_colours import seen_colours
+from liftcore.query.splat_colours import view_colours
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Cameras
 from liftcore.scene.compositing import CompositingParams
@@ -39,7 +39,7 @@ def scene() -> StillLife:
 def photos(scene: StillLife, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder, raster = tmp_path_factory.mktemp("photos"), CpuRaster(scene.splats)
     for name, camera in scene.cameras.items():
-        image = raster.render(camera, seen_colours(scene.splats, camera), CompositingParams()).clamp(0, 1).numpy()
+        image = raster.render(camera, view_colours(scene.splats, camera), CompositingParams()).clamp(0, 1).numpy()
         Image.fromarray((255 * image).astype(np.uint8)).save(folder / f"{name}.png")
     return {path.stem: path for path in sorted(folder.iterdir())}
 

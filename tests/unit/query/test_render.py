@@ -29,7 +29,7 @@ from liftcore.query.render import (
     view_mask,
 )  # fmt: skip
 from liftcore.query.scene import Scene
-from liftcore.query.splat_colours import principal_colours, seen_colours
+from liftcore.query.splat_colours import principal_colours, view_colours
 from liftcore.query.terms import Region
 from liftcore.raster.reference import ReferenceRaster
 from liftcore.scene.cameras import Camera, Cameras, behind_lens, drawn_by
@@ -189,10 +189,10 @@ def test_colours_follow_the_spherical_harmonics() -> None:
     camera = look_at("v", np.array([0.0, 0.0, -3.0]), 8, 8, 8.0)
     plain = random_splats(0, 5)
     grey = Splats(plain.means, plain.quats, plain.log_scales, plain.opacity_logits, sh=torch.zeros(5, 16, 3))
-    assert torch.allclose(seen_colours(grey, camera), torch.tensor(0.5))
+    assert torch.allclose(view_colours(grey, camera), torch.tensor(0.5))
     assert plain.sh is not None
     expected = (0.5 + SH_C0 * plain.sh[:, 0]).clamp_min(0)
-    torch.testing.assert_close(seen_colours(plain, camera), expected)
+    torch.testing.assert_close(view_colours(plain, camera), expected)
 
 
 def test_spherical_beta_lobes_add_to_the_base_colour() -> None:
@@ -213,11 +213,11 @@ def test_spherical_beta_lobes_add_to_the_base_colour() -> None:
             colour = np.log1p(np.exp(sharpness * np.array([r, g, b]))) / sharpness
             expected[p] += colour * max(0.0, axis @ direction) ** (4 * np.exp(beta))
     torch.testing.assert_close(
-        seen_colours(splats, camera), torch.from_numpy(expected.clip(0)).float(), atol=1e-5, rtol=1e-5
+        view_colours(splats, camera), torch.from_numpy(expected.clip(0)).float(), atol=1e-5, rtol=1e-5
     )
     wild = torch.tensor([0.0, 0.0, 0.0, 1.0, 1.0, 1e4]).expand(5, 1, 6).contiguous()
     for sign in (1, -1):
-        assert seen_colours(replace(bare, sb_params=wild * sign), camera).isfinite().all()
+        assert view_colours(replace(bare, sb_params=wild * sign), camera).isfinite().all()
 
 
 def test_groups_get_colours_that_can_be_told_apart_at_every_run() -> None:

@@ -22,7 +22,7 @@ from liftcore.query.render import render
 from liftcore.query.result import LiftResult
 from liftcore.query.scene import Scene
 from liftcore.query.segment import best_words, map_png, named_ply, picture_png, segment, word_map
-from liftcore.query.splat_colours import seen_colours
+from liftcore.query.splat_colours import view_colours
 from liftcore.query.terms import Pixel, SplatTerm, Vector
 from liftcore.scene.cameras import Cameras
 from tests.api.tiny_scene import CHANNELS, HEIGHT, SPLATS_A_CLUSTER, WIDTH, text_table
@@ -154,7 +154,7 @@ def test_pictures_show_the_words_of_the_pixels(clear: Scene) -> None:
 def test_coloured_splats_have_the_colours_of_their_words(clear: Scene, tmp_path: Path) -> None:
     found = segment(clear, ["apple", "book"], EYE[:2])
     (tmp_path / "named.ply").write_bytes(b"".join(named_ply(clear, found)))
-    seen = seen_colours(read_splats(tmp_path / "named.ply"), clear.cameras["middle"]).numpy()
+    seen = view_colours(read_splats(tmp_path / "named.ply"), clear.cameras["middle"]).numpy()
     np.testing.assert_allclose(255 * seen, found.colours[found.values], atol=1e-2)
     assert tuple(found.colours[0]) == NO_CLUSTER_COLOUR
 

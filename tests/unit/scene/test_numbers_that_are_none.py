@@ -17,7 +17,7 @@ import liftcore as lc
 from liftcore.evaluate.inspect import inspect_file
 from liftcore.io.splats import read_places, read_splats, some_rows, write_splats
 from liftcore.lifting.planning.photos import plan_photos
-from liftcore.query.splat_colours import seen_colours
+from liftcore.query.splat_colours import view_colours
 from liftcore.raster.reference import dense_view
 from liftcore.scene.compositing import CompositingParams
 from liftcore.scene.kernel import Kernel
@@ -79,7 +79,7 @@ def test_a_colour_that_is_no_number_is_grey_from_everywhere(kernel: Kernel) -> N
     grey = [7, 8] + [9] * (lobes is not None)
     assert f"{len(grey)} of 40 splats have a colour that is no number" in shown.warnings[0]
     for centre in ([3.0, 1.0, -4.0], [0.0, -5.0, 0.3]):
-        colours = seen_colours(shown, look_at("v", np.array(centre), 8, 8, 8.0))
+        colours = view_colours(shown, look_at("v", np.array(centre), 8, 8, 8.0))
         torch.testing.assert_close(colours[grey], torch.full((len(grey), 3), 0.5), atol=1e-6, rtol=0)
         assert bool(torch.isfinite(colours).all())
     assert torch.equal(shown.opacity_logits, splats.opacity_logits)

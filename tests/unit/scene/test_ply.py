@@ -17,7 +17,7 @@ from plyfile import PlyData
 from liftcore.errors import InvalidSplats
 from liftcore.io.ply import BLOCK_ROWS
 from liftcore.io.splats import read_splats, recoloured, some_rows, write_splats
-from liftcore.query.splat_colours import seen_colours
+from liftcore.query.splat_colours import view_colours
 from liftcore.scene.splats import Kernel
 from tests.scenes import look_at, random_splats
 
@@ -319,7 +319,7 @@ def test_colours_of_every_dialect_are_the_same_from_everywhere(dialect: str, tmp
     (tmp_path / "coloured.ply").write_bytes(b"".join(recoloured(path, wanted)))
     splats = read_splats(tmp_path / "coloured.ply")
     for centre in ([3.0, 1.0, -4.0], [-0.2, 0.1, 9.0], [0.0, -5.0, 0.3]):
-        shown = seen_colours(splats, look_at("v", np.array(centre), 8, 8, 8.0))
+        shown = view_colours(splats, look_at("v", np.array(centre), 8, 8, 8.0))
         torch.testing.assert_close(shown, torch.from_numpy(wanted / 255).float(), atol=1e-6, rtol=0)
     before, after = rows_of(path.read_bytes()), rows_of((tmp_path / "coloured.ply").read_bytes())
     coloured = ("f_dc", "f_rest", "sh0", "sb_params")
@@ -346,7 +346,7 @@ def test_red_green_and_blue_are_the_colour_where_no_harmonics_are(kind, full, ch
     content = ply_bytes([*DIALECTS["no colour"], *channels], types=types, **columns)
     path = with_ply(tmp_path, content)
     splats = read_splats(path)
-    seen = seen_colours(splats, look_at("v", np.array([3.0, 1.0, -4.0]), 8, 8, 8.0))
+    seen = view_colours(splats, look_at("v", np.array([3.0, 1.0, -4.0]), 8, 8, 8.0))
     torch.testing.assert_close(seen, torch.from_numpy(levels).float(), atol=2e-5, rtol=0)
     write_splats(tmp_path / "again.ply", splats)
     assert (tmp_path / "again.ply").read_bytes() == content

@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import liftcore as lc
-from liftcore.query.splat_colours import seen_colours
+from liftcore.query.splat_colours import view_colours
 from liftcore.scene.kernel import Kernel
 from tests.scenes import random_camera, random_splats
 
@@ -86,7 +86,7 @@ def test_cameras_moved_with_the_splats_see_the_same(kernel: Kernel) -> None:
     np.testing.assert_allclose(moved.positions(), splats.positions() @ MATRIX[:3, :3].T + MATRIX[:3, 3], atol=1e-4)
     image, other = lc.render(splats, camera, values), lc.render(moved, seen_from, values)
     assert float(image.max()) > 0.1 and float((image - other).abs().max()) < 2e-3
-    colours, others = seen_colours(splats, camera), seen_colours(moved, seen_from)
+    colours, others = view_colours(splats, camera), view_colours(moved, seen_from)
     assert torch.allclose(colours, others, atol=2e-3) and float(colours.std()) > 0.1
     normals = [torch.stack([one.extras[name] for name in ("nx", "ny", "nz")], dim=1) for one in (splats, moved)]
     np.testing.assert_allclose(TURN.apply(normals[0].numpy()), normals[1].numpy(), atol=1e-12)
