@@ -135,7 +135,7 @@ def weigh_views(
             del answer, part, request  # frees their memory before the raster computes the next one
             progress("geometry", len(by_number), len(views), "views")
             if on_first and len(by_number) == len(first):
-                on_first(_stacked_views([by_number[one] for one in first], splats, threads))
+                on_first(_stacked_views([by_number[view] for view in first], splats, threads))
     return _stacked_views([by_number.pop(number) for number in range(len(views))], splats, threads)
 
 

@@ -279,7 +279,9 @@ def plan(
     """
     inputs = LiftInputs.of(splats, cameras, views, preset, settings, threads)
     device = choose_device(inputs.settings.device)
-    lift_plan = plan_lift(inputs.splats, inputs.views, inputs.settings, device, threads, apart=in_blocks, look=True)
+    lift_plan = plan_lift(
+        inputs.splats, inputs.views, inputs.settings, device, threads, in_workers=in_blocks, probe=True
+    )
     return plan_of_a_worker(lift_plan) if in_blocks else lift_plan
 
 

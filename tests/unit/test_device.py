@@ -11,7 +11,7 @@ import torch
 
 from liftcore.errors import InvalidSettings, Unavailable
 from liftcore.lifting.files import lift_files
-from liftcore.lifting.planning.plan import check_card
+from liftcore.lifting.planning.plan import check_device_memory
 from liftcore.runtime.device import CPU, Device, choose_device, driver_version, processor, within_memory
 from liftcore.values.settings import LiftSettings
 from tests.scenes import write_scene
@@ -112,7 +112,7 @@ def test_room_that_ends_in_the_middle_is_said_in_words(card: pytest.MonkeyPatch)
 def test_scene_without_room_on_the_card_is_refused_or_left_to_the_processor(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Device, "free_bytes", lambda device: GIB)
     monkeypatch.setattr(Device, "name", "Card")
-    assert check_card(CARD, 1_000_000, "cuda") == []
+    assert check_device_memory(CARD, 1_000_000, "cuda") == []
     with pytest.raises(Unavailable, match=r"3\.7 GiB of free memory on Card, got 1\.0 GiB"):
-        check_card(CARD, 10_000_000, "cuda")
-    assert "the processor lifts" in check_card(CARD, 10_000_000, "auto")[0]
+        check_device_memory(CARD, 10_000_000, "cuda")
+    assert "the lift runs on the CPU" in check_device_memory(CARD, 10_000_000, "auto")[0]

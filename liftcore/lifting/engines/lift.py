@@ -221,7 +221,7 @@ class InBlocks(LiftSteps[Job]):
         if self.inputs.settings.device == "auto" and not isinstance(self.engine, LocalEngine):
             device = CPU  # workers may have other GPUs than this machine, or none
         return plan_lift(
-            self.inputs.splats, views, self.inputs.settings, device, self.threads, apart=True, look=probe
+            self.inputs.splats, views, self.inputs.settings, device, self.threads, in_workers=True, probe=probe
         )
 
     def weigh(self, views: LiftViews, plan: Plan, on_plan: Callable[[Plan], None]) -> tuple[Job, WeightStatistics]:

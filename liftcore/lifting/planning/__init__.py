@@ -1,1 +1,1 @@
-"""What a lift will take, before it is made: splats, views, channels, memory; the work is sized from it."""
+"""Plans of lifts, before the first view: the views, the memory, the order of photos, contradictions of inputs."""

@@ -1,16 +1,17 @@
-"""Which photos to encode first, before there is a feature of any, and what fewer of them would show.
+"""The order in which to encode photos, before there are features, and the coverage of the first ones.
 
-What a photo will say of a splat is unknown, but not how much: ``e_jv``, the evidence of view v in splat j, is the sum
-of the splat's weights on the view's rays, with all that hides it. It is found for sampled splats at coarse pixels.
+The feature that a photo will give a splat is unknown, but its weight is not: ``e_jv``, the evidence of view v in
+splat j, is the sum of the splat's weights on the view's rays, with occlusion. It is computed for sampled splats at
+coarse pixels.
 
-**Seen.** A view sees a splat where it has SEEN of the evidence that the best view has of it, or more. That needs no
-unit: it leaves out what leaks through a surface, and keeps the same look from three times as far.
+**Visible.** A view sees a splat if its evidence is at least VISIBLE_SHARE of the largest of any view. This rule needs
+no unit. It ignores light that leaks through a surface, and accepts the same view from three times the distance.
 
-**The order.** Each next photo adds the most to ``sum_j e_j (1 - 2^-n_j)``, e_j the evidence of all views and n_j the
-number of chosen photos that see splat j. A first look counts a half, a second a quarter, and so on: what nobody has
-seen comes first, then what one photo alone has seen, whose mistakes no other can tell. No splat is ever done with, so
-that the order has no arbitrary end. As a further look never counts more than the one before, the first N photos are
-worth at least 1 - 1/e of the best N (Nemhauser, Wolsey and Fisher 1978).
+**Order.** Each next photo adds the most to ``sum_j e_j (1 - 2^-n_j)``, with e_j the evidence of all views and n_j the
+number of chosen photos that see splat j. A first photo of a splat counts a half, a second a quarter, and so on. So
+unseen splats come first, then splats of a single photo, whose errors no other photo corrects. A further photo always
+counts a little, so that the order has no arbitrary end. As it never counts more than the one before, the first N
+photos are worth at least 1 - 1/e of the best N (Nemhauser, Wolsey and Fisher 1978).
 """
 
 from __future__ import annotations
@@ -41,9 +42,9 @@ from liftcore.values.settings import LiftSettings
 from liftcore.values.views import Regions
 
 SIDE = 240  # pixels of an image's longer side, about: shares of weight are within .01 of those of all pixels
-SEEN = 0.1  # of the evidence of the view that sees a splat best
+VISIBLE_SHARE = 0.1  # of the evidence of the view that sees a splat best
 LEAST_NEW = 0.001  # of the weight: a photo that adds less adds nothing
-FIRST_COUNT = 4  # photos of the first row; each further row has twice as many
+FIRST_COUNT = 4  # photos of the first row; each next row has twice as many
 SHOWN_PHOTOS = 12  # names in a line for people
 ONE_REGION = Regions(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1, dtype=torch.float32))
 NO_PIXELS = torch.empty(0, 2, dtype=torch.int32)
@@ -61,10 +62,10 @@ class Shown:
 
 @dataclass(frozen=True)
 class PhotoPlan(PlannedScene):
-    """Which photos to encode first. Plain values; but for the seconds, the same inputs give the same plan."""
+    """An order of photos to encode. Plain values; except for the seconds, the same inputs give the same plan."""
 
-    order: tuple[str, ...]  # all photos, the one to encode first at first
-    spare: tuple[str, ...]  # of those: what they see, WELL_COVERED before them in the order see too
+    order: tuple[str, ...]  # all photos, in the order to encode them
+    spare: tuple[str, ...]  # of those: WELL_COVERED before them in the order see the same splats
     shown: tuple[Shown, ...]  # by the first 4, 8, 16, ... and all of them
     seen_share: float  # of the splats, that some photo sees
     row_sum: float  # mean sum of the weights of a ray
@@ -75,25 +76,25 @@ class PhotoPlan(PlannedScene):
         return one_line(self, f"{self.splats} of {self.kernel}", *photos, f"seen_share={self.seen_share:.3g}")
 
     def facts(self) -> dict[str, Any]:
-        """Plain values, as JSON has them."""
+        """Return plain values for JSON."""
         return {**asdict(self), "photos": len(self.order)}
 
     def lines(self, *, verbose: bool = False) -> Iterator[str]:
-        """The plan for people.
+        """Yield lines of the plan for people.
 
         Args:
-            verbose: all names, not the first ones.
+            verbose: all names instead of the first ones.
         """
-        most = None if verbose else SHOWN_PHOTOS
+        limit = None if verbose else SHOWN_PHOTOS
         yield f"plan: {self.splats} splats ({self.rendered}), {len(self.order)} photos, no features yet"
         yield "  photos  see of the weight  twice or more  to look through"
         for row in self.shown:
             seconds = f"about {max(row.seconds, 1):.0f} s"
             yield f"  {row.photos:>6}  {row.once:>17.1%}  {row.twice:>13.1%}  {seconds:>15}"
-        yield f"encode first: {first_names(self.order, most)}"
+        yield f"encode first: {first_names(self.order, limit)}"
         if self.spare:
-            named = first_names(self.spare, most)
-            yield f"{len(self.spare)} add nothing that {WELL_COVERED} before them do not show: {named}"
+            spare_names = first_names(self.spare, limit)
+            yield f"{len(self.spare)} add nothing that {WELL_COVERED} before them do not show: {spare_names}"
         yield from (f"warning: {warning}" for warning in self.warnings)
 
 
@@ -109,9 +110,9 @@ def plan_photos(
     """Order the photos of a scene by what each adds to those before it; no feature is needed.
 
     Args:
-        cameras: of the photos that there are; every ``view_stride``-th is looked at.
-        settings: of the lift that is to come; its compositing parameters count. None: the default ones.
-        threads: None takes the cores that this process may use. progress: as `lift` has it.
+        cameras: of all photos; every ``view_stride``-th is used.
+        settings: of the later lift, for its compositing parameters. None: the defaults.
+        threads: None uses the cores that this process may use. progress: as in `lift`.
 
     Raises:
         InvalidCameras: there is no camera.
@@ -120,95 +121,95 @@ def plan_photos(
     settings = LiftSettings.or_default(settings)
     splats = check_given(splats, threads)
     settings = settings.for_splats(splats)
-    known = cameras if isinstance(cameras, Cameras) else Cameras(cameras)
-    views = list(known.values())[:: settings.view_stride]
+    all_cameras = cameras if isinstance(cameras, Cameras) else Cameras(cameras)
+    views = list(all_cameras.values())[:: settings.view_stride]
     rows = spread(splats.count, min(SAMPLE, splats.count))
     raster = open_raster(splats, CPU, threads)
     with one_thread(), shown_progress(progress) as reporter:
         evidence, row_sum = evidence_of_views(raster, views, rows, settings, reporter)
         seconds = _seconds(raster, views[len(views) // 2], settings)
-    weight, seen = evidence.sum(axis=0, dtype=np.float64), sees(evidence)
-    order = list(photo_order(seen, weight))
-    seen_share = float(seen.any(axis=0).mean())
-    told = [unseen(seen_share)] if seen_share < LEAST_IN_VIEW else []
-    if not told and row_sum < LEAST_ROW_SUM:
-        told.append(empty(row_sum))
+    weight, visible = evidence.sum(axis=0, dtype=np.float64), sees(evidence)
+    order = list(photo_order(visible, weight))
+    seen_share = float(visible.any(axis=0).mean())
+    empty_warnings = [unseen(seen_share)] if seen_share < LEAST_IN_VIEW else []
+    if not empty_warnings and row_sum < LEAST_ROW_SUM:
+        empty_warnings.append(empty(row_sum))
     return PhotoPlan(
         **vars(planned_scene(splats, settings)),
         order=tuple(views[k].name for k in order),
-        spare=tuple(views[k].name for k in spare_photos(seen, weight, order)),
-        shown=tuple(shown_by(seen, weight, order, seconds)),
+        spare=tuple(views[k].name for k in spare_photos(visible, weight, order)),
+        shown=tuple(coverage_rows(visible, weight, order, seconds)),
         seen_share=seen_share,
         row_sum=row_sum,
-        warnings=(*scene_warnings(splats, known, views, settings), *told),
+        warnings=(*scene_warnings(splats, all_cameras, views, settings), *empty_warnings),
     )
 
 
 def evidence_of_views(
     raster: Raster, views: Sequence[Camera], rows: np.ndarray, settings: LiftSettings, progress: Progress = silent
 ) -> tuple[np.ndarray, float]:
-    """Evidence [V, n] f32 of the views in the splats ``rows`` [n] i64, and the mean sum of weights of a ray.
+    """Compute the evidence [V, n] f32 of the views in the splats ``rows`` [n] i64, and a ray's mean sum of weights.
 
-    Found at coarse pixels, each of which stands for those between it and the next.
+    At coarse pixels, each of which stands for all pixels up to the next.
     """
-    walks = [_coarse(settings, camera, number) for number, camera in enumerate(views)]
+    view_params = [_coarse(settings, camera, number) for number, camera in enumerate(views)]
     requests = (
         ViewRequest(camera, ONE_REGION, params, settings.weighting, NO_PIXELS)
-        for camera, params in zip(views, walks, strict=True)
+        for camera, params in zip(views, view_params, strict=True)
     )
-    evidence, every = np.zeros((len(views), len(rows)), np.float32), np.zeros(raster.splats.count, np.float32)
-    rays, sums = 0, 0.0
-    for number, found in enumerate(raster.iterate_views(requests)):
-        camera, stride = views[number], walks[number].stride
-        every[:] = 0.0
-        every[found.weights.evidence_splats.numpy()] = found.weights.evidence.numpy()
-        evidence[number] = every[rows] * stride**2
-        left, top = walks[number].offset
+    evidence, view_evidence = np.zeros((len(views), len(rows)), np.float32), np.zeros(raster.splats.count, np.float32)
+    rays, total = 0, 0.0
+    for number, answer in enumerate(raster.iterate_views(requests)):
+        camera, stride = views[number], view_params[number].stride
+        view_evidence[:] = 0.0
+        view_evidence[answer.weights.evidence_splats.numpy()] = answer.weights.evidence.numpy()
+        evidence[number] = view_evidence[rows] * stride**2
+        left, top = view_params[number].offset
         rays += len(range(left, camera.width, stride)) * len(range(top, camera.height, stride))
-        sums += float(every.sum(dtype=np.float64))
+        total += float(view_evidence.sum(dtype=np.float64))
         progress("photos", number + 1, len(views), "photos")
-    return evidence, sums / max(rays, 1)
+    return evidence, total / max(rays, 1)
 
 
 def sees(evidence: np.ndarray) -> np.ndarray:
-    """[V, n] bool: which view sees which splat, by their evidence [V, n]."""
-    return (evidence > 0) & (evidence >= SEEN * evidence.max(axis=0, initial=0.0))
+    """Return [V, n] bool: True where the view sees the splat, by its evidence [V, n]."""
+    return (evidence > 0) & (evidence >= VISIBLE_SHARE * evidence.max(axis=0, initial=0.0))
 
 
-def photo_order(seen: np.ndarray, weight: np.ndarray) -> Iterator[int]:
-    """All photos, each next one adding the most. Of equal ones the first is taken.
+def photo_order(visible: np.ndarray, weight: np.ndarray) -> Iterator[int]:
+    """Order all photos: each next one adds the most; of equal ones the first comes first.
 
     Args:
         seen: [V, n] bool. weight: [n] f64, of the splats.
     """
-    shown, left = [np.flatnonzero(row) for row in seen], weight / 2  # what a further look at a splat counts
+    splats_of, gains = [np.flatnonzero(row) for row in visible], weight / 2  # of one more photo of a splat
 
     def take(photo: int) -> None:
-        left[shown[photo]] /= 2
+        gains[splats_of[photo]] /= 2
 
-    return greedy(len(shown), lambda photo: float(left[shown[photo]].sum()), take)
+    return greedy(len(splats_of), lambda photo: float(gains[splats_of[photo]].sum()), take)
 
 
-def spare_photos(seen: np.ndarray, weight: np.ndarray, order: Sequence[int]) -> list[int]:
-    """Photos that add nothing to those before them: what they see, WELL_COVERED of those see, but for LEAST_NEW."""
-    looks, spare, whole = np.zeros(seen.shape[1], np.int64), [], weight.sum()
+def spare_photos(visible: np.ndarray, weight: np.ndarray, order: Sequence[int]) -> list[int]:
+    """List photos whose splats WELL_COVERED photos before them see, except for a share LEAST_NEW of the weight."""
+    view_counts, spare, total = np.zeros(visible.shape[1], np.int64), [], weight.sum()
     for photo in order:
-        own = seen[photo]
-        if weight[own & (looks < WELL_COVERED)].sum() <= LEAST_NEW * whole:
+        splats = visible[photo]
+        if weight[splats & (view_counts < WELL_COVERED)].sum() <= LEAST_NEW * total:
             spare.append(photo)
-        looks += own
+        view_counts += splats
     return spare
 
 
-def shown_by(seen: np.ndarray, weight: np.ndarray, order: Sequence[int], seconds: float) -> Iterator[Shown]:
-    """What the first photos of the order show, twice as many a row; ``seconds`` are of one photo."""
-    looks, whole, wanted = np.zeros(seen.shape[1], np.int64), max(weight.sum(), 1e-30), FIRST_COUNT
+def coverage_rows(visible: np.ndarray, weight: np.ndarray, order: Sequence[int], seconds: float) -> Iterator[Shown]:
+    """Yield the coverage of the first 4, 8, 16, ... photos of the order; ``seconds`` are of one photo."""
+    view_counts, total, next_row = np.zeros(visible.shape[1], np.int64), max(weight.sum(), 1e-30), FIRST_COUNT
     for count, photo in enumerate(order, start=1):
-        looks += seen[photo]
-        if count in (wanted, len(order)):
-            once, twice = (float(weight[looks >= times].sum() / whole) for times in (1, 2))
+        view_counts += visible[photo]
+        if count in (next_row, len(order)):
+            once, twice = (float(weight[view_counts >= times].sum() / total) for times in (1, 2))
             yield Shown(count, once, twice, count * seconds)
-            wanted *= 2
+            next_row *= 2
 
 
 def _coarse(settings: LiftSettings, camera: Camera, number: int) -> CompositingParams:
@@ -217,7 +218,7 @@ def _coarse(settings: LiftSettings, camera: Camera, number: int) -> CompositingP
 
 
 def _seconds(raster: Raster, camera: Camera, settings: LiftSettings) -> float:
-    """About how long a lift looks at a view like this one."""
+    """Time the weights of one view, as an estimate for the others."""
     begin = time.perf_counter()
     params = strided(settings.lift_params, settings, camera, 0)
     raster.region_weights(camera, ONE_REGION, params, settings.weighting)

@@ -1,4 +1,4 @@
-"""The plan of a lift: what is visible, which views it takes, and a bound of its memory, before the first view."""
+"""The plan of a lift, before the first view: visibility, the choice of views, estimates of memory, warnings."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from liftcore.errors import Unavailable
 from liftcore.lifting.geometry import weigh_views
 from liftcore.lifting.planning.contradictions import contradictions
 from liftcore.lifting.planning.views import (
-    PILOT_VIEWS,
+    NOISE_VIEWS,
     WELL_COVERED,
     Visibility,
+    count_covering_views,
     estimate_view_noise,
     spare_views,
     view_order,
-    views_to_show,
     visibility,
 )
 from liftcore.raster import open_raster
@@ -45,52 +45,52 @@ from liftcore.values.region_weights import MEMORY_LIMIT
 from liftcore.values.settings import LiftSettings
 from liftcore.values.views import DENSE_ROWS
 
-FEW_VIEWS = 32  # and below, view_cosine takes all: a pilot would cost what it saves
-TIMED_VIEWS = 32  # and more have one of them timed: it costs a part of what it tells
-TRACED_RAYS = 1_000  # of a view of a dense map, that tell how many splats a ray meets
+FEW_VIEWS = 32  # and fewer are all lifted, whatever view_cosine: estimating the noise would cost what it saves
+TIMED_VIEWS = 32  # and more have one of them timed, which costs little of the lift then
+TRACED_RAYS = 1_000  # of a view of a dense map, to count the splats on a ray
 SHOWN_VIEWS = 6  # names in a line for people
 MIB, GIB = 2**20, 2**30
 LIBRARIES = 450_000_000  # of torch, numba, numpy and the compiled kernels, before anything is read
-SCENE_BYTES = 230  # of a splat: as the raster has it, its order and counts in a view, sums of the solution
-RECORD_BYTES = 240  # of a splat that a view shows: projected, with its row of W
-TILE_BYTES = 100  # of a splat in a tile: its place in the tile's list, and what the tile found of it
+SCENE_BYTES = 230  # of a splat: in the raster, its order and counts in a view, sums of the solution
+RECORD_BYTES = 240  # of a visible splat: projected, with its row of W
+TILE_BYTES = 100  # of a splat in a tile: its index in the tile's list, and its weights there
 ENTRY_BYTES, ROW_BYTES = 8, 20  # of W: region and weight; a splat's number, row start and evidence
-DENSE_BYTES = 27  # of an entry of a dense map as it is found: from tiles, and gathered by splat
-JUDGED_BYTES = 12  # of an entry: factors, and the products and squares that they are made of
-CONSENSUS_BYTES = 10  # of an entry: what it gets, of how many views, whether it belongs; the tuple of its view
+DENSE_BYTES = 27  # of an entry of a dense map: by tiles, and gathered by splat
+REWEIGHT_BYTES = 12  # of an entry: factors, and the products and squares behind them
+CONSENSUS_BYTES = 10  # of an entry: its share, the count of views, its membership; the tuple of its view
 BLOCK_BYTES = 9  # of an entry that lies by region
 CG_VECTORS, CG_CHANNELS = 14, 32  # [P, 32] f32 of conjugate gradients, with the images of a view
-CLUSTERING = 80_000_000  # of hdbscan and what it stands on
-TOUCHING_BYTES = 1_000  # of a splat, where those that touch are told
-MEMBER_BYTES = 5  # of an entry: whether its splat belongs to its region, and to which
-SMOOTHING_BYTES = 1_300  # of a splat: the graph as it is made, or with a block of channels
+CLUSTERING = 80_000_000  # of hdbscan and its dependencies
+TOUCHING_BYTES = 1_000  # of a splat, for the graph of splats that touch
+MEMBER_BYTES = 5  # of an entry: the membership of its splat in its region
+SMOOTHING_BYTES = 1_300  # of a splat: the graph while it is built, or with a block of channels
 SPARE = 0.9  # of the free memory: 10 % are left to other processes
-CARD_SPARE = 0.8  # of a card's free memory: what is freed does not lie in one piece
-CARD_SPLAT_BYTES = 400  # of a splat on a card, walked in the smallest pieces
+DEVICE_SPARE = 0.8  # of a GPU's free memory, which is fragmented
+DEVICE_SPLAT_BYTES = 400  # of a splat on a GPU, with the smallest batches of tiles
 
 
 @dataclass(frozen=True)
 class PlannedScene:
-    """How many splats there are, and how rays meet them."""
+    """The splats of a plan, and how they are rendered."""
 
     kernel: str
     antialiased: bool  # opacities are compensated for the low-pass
-    rendering: str  # why: what says so, or who
+    rendering: str  # the reason of ``antialiased``: a file, a trainer or a setting
     splats: int  # P
 
     @property
     def rendered(self) -> str:
-        """The kernel and the rendering, for people."""
+        """The kernel and the rendering, as text for people."""
         return f"{self.kernel}, antialiased: {self.rendering}" if self.antialiased else self.kernel
 
 
-def first_names(names: Sequence[str], most: int | None) -> str:
-    """So many of the names, for people; None for all."""
-    return ", ".join(names[:most]) + (", ..." if most is not None and len(names) > most else "")
+def first_names(names: Sequence[str], limit: int | None) -> str:
+    """Join the first ``limit`` names for people; None for all."""
+    return ", ".join(names[:limit]) + (", ..." if limit is not None and len(names) > limit else "")
 
 
 def planned_scene(splats: Splats, settings: LiftSettings) -> PlannedScene:
-    """Of these splats, as a lift with the settings has them."""
+    """Describe splats as a lift with these settings renders them."""
     antialiased = settings.lift_params.antialiased
     return PlannedScene(
         str(splats.kernel), antialiased, rendering_reason(splats.render_mode, antialiased), splats.count
@@ -100,31 +100,31 @@ def planned_scene(splats: Splats, settings: LiftSettings) -> PlannedScene:
 def scene_warnings(
     splats: Splats, cameras: Cameras, views: Sequence[Camera], settings: LiftSettings
 ) -> tuple[str, ...]:
-    """Warnings of splats and cameras, and of lenses of the views among these."""
+    """Return warnings of splats and cameras, and of the lenses of ``views``."""
     rendering = rendering_warnings(splats.render_mode, settings.lift_params.antialiased, splats.kernel)
     return *splats.warnings, *rendering, *cameras.warnings, *distortion_warning(views)
 
 
 @dataclass(frozen=True)
 class Plan(PlannedScene):
-    """What a lift is about to do. Plain values: the same inputs and settings give the same plan."""
+    """The plan of a lift. Plain values: the same inputs and settings give the same plan."""
 
     views: tuple[str, ...]  # that will be lifted, in the order of the sums
     left_out: tuple[str, ...]  # that the settings' coverage or view_cosine leaves out
     there: int  # views with features and a camera, whatever the settings take of them
-    view_cosine: float | None  # expected of the views' features against those of all, where a pilot chose them
-    spare: tuple[str, ...]  # of those lifted: what they show, WELL_COVERED of the others show too
+    view_cosine: float | None  # expected, of the views' features to those of all, if the setting chose views
+    spare: tuple[str, ...]  # of those lifted: WELL_COVERED of the others see the same splats
     seen_share: float  # of the splats, that some view can see, before occlusion
     splats_a_view: float  # that a view can see, before occlusion
-    levels: tuple[int, int] | None  # the one that the setting levels takes alone, and how many maps have; None: all
+    levels: tuple[int, int] | None  # the single level of the setting, and the number of levels in maps; None: all
     channels: int  # F
-    dtype: str  # that X is stored as, when it can hold the codebooks
+    dtype: str  # of X, if it can represent the codebooks
     memory: Mapping[str, int]  # bytes a part at the peak, about
     weight_bytes: int  # of W of all views, about
-    device: Device  # that will walk and solve
-    kept_on_card: int  # bytes of W that may stay on a card between the phases
+    device: Device  # of rasterization and solve
+    kept_on_card: int  # bytes of W that may stay on a GPU between the phases
     features_room: int | None  # bytes of this machine's memory that X may take today; None for no limit
-    seconds: float | None  # that looking through the views takes on this machine today, about; None for few views
+    seconds: float | None  # estimate for the geometry of all views on this machine now; None for few views
     warnings: tuple[str, ...]  # of this machine, today
     told: tuple[str, ...]  # warnings of what is lifted, which the certificate of the lift has too
 
@@ -145,7 +145,7 @@ class Plan(PlannedScene):
         return max(0, self.weight_bytes - MEMORY_LIMIT - self.kept_on_card)
 
     def facts(self) -> dict[str, Any]:
-        """Plain numbers for the certificate, without what only this machine has to do with."""
+        """Return plain values for the diagnostics, without those that depend on this machine alone."""
         return {
             "kernel": self.kernel,
             "antialiased": self.antialiased,
@@ -167,24 +167,24 @@ class Plan(PlannedScene):
         }
 
     def summary(self) -> Iterator[str]:
-        """The plan in short, for people: what is lifted, what it is made of, and what that takes."""
-        seen = f"{self.seen_share:.1%} in some view's field"
+        """Yield three lines for people: the scene and its views, the channels, the memory."""
+        visible = f"{self.seen_share:.1%} in some view's field"
         spare = f", {len(self.spare)} of them see nothing that {WELL_COVERED} others do not" if self.spare else ""
-        yield f"{self.splats} splats ({self.rendered}), {seen}; {len(self.views)} of {self.there} views{spare}"
+        yield f"{self.splats} splats ({self.rendered}), {visible}; {len(self.views)} of {self.there} views{spare}"
         level = f", level {self.levels[0]} alone of {self.levels[1]}, as the settings choose" if self.levels else ""
         yield f"{self.channels} channels, stored as {self.dtype}{level}"
         files = f", {self.in_files / MIB:.0f} MiB of region weights in files" if self.in_files else ""
         yield f"about {self.memory_bytes / MIB:.0f} MiB at the peak{files}, on {self.device.name}"
 
     def lines(self) -> Iterator[str]:
-        """The whole plan for people."""
+        """Yield all lines of the plan for people."""
         head, channels, memory = self.summary()
         yield f"plan: {head}"
         yield f"  a view shows {self.splats_a_view:.0f} of them, before occlusion"
-        left = f"{len(self.left_out)} views left out" if self.left_out else "no view left out"
+        omitted = f"{len(self.left_out)} views left out" if self.left_out else "no view left out"
         if self.view_cosine is not None:
-            left += f" (a pilot expects features with a cosine of {self.view_cosine:.3f} to those of all)"
-        yield f"  {left}{self._spare_line()}"
+            omitted += f" (expected: features with a cosine of {self.view_cosine:.3f} to those of all)"
+        yield f"  {omitted}{self._spare_line()}"
         yield f"  {channels}"
         parts = ", ".join(f"{name} {size / MIB:.0f}" for name, size in self.memory.items())
         yield f"  {memory} ({parts})"
@@ -193,8 +193,8 @@ class Plan(PlannedScene):
     def _spare_line(self) -> str:
         if not self.spare:
             return ""
-        some = first_names(self.spare, SHOWN_VIEWS)
-        return f"; {len(self.spare)} add nothing that {WELL_COVERED} others do not show: {some}"
+        names = first_names(self.spare, SHOWN_VIEWS)
+        return f"; {len(self.spare)} add nothing that {WELL_COVERED} others do not show: {names}"
 
 
 @one_thread()
@@ -205,47 +205,47 @@ def plan_lift(
     device: Device,
     threads: int | None = None,
     *,
-    apart: bool = False,
-    look: bool = False,
+    in_workers: bool = False,
+    probe: bool = False,
 ) -> Plan:
     """Plan the lift of the views; the settings' coverage and view_cosine may choose among them.
 
     Args:
-        device: where it should run. A card with too little room leaves an ``auto`` lift to the processor.
-        threads: that walk on the processor; None takes the cores that this process may use.
-        apart: whether others hold W and X, so that this machine needs no room for them.
-        look: whether a few views are weighed, to tell inputs that contradict each other and how long the views take.
-            A lift in one place tells both by the views that it begins with.
+        device: of the lift. With ``auto``, a GPU with too little memory is replaced by the CPU.
+        threads: of the CPU; None uses the cores that this process may use.
+        in_workers: True if workers hold W and X, so that this machine needs no memory for them.
+        probe: True computes W of a few views, to report contradictions of the inputs and to estimate the time. A lift
+            in memory does both with the views that it begins with.
 
     Raises:
-        Unavailable: this machine has no room for the codebooks, or for the features in no place; or the card that
-            the lift was sent to has none.
+        Unavailable: the codebooks do not fit memory, or the features neither memory nor disk; or the GPU that
+            settings require is too small.
     """
     features = views.features
     names = views.names
     cameras = [views.cameras[name] for name in names]
-    seen = visibility(splats, cameras, settings.lift_params, device, threads)
-    short = [] if apart else check_card(device, splats.count, settings.device)
+    visible = visibility(splats, cameras, settings.lift_params, device, threads)
+    short = [] if in_workers else check_device_memory(device, splats.count, settings.device)
     device = CPU if short else device
-    raster, seconds, wrong = None, None, list[str]()
-    if look or _has_pilot(settings, len(names)):
+    raster, seconds, contradicting = None, None, list[str]()
+    if probe or _estimates_noise(settings, len(names)):
         raster = open_raster(splats, device, threads)
-    chosen, expected = _choose_views(raster, views, settings, seen)
-    names, seen, cameras = [names[k] for k in chosen], seen.of(chosen), [cameras[k] for k in chosen]
-    if look and raster is not None:  # of the views that a lift takes: as it does
-        wrong = contradictions(raster, views.only(names), settings, seen.seen_share)
-    if look and raster is not None and device.kind == "cpu":
+    selection, expected = _choose_views(raster, views, settings, visible)
+    names, visible, cameras = [names[k] for k in selection], visible.of(selection), [cameras[k] for k in selection]
+    if probe and raster is not None:  # of the views that a lift uses
+        contradicting = contradictions(raster, views.only(names), settings, visible.seen_share)
+    if probe and raster is not None and device.kind == "cpu":
         seconds = _seconds(raster, views, names, settings)
     dense = [name for name in names if _is_dense(features, name)]
     if dense and raster is None:
         raster = open_raster(splats, device, threads)
-    met = _met_share(raster, views.only(dense), settings, seen) if dense and raster is not None else 1.0
-    entries = _entries(seen, cameras, features, names, settings, met)
-    weights = weight_bytes(seen, entries, settings)
-    parts = memory_parts(splats, seen, cameras, features, names, settings, entries)
-    free, on_card = (None, None) if apart else (free_memory(), None if short else device.free_bytes())
-    kept = 0 if on_card is None else min(weights, int(CARD_SPARE * on_card) // 4)
-    in_files = 0 if apart else max(0, weights - MEMORY_LIMIT - kept)
+    hit_share = _hit_share(raster, views.only(dense), settings, visible) if dense and raster is not None else 1.0
+    entries = _entries(visible, cameras, features, names, settings, hit_share)
+    weights = weight_bytes(visible, entries, settings)
+    parts = memory_parts(splats, visible, cameras, features, names, settings, entries)
+    free, on_card = (None, None) if in_workers else (free_memory(), None if short else device.free_bytes())
+    device_weights = 0 if on_card is None else min(weights, int(DEVICE_SPARE * on_card) // 4)
+    in_files = 0 if in_workers else max(0, weights - MEMORY_LIMIT - device_weights)
     lifted = set(names)
     return Plan(
         **vars(planned_scene(splats, settings)),
@@ -253,104 +253,104 @@ def plan_lift(
         left_out=tuple(name for name in views.names if name not in lifted),
         there=len(features),
         view_cosine=expected,
-        spare=tuple(names[k] for k in spare_views(seen)),
-        seen_share=seen.seen_share,
-        splats_a_view=seen.splats_a_view,
-        levels=_level_alone(features, names, settings),
+        spare=tuple(names[k] for k in spare_views(visible)),
+        seen_share=visible.seen_share,
+        splats_a_view=visible.splats_a_view,
+        levels=_single_level(features, names, settings),
         channels=features.channels,
         dtype=settings.dtype,
         memory=parts,
         weight_bytes=weights,
         device=device,
-        kept_on_card=kept,
+        kept_on_card=device_weights,
         features_room=features_room(parts, free),
         seconds=seconds,
         warnings=(*short, *check_memory(parts, free), *check_weights(in_files)),
         told=(
             *scene_warnings(splats, views.cameras, cameras, settings),
             *shape_warnings(features, cameras),
-            *wrong,
+            *contradicting,
         ),
     )
 
 
-def _has_pilot(settings: LiftSettings, views: int) -> bool:
-    """Whether the settings choose among so many views by what a pilot tells of them."""
+def _estimates_noise(settings: LiftSettings, views: int) -> bool:
+    """Return True if the settings choose among ``views`` views by the noise of features."""
     return bool(settings.view_cosine) and views > FEW_VIEWS
 
 
 def _choose_views(
-    raster: Raster | None, views: LiftViews, settings: LiftSettings, seen: Visibility
+    raster: Raster | None, views: LiftViews, settings: LiftSettings, visible: Visibility
 ) -> tuple[list[int], float | None]:
-    """The views to lift, ascending, and the cosine that a pilot expects of them, where one was flown.
+    """Choose the views to lift, ascending; return their expected cosine too, if noise was estimated.
 
-    They show each splat ``coverage`` times and come to ``view_cosine``, whatever takes more of the same order. Where
-    a pilot could spare no more views than it looks at, none is flown and all are taken.
+    The first views of one order that satisfy both: each splat is seen ``coverage`` times, and ``view_cosine`` is
+    reached. If the estimate could save no more views than it needs, it is skipped and all views are chosen.
     """
-    every = list(range(seen.areas.shape[0]))
-    if not settings.coverage and not _has_pilot(settings, len(every)):
-        return every, None
-    order = list(view_order(seen))
-    least = views_to_show(seen, order, settings.coverage)
+    all_views = list(range(visible.areas.shape[0]))
+    if not settings.coverage and not _estimates_noise(settings, len(all_views)):
+        return all_views, None
+    order = list(view_order(visible))
+    least = count_covering_views(visible, order, settings.coverage)
     if not settings.view_cosine:
         return sorted(order[:least]), None
-    if raster is None or len(every) <= max(FEW_VIEWS, least + PILOT_VIEWS):
-        return every, None
-    pilot = estimate_view_noise(raster, views, settings, seen)
-    count, expected = pilot.views_for(settings.view_cosine, order, least)
+    if raster is None or len(all_views) <= max(FEW_VIEWS, least + NOISE_VIEWS):
+        return all_views, None
+    estimate = estimate_view_noise(raster, views, settings, visible)
+    count, expected = estimate.views_for(settings.view_cosine, order, least)
     return sorted(order[:count]), expected
 
 
 def _seconds(raster: Raster, views: LiftViews, names: Sequence[str], settings: LiftSettings) -> float | None:
-    """About how long the views take, by the one in the middle."""
+    """Estimate the seconds of all views by timing the middle one; None for few views."""
     if len(names) < TIMED_VIEWS:
         return None
     begin = time.perf_counter()
-    one = views.only([names[len(names) // 2]])
-    own = settings.model_copy(update={"certificate_rays": 0})
-    weigh_views(raster, raster.splats.count, one, own, silent, by_rows=False)
+    middle = views.only([names[len(names) // 2]])
+    probe_settings = settings.model_copy(update={"certificate_rays": 0})
+    weigh_views(raster, raster.splats.count, middle, probe_settings, silent, by_rows=False)
     return len(names) * (time.perf_counter() - begin)
 
 
-def weight_bytes(seen: Visibility, entries: np.ndarray, settings: LiftSettings) -> int:
-    """Bytes of W of all views with so many entries each [V], about."""
-    judged = 4 if settings.robust_steps or settings.loss == "huber" else 0
-    return int(ROW_BYTES * _shown(seen).sum() + (ENTRY_BYTES + judged) * entries.sum())
+def weight_bytes(visible: Visibility, entries: np.ndarray, settings: LiftSettings) -> int:
+    """Estimate the bytes of W of all views from the number of entries of each [V]."""
+    factor_bytes = 4 if settings.robust_steps or settings.loss == "huber" else 0
+    return int(ROW_BYTES * _splat_counts(visible).sum() + (ENTRY_BYTES + factor_bytes) * entries.sum())
 
 
-def _shown(seen: Visibility) -> np.ndarray:
-    """[V] f64, the splats that each view shows, about."""
-    return seen.in_view.sum(axis=1) / seen.areas.shape[1] * seen.splats
+def _splat_counts(visible: Visibility) -> np.ndarray:
+    """Estimate the number of visible splats of each view, [V] f64."""
+    return visible.in_view.sum(axis=1) / visible.areas.shape[1] * visible.splats
 
 
 def _entries(
-    seen: Visibility,
+    visible: Visibility,
     cameras: Sequence[Camera],
     features: Views,
     names: Sequence[str],
     settings: LiftSettings,
-    met: float,
+    hit_share: float,
 ) -> np.ndarray:
-    """[V] f64, of W of each view, about: a splat meets a region or four cells in each tile and level that it touches.
+    """Estimate the entries of W of each view, [V] f64: one region or four cells a splat, tile and level.
 
-    Of a dense map it meets the cells under its outline, as far as rays get to it.
+    In a dense map, the cells under the outline of a splat count, times the share of pixels where rays reach it.
 
     Args:
-        met: of `_met_share`.
+        hit_share: of `_hit_share`.
     """
     parts = max(_parts_a_tile(features, name, settings) for name in names)
-    found = _shown(seen) * parts * _tiles(seen)
+    entries = _splat_counts(visible) * parts * _tiles(visible)
     for number, (name, camera) in enumerate(zip(names, cameras, strict=True)):
         if _is_dense(features, name):
-            sides = np.sqrt(seen.areas[number][seen.in_view[number]], dtype=np.float64)
+            sides = np.sqrt(visible.areas[number][visible.in_view[number]], dtype=np.float64)
             across, down = (
                 sides * min(cells, reads * -(-pixels // settings.stride)) / pixels + reads
                 for cells, pixels in zip(_cells(features, name, camera), (camera.width, camera.height), strict=True)
                 for reads in (1 if cells == pixels or features.is_regions(name) else 2,)  # of a pixel, in a line
             )
             levels = 1 if isinstance(settings.levels, int) else _levels(features, name)
-            found[number] = met * levels * float(across @ down) / seen.areas.shape[1] * seen.splats
-    return found
+            entries[number] = hit_share * levels * float(across @ down) / visible.areas.shape[1] * visible.splats
+    return entries
 
 
 def _is_dense(features: Views, view: str) -> bool:
@@ -358,7 +358,7 @@ def _is_dense(features: Views, view: str) -> bool:
 
 
 def _cells(features: Views, view: str, camera: Camera) -> tuple[float, float]:
-    """Columns and rows of a grid; of regions those that as many squares on each level would have."""
+    """Return columns and rows of a grid; for regions, those of as many square cells a level."""
     if not features.is_regions(view):
         rows, columns, _ = _codebook(features, view)
         return columns, rows
@@ -366,42 +366,44 @@ def _cells(features: Views, view: str, camera: Camera) -> tuple[float, float]:
     return side * math.sqrt(camera.width / camera.height), side * math.sqrt(camera.height / camera.width)
 
 
-def _met_share(raster: Raster, views: LiftViews, settings: LiftSettings, seen: Visibility) -> float:
-    """The share of the outlines' area that rays get to, by some rays of a few views: what is opaque hides the rest.
+def _hit_share(raster: Raster, views: LiftViews, settings: LiftSettings, visible: Visibility) -> float:
+    """Estimate the share of the outlines' area that rays reach before they are absorbed, by some rays of a few views.
 
     Args:
-        views: of dense maps. seen: of all views that are lifted, whose mean area stands for that of each.
+        views: of dense maps. visible: of all views that are lifted; their mean area stands for that of each.
     """
     counts = list[float]()
     for number in sorted({0, len(views) // 2, len(views) - 1}):
         camera = views.cameras[views.names[number]]
         places = sample_pixels(camera, TRACED_RAYS, (settings.seed, number), settings.lift_params)
         lengths = raster.ray_rows(camera, places, settings.lift_params).indptr.diff().numpy()
-        most = settings.k if settings.selection == "top-k" else lengths.max(initial=0)
-        counts.append(float(lengths.clip(max=most).mean()) * camera.width * camera.height)
-    area = float(seen.areas.sum(dtype=np.float64)) / len(seen.areas) / seen.areas.shape[1] * seen.splats
+        limit = settings.k if settings.selection == "top-k" else lengths.max(initial=0)
+        counts.append(float(lengths.clip(max=limit).mean()) * camera.width * camera.height)
+    area = float(visible.areas.sum(dtype=np.float64)) / len(visible.areas) / visible.areas.shape[1] * visible.splats
     return min(1.0, float(np.mean(counts)) / max(area, 1.0))
 
 
 def memory_parts(
     splats: Splats,
-    seen: Visibility,
+    visible: Visibility,
     cameras: Sequence[Camera],
     features: Views,
     names: Sequence[str],
     settings: LiftSettings,
     entries: np.ndarray,
 ) -> dict[str, int]:
-    """Bytes of each part of a lift at its peak, about.
+    """Estimate the bytes of each part of a lift at its peak.
 
     Args:
         entries: [V], of W of each view.
     """
     inputs = sum(t.nbytes for t in (splats.means, splats.quats, splats.log_scales, splats.opacity_logits))
     largest, channels = max(camera.width * camera.height for camera in cameras), features.channels
-    weights, of_all = weight_bytes(seen, entries, settings), float(entries.sum())
-    view = int(_shown(seen).max(initial=0) * (RECORD_BYTES + TILE_BYTES * _tiles(seen))) + 16 * largest
-    dense = max((int(own) for own, name in zip(entries, names, strict=True) if _is_dense(features, name)), default=0)
+    weights, of_all = weight_bytes(visible, entries, settings), float(entries.sum())
+    view = int(_splat_counts(visible).max(initial=0) * (RECORD_BYTES + TILE_BYTES * _tiles(visible))) + 16 * largest
+    dense = max(
+        (int(count) for count, name in zip(entries, names, strict=True) if _is_dense(features, name)), default=0
+    )
     books = [math.prod(_codebook(features, name)) for name in names]
     regions = sum(books) // max(channels, 1)
     size = 2 if settings.dtype == "float16" else 4
@@ -416,7 +418,7 @@ def memory_parts(
         "features": splats.count * channels * size,
     }
     if settings.robust_steps or settings.loss == "huber":
-        parts["reweighting"] = int(JUDGED_BYTES * min(of_all, MEMORY_LIMIT / ENTRY_BYTES))  # more lies in files
+        parts["reweighting"] = int(REWEIGHT_BYTES * min(of_all, MEMORY_LIMIT / ENTRY_BYTES))  # more lies in files
         if settings.consensus and any(features.is_regions(name) for name in names):
             parts["reweighting"] += int(CONSENSUS_BYTES * of_all + BLOCK_BYTES * min(of_all, BLOCK_ENTRIES))
     if settings.cg_steps or settings.reference_channels:
@@ -430,89 +432,93 @@ def memory_parts(
     return parts
 
 
-def _tiles(seen: Visibility) -> float:
-    """Tiles that a shown splat touches, in the mean."""
-    sides = np.sqrt(seen.areas[seen.in_view], dtype=np.float64)
+def _tiles(visible: Visibility) -> float:
+    """Estimate the mean number of tiles that a visible splat touches."""
+    sides = np.sqrt(visible.areas[visible.in_view], dtype=np.float64)
     return float(np.mean((sides / TILE + 1.0) ** 2)) if sides.size else 1.0
 
 
 def _parts_a_tile(features: Views, view: str, settings: LiftSettings) -> int:
     if not features.is_regions(view):
-        return 4  # nearest reads fewer, but fine cells are smaller than a tile
+        return 4  # of bilinear reading; nearest reads fewer, but fine cells are smaller than a tile
     return 1 if isinstance(settings.levels, int) else _levels(features, view)
 
 
 def _levels(features: Views, view: str) -> int:
-    """The levels of a view's region map; one of a grid."""
+    """Return the number of levels of a view's region map; 1 for a grid."""
     shape = features.specs(view)["labels"].shape if features.is_regions(view) else ()
     return shape[0] if len(shape) == 3 else 1
 
 
-def _level_alone(features: Views, names: Sequence[str], settings: LiftSettings) -> tuple[int, int] | None:
-    """The level that the settings take alone, and how many the maps have; None where nothing is left out."""
-    there = max(_levels(features, name) for name in names) if isinstance(settings.levels, int) else 1
-    return (settings.levels, there) if isinstance(settings.levels, int) and there > 1 else None
+def _single_level(features: Views, names: Sequence[str], settings: LiftSettings) -> tuple[int, int] | None:
+    """Return the single level of the settings, and the number of levels of the maps; None if all are used."""
+    level_count = max(_levels(features, name) for name in names) if isinstance(settings.levels, int) else 1
+    return (settings.levels, level_count) if isinstance(settings.levels, int) and level_count > 1 else None
 
 
 def _codebook(features: Views, view: str) -> tuple[int, ...]:
-    """The shape of the view's codebook, or of its grid."""
+    """Return the shape of the view's codebook, or of its grid."""
     return next(spec.shape for part, spec in features.specs(view).items() if part != "labels")
 
 
-def check_card(device: Device, splats: int, asked: str) -> list[str]:
-    """What to say when the card has no room for the scene and ``auto`` may take the processor.
+def check_device_memory(device: Device, splats: int, requested: str) -> list[str]:
+    """Return a warning if the GPU's memory is too small for the scene and ``auto`` may use the CPU, else none.
 
     Raises:
-        Unavailable: the same, and ``cuda`` was asked for.
+        Unavailable: it is too small, and ``cuda`` was requested.
     """
     free = device.free_bytes()
-    least = splats * CARD_SPLAT_BYTES
-    if free is None or least <= free:
+    required_bytes = splats * DEVICE_SPLAT_BYTES
+    if free is None or required_bytes <= free:
         return []
-    need, there = f"{least / GIB:.1f} GiB", f"{free / GIB:.1f} GiB"
-    if asked == "cuda":
+    required, available = f"{required_bytes / GIB:.1f} GiB", f"{free / GIB:.1f} GiB"
+    if requested == "cuda":
         raise Unavailable(
-            "device", expected=f"{need} of free memory on {device.name}", got=there,
-            hint="end what else runs there, take fewer splats, smaller images or fewer channels, or take device=cpu",
+            "device", expected=f"{required} of free memory on {device.name}", got=available,
+            hint="end other programs there, lift fewer splats, smaller images or fewer channels, or take device=cpu",
         )  # fmt: skip
-    return [f"{device.name} has {there} free and the lift needs {need}: the processor lifts"]
+    return [f"{device.name} has {available} free and the lift needs {required}: the lift runs on the CPU"]
 
 
 def features_room(parts: Mapping[str, int], free: int | None) -> int | None:
-    """Bytes that X may take beside the rest; None for no limit. Beyond them it is kept in a mapped file."""
+    """Return the bytes that X may take beside the rest, beyond which it is a mapped file; None for no limit."""
     if free is None:
         return None
     return max(0, int(SPARE * free) - sum(parts.values()) + parts["features"])
 
 
 def check_memory(parts: Mapping[str, int], free: int | None) -> list[str]:
-    """What to say about the room that there is: nothing, or warnings.
+    """Return warnings about the free memory, if it is too small.
 
     Raises:
-        Unavailable: not even the codebooks fit, or there is no disk for features that do not.
+        Unavailable: even the codebooks do not fit, or the features fit neither memory nor disk.
     """
     if free is None:
         return []
-    room = features_room(parts, free)
-    there, rest = f"{free / GIB:.1f} GiB", sum(parts.values()) - parts["features"]
+    capacity = features_room(parts, free)
+    available, rest = f"{free / GIB:.1f} GiB", sum(parts.values()) - parts["features"]
     hint = "try fewer views (coverage) or fewer channels"
     if parts["codebooks"] > free:
         got = f"{parts['codebooks'] / GIB:.1f} GiB for codebooks"
-        raise Unavailable("memory", expected=f"at most the {there} that are free", got=got, hint=hint)
-    told = []
-    if room is not None and parts["features"] > room:
+        raise Unavailable("memory", expected=f"at most the {available} that are free", got=got, hint=hint)
+    warnings = []
+    if capacity is not None and parts["features"] > capacity:
         check_disk(parts["features"], "features")
         size = f"{parts['features'] / GIB:.1f} GiB"
-        told.append(f"the features, {size}, do not fit into the {there} that are free: they go through a mapped file")
+        warnings.append(
+            f"the features, {size}, do not fit into the {available} that are free: they go through a mapped file"
+        )
     if rest > SPARE * free:
-        told.append(f"the rest of the lift may take {rest / GIB:.1f} GiB and {there} are free: {hint}")
-    return told
+        warnings.append(f"the rest of the lift may take {rest / GIB:.1f} GiB and {available} are free: {hint}")
+    return warnings
 
 
 def check_weights(size: int) -> list[str]:
-    """What to say of so many bytes of region weights in the temporary folder: nothing, or a warning."""
+    """Return a warning if the temporary folder is too small for ``size`` bytes of region weights, else none."""
     got = lack_of_disk(size) if size else ""
     if not got:
         return []
-    told = f"region weights of about {size / GIB:.1f} GiB go to files in {tempfile.gettempdir()}, and there is {got}"
-    return [f"{told}: set TMPDIR to a folder with more room on a disk, or try fewer views (coverage)"]
+    message = (
+        f"region weights of about {size / GIB:.1f} GiB go to files in {tempfile.gettempdir()}, and there is {got}"
+    )
+    return [f"{message}: set TMPDIR to a folder with more room on a disk, or try fewer views (coverage)"]

@@ -1,37 +1,36 @@
-"""Which views a lift takes: what each can see, which cover the splats, and how many come near to all of them.
+"""The choice of views for a lift: the visible splats of each, the views that cover the scene, and how many suffice.
 
-**Visible** is what the raster's own projection puts into the image, on a sample of the splats: whatever it would
-blend is counted, and what other splats hide is counted too.
+**Visible** splats are those that the raster's projection puts into the image, on a sample of the splats. Occlusion is
+ignored: a splat behind others counts as visible.
 
-**Coverage.** A view's pull on a splat is its footprint's area there, as the sum of weights is about that. With
-``s_jd`` the share of splat j's area over all views that the chosen ones hold which look from the side d, views are
-chosen greedily for the largest ``sum_jd sqrt(s_jd)``: the root makes the first views of a side count more than its
-last. Sides stand for what is hidden: a footprint in the image may lie behind another, but some view from each side
-sees what can be seen.
+**Coverage.** The influence of a view on a splat is estimated by the area of its footprint, which the sum of weights
+follows. Let ``s_jd`` be the share of splat j's area over all views that lies in the chosen views from direction d.
+Views are chosen greedily for the largest ``sum_jd sqrt(s_jd)``: with the root, the first views from a direction count
+more than the last. Directions stand for occlusion: a splat may be hidden in one view, but some view from each
+direction sees what is visible from there.
 
-The gain of a view only shrinks as others are chosen. So gains are looked at lazily, from the largest that was ever
-found on: of 300 views a choice asks for the gain of a few, over ORDER_SPLATS splats.
+The gain of a view only decreases as others are chosen. So gains are evaluated lazily, in the order of the last known
+gain: of 300 views a choice evaluates a few, over ORDER_SPLATS splats.
 
-**How many.** How near the features of some views come to those of all depends on how much the views disagree, which
-no footprint says: where encoders and masks agree, a part of the views will do, and where a feature is mostly what one
-view made of it, the last view counts. Say that every view adds an error of its own, of variance v beside a feature of
-length one, and that the share q_i of a splat's weight lies in view i. Then the squared length of its feature is ``1 +
-v B`` with ``B = sum_i q_i^2`` (one over the number of views, where they weigh alike), of which ``d = v B / (1 + v
-B)`` is error, and views that hold the share s of its weight give a feature whose cosine c to that of all views is
-expected at
+**Number of views.** How near the features of some views come to those of all depends on the disagreement of views,
+which footprints do not show. Where encoders and masks agree, a part of the views suffices; where a feature depends on
+single views, each counts. Assume that every view adds an independent error of variance v to a feature of length one,
+and that view i holds the share q_i of a splat's weight. Then the squared length of its feature is ``1 + v B`` with
+``B = sum_i q_i^2`` (one over the number of views, if their weights are equal). Of this, ``d = v B / (1 + v B)`` is
+error. Views with the share s of its weight give a feature with an expected cosine c to that of all views:
 
     c^2 = s / (s + d (1 - s)).
 
-A splat that none of them shows has s = 0 and counts zero, so that coverage is no matter of its own.
+A splat in none of these views has s = 0 and c = 0, so that the mean cosine includes coverage.
 
-Before a lift, s and B are known by footprints alone: their areas stand for weights. v is not, nor what is hidden.
-Both come from PILOT_VIEWS views, spread evenly, of the whole scene at coarse pixels, by three means over the sampled
-splats, weighted by evidence: S of the squared length of what one view says of a splat, M of the squared length of
-what the pilot's views say together, and b, the B of the pilot's views alone. As ``S = m + e`` and ``M = m + e b`` for
-features of squared length m and errors of variance e, ``e = (S - M) / (1 - b)`` and ``v = e / (S - e)``. And b, the
-chance that two looks at a splat are from one view, goes up as views are left out: of K of V views it is ``B / (B + (1
-- B) (K - 1) / (V - 1))``. Solved for B, this says how many fewer views there are in truth than by their areas.
-Vectors are compared in PILOT_CHANNELS random projections.
+Before a lift, s and B are estimated by footprints: areas in place of weights. The variance v and occlusion are
+estimated from NOISE_VIEWS evenly spaced views of the full scene at coarse pixels. Three means over the sampled
+splats, weighted by evidence, are needed: S of the squared length of a single view's feature, M of the squared length
+of the combined feature of these views, and b, the B of these views. As ``S = m + e`` and ``M = m + e b`` for features
+of squared length m and errors of variance e, ``e = (S - M) / (1 - b)`` and ``v = e / (S - e)``. b is the chance that
+two observations of a splat are from one view. It rises as views are left out: for K of V views it is ``B / (B + (1 -
+B) (K - 1) / (V - 1))``. Solved for B, this corrects the B by areas for occlusion. Vectors are compared in
+NOISE_CHANNELS random projections.
 """
 
 import heapq
@@ -59,16 +58,16 @@ from liftcore.values.settings import LiftSettings
 
 SAMPLE = 16_384  # splats at most; a view of them takes a millisecond
 ORDER_SPLATS = 4_096  # at most: 300 views are in order after .3 s, where 16,384 take 1 s
-SIDES = 24  # directions that a splat is looked at from: the three of each octant
-WELL_COVERED = 8  # views that show a splat well enough to spare another one
-PILOT_SIDE = 160  # pixels of an image's longer side, about
-PILOT_CHANNELS = 64
-PILOT_VIEWS = 12
+SIDES = 24  # directions of view: three of each octant
+WELL_COVERED = 8  # views of a splat, beyond which another view is redundant
+NOISE_SIDE = 160  # pixels of an image's longer side, about
+NOISE_CHANNELS = 64
+NOISE_VIEWS = 12
 
 
 @dataclass(frozen=True)
 class Visibility:
-    """How large the sampled splats are in each view."""
+    """The areas of the sampled splats in each view."""
 
     areas: np.ndarray  # [V, n] f32, px^2 of the footprint's outline, at most the image's; 0 where it is not in it
     centres: np.ndarray  # [V, 3] f64, of the cameras, about the splats' origin as the means are
@@ -77,11 +76,11 @@ class Visibility:
 
     @property
     def in_view(self) -> np.ndarray:
-        """[V, n] bool."""
+        """[V, n] bool, True where the view can see the splat."""
         return self.areas > 0
 
     def of(self, views: Sequence[int]) -> "Visibility":
-        """The same of some views alone."""
+        """Select views."""
         return Visibility(self.areas[views], self.centres[views], self.means, self.splats)
 
     @property
@@ -91,7 +90,7 @@ class Visibility:
 
     @property
     def splats_a_view(self) -> float:
-        """How many of all splats a view can see, in the mean."""
+        """The mean number of splats, of all P, that a view can see."""
         return float(self.in_view.mean()) * self.splats
 
 
@@ -113,12 +112,12 @@ def visibility(
 
 
 def spread(total: int, count: int) -> np.ndarray:
-    """[count] i64, evenly spaced numbers below ``total``, with the first and the last."""
+    """Return [count] i64: evenly spaced numbers below ``total``, with the first and the last."""
     return np.linspace(0, total - 1, count).astype(np.int64)
 
 
 def spread_splats(splats: Splats, count: int) -> Splats:
-    """The geometry of so many evenly spaced splats, a copy."""
+    """Copy the geometry of ``count`` evenly spaced splats."""
     rows = torch.from_numpy(spread(splats.count, count))
     return replace(
         splats,
@@ -135,36 +134,36 @@ def spread_splats(splats: Splats, count: int) -> Splats:
     )
 
 
-def view_order(seen: Visibility) -> Iterator[int]:
-    """All views, the one that covers most first, then the one that adds most to it, and so on.
-
-    Of equal views the first is taken.
-    """
-    step = -(-seen.areas.shape[1] // ORDER_SPLATS)
-    areas, means = seen.areas[:, ::step], seen.means[::step]
+def view_order(visible: Visibility) -> Iterator[int]:
+    """Order all views greedily: each next view adds the most coverage; of equal views the first comes first."""
+    step = -(-visible.areas.shape[1] // ORDER_SPLATS)
+    areas, means = visible.areas[:, ::step], visible.means[::step]
     totals = areas.sum(axis=0, dtype=np.float64)
     shares = np.divide(areas, totals, out=np.zeros(areas.shape, np.float32), where=totals > 0)
-    shown = [np.flatnonzero(row) for row in shares]
-    added = [row[own] for row, own in zip(shares, shown, strict=True)]
-    places = [SIDES * own + side_of(centre - means[own]) for centre, own in zip(seen.centres, shown, strict=True)]
-    held, roots = np.zeros((2, len(means) * SIDES), np.float32)
+    splats_of = [np.flatnonzero(row) for row in shares]
+    view_shares = [row[splats] for row, splats in zip(shares, splats_of, strict=True)]
+    side_rows = [
+        SIDES * splats + side_of(centre - means[splats])
+        for centre, splats in zip(visible.centres, splats_of, strict=True)
+    ]
+    covered_area, roots = np.zeros((2, len(means) * SIDES), np.float32)
 
     def gain(view: int) -> float:
-        before = places[view]
-        return float((np.sqrt(held[before] + added[view]) - roots[before]).sum(dtype=np.float64))
+        before = side_rows[view]
+        return float((np.sqrt(covered_area[before] + view_shares[view]) - roots[before]).sum(dtype=np.float64))
 
     def take(view: int) -> None:
-        held[places[view]] += added[view]
-        roots[places[view]] = np.sqrt(held[places[view]])
+        covered_area[side_rows[view]] += view_shares[view]
+        roots[side_rows[view]] = np.sqrt(covered_area[side_rows[view]])
 
-    return greedy(len(shown), gain, take)
+    return greedy(len(splats_of), gain, take)
 
 
 def greedy(count: int, gain: Callable[[int], float], take: Callable[[int], None]) -> Iterator[int]:
-    """All numbers below ``count``, each next the one with the largest gain, of equal ones the first.
+    """Order all numbers below ``count`` greedily: each next number has the largest gain; of equal ones the first.
 
     Args:
-        gain: of a number, beside what was taken; it never grows. take: called with each number as it is taken.
+        gain: of a number, given those before it; it never grows. take: called with each number as it is chosen.
     """
     queue = [(-gain(number), number) for number in range(count)]
     heapq.heapify(queue)
@@ -180,59 +179,59 @@ def greedy(count: int, gain: Callable[[int], float], take: Callable[[int], None]
 
 
 def side_of(directions: np.ndarray) -> np.ndarray:
-    """Directions [n, 3] -> [n] i64, below SIDES: the octant, and the longest component in it."""
+    """Return the bin [n] i64, below SIDES, of directions [n, 3]: the octant, and the longest component in it."""
     octants = (directions > 0) @ np.array([1, 2, 4])
     return 3 * octants + np.abs(directions).argmax(axis=1)
 
 
-def views_to_show(seen: Visibility, order: Sequence[int], times: int) -> int:
-    """How many views of the order, one at least, show each splat ``times`` times in the mean.
+def count_covering_views(visible: Visibility, order: Sequence[int], times: int) -> int:
+    """Count the first views of the order, one at least, that see each splat ``times`` times in the mean.
 
-    All of them, when not even they do. Splats that no view shows do not count.
+    If even all of them do not, all. Splats that no view sees do not count.
     """
-    in_view = seen.in_view
-    wanted = times * int(in_view.any(axis=0).sum())
-    held = in_view.sum(axis=1)[list(order)].cumsum()
-    return min(len(order), int(np.searchsorted(held, wanted)) + 1)
+    in_view = visible.in_view
+    target = times * int(in_view.any(axis=0).sum())
+    counts = in_view.sum(axis=1)[list(order)].cumsum()
+    return min(len(order), int(np.searchsorted(counts, target)) + 1)
 
 
-def spare_views(seen: Visibility) -> list[int]:
-    """Views that could all be left out together: every splat they show is shown by WELL_COVERED others that stay.
+def spare_views(visible: Visibility) -> list[int]:
+    """List views that may all be left out: WELL_COVERED of the remaining views see every splat that they see.
 
-    They are looked for from the one that shows the fewest splats on.
+    The search begins with the view that sees the fewest splats.
     """
-    in_view = seen.in_view
+    in_view = visible.in_view
     times = in_view.sum(axis=0)
     spare = []
     for view in np.argsort(in_view.sum(axis=1), kind="stable"):
-        own = in_view[view]
-        if own.sum() == 0 or int(times[own].min()) > WELL_COVERED:
+        splats = in_view[view]
+        if splats.sum() == 0 or int(times[splats].min()) > WELL_COVERED:
             spare.append(int(view))
-            times = times - own
+            times = times - splats
     return sorted(spare)
 
 
 @dataclass(frozen=True)
 class ViewNoiseEstimate:
-    """What is expected of some of the views."""
+    """The expected errors of features by view noise, for choosing how many views to lift."""
 
     areas: np.ndarray  # [V, n] f32, of the sampled splats in all views
     errors: np.ndarray  # [n] f64, d: the share of errors in the squared lengths of the features of all views
     weights: np.ndarray  # [n] f64, the evidence of all views, in any unit
 
     def cosines(self, order: Sequence[int]) -> Iterator[float]:
-        """Of the first view of the order, of the first two, and so on: the expected mean cosine to all views."""
-        totals, held = self.areas.sum(axis=0, dtype=np.float64), np.zeros(self.areas.shape[1])
+        """Yield the expected mean cosine to all views of the first view of the order, of the first two, and so on."""
+        totals, covered_area = self.areas.sum(axis=0, dtype=np.float64), np.zeros(self.areas.shape[1])
         weights = self.weights / self.weights.sum()
         for view in order:
-            held += self.areas[view]
-            share = _ratio(held, totals).clip(max=1.0)
+            covered_area += self.areas[view]
+            share = _ratio(covered_area, totals).clip(max=1.0)
             yield float(weights @ np.sqrt(_ratio(share, share + self.errors * (1.0 - share))))
 
     def views_for(self, cosine: float, order: Sequence[int], least: int = 1) -> tuple[int, float]:
-        """How many views of the order, ``least`` or more, come to this mean cosine, and what is expected of them.
+        """Count the first views of the order, ``least`` or more, that reach a mean cosine; return their cosine too.
 
-        All of them, where no fewer do.
+        All of them if no fewer do.
         """
         expected = 1.0
         for count, expected in enumerate(self.cosines(order), start=1):
@@ -242,84 +241,98 @@ class ViewNoiseEstimate:
 
 
 def estimate_view_noise(
-    raster: Raster, views: LiftViews, settings: LiftSettings, seen: Visibility
+    raster: Raster, views: LiftViews, settings: LiftSettings, visible: Visibility
 ) -> ViewNoiseEstimate:
-    """Weigh evenly spaced views of those of which ``seen`` tells, two at least."""
-    total, count = len(views.names), min(PILOT_VIEWS, len(views.names))
-    flown: list[int] = spread(total, count).tolist()
-    chosen = views.only(views.names[view] for view in flown)
-    longest = max(max(chosen.camera(k).width, chosen.camera(k).height) for k in range(count))
-    coarse = {"stride": max(1, longest // PILOT_SIDE), "certificate_rays": 0, "robust_steps": 0, "consensus": False}
-    own = settings.model_copy(update=coarse)
+    """Estimate the noise of features from evenly spaced views, two at least; ``visible`` is of all views."""
+    total, count = len(views.names), min(NOISE_VIEWS, len(views.names))
+    sample: list[int] = spread(total, count).tolist()
+    sample_views = views.only(views.names[view] for view in sample)
+    longest = max(max(sample_views.camera(k).width, sample_views.camera(k).height) for k in range(count))
+    coarse = {"stride": max(1, longest // NOISE_SIDE), "certificate_rays": 0, "robust_steps": 0, "consensus": False}
+    coarse_settings = settings.model_copy(update=coarse)
     channels = views.features.channels
-    axes = random_axes(channels, min(PILOT_CHANNELS, channels), settings.seed)
-    rows = spread(raster.splats.count, seen.areas.shape[1])
+    axes = random_axes(channels, min(NOISE_CHANNELS, channels), settings.seed)
+    rows = spread(raster.splats.count, visible.areas.shape[1])
     with one_thread():
-        geometry = weigh_views(raster, raster.splats.count, chosen, own, silent, by_rows=False)
-        read = [view.means(view.rows.float() @ axes) for view in geometry.codebook.views]
-        said = ViewDisagreement(geometry.weights, torch.cat(read), torch.from_numpy(rows))
-    evidence = _evidence(geometry.evidence().numpy()[rows], seen.areas, seen.areas[flown])
-    if not evidence.any():  # no ray met a splat, so nothing is known of any view
-        return ViewNoiseEstimate(seen.areas, np.ones(len(evidence)), np.ones(len(evidence)))
-    variance, together = said.disagreement(evidence)
-    share = together / (together + (1.0 - together) * (total - 1) / (count - 1))  # B, in the mean
-    by_area = _ratio((seen.areas.astype(np.float64) ** 2).sum(axis=0), seen.areas.sum(axis=0, dtype=np.float64) ** 2)
-    return ViewNoiseEstimate(seen.areas, _errors(variance, by_area * share / _mean(by_area, evidence)), evidence)
+        geometry = weigh_views(raster, raster.splats.count, sample_views, coarse_settings, silent, by_rows=False)
+        means = [view.means(view.rows.float() @ axes) for view in geometry.codebook.views]
+        disagreement = ViewDisagreement(geometry.weights, torch.cat(means), torch.from_numpy(rows))
+    evidence = _evidence(geometry.evidence().numpy()[rows], visible.areas, visible.areas[sample])
+    if not evidence.any():  # no ray hits a splat: there is no estimate
+        return ViewNoiseEstimate(visible.areas, np.ones(len(evidence)), np.ones(len(evidence)))
+    variance, same_view_share = disagreement.disagreement(evidence)
+    share = same_view_share / (
+        same_view_share + (1.0 - same_view_share) * (total - 1) / (count - 1)
+    )  # B, in the mean
+    by_area = _ratio(
+        (visible.areas.astype(np.float64) ** 2).sum(axis=0), visible.areas.sum(axis=0, dtype=np.float64) ** 2
+    )
+    return ViewNoiseEstimate(visible.areas, _errors(variance, by_area * share / _mean(by_area, evidence)), evidence)
 
 
 class ViewDisagreement:
-    """What views say of some splats, in sums over the views."""
+    """Sums over views of the features that each view alone gives some splats."""
 
-    def __init__(self, W: RegionWeights, read: Tensor, rows: Tensor) -> None:
-        """Args: read: [M, C] f32, what all regions read. rows: [n] i64, the splats."""
+    def __init__(self, W: RegionWeights, means: Tensor, rows: Tensor) -> None:
+        """Args: means: [M, C] f32, features of all regions. rows: [n] i64, the splats."""
         starts, entries = W.take(rows)
         region, weight = W.region[entries], W.weight[entries]
         runs, row = W.runs(starts, region)
-        said, total = bag_sums(region, read, runs, weight).double(), segment_sums(weight, runs)
+        sums, total = bag_sums(region, means, runs, weight).double(), segment_sums(weight, runs)
         of_rows = torch.searchsorted(row, torch.arange(len(rows) + 1))
-        squares = torch.where(total > 0, said.square().sum(dim=1) / total, 0.0)
+        squares = torch.where(total > 0, sums.square().sum(dim=1) / total, 0.0)
         self.weights, self._squared_weights, self._squares = (
             segment_sums(part, of_rows).numpy() for part in (total, total.square(), squares)
         )
-        self._vectors = bag_sums(torch.arange(len(row)), said.float(), of_rows).double().numpy()
+        self._vectors = bag_sums(torch.arange(len(row)), sums.float(), of_rows).double().numpy()
 
     def means(self, weights: np.ndarray) -> tuple[float, float, float]:
-        """Means by these weights [n] of the splats, over those that a labelled ray met; one of them counts at least.
+        """Return S, M and b: means over the splats that a labelled ray hits, at least one of which has a weight.
 
-        Of the squared length of what one view says, of that of what all say together, and of b.
+        Args:
+            weights: [n], of the splats.
+
+        Returns:
+            The mean squared length of a single view's feature, that of the combined feature, and the chance that two
+            observations are from one view.
         """
-        met, total = self.weights > 0, self.weights**2
+        hit, total = self.weights > 0, self.weights**2
         means = (
             _ratio(self._squares, self.weights),
             _ratio((self._vectors**2).sum(axis=1), total),
             _ratio(self._squared_weights, total),
         )
-        alone, mean, together = (_mean(values[met], weights[met]) for values in means)
-        return alone, mean, together
+        single, combined, same_view_share = (_mean(values[hit], weights[hit]) for values in means)
+        return single, combined, same_view_share
 
     def disagreement(self, evidence: np.ndarray) -> tuple[float, float]:
-        """v, infinite where the views have nothing in common, and b, over the splats that a labelled ray met."""
+        """Return v, infinite if the views have nothing in common, and b, over the splats that a labelled ray hits."""
         if not (evidence[self.weights > 0] > 0).any():
             return np.inf, 1.0
-        alone, mean, together = self.means(evidence)
-        if together >= 1.0:
+        single, combined, same_view_share = self.means(evidence)
+        if same_view_share >= 1.0:
             return np.inf, 1.0
-        error = max(0.0, alone - mean) / (1.0 - together)
-        return (error / (alone - error) if error < alone else np.inf), together
+        error = max(0.0, single - combined) / (1.0 - same_view_share)
+        return (error / (single - error) if error < single else np.inf), same_view_share
 
 
-def _evidence(found: np.ndarray, areas: np.ndarray, flown: np.ndarray) -> np.ndarray:
-    """[n] f64, of all views, from what the flown ones found: in the same proportion to a splat's areas.
+def _evidence(sample_evidence: np.ndarray, areas: np.ndarray, sample_areas: np.ndarray) -> np.ndarray:
+    """Estimate the evidence of all views [n] f64 from that of the sample, in proportion to a splat's areas.
 
-    Splats that they do not show get the mean proportion.
+    Splats that the sample does not see get the mean proportion.
     """
-    shown = flown.sum(axis=0, dtype=np.float64)
-    light = np.divide(found, shown, out=np.full(len(found), found.sum() / max(shown.sum(), 1.0)), where=shown > 0)
-    return light * areas.sum(axis=0, dtype=np.float64)
+    area_sums = sample_areas.sum(axis=0, dtype=np.float64)
+    per_area = np.divide(
+        sample_evidence,
+        area_sums,
+        out=np.full(len(sample_evidence), sample_evidence.sum() / max(area_sums.sum(), 1.0)),
+        where=area_sums > 0,
+    )
+    return per_area * areas.sum(axis=0, dtype=np.float64)
 
 
 def _errors(variance: float, shares: np.ndarray) -> np.ndarray:
-    """d of the splats, from v and their B."""
+    """Compute d of the splats from v and their B."""
     return variance * shares / (1.0 + variance * shares) if np.isfinite(variance) else np.ones(len(shares))
 
 
@@ -327,6 +340,6 @@ def _mean(values: np.ndarray, weights: np.ndarray) -> float:
     return float((values * weights).sum() / weights.sum())
 
 
-def _ratio(values: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Nought where the others are nought."""
-    return np.divide(values, others, out=np.zeros(np.shape(values)), where=others > 0)
+def _ratio(values: np.ndarray, divisors: np.ndarray) -> np.ndarray:
+    """Divide; 0 where the divisor is 0."""
+    return np.divide(values, divisors, out=np.zeros(np.shape(values)), where=divisors > 0)

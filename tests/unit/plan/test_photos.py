@@ -11,7 +11,7 @@ import torch
 
 import liftcore as lc
 from liftcore import cli
-from liftcore.lifting.planning.photos import SEEN
+from liftcore.lifting.planning.photos import VISIBLE_SHARE
 from liftcore.lifting.planning.views import WELL_COVERED
 from liftcore.raster.reference import dense_view
 from liftcore.scene.cameras import Cameras
@@ -28,7 +28,7 @@ def test_order_and_shares_are_those_of_the_dense_definition():
     evidence = np.stack(
         [dense_view(splats, camera, CompositingParams()).A.sum(axis=0) for camera in cameras.values()]
     )
-    weight, seen = evidence.sum(axis=0), evidence >= np.maximum(SEEN * evidence.max(axis=0), 1e-12)
+    weight, seen = evidence.sum(axis=0), evidence >= np.maximum(VISIBLE_SHARE * evidence.max(axis=0), 1e-12)
     order, looks, shares = [], np.zeros(splats.count), []
     while len(order) < 9:
         gains = seen @ (weight / 2 ** (looks + 1))

@@ -13,7 +13,7 @@ from liftcore.io.inria import write_inria_cameras
 from liftcore.io.splats import write_splats
 from liftcore.lifting.files import lift_files, open_files
 from liftcore.lifting.planning.plan import FEW_VIEWS
-from liftcore.lifting.planning.views import PILOT_VIEWS, ViewNoiseEstimate, estimate_view_noise, visibility
+from liftcore.lifting.planning.views import NOISE_VIEWS, ViewNoiseEstimate, estimate_view_noise, visibility
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.scene.cameras import Cameras
 from liftcore.values.lift_views import LiftViews
@@ -138,7 +138,7 @@ def test_in_a_room_where_views_share_few_splats_a_pilot_is_right_too(tmp_path):
 def test_with_coverage_beside_it_a_cosine_takes_no_fewer_views_and_no_pilot_flies_for_few(tmp_path):
     paths = disagreeing(tmp_path / "scene", 0.3)
     counts, expected = [], []
-    for coverage in (0, 12, 20, VIEWS - PILOT_VIEWS):
+    for coverage in (0, 12, 20, VIEWS - NOISE_VIEWS):
         made = lift_files(*paths[:2], [paths[2]], LiftSettings.of(view_cosine=0.95, coverage=coverage))
         counts.append(len(made.metadata.views))
         expected.append(made.metadata.certificate["plan"]["view_cosine"])

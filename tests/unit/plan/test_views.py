@@ -12,10 +12,10 @@ from liftcore.lifting.planning.views import (
     SIDES,
     WELL_COVERED,
     Visibility,
+    count_covering_views,
     side_of,
     spare_views,
     view_order,
-    views_to_show,
     visibility,
 )
 from liftcore.raster.cpu.raster import CpuRaster
@@ -57,7 +57,7 @@ def test_whatever_a_view_blends_is_in_its_field(kernel):
 def test_chosen_views_look_from_all_sides():
     seen = visibility(random_splats(0, 80, 0.3), ring(24), CompositingParams())
     order = list(view_order(seen))
-    chosen = sorted(order[: views_to_show(seen, order, 6)])
+    chosen = sorted(order[: count_covering_views(seen, order, 6)])
     gaps = np.diff([*chosen, chosen[0] + 24])
     assert len(chosen) == 6
     assert gaps.max() <= 8  # of 24; the first six in order would leave one of 19
@@ -69,10 +69,10 @@ def test_views_are_added_until_each_splat_is_shown_often_enough_and_the_choice_r
     assert order == list(view_order(seen))
     shown = seen.in_view[:, seen.in_view.any(axis=0)]
     for times in (1, 3, 5):
-        count = views_to_show(seen, order, times)
+        count = count_covering_views(seen, order, times)
         assert shown[order[:count]].sum(axis=0).mean() >= times > shown[order[: count - 1]].sum(axis=0).mean()
-    assert views_to_show(seen, order, 0) == 1
-    assert views_to_show(seen, order, 1_000) == 12
+    assert count_covering_views(seen, order, 0) == 1
+    assert count_covering_views(seen, order, 1_000) == 12
 
 
 def test_looking_at_gains_lazily_finds_the_order_of_looking_at_all():
