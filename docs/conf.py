@@ -16,7 +16,7 @@ from fastapi.routing import APIRoute
 
 import liftcore
 import service.routes
-from liftcore.values.settings import Preset
+from liftcore.values.settings import Preset, Speed
 
 ROOT = Path(__file__).parents[1]
 
@@ -113,6 +113,17 @@ def table_of_routes() -> str:
     return table(("route", "answer"), *(rows[key] for key in sorted(rows)))
 
 
+def table_of_speeds() -> str:
+    """Return the settings that each speed sets, beside those of `exact`."""
+    speeds = {speed.value: liftcore.LiftSettings.of(speed=speed).model_dump(mode="json") for speed in Speed}
+    exact = speeds[Speed.EXACT]
+    names = [
+        name for name in exact if name != "speed" and any(values[name] != exact[name] for values in speeds.values())
+    ]
+    rows = ((f"`{speed}`", *(f"`{code(values[name])}`" for name in names)) for speed, values in speeds.items())
+    return table(("`speed`", *(f"`{name}`" for name in names)), *rows)
+
+
 def code(value: Any) -> str:
     """Return a value as people type it after `--set NAME=`."""
     return json.dumps(value).strip('"')
@@ -120,6 +131,7 @@ def code(value: Any) -> str:
 
 TABLES = {
     "settings": table_of_settings,
+    "speeds": table_of_speeds,
     "fields of a question": table_of_question,
     "public names": table_of_names,
     "routes": table_of_routes,

@@ -15,7 +15,7 @@ import pytest
 
 from liftcore import Query
 from liftcore.cli import COMMANDS, SERVICE_COMMANDS, build_parser
-from liftcore.values.settings import LiftSettings, Preset
+from liftcore.values.settings import LiftSettings, Preset, Speed
 from service.settings import ServiceSettings
 
 from .readme import (
@@ -24,6 +24,7 @@ from .readme import (
     GUIDE,
     PAGES,
     PYTHON,
+    RESULTS,
     ROOT,
     SERVICE,
     SETTINGS,
@@ -142,6 +143,17 @@ def test_every_setting_of_a_lift_is_in_the_sites_table_with_its_default() -> Non
         assert default_cell.split(" (")[0].strip("`") in (str(default), json.dumps(default)), name
         assert meaning.replace(r"\|", "|") == LiftSettings.model_fields[name].description, name
     assert rows["k"][0] == "`40` (`argmax`: `1`)" and rows["robust_steps"][0] == "`1` (the other presets: `0`)"
+
+
+def test_every_speed_is_in_the_sites_table_with_what_it_sets() -> None:
+    section = site_text(RESULTS).partition("### Speed against accuracy")[2].partition("\n### ")[0]
+    head, _, *rows = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("|")]
+    for row, speed in zip(rows, Speed, strict=True):
+        values = LiftSettings.of(speed=speed).model_dump(mode="json")
+        names = [name.strip("`") for name in head]
+        expected = [json.dumps(values[name]).strip(chr(34)) for name in names]
+        assert [cell.strip("`") for cell in row] == expected, speed
+        assert {name for name, value in LiftSettings.of(speed="exact") if values[name] != value} <= {*names}, speed
 
 
 def test_help_of_a_lift_lists_every_setting_with_its_default_and_meaning_in_a_group(
