@@ -251,7 +251,7 @@ def _other_shapes(
     """The views whose photos no scale makes as large as their cameras say, and a sentence for each kind of them."""
     across, others = [], []
     for name, header in headers.items():
-        size = header.turned if header.turns_for(sizes[name]) else header.stored
+        size = header.oriented if header.turns_for(sizes[name]) else header.stored
         if not is_stretched(size, sizes[name]):
             continue
         (across if not is_stretched((size[1], size[0]), sizes[name]) else others).append(name)

@@ -1,17 +1,17 @@
-"""glTF 2.0 with ``KHR_gaussian_splatting`` (release candidate of 2026): a point primitive with attributes a splat.
+"""glTF 2.0 with ``KHR_gaussian_splatting`` (release candidate of 2026): a point primitive with splat attributes.
 
 Positions, linear scales, linear opacities, quaternions x y z w and spherical harmonics of degree 0 to 3, which are
 ordered and signed as 3DGS has them. The frame is +Y up, +Z forward, -X right (LUF); PLYs and cameras are in right,
-down, front (RDF): half a turn about z, which is baked in, as few readers turn harmonics by a node. The node's
-transform has the origin of scenes in map coordinates, and what brings the splats to +Y up and metres, where these are
-known (`liftcore.scene.world`). ``asset.extras`` has what is known, by which our reader undoes that transform. In
-files of others +Y is up and a unit is a metre, as the format has it.
+down, front (RDF): a rotation by 180 degrees about z, which is baked in, as few readers rotate harmonics by a node.
+The node's transform has the origin of scenes in map coordinates, and the transform to +Y up and metres, where these
+are known (`liftcore.scene.world`). ``asset.extras`` stores the same, by which our reader undoes that transform. In files
+of other programs +Y is up and a unit is a metre, as the format defines.
 
 Labels are feature ids (``EXT_mesh_features``): ``_FEATURE_ID_0`` is the instance, ``_FEATURE_ID_1`` the class, 0 is
-none, and a property table each (``EXT_structural_metadata``) has a row an id. Other columns of splats are attributes
-with an underscore before their name.
+none, and a property table of each (``EXT_structural_metadata``) has a row of each id. Other columns of splats are
+attributes with an underscore before their name.
 
-What is read is in the file itself: a .glb, or a .gltf with its buffers in data URIs.
+Only the file itself is read: a .glb, or a .gltf with its buffers in data URIs.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 EXTENSION = "KHR_gaussian_splatting"
 FEATURES, METADATA = "EXT_mesh_features", "EXT_structural_metadata"
-UNDERSTOOD = {EXTENSION, FEATURES, METADATA, "KHR_mesh_quantization"}
+SUPPORTED_EXTENSIONS = {EXTENSION, FEATURES, METADATA, "KHR_mesh_quantization"}
 MAGIC, JSON_CHUNK, BINARY_CHUNK = b"glTF", b"JSON", b"BIN\0"
 MAX_JSON_BYTES = 64 << 20
 MAX_DEGREE = 3  # of harmonics
@@ -58,7 +58,7 @@ TO_FILE = np.diag([-1.0, -1.0, 1.0])  # RDF to LUF, and back
 TRANSFORM = {"matrix", "rotation", "scale", "translation"}  # of a node
 RENDER_MODE = "SplatRenderMode"
 WORLD = "splatlift_world"  # of asset.extras
-METRES = UPRIGHT.model_copy(update={"metres_per_unit": 1.0})  # of a file that says nothing else
+METRES = UPRIGHT.model_copy(update={"metres_per_unit": 1.0})  # of a file without ``WORLD``
 SRGB = "srgb_rec709_display"
 BOXES = {  # numbers of each
     "box_low": 3, "box_high": 3, "oriented_box_centre": 3, "oriented_box_axes": 9, "oriented_box_half_sizes": 3,
@@ -70,7 +70,7 @@ HINT = "export it again, or as PLY"
 
 
 def read_gltf(path: Path, *, colour: bool = True) -> Fields:
-    """The fields of all splats in a ``.glb`` or ``.gltf``, node by node, in the frame of PLYs and cameras.
+    """Read the fields of all splats in a ``.glb`` or ``.gltf``, node by node, in the frame of PLYs and cameras.
 
     Feature ids come as ``instance_id`` and ``class_id`` with 0 for none, other attributes with an underscore by their
     names, in lower case.
@@ -85,14 +85,14 @@ def read_gltf(path: Path, *, colour: bool = True) -> Fields:
 
 
 def _hint_of(extension: str) -> str:
-    """The advice for a file that needs an extension that is not read."""
+    """Return the advice for a file that needs an extension that is not read."""
     if "spz" in extension.lower():
         return "export its splats as .spz, which is read, as .ply, or as .glb without compression"
     return HINT
 
 
 def read_gltf_document(path: Path) -> dict[str, Any]:
-    """What the property tables of a file say of its feature ids: ``instances``, ``classes``, ``nodes``; may be empty.
+    """Read the property tables of feature ids: ``instances``, ``classes``, ``nodes``; may be empty.
 
     Raises:
         InvalidSplats: the file is malformed.
@@ -115,11 +115,11 @@ class _Asset:
             if length > min(MAX_JSON_BYTES, self.size - 20):
                 raise self._broken(f"at most {MAX_JSON_BYTES} bytes of JSON in the file", str(length))
             content = np.memmap(path, np.uint8, "r")
-            text, at = content[20 : 20 + length].tobytes(), 20 + length
+            text, offset = content[20 : 20 + length].tobytes(), 20 + length
             self.binary = content[:0]
-            if at + 8 <= self.size and content[at + 4 : at + 8].tobytes() == BINARY_CHUNK:
-                (own,) = struct.unpack("<I", content[at : at + 4].tobytes())
-                self.binary = content[at + 8 : at + 8 + own]
+            if offset + 8 <= self.size and content[offset + 4 : offset + 8].tobytes() == BINARY_CHUNK:
+                (binary_length,) = struct.unpack("<I", content[offset : offset + 4].tobytes())
+                self.binary = content[offset + 8 : offset + 8 + binary_length]
         else:
             if self.size > MAX_JSON_BYTES:
                 raise self._broken(f"at most {MAX_JSON_BYTES} bytes of JSON", str(self.size), "make a .glb of it")
@@ -130,20 +130,22 @@ class _Asset:
             raise self._broken("JSON", str(error)[:120]) from None
         if not isinstance(self.json, dict):
             raise self._broken("a JSON object", repr(self.json)[:40])
-        others = [name for name in map(str, self._list(self.json, "extensionsRequired")) if name not in UNDERSTOOD]
-        if others:
-            got = f"one that requires {others[0][:80]}"
-            raise self._broken("a file without extensions of others", got, _hint_of(others[0]))
+        unsupported = [
+            name for name in map(str, self._list(self.json, "extensionsRequired")) if name not in SUPPORTED_EXTENSIONS
+        ]
+        if unsupported:
+            got = f"one that requires {unsupported[0][:80]}"
+            raise self._broken("a file without other required extensions", got, _hint_of(unsupported[0]))
         self._buffers: dict[int, np.ndarray] = {}
         asset = self.json.get("asset")
         extras = asset.get("extras") if isinstance(asset, dict) else None
         self.world = world_of(extras[WORLD]) if isinstance(extras, dict) and WORLD in extras else METRES
 
     def splats(self) -> list[tuple[np.ndarray, dict[str, Any]]]:
-        """The primitives of splats with their nodes' matrices [4, 4] f64, as the scene has them."""
+        """Return the primitives of splats with their nodes' matrices [4, 4] f64, as the scene has them."""
         meshes, nodes = self._list(self.json, "meshes"), self._list(self.json, "nodes")
         scenes = self._list(self.json, "scenes")
-        chosen = self.json.get("scene", 0)
+        scene = self.json.get("scene", 0)
         inner = {
             child
             for node in nodes
@@ -153,30 +155,30 @@ class _Asset:
         }
         roots = [place for place in range(len(nodes)) if place not in inner]
         if scenes:
-            roots = self._list(self._at(scenes, chosen, "scene"), "nodes")
+            roots = self._list(self._at(scenes, scene, "scene"), "nodes")
         origin = np.linalg.inv(self.world.placement(TO_FILE, in_metres=True))
-        found, queue, visited = [], [(root, origin) for root in reversed(roots)], set[int]()
+        primitives, queue, visited = [], [(root, origin) for root in reversed(roots)], set[int]()
         while queue:
             place, above = queue.pop()
             node = self._at(nodes, place, "node")
-            if place in visited or max(len(visited), len(found)) >= MAX_NODES:
-                got = "one that meets a node twice, or more"
+            if place in visited or max(len(visited), len(primitives)) >= MAX_NODES:
+                got = "a node twice, or more nodes"
                 raise self._broken(f"a tree of at most {MAX_NODES} nodes with splats", got)
             visited.add(place)
             matrix = above @ self._matrix(node, place) if TRANSFORM & node.keys() else above
             queue += [(child, matrix) for child in reversed(self._list(node, "children"))]
             if "mesh" in node:
                 mesh = self._at(meshes, node["mesh"], "mesh")
-                found += [(matrix, one) for one in self._list(mesh, "primitives") if _is_of_splats(one)]
-        if not found:
+                primitives += [(matrix, item) for item in self._list(mesh, "primitives") if _is_of_splats(item)]
+        if not primitives:
             raise InvalidSplats(str(self.path), expected=f"splats ({EXTENSION})", got="a glTF model without any")
-        total = sum(self._count(primitive) for _, primitive in found)
+        total = sum(self._count(primitive) for _, primitive in primitives)
         if not 0 < total * SPLAT_BYTES <= MOST_GROWTH * self.size:
             raise self._broken("as many splats as the file's size can be of", str(total))
-        return found
+        return primitives
 
     def fields(self, matrix: np.ndarray, primitive: dict[str, Any], *, colour: bool) -> Fields:
-        """The fields of one primitive, with its extras and warnings."""
+        """Return the fields of one primitive, with its extras and warnings."""
         attributes, warnings = primitive["attributes"], self._require_kernel(primitive)
         count = self._count(primitive)
         try:
@@ -185,25 +187,25 @@ class _Asset:
             hint = "apply the node's transform to its splats in the program that made it"
             argument = f"{self.path} transform of a node"
             raise InvalidSplats(argument, expected=error.expected, got=error.got, hint=hint) from None
-        turn = TO_FILE @ move.rotation
+        rotation = TO_FILE @ move.rotation
 
         def read(name: str, width: int) -> np.ndarray:
             return self._attribute(attributes, name, width, count)
 
-        places = read("POSITION", 3).astype(np.float64) @ (move.scale * turn).T + TO_FILE @ move.translation
+        places = read("POSITION", 3).astype(np.float64) @ (move.scale * rotation).T + TO_FILE @ move.translation
         quats = np.roll(read(f"{EXTENSION}:ROTATION", 4).astype(np.float64), 1, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             scales = np.log(read(f"{EXTENSION}:SCALE", 3).astype(np.float64)) + np.log(move.scale)
         fields: Fields = {
             "means": places,
-            "quats": (quats @ product_matrix(turn).T).astype(np.float32),
+            "quats": (quats @ product_matrix(rotation).T).astype(np.float32),
             "log_scales": scales.astype(np.float32),
             "opacity_logits": logits(read(f"{EXTENSION}:OPACITY", 1)[:, 0]).astype(np.float32),
         }
-        said = primitive.get("extras")
+        extras = primitive.get("extras")
         mode, odd = None, ()
-        if isinstance(said, dict) and RENDER_MODE in said:
-            mode, odd = mode_of_word(said[RENDER_MODE], f"{RENDER_MODE!r} of a primitive")
+        if isinstance(extras, dict) and RENDER_MODE in extras:
+            mode, odd = mode_of_word(extras[RENDER_MODE], f"{RENDER_MODE!r} of a primitive")
         fields |= {"extras": {}, "warnings": (*warnings, *odd), "render_mode": mode}
         if not colour:
             return fields
@@ -217,50 +219,50 @@ class _Asset:
         )
         sh = np.empty((count, (degree + 1) ** 2, 3), np.float32)
         for band in range(degree + 1):
-            own = np.stack([read(harmonic_name(band, place), 3) for place in range(2 * band + 1)], axis=1)
-            sh[:, band**2 : (band + 1) ** 2] = np.einsum("ij,njc->nic", band_rotation(band, turn), own)
+            coefficients = np.stack([read(harmonic_name(band, place), 3) for place in range(2 * band + 1)], axis=1)
+            sh[:, band**2 : (band + 1) ** 2] = np.einsum("ij,njc->nic", band_rotation(band, rotation), coefficients)
         return fields | {"sh": sh, "extras": self._extras(primitive, count)}
 
     def document(self) -> dict[str, Any]:
-        """The rows of property tables that feature ids refer to, with their numbers."""
+        """Return the rows of property tables that feature ids refer to, with their numbers."""
         tables = self._list(self._extension(self.json, METADATA), "propertyTables")
-        found: dict[str, Any] = {}
+        tables_by_kind: dict[str, Any] = {}
         for _, primitive in self.splats():
-            for name, one in self._feature_sets(primitive).items():
+            for name, feature_set in self._feature_sets(primitive).items():
                 kind = KINDS[IDS.index(name)] if name in IDS else None
-                if kind is None or kind in found or "propertyTable" not in one:
+                if kind is None or kind in tables_by_kind or "propertyTable" not in feature_set:
                     continue
-                table = self._at(tables, one["propertyTable"], "property table")
-                shift = 0 if one.get("nullFeatureId") == 0 else 1
+                table = self._at(tables, feature_set["propertyTable"], "property table")
+                shift = 0 if feature_set.get("nullFeatureId") == 0 else 1
                 rows = enumerate(self._table_rows(table), shift)
-                found[kind] = [{name: number, **_document_row(row)} for number, row in rows if number]
-        return found
+                tables_by_kind[kind] = [{name: number, **_document_row(row)} for number, row in rows if number]
+        return tables_by_kind
 
     def _table_rows(self, table: dict[str, Any]) -> list[dict[str, Any]]:
         schema = self._extension(self.json, METADATA).get("schema", {})
         count, members = table.get("count"), self._at_key(self._at_key(schema, "classes"), table.get("class"))
-        own = self._at_key(table, "properties")
-        if type(count) is not int or not 0 <= count * max(len(own), 1) <= MAX_TABLE_CELLS:
+        properties = self._at_key(table, "properties")
+        if type(count) is not int or not 0 <= count * max(len(properties), 1) <= MAX_TABLE_CELLS:
             raise self._broken(f"at most {MAX_TABLE_CELLS} cells of a property table", repr(count)[:40])
         rows: list[dict[str, Any]] = [{} for _ in range(count)]
-        for key in own:
+        for key in properties:
             member = self._at_key(self._at_key(members, "properties"), key)
-            listed = member.get("array") and member.get("type") == "SCALAR" and "count" not in member
-            if listed or (not member.get("array") and member.get("type") in ("STRING", *TABLE_WIDTHS)):
-                column = self._table_column(self._at_key(own, key), member, count)
+            is_array = member.get("array") and member.get("type") == "SCALAR" and "count" not in member
+            if is_array or (not member.get("array") and member.get("type") in ("STRING", *TABLE_WIDTHS)):
+                column = self._table_column(self._at_key(properties, key), member, count)
                 for row, value in zip(rows, column, strict=True):
                     row[str(key)[:64]] = value
         return rows
 
-    def _table_column(self, own: dict[str, Any], member: dict[str, Any], count: int) -> list[Any]:
-        values = self._view(own.get("values"))
+    def _table_column(self, property_json: dict[str, Any], member: dict[str, Any], count: int) -> list[Any]:
+        values = self._view(property_json.get("values"))
         if member["type"] == "STRING":
             text = values.tobytes()
-            ends = self._ends(own, "string", count)
+            ends = self._ends(property_json, "string", count)
             return [text[low:high].decode("utf-8", "replace") for low, high in pairwise(ends)]
         width, code = TABLE_WIDTHS[member["type"]], TABLE_TYPES.get(str(member.get("componentType")), "<f4")
         if member.get("array"):
-            ends = self._ends(own, "array", count)
+            ends = self._ends(property_json, "array", count)
             if not 0 <= ends[-1] <= MAX_TABLE_CELLS:
                 raise self._broken(f"at most {MAX_TABLE_CELLS} values of a property", str(ends[-1]))
             numbers = self._typed(values, code, ends[-1])
@@ -269,70 +271,79 @@ class _Asset:
         rows: list[Any] = (numbers[:, 0] if width == 1 else numbers).tolist()
         return rows
 
-    def _ends(self, own: dict[str, Any], kind: str, count: int) -> list[int]:
-        """Where each row of a property of texts or arrays begins, and the end of the last."""
-        code = TABLE_TYPES.get(str(own.get(f"{kind}OffsetType", "UINT32")), "<u4")
-        ends = self._typed(self._view(own.get(f"{kind}Offsets")), code, count + 1).astype(np.int64)
+    def _ends(self, property_json: dict[str, Any], kind: str, count: int) -> list[int]:
+        """Return the start of each row of a property of texts or arrays, and the end of the last."""
+        code = TABLE_TYPES.get(str(property_json.get(f"{kind}OffsetType", "UINT32")), "<u4")
+        ends = self._typed(self._view(property_json.get(f"{kind}Offsets")), code, count + 1).astype(np.int64)
         if (np.diff(ends, prepend=0) < 0).any():
             raise self._broken("rows one after the other", "offsets that go back")
         rows: list[int] = ends.tolist()
         return rows
 
     def _typed(self, values: np.ndarray, code: str, count: int) -> np.ndarray:
-        needed = count * np.dtype(code).itemsize
-        if len(values) < needed:
-            raise self._broken(f"{needed} bytes of a property", str(len(values)))
-        return values[:needed].view(code)
+        required_bytes = count * np.dtype(code).itemsize
+        if len(values) < required_bytes:
+            raise self._broken(f"{required_bytes} bytes of a property", str(len(values)))
+        return values[:required_bytes].view(code)
 
     def _extras(self, primitive: dict[str, Any], count: int) -> dict[str, np.ndarray]:
         attributes = primitive["attributes"]
         if len(attributes) > MAX_ATTRIBUTES:
             raise self._broken(f"at most {MAX_ATTRIBUTES} attributes", str(len(attributes)))
         extras = {}
-        for name, one in self._feature_sets(primitive).items():
-            ids = self._attribute(attributes, f"_FEATURE_ID_{one['attribute']}", 1, count)[:, 0].astype(np.int64)
-            none = one.get("nullFeatureId") if type(one.get("nullFeatureId")) is int else -1
+        for name, feature_set in self._feature_sets(primitive).items():
+            ids = self._attribute(attributes, f"_FEATURE_ID_{feature_set['attribute']}", 1, count)[:, 0].astype(
+                np.int64
+            )
+            none = feature_set.get("nullFeatureId") if type(feature_set.get("nullFeatureId")) is int else -1
             extras[name] = (
                 np.where(ids == none, 0, ids + (none != 0)).clip(0, np.iinfo(np.int32).max).astype(np.int32)
             )
         for name, place in attributes.items():
-            plain = name[1:].lower() if name == name.upper() else name[1:]
-            is_column = COLUMN.fullmatch(plain) and not MODEL.fullmatch(plain) and plain not in extras
+            column = name[1:].lower() if name == name.upper() else name[1:]
+            is_column = COLUMN.fullmatch(column) and not MODEL.fullmatch(column) and column not in extras
             if name[:1] != "_" or name.startswith("_FEATURE_ID_") or not is_column:
                 continue
             if self._at(self._list(self.json, "accessors"), place, "accessor").get("type") == "SCALAR":
                 values = self._attribute(attributes, name, 1, count)[:, 0]
-                extras[plain] = values.astype(np.float32 if values.dtype.kind == "f" else np.int32)
+                extras[column] = values.astype(np.float32 if values.dtype.kind == "f" else np.int32)
         return extras
 
     def _feature_sets(self, primitive: dict[str, Any]) -> dict[str, dict[str, Any]]:
-        """The feature ids of attributes by the names of their columns: by their label, else by their order."""
-        found: dict[str, dict[str, Any]] = {}
+        """Return the feature ids of attributes by the names of their columns: by their label, else by their order."""
+        sets_by_column: dict[str, dict[str, Any]] = {}
         sets = self._list(self._extension(primitive, FEATURES), "featureIds")
-        of_attributes = [one for one in sets if isinstance(one, dict) and type(one.get("attribute")) is int]
-        named = {int(one["attribute"]) for one in of_attributes}
-        plain = (
+        of_attributes = [
+            feature_set
+            for feature_set in sets
+            if isinstance(feature_set, dict) and type(feature_set.get("attribute")) is int
+        ]
+        numbers = {int(feature_set["attribute"]) for feature_set in of_attributes}
+        attribute_numbers = (
             int(name[12:])
             for name in primitive["attributes"]
             if name.startswith("_FEATURE_ID_") and re.fullmatch("[0-9]{1,9}", name[12:])
         )
-        for one in [*of_attributes, *({"attribute": place} for place in sorted(plain) if place not in named)]:
-            label, place = f"{one.get('label')}_id", one["attribute"]
-            usual = IDS[place] if 0 <= place < 2 and IDS[place] not in found else f"feature_id_{place}"
-            found[label if label in IDS else usual] = one
-        return found
+        for feature_set in [
+            *of_attributes,
+            *({"attribute": place} for place in sorted(attribute_numbers) if place not in numbers),
+        ]:
+            label, place = f"{feature_set.get('label')}_id", feature_set["attribute"]
+            default = IDS[place] if 0 <= place < 2 and IDS[place] not in sets_by_column else f"feature_id_{place}"
+            sets_by_column[label if label in IDS else default] = feature_set
+        return sets_by_column
 
     def _require_kernel(self, primitive: dict[str, Any]) -> tuple[str, ...]:
         kind = self._extension(primitive, EXTENSION)
         compressed = next(iter(self._at_key(kind, "extensions")), None) if "extensions" in kind else None
-        refused = f"the extension {compressed!r}" if compressed else None
-        if kind.get("kernel") != "ellipse" and refused is None:
-            refused = f"the kernel {kind.get('kernel')!r}"
+        unsupported = f"the extension {compressed!r}" if compressed else None
+        if kind.get("kernel") != "ellipse" and unsupported is None:
+            unsupported = f"the kernel {kind.get('kernel')!r}"
         if primitive.get("mode") != 0 or "indices" in primitive:
-            refused = refused or "a primitive that is no list of points"
-        if refused:
+            unsupported = unsupported or "a primitive that is no list of points"
+        if unsupported:
             raise InvalidSplats(
-                str(self.path), expected="plain splats with the kernel 'ellipse'", got=refused[:100],
+                str(self.path), expected="plain splats with the kernel 'ellipse'", got=unsupported[:100],
                 hint=_hint_of(compressed or ""),
             )  # fmt: skip
         space = kind.get("colorSpace")
@@ -345,7 +356,10 @@ class _Asset:
         accessor = self._at(self._list(self.json, "accessors"), attributes.get(name), f"accessor of {name}")
         component, kind, normalized = (accessor.get(key) for key in ("componentType", "type", "normalized"))
         code = COMPONENTS.get(component) if type(component) is int else None
-        fits = kind in [name for name, own in WIDTHS.items() if own == width] and accessor.get("count") == count
+        fits = (
+            kind in [name for name, components in WIDTHS.items() if components == width]
+            and accessor.get("count") == count
+        )
         if code is None or not fits or "sparse" in accessor or "bufferView" not in accessor:
             raise self._broken(f"{count} rows of {width} plain numbers as {name}", repr(accessor)[:80])
         content = self._view(accessor["bufferView"])
@@ -402,8 +416,8 @@ class _Asset:
             if "matrix" in node:
                 return np.array(node["matrix"], np.float64).reshape(4, 4).T
             matrix = np.eye(4)
-            turn = np.roll(np.array(node.get("rotation", (0, 0, 0, 1)), np.float64), 1)
-            matrix[:3, :3] = rotation_matrices(turn) * np.array(node.get("scale", (1, 1, 1)), np.float64)
+            rotation = np.roll(np.array(node.get("rotation", (0, 0, 0, 1)), np.float64), 1)
+            matrix[:3, :3] = rotation_matrices(rotation) * np.array(node.get("scale", (1, 1, 1)), np.float64)
             matrix[:3, 3] = node.get("translation", (0, 0, 0))
             return matrix
         except (TypeError, ValueError, OverflowError):
@@ -411,8 +425,8 @@ class _Asset:
 
     def _extension(self, owner: dict[str, Any], name: str) -> dict[str, Any]:
         extensions = owner.get("extensions")
-        own = extensions.get(name) if isinstance(extensions, dict) else None
-        return own if isinstance(own, dict) else {}
+        extension = extensions.get(name) if isinstance(extensions, dict) else None
+        return extension if isinstance(extension, dict) else {}
 
     def _list(self, owner: Any, key: str) -> list[Any]:
         values = owner.get(key, []) if isinstance(owner, dict) else None
@@ -420,17 +434,17 @@ class _Asset:
             raise self._broken(f"a list of {key}", repr(values)[:40])
         return values
 
-    def _at(self, values: list[Any], place: Any, what: str) -> dict[str, Any]:
+    def _at(self, values: list[Any], place: Any, noun: str) -> dict[str, Any]:
         if type(place) is not int or not 0 <= place < len(values) or not isinstance(values[place], dict):
-            raise self._broken(f"a {what}", f"the number {place!r}"[:60])
+            raise self._broken(f"a {noun}", f"the number {place!r}"[:60])
         item: dict[str, Any] = values[place]
         return item
 
     def _at_key(self, owner: Any, key: Any) -> dict[str, Any]:
-        own = owner.get(key) if isinstance(owner, dict) and isinstance(key, str) else None
-        if not isinstance(own, dict):
-            raise self._broken(f"{str(key)[:40]!r} as an object", repr(own)[:40])
-        return own
+        value = owner.get(key) if isinstance(owner, dict) and isinstance(key, str) else None
+        if not isinstance(value, dict):
+            raise self._broken(f"{str(key)[:40]!r} as an object", repr(value)[:40])
+        return value
 
     def _broken(
         self, expected: str, got: str, hint: str = f"the file is truncated or damaged: {HINT}"
@@ -444,21 +458,23 @@ def _is_of_splats(primitive: Any) -> bool:
 
 
 def _document_row(row: Mapping[str, Any]) -> dict[str, Any]:
-    """A row of a property table as the document has it, with its boxes in the frame of PLYs."""
-    one = {key: value for key, value in row.items() if key not in BOXES}
-    row = {key: value for key, value in row.items() if np.size(value) == BOXES.get(key)}  # others' may be anything
+    """Return a row of a property table as the document has it, with its boxes in the frame of PLYs."""
+    document_row = {key: value for key, value in row.items() if key not in BOXES}
+    row = {
+        key: value for key, value in row.items() if np.size(value) == BOXES.get(key)
+    }  # other programs may store anything
     if {"box_low", "box_high"} <= row.keys():
         corners = np.array([row["box_low"], row["box_high"]]) @ TO_FILE
-        one["box"] = {"low": corners.min(axis=0).tolist(), "high": corners.max(axis=0).tolist()}
+        document_row["box"] = {"low": corners.min(axis=0).tolist(), "high": corners.max(axis=0).tolist()}
     if {"oriented_box_centre", "oriented_box_axes", "oriented_box_half_sizes"} <= row.keys():
         axes = np.array(row["oriented_box_axes"]).reshape(3, 3) @ TO_FILE
         centre = TO_FILE @ row["oriented_box_centre"]
-        one["oriented_box"] = {
+        document_row["oriented_box"] = {
             "centre": centre.tolist(),
             "axes": axes.tolist(),
             "half_sizes": row["oriented_box_half_sizes"],
         }
-    return one
+    return document_row
 
 
 def harmonic_name(band: int, place: int) -> str:

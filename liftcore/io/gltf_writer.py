@@ -1,4 +1,4 @@
-"""A ``.glb`` of splats with labels, whose layout `liftcore.io.gltf` tells."""
+"""Writer of a ``.glb`` of splats with labels, in the layout of `liftcore.io.gltf`."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from liftcore.scene.quaternions import product_matrix
 if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
 
-LARGEST_FILE = (1 << 32) - 1  # bytes, which a .glb counts with 32 bits
+LARGEST_FILE = (1 << 32) - 1  # bytes; a .glb stores its size in 32 bits
 IDENTITY = [1.0, 0.0, 0.0, 0.0]  # w x y z
 CODES = {np.dtype(code): number for number, code in COMPONENTS.items()}
 NEAREST = "{kernel} splats as the nearest Gaussians: the format has the kernel 'ellipse' alone"
@@ -57,7 +57,7 @@ ARRAYS = ("path", "parts")  # members with any number of values in a row
 
 
 def gltf_blocks(splats: Splats, document: Mapping[str, Any] | None = None) -> Iterator[bytes]:
-    """The bytes of a ``.glb`` of any splats (`gaussian_rows`), in blocks, with their extras and what these mean.
+    """Yield the bytes of a ``.glb`` of any splats (`gaussian_rows`), with their extras and the labels' document.
 
     Harmonics above degree 3 are left out; 2DGS and DBS become the nearest Gaussians, which ``asset.extras`` says.
 
@@ -65,7 +65,7 @@ def gltf_blocks(splats: Splats, document: Mapping[str, Any] | None = None) -> It
         splats: P. document: of `liftcore.io.labels`; None: splats without labels.
 
     Raises:
-        InvalidSplats: the file would take more bytes than the format counts, or it does not hold the columns.
+        InvalidSplats: the file would be too large for the format, or cannot store the columns.
     """
     binary, columns = _Binary(), stored_columns(splats)
     sets = [name for name in IDS if name in columns]
@@ -95,7 +95,7 @@ def gltf_blocks(splats: Splats, document: Mapping[str, Any] | None = None) -> It
 
 
 def _transform(splats: Splats) -> dict[str, Any]:
-    """The transform of the node, which brings the splats to +Y up and metres, as far as these are known."""
+    """Return the node's transform to +Y up and metres, as far as these are known."""
     world, parts = splats.world, dict[str, Any]()
     if (turn := world.upright(TO_FILE)).tolist() != IDENTITY:
         parts["rotation"] = np.roll(turn, -1).tolist()
@@ -116,24 +116,24 @@ class _Binary:
         self.views: list[dict[str, Any]] = []
         self.accessors: list[dict[str, Any]] = []
 
-    def view(self, content: bytes, **more: Any) -> int:
-        """The number of a new buffer view."""
-        self.views.append({"buffer": 0, "byteOffset": self.size, "byteLength": len(content), **more})
+    def view(self, content: bytes, **members: Any) -> int:
+        """Add a buffer view, and return its number."""
+        self.views.append({"buffer": 0, "byteOffset": self.size, "byteLength": len(content), **members})
         self.parts.append(content + b"\0" * (-len(content) % 8))
         self.size += len(self.parts[-1])
         return len(self.views) - 1
 
-    def attribute(self, values: np.ndarray, **more: Any) -> int:
-        """The number of a new accessor of values [P] or [P, n]; elements begin at multiples of 4 bytes."""
+    def attribute(self, values: np.ndarray, **members: Any) -> int:
+        """Add an accessor of values [P] or [P, n], aligned to 4 bytes, and return its number."""
         width = 1 if values.ndim == 1 else values.shape[1]
-        used = width * values.itemsize
-        stride = used + -used % 4
+        row_bytes = width * values.itemsize
+        stride = row_bytes + -row_bytes % 4
         rows = np.zeros((len(values), stride), np.uint8)
-        rows[:, :used] = np.ascontiguousarray(values).view(np.uint8).reshape(len(values), used)
+        rows[:, :row_bytes] = np.ascontiguousarray(values).view(np.uint8).reshape(len(values), row_bytes)
         view = self.view(rows.tobytes(), target=34962, byteStride=stride)
-        kind = next(name for name, own in WIDTHS.items() if own == width)
+        kind = next(name for name, components in WIDTHS.items() if components == width)
         accessor = {"bufferView": view, "componentType": CODES[values.dtype], "count": len(values), "type": kind}
-        self.accessors.append(accessor | more)
+        self.accessors.append(accessor | members)
         return len(self.accessors) - 1
 
 
@@ -142,36 +142,36 @@ def _primitive(
 ) -> dict[str, Any]:
     rows = list(gaussian_rows(splats))
 
-    def joined(name: str) -> np.ndarray:
-        return np.concatenate([getattr(some, name) for some in rows])
+    def concatenate(name: str) -> np.ndarray:
+        return np.concatenate([getattr(block, name) for block in rows])
 
     means, opacities, colours = (
-        (joined("means") * np.diag(TO_FILE)).astype("<f4"),
-        joined("opacities"),
-        joined("colours"),
+        (concatenate("means") * np.diag(TO_FILE)).astype("<f4"),
+        concatenate("opacities"),
+        concatenate("colours"),
     )
     sh = None if splats.sh is None else splats.sh.cpu().numpy()
     sh = constant_terms(colours)[:, None] if sh is None else sh[:, : (MAX_DEGREE + 1) ** 2]
-    shown = colours.clip(0, 1)
-    linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+    srgb = colours.clip(0, 1)
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     extents = {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
-    quats = np.roll(joined("quats") @ product_matrix(TO_FILE).T, -1, axis=1)
+    quats = np.roll(concatenate("quats") @ product_matrix(TO_FILE).T, -1, axis=1)
     attributes = {
         "POSITION": binary.attribute(means, **extents),
-        "COLOR_0": binary.attribute(  # for viewers that know points alone
+        "COLOR_0": binary.attribute(  # for viewers that draw points only
             np.round(255 * np.column_stack([linear, opacities])).astype("<u1"), normalized=True
         ),
         f"{EXTENSION}:ROTATION": binary.attribute(quats.astype("<f4")),
-        f"{EXTENSION}:SCALE": binary.attribute(joined("scales").astype("<f4")),
+        f"{EXTENSION}:SCALE": binary.attribute(concatenate("scales").astype("<f4")),
         f"{EXTENSION}:OPACITY": binary.attribute(opacities.astype("<f4")),
     }
     for band in range(round(sh.shape[1] ** 0.5)):
-        own = np.einsum("ij,njc->nic", band_rotation(band, TO_FILE), sh[:, band**2 : (band + 1) ** 2])
+        coefficients = np.einsum("ij,njc->nic", band_rotation(band, TO_FILE), sh[:, band**2 : (band + 1) ** 2])
         for place in range(2 * band + 1):
-            attributes[harmonic_name(band, place)] = binary.attribute(own[:, place].astype("<f4"))
+            attributes[harmonic_name(band, place)] = binary.attribute(coefficients[:, place].astype("<f4"))
     for name, column in columns.items():
-        plain = f"_{name.upper() if name == name.lower() else name}"
-        attribute = f"_FEATURE_ID_{sets.index(name)}" if name in sets else plain
+        attribute_name = f"_{name.upper() if name == name.lower() else name}"
+        attribute = f"_FEATURE_ID_{sets.index(name)}" if name in sets else attribute_name
         if attribute in attributes:
             expected = "names that differ in more than their case, and are no feature_id_0"
             raise InvalidSplats("columns", expected=expected, got=f"a second {attribute}")
@@ -179,12 +179,12 @@ def _primitive(
     kind = {"kernel": "ellipse", "colorSpace": SRGB, "projection": "perspective", "sortingMethod": "cameraDistance"}
     primitive: dict[str, Any] = {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: kind}}
     if splats.antialiased:
-        primitive["extras"] = {RENDER_MODE: "mip"}  # as PLYs say it; the format has no word for it
+        primitive["extras"] = {RENDER_MODE: "mip"}  # as in PLYs; the format has no property for it
     return primitive
 
 
 def _attribute_values(name: str, column: np.ndarray) -> np.ndarray:
-    """A column [P] of a type that attributes have: whole numbers of 16 bits at most, or f32.
+    """Convert a column [P] to a type that attributes have: integers of at most 16 bits, or f32.
 
     Raises:
         InvalidSplats: whole numbers too large for float32.
@@ -211,38 +211,38 @@ def _feature_set(columns: Mapping[str, np.ndarray], name: str, sets: Sequence[st
 def _add_tables(
     binary: _Binary, columns: Mapping[str, np.ndarray], document: Mapping[str, Any], sets: Sequence[str]
 ) -> dict[str, Any]:
-    """The property tables of instances, classes and nodes: a row an id, the first of which is that of none."""
+    """Add the property tables of instances, classes and nodes: a row of each id, and a first one for 0, none."""
     tables, classes = [], {}
     for name, kind in zip(IDS, KINDS, strict=True):
         if name not in sets:
             continue
         count = int(columns[name].max()) + 1
-        rows = [_table_row(one) for one in rows_by_id(dict(document), kind)]
+        rows = [_table_row(document_row) for document_row in rows_by_id(dict(document), kind)]
         rows += [{}] * (count - len(rows))
         label, present = name.removesuffix("_id"), {key for row in rows for key in row}
-        whole = {
+        complete = {
             key for key in present if all(key in row for row in rows[1:] if row)
-        }  # scores that some lack are left out
-        members = {key: own for key, own in MEMBERS.items() if key in whole}
+        }  # properties that some rows lack are left out
+        members = {key: types for key, types in MEMBERS.items() if key in complete}
         properties = {key: _add_property(binary, key, rows) for key in members}
         tables.append({"name": kind, "class": label, "count": len(rows), "properties": properties})
-        described = {
+        schemas = {
             key: {"type": kind}
             | ({"componentType": component} if component else {})
             | ({"array": True} if key in ARRAYS else {})
             for key, (kind, component) in members.items()
         }
-        classes[label] = {"name": label, "properties": described}
+        classes[label] = {"name": label, "properties": schemas}
     return {"schema": {"id": "splatlift", "classes": classes}, "propertyTables": tables}
 
 
-def _table_row(one: Mapping[str, Any]) -> dict[str, Any]:
-    """A row of the document as one of a property table, with its boxes in the file's frame."""
-    row = {key: value for key, value in one.items() if key in MEMBERS and value is not None}
-    if box := one.get("box"):
+def _table_row(document_row: Mapping[str, Any]) -> dict[str, Any]:
+    """Convert a row of the document to one of a property table, with its boxes in the file's frame."""
+    row = {key: value for key, value in document_row.items() if key in MEMBERS and value is not None}
+    if box := document_row.get("box"):
         corners = np.array([box["low"], box["high"]]) @ TO_FILE
         row |= {"box_low": corners.min(axis=0), "box_high": corners.max(axis=0)}
-    if box := one.get("oriented_box"):
+    if box := document_row.get("oriented_box"):
         axes = np.array(box["axes"]) @ TO_FILE  # rows; of MAT3 they are columns
         row |= {"oriented_box_centre": TO_FILE @ box["centre"], "oriented_box_axes": axes.ravel()}
         row |= {"oriented_box_half_sizes": box["half_sizes"]}

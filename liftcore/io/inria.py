@@ -15,7 +15,7 @@ KEEP = "keep these cameras as a COLMAP model or transforms.json"
 
 
 def parse_inria(document: Any, source: str) -> Cameras:
-    """The cameras of a cameras.json document; the format puts the principal point at the image's centre.
+    """Parse a cameras.json document; the format puts the principal point at the image's centre.
 
     Raises:
         InvalidCameras: a key is missing or malformed.
@@ -35,12 +35,14 @@ def parse_inria(document: Any, source: str) -> Cameras:
 
 
 def _cameras(name: str, record: dict[str, Any], source: str) -> list[Camera]:
-    where = f"{source} camera {name!r}"
-    width, height = (pixels(entry(record, key, where), f"{where} {key}") for key in ("width", "height"))
-    fx, fy = (number(entry(record, key, where), f"{where} {key}") for key in ("fx", "fy"))
+    camera_source = f"{source} camera {name!r}"
+    width, height = (
+        pixels(entry(record, key, camera_source), f"{camera_source} {key}") for key in ("width", "height")
+    )
+    fx, fy = (number(entry(record, key, camera_source), f"{camera_source} {key}") for key in ("fx", "fy"))
     with pose_from():
-        rotation = matrix(entry(record, "rotation", where), (3,), 3, f"{where} rotation")
-        (position,) = matrix([entry(record, "position", where)], (1,), 3, f"{where} position")
+        rotation = matrix(entry(record, "rotation", camera_source), (3,), 3, f"{camera_source} rotation")
+        (position,) = matrix([entry(record, "position", camera_source)], (1,), 3, f"{camera_source} position")
     pose = viewmat_of(rotation, position)
     return [Camera.pinhole(name, width, height, fx, fy, width / 2, height / 2, viewmat=pose)]
 
@@ -49,7 +51,7 @@ def write_inria_cameras(cameras: Cameras, path: Path) -> None:
     """Write cameras.json, whole or not at all.
 
     Raises:
-        InvalidCameras: a photo is distorted, or its principal point off the centre, which the format cannot say.
+        InvalidCameras: a photo is distorted, or its principal point off the centre, which the format cannot store.
     """
     records = [_record(i, camera) for i, camera in enumerate(cameras.values())]
     with whole_file(path) as handle:

@@ -1,4 +1,4 @@
-"""JSON: camera files read under a limit, with numbers that say where they were wrong, and numbers that it can say."""
+"""JSON: camera files read under a limit, checked values with their place in errors, and finite output."""
 
 import json
 import math
@@ -16,7 +16,7 @@ FORMATS = "an object with 'frames' (nerfstudio) or a list of cameras with 'img_n
 
 
 def read_json(path: Path) -> Any:
-    """The document in a JSON file of at most 64 MiB.
+    """Read the document in a JSON file of at most 64 MiB.
 
     Raises:
         InvalidCameras: the file does not open, is too large or is not JSON.
@@ -37,7 +37,7 @@ def read_json(path: Path) -> Any:
 
 
 def entry(record: Any, key: str, source: str) -> Any:
-    """The value of a key that must be there."""
+    """Return the value of a required key."""
     if not isinstance(record, dict) or key not in record:
         got = "an object without it" if isinstance(record, dict) else type(record).__name__
         raise InvalidCameras(source, expected=f"an object with {key!r}", got=got)
@@ -45,17 +45,17 @@ def entry(record: Any, key: str, source: str) -> Any:
 
 
 def number(value: Any, source: str) -> float:
-    """A finite number."""
+    """Check that a value is a finite number, and return it as float."""
     try:
         if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
             return float(value)
     except OverflowError:
-        pass  # an integer beyond every float is as wrong as infinity
+        pass  # an integer beyond every float is refused as infinity is
     raise InvalidCameras(source, expected="a finite number", got=repr(value)[:60])
 
 
 def pixels(value: Any, source: str) -> int:
-    """A whole number of pixels; 990.0 counts as 990."""
+    """Check that a value is a whole number of pixels; 990.0 counts as 990."""
     count = number(value, source)
     if count != int(count):
         raise InvalidCameras(source, expected="a whole number of pixels", got=repr(value)[:60])
@@ -63,16 +63,16 @@ def pixels(value: Any, source: str) -> int:
 
 
 def matrix(value: Any, rows: tuple[int, ...], columns: int, source: str) -> np.ndarray:
-    """[r, columns] f64 of nested lists, for any allowed number of rows r."""
+    """Convert nested lists to a matrix [r, columns] f64, r being one of ``rows``."""
     shaped = isinstance(value, list) and len(value) in rows
     if not shaped or not all(isinstance(row, list) and len(row) == columns for row in value):
-        wanted = " or ".join(f"{count}x{columns}" for count in rows)
-        raise InvalidCameras(source, expected=f"a {wanted} matrix as nested lists", got=repr(value)[:60])
+        shapes = " or ".join(f"{count}x{columns}" for count in rows)
+        raise InvalidCameras(source, expected=f"a {shapes} matrix as nested lists", got=repr(value)[:60])
     return np.array([[number(cell, source) for cell in row] for row in value])
 
 
 def finite(value: Any) -> Any:
-    """The value with null for infinities and what is no number, at any depth of mappings, lists and tuples."""
+    """Replace infinities and NaN with null, at any depth of mappings, lists and tuples."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):

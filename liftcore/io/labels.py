@@ -1,10 +1,10 @@
-"""What every splat is, as files keep it: a number or two a splat, and a document of what these mean.
+"""Labels of splats in files: columns of ids and scores, and a document that describes the ids.
 
-The columns of a splat are ``class_id``, ``instance_id`` and ``node_id``, from 1 with 0 for none, ``score`` and
-``confidence``; a file may have others. They are `Splats.extras` of splats that are read or written. The document has
-``classes``, ``instances`` and ``nodes``, each a list of objects whose ``class_id``, ``instance_id`` or ``node_id`` is
-that of the columns, with their names, scores, colours, boxes and questions (docs/formats.md). A splat's node is the
-smallest; it is of all others of that node's ``path``, too.
+The columns are ``class_id``, ``instance_id`` and ``node_id``, from 1 with 0 for none, ``score`` and ``confidence``; a
+file may have others. They are `Splats.extras` of splats that are read or written. The document has ``classes``,
+``instances`` and ``nodes``, each a list of objects whose ``class_id``, ``instance_id`` or ``node_id`` is that of the
+columns, with their names, scores, colours, boxes and queries (docs/formats.md). ``node_id`` is the smallest node that
+has the splat; the splat belongs to all nodes of that node's ``path``.
 """
 
 from __future__ import annotations
@@ -34,32 +34,32 @@ KINDS = ("instances", "classes", "nodes")  # of the document, by the columns abo
 
 @dataclass(frozen=True)
 class Labels:
-    """Columns of splats, and the document that says what their numbers mean."""
+    """Columns of splats, and the document that describes their ids."""
 
     columns: dict[str, np.ndarray]  # name -> [P] i32 or f32
     document: dict[str, Any]
 
-    def chosen(self, rows: np.ndarray) -> Labels:
-        """The labels of the rows that a mask [P] chooses, with what the document says of those alone."""
+    def subset(self, rows: np.ndarray) -> Labels:
+        """Return the labels of the rows of a mask [P], with the document's entries of these alone."""
         columns = {name: values[rows] for name, values in self.columns.items()}
-        left = {name: set(np.unique(columns[name]).tolist()) for name in IDS if name in columns}
-        if "node_id" in left:  # a node is left with any of its parts
-            paths = (one["path"] for one in self.document["nodes"] if one["node_id"] in left["node_id"])
-            left["node_id"] = {number for path in paths for number in path}
+        ids = {name: set(np.unique(columns[name]).tolist()) for name in IDS if name in columns}
+        if "node_id" in ids:  # a node stays if any of its parts does
+            paths = (row["path"] for row in self.document["nodes"] if row["node_id"] in ids["node_id"])
+            ids["node_id"] = {number for path in paths for number in path}
         document = self.document | {"splats": int(np.count_nonzero(rows))}
         for name, kind in zip(IDS, KINDS, strict=True):
-            if name in left:
-                document[kind] = [one for one in self.document.get(kind, []) if one.get(name) in left[name]]
+            if name in ids:
+                document[kind] = [row for row in self.document.get(kind, []) if row.get(name) in ids[name]]
         return Labels(columns, document)
 
 
 def id_column(values: np.ndarray) -> np.ndarray:
-    """[P] i32, ids [P] of any type; what is no number from 1 to 2^31 - 1 is 0, none."""
+    """Convert ids [P] of any type to i32; any other than a number from 1 to 2^31 - 1 becomes 0, none."""
     return np.where((values >= 1) & (values <= np.iinfo(np.int32).max), values, 0).astype(np.int32)
 
 
 def stored_columns(splats: Splats) -> dict[str, np.ndarray]:
-    """The extras of splats without normals, each [P] i32 or f32, as formats with columns of 32 bits hold them.
+    """Return the extras of splats without normals, each [P] i32 or f32, as formats with columns of 32 bits hold them.
 
     Raises:
         InvalidSplats: whole numbers need more bits, or the columns are too many.
@@ -83,32 +83,32 @@ def stored_columns(splats: Splats) -> dict[str, np.ndarray]:
 
 
 def document_bytes(labels: Labels) -> bytes:
-    """The document as a JSON file."""
+    """Return the document as a JSON file."""
     return json.dumps(labels.document, ensure_ascii=False, indent=1).encode() + b"\n"
 
 
-# What JSON leaves as it is, and readers of lines take for the end of one
-LINE_ENDS = {ord(one): f"\\u{ord(one):04x}" for one in "\x85\u2028\u2029"}
+# Characters that JSON does not escape, and that readers of lines take for line ends
+LINE_ENDS = {ord(character): f"\\u{ord(character):04x}" for character in "\x85\u2028\u2029"}
 
 
 def document_lines(labels: Labels) -> bytes:
-    """The instances, or the nodes where there are any, as JSON Lines: a line each, with all that is said of it."""
+    """Return the nodes if there are any, else the instances, as JSON Lines with the shared entries on each line."""
     names = ("format", "made_by", "frame", "world", "unit")
-    whole = {name: labels.document[name] for name in names if name in labels.document}
-    listed = labels.document.get("nodes") or labels.document.get("instances", [])
-    rows = (json.dumps(one | whole, ensure_ascii=False).translate(LINE_ENDS) for one in listed)
+    shared = {name: labels.document[name] for name in names if name in labels.document}
+    objects = labels.document.get("nodes") or labels.document.get("instances", [])
+    rows = (json.dumps(item | shared, ensure_ascii=False).translate(LINE_ENDS) for item in objects)
     return "".join(f"{row}\n" for row in rows).encode()
 
 
 def rows_by_id(document: dict[str, Any], kind: str) -> list[dict[str, Any]]:
-    """The rows of one of KINDS where their numbers are their places; an empty one where is none."""
+    """Return the rows of one of KINDS, indexed by their ids; an empty row for an id without one."""
     name = IDS[KINDS.index(kind)]
-    rows = {one[name]: one for one in document.get(kind, [])}
+    rows = {row[name]: row for row in document.get(kind, [])}
     return [rows.get(place, {}) for place in range(max(rows, default=0) + 1)]
 
 
 def read_document(path: Path) -> dict[str, Any]:
-    """The document of a JSON file; empty where there is none of its format, or no such file."""
+    """Return the document of a JSON file; empty where there is none of its format, or no such file."""
     try:
         with open_regular(path) as handle:
             document = json.loads(handle.read(MAX_DOCUMENT_BYTES))

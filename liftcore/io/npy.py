@@ -1,4 +1,4 @@
-"""Arrays in files from strangers: NumPy's, mapped and never unpickled, and tensors of torch, read as tensors only."""
+"""Arrays in untrusted files: NumPy's, mapped and never unpickled, and tensors of torch, loaded as weights only."""
 
 import math
 from pathlib import Path
@@ -13,12 +13,12 @@ from liftcore.io.files import BROKEN_ZIP, open_regular, open_zip
 if TYPE_CHECKING:
     from torch import Tensor
 
-# Version 3 is for named columns only, which no array of numbers has.
+# Version 3 is for structured arrays only.
 READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-# What NumPy raises over a header that is no Python literal, besides its own ValueError.
+# Errors of NumPy for a header that is no Python literal, besides its own ValueError.
 PARSE_ERRORS = (ValueError, TypeError, SyntaxError, EOFError, RecursionError, MemoryError, TokenError)
 NUMBERS = "fiu"  # kinds of NumPy: floats, integers, unsigned integers
-BFLOAT16 = np.dtype("V2")  # what NumPy, which has none, makes of them
+BFLOAT16 = np.dtype("V2")  # NumPy has no bfloat16, and reads it as this
 MOST_UNZIPPED_BYTES = 1 << 32  # of the array of a .npz
 ARRAYS, TENSORS = (".npy", ".npz"), (".pt", ".pth")
 HINT = "save plain arrays with numpy.save"
@@ -26,7 +26,7 @@ Values = TypeVar("Values", np.ndarray, "Tensor")
 
 
 def open_array(path: Path, kinds: str = NUMBERS) -> np.ndarray:
-    """The array of a ``.npy`` file, the only one of a ``.npz`` file, or the tensor of a ``.pt`` or ``.pth`` file.
+    """Open the array of a ``.npy`` file, the only one of a ``.npz``, or the tensor of a ``.pt`` or ``.pth`` file.
 
     Raises:
         InvalidFeatures: as `open_npy`; a ``.npz`` of several arrays, or a ``.pt`` that holds more than a tensor.
@@ -37,7 +37,7 @@ def open_array(path: Path, kinds: str = NUMBERS) -> np.ndarray:
 
 
 def open_npy(path: Path, kinds: str = NUMBERS) -> np.ndarray:
-    """Map a ``.npy`` file of numbers, or of what else ``kinds`` allows, in NumPy's letters.
+    """Map a ``.npy`` file whose dtype is one of ``kinds``, in NumPy's letters.
 
     Raises:
         InvalidFeatures: the file is no ``.npy`` file, holds Python objects, or has another size than it says.
@@ -47,8 +47,8 @@ def open_npy(path: Path, kinds: str = NUMBERS) -> np.ndarray:
             size = handle.seek(0, 2)
             handle.seek(0)
             dtype = _check_header(handle, size, path, kinds)
-        found = np.load(path, mmap_mode="r", allow_pickle=False)
-        return _widened(found) if dtype == BFLOAT16 else found
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+        return _widened(array) if dtype == BFLOAT16 else array
     except OSError as error:
         got = f"one that does not open ({error.strerror})"
         raise InvalidFeatures(str(path), expected="a .npy file", got=got) from None
@@ -57,7 +57,7 @@ def open_npy(path: Path, kinds: str = NUMBERS) -> np.ndarray:
 
 
 def _check_header(handle: IO[bytes], size: int, path: Path, kinds: str) -> np.dtype[Any]:
-    """The type of an array of so many bytes in all, at whose data the handle then is."""
+    """Check the header of a file of ``size`` bytes, leave the handle at the data, and return the dtype."""
     version = np.lib.format.read_magic(handle)
     if version not in READERS:
         raise ValueError(f"format version {version}")
@@ -72,7 +72,7 @@ def _check_header(handle: IO[bytes], size: int, path: Path, kinds: str) -> np.dt
 
 
 def _widened(stored: np.ndarray) -> np.ndarray:
-    """Floats of 16 bits with eight of exponent as f32, whose upper half they are."""
+    """Convert bfloat16, the upper half of a float32, to f32."""
     return (stored.view(np.uint16).astype(np.uint32) << 16).view(np.float32)
 
 
@@ -87,16 +87,16 @@ def _read_npz(path: Path, kinds: str) -> np.ndarray:
         with open_zip(path) as archive:
             members = archive.infolist()
             if len(members) != 1:
-                some = ", ".join(repr(member.filename[:40]) for member in members[:3])
-                raise InvalidFeatures(str(path), expected=expected, got=f"{len(members)}: {some}")
+                file_names = ", ".join(repr(member.filename[:40]) for member in members[:3])
+                raise InvalidFeatures(str(path), expected=expected, got=f"{len(members)}: {file_names}")
             if members[0].file_size > MOST_UNZIPPED_BYTES:
                 got = f"{members[0].file_size} bytes"
                 raise InvalidFeatures(str(path), expected=f"at most {MOST_UNZIPPED_BYTES} bytes", got=got)
             with archive.open(members[0]) as handle:
                 dtype = _check_header(handle, members[0].file_size, path, kinds)
             with archive.open(members[0]) as handle:
-                found = np.lib.format.read_array(handle, allow_pickle=False)
-            return _widened(found) if dtype == BFLOAT16 else found
+                array = np.lib.format.read_array(handle, allow_pickle=False)
+            return _widened(array) if dtype == BFLOAT16 else array
     except (*BROKEN_ZIP, *PARSE_ERRORS) as error:
         raise _unparsed(path, expected, error) from None
 
@@ -109,53 +109,53 @@ def _read_tensor(path: Path, kinds: str) -> np.ndarray:
     try:
         with open_regular(path):
             pass
-        found = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except Exception as error:  # unpickling fails in many kinds
+        tensor = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except Exception as error:  # unpickling raises errors of many types
         got = f"one that holds more than tensors, or is damaged ({str(error).splitlines()[0][:100]})"
         raise InvalidFeatures(str(path), expected=expected, got=got, hint=hint) from None
-    if not isinstance(found, torch.Tensor):
-        raise InvalidFeatures(str(path), expected=expected, got=type(found).__name__, hint=hint)
-    if found.layout != torch.strided or found.is_quantized or found.device.type != "cpu":
-        raise InvalidFeatures(str(path), expected=expected, got=f"a tensor of {found.layout}", hint=hint)
+    if not isinstance(tensor, torch.Tensor):
+        raise InvalidFeatures(str(path), expected=expected, got=type(tensor).__name__, hint=hint)
+    if tensor.layout != torch.strided or tensor.is_quantized or tensor.device.type != "cpu":
+        raise InvalidFeatures(str(path), expected=expected, got=f"a tensor of {tensor.layout}", hint=hint)
     # A tensor may repeat a few numbers of the file without end.
-    if found.untyped_storage().nbytes() < found.numel() * found.element_size() or not found.numel():
-        got = f"{list(found.shape)} of {found.untyped_storage().nbytes()} bytes"
+    if tensor.untyped_storage().nbytes() < tensor.numel() * tensor.element_size() or not tensor.numel():
+        got = f"{list(tensor.shape)} of {tensor.untyped_storage().nbytes()} bytes"
         raise InvalidFeatures(str(path), expected="a tensor with all of its numbers", got=got, hint=hint)
-    found = found.detach().resolve_conj().resolve_neg()
-    array = (found.float() if found.dtype == torch.bfloat16 else found).numpy()
+    tensor = tensor.detach().resolve_conj().resolve_neg()
+    array = (tensor.float() if tensor.dtype == torch.bfloat16 else tensor).numpy()
     if array.dtype.kind not in kinds:
-        raise InvalidFeatures(str(path), expected="an array of numbers", got=str(found.dtype), hint=hint)
+        raise InvalidFeatures(str(path), expected="an array of numbers", got=str(tensor.dtype), hint=hint)
     return array
 
 
 def without_unit_axes(stored: Values, dimensions: int) -> Values:
-    """The array without axes of length 1 that stand before so many dimensions, such as that of a batch of one."""
+    """Remove leading axes of length 1 beyond ``dimensions``, such as that of a batch of one."""
     extra = max(stored.ndim - dimensions, 0)
     before = next((k for k, side in enumerate(stored.shape[:extra]) if side != 1), extra)
     return stored.reshape(tuple(stored.shape[before:])) if before else stored
 
 
 def read_floats(path: Path, axes: str) -> np.ndarray:
-    """An array of floats of such axes, "M, F": f16, or f32 where it is stored wider; perhaps not finite.
+    """Read an array of floats with axes such as "M, F": f16, or f32 if it is stored wider; perhaps not finite.
 
-    Axes of length 1 before them are taken off.
+    Leading axes of length 1 are removed.
 
     Raises:
         InvalidFeatures: as `open_array`, or it has other axes or no floats.
     """
     stored = open_array(path)
-    found = without_unit_axes(stored, len(axes.split()))
-    if found.ndim == 3 and found.shape[1] == 1 and axes == "M, F":  # a vector each of M batches of one
-        found = found[:, 0]
-    if found.ndim != len(axes.split()) or found.dtype.kind != "f" or found.dtype.itemsize > 8:
+    array = without_unit_axes(stored, len(axes.split()))
+    if array.ndim == 3 and array.shape[1] == 1 and axes == "M, F":  # a vector each of M batches of one
+        array = array[:, 0]
+    if array.ndim != len(axes.split()) or array.dtype.kind != "f" or array.dtype.itemsize > 8:
         got, hint = f"{stored.dtype} {list(stored.shape)}", ""
-        if found.ndim > len(axes.split()):
-            hint = f"a file is of one view: save each of the {len(found)} under its own name"
-            hint = f"{hint}, or take the last axis off: array[..., 0]" if found.shape[-1] == 1 else hint
-        elif found.ndim < len(axes.split()):
+        if array.ndim > len(axes.split()):
+            hint = f"a file is of one view: save each of the {len(array)} under its own name"
+            hint = f"{hint}, or take the last axis off: array[..., 0]" if array.shape[-1] == 1 else hint
+        elif array.ndim < len(axes.split()):
             hint = f"give it its axes before it is saved: array.reshape({axes})"
-        elif found.dtype.kind in "iu":
+        elif array.dtype.kind in "iu":
             hint = "save what the integers stand for, times their scale: array.astype(numpy.float32)"
         raise InvalidFeatures(str(path), expected=f"floats [{axes}]", got=got, hint=hint)
-    with np.errstate(over="ignore"):  # becomes infinite, and is refused as such where values are made
-        return found.astype(np.float16 if found.dtype.itemsize == 2 else np.float32)
+    with np.errstate(over="ignore"):  # becomes infinite, and is refused as such later
+        return array.astype(np.float16 if array.dtype.itemsize == 2 else np.float32)

@@ -1,4 +1,4 @@
-"""Files to write, looked at before the work: an hour of it is not lost over a misspelt name."""
+"""Checks of output files before the work, so that no hour of it is lost to a misspelt name."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from liftcore.runtime.arguments import as_list, check_choice
 
 @dataclass(frozen=True)
 class OutputType:
-    """What is written to a file."""
+    """A type of output file."""
 
     name: str  # as errors have it
     suffixes: tuple[str, ...]
@@ -38,9 +38,9 @@ CONVERTED = (".sog", ".html", ".csv", ".compressed.ply", ".splat", ".spz")  # wh
 
 
 def check_output(path: Path | str, inputs: Path | str | Iterable[Path | str], kind: str) -> Path | str:
-    """An output path that can be written, and is no folder, none of the inputs and no file of another kind.
+    """Check that an output can be written, and is no folder, none of the inputs and no file of another kind.
 
-    A file of the kind that is written is replaced. Of a lift that lies elsewhere (`liftcore.io.remote`) the storage
+    A file of the kind that is written is replaced. Of a lift at a URL (`liftcore.io.remote`) the storage
     is looked at; of one in shards the index is the file.
 
     Args:
@@ -79,7 +79,7 @@ def check_output(path: Path | str, inputs: Path | str | Iterable[Path | str], ki
 
 
 def _files_of(inputs: Iterable[Path]) -> list[Path]:
-    """The files of inputs that are there; of a folder of cameras those that are read."""
+    """Return the existing files of inputs; of a folder of cameras those that are read."""
     from liftcore.io.cameras import camera_source
 
     files = (file for source in inputs for file in (camera_source(source).files if source.is_dir() else [source]))
@@ -113,7 +113,7 @@ def _require_same_kind(path: Path, output: OutputType) -> None:
 
 @contextmanager
 def writing(path: Path | str) -> Iterator[None]:
-    """Say which output failed, and why, when the disk is full or the folder is not for us to write.
+    """Name the output in errors of the operating system: a full disk, a folder without permission.
 
     Raises:
         InvalidInput: the operating system refused.

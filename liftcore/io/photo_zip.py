@@ -19,7 +19,7 @@ from liftcore.io.files import BROKEN_ZIP, is_system_file, open_zip
 from liftcore.io.photos import LARGEST_TAG, ORIENTATION, UPRIGHT, PhotoHeader
 from liftcore.scene.views import cameras_of_views, view_names
 
-MOST = 10_000  # photos
+MAX_PHOTOS = 10_000  # photos
 DIRECTORY_BYTES = 8 << 20  # of the list of what is in a zip: of 20,000 files with long names
 KEPT_ZIPS = 4  # whose directories stay in memory
 LOCAL_HEADER = struct.Struct("<26x2H")  # before a member: the lengths of its name and its extra field
@@ -34,7 +34,7 @@ EXPECTED = "a zip of JPEG or PNG photos, named like the views"
 
 
 def describe_photos(path: Path) -> dict[str, Any]:
-    """Read a zip whole: how many ``photos``, their ``names`` as views have them, and ``warnings``.
+    """Check a zip of photos: return the number of ``photos``, their ``names`` as of views, and ``warnings``.
 
     Raises:
         InvalidPhotos: it is no zip, a photo is none or too large, or it would unpack to much more than it is.
@@ -53,15 +53,15 @@ def describe_photos(path: Path) -> dict[str, Any]:
         raise InvalidPhotos("image name", expected=error.expected, got=error.got) from None
     except BROKEN_ZIP as error:
         raise InvalidPhotos("photos", expected=EXPECTED, got=f"{error}"[:200] or "a damaged one") from None
-    others = len(entries) - len(members)
-    warnings = [f"{others} entries are no .jpg, .jpeg or .png and are left alone"] if others else []
+    other_count = len(entries) - len(members)
+    warnings = [f"{other_count} entries are no .jpg, .jpeg or .png and are left alone"] if other_count else []
     return {"photos": len(members), "names": list(members), "warnings": warnings}
 
 
 def _members(entries: Collection[zipfile.ZipInfo]) -> dict[str, zipfile.ZipInfo]:
-    """View -> photo, of what has the name of one; what systems put beside it (``__MACOSX``, dot files) has not."""
-    named = [(entry, PurePosixPath(entry.filename.replace("\\", "/"))) for entry in entries]
-    photos = [entry for entry, path in named if _media_type(entry.filename) and not is_system_file(path)]
+    """Return view -> photo, by suffix, without files of the operating system (``__MACOSX``, dot files)."""
+    entry_paths = [(entry, PurePosixPath(entry.filename.replace("\\", "/"))) for entry in entries]
+    photos = [entry for entry, path in entry_paths if _media_type(entry.filename) and not is_system_file(path)]
     return dict(zip(view_names([photo.filename for photo in photos]), photos, strict=True))
 
 
@@ -72,9 +72,9 @@ def _media_type(name: str) -> str:
 def _require_bounds(entries: Collection[zipfile.ZipInfo], members: Mapping[str, zipfile.ZipInfo], size: int) -> None:
     unpacked = sum(member.file_size for member in members.values())
     largest = max((member.file_size for member in members.values()), default=0)
-    if not 0 < len(members) <= MOST or len(entries) > 2 * MOST:
+    if not 0 < len(members) <= MAX_PHOTOS or len(entries) > 2 * MAX_PHOTOS:
         raise InvalidPhotos(
-            "photos", expected=f"1 to {MOST} photos", got=f"{len(members)} among {len(entries)} files"
+            "photos", expected=f"1 to {MAX_PHOTOS} photos", got=f"{len(members)} among {len(entries)} files"
         )
     if largest > LARGEST_BYTES or unpacked > 2 * size + SPARE_BYTES:
         expected = f"photos of at most {LARGEST_BYTES} bytes, and together at most twice the zip"
@@ -84,34 +84,34 @@ def _require_bounds(entries: Collection[zipfile.ZipInfo], members: Mapping[str, 
 def _require_photo(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> None:
     from PIL import Image, UnidentifiedImageError  # in the check of an upload alone
 
-    kind, shown = FORMATS[_media_type(member.filename)], member.filename[:80]
+    kind, label = FORMATS[_media_type(member.filename)], member.filename[:80]
     if member.flag_bits & ENCRYPTED:
-        raise InvalidPhotos(shown, expected="a photo that is not encrypted", got="one that is")
+        raise InvalidPhotos(label, expected="a photo that is not encrypted", got="one that is")
     content = archive.read(member)  # all of it, so that its checksum is looked at
     try:
         with Image.open(io.BytesIO(content), formats=[kind]) as photo:
             width, height = photo.size
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError):
         raise InvalidPhotos(
-            shown, expected=f"a {kind} file, as its name says", got="another, or a damaged one"
+            label, expected=f"a {kind} file, as its name says", got="another, or a damaged one"
         ) from None
     if max(width, height) > SIDE:
-        raise InvalidPhotos(shown, expected=f"sides of at most {SIDE} pixels", got=f"{width}x{height}")
+        raise InvalidPhotos(label, expected=f"sides of at most {SIDE} pixels", got=f"{width}x{height}")
 
 
 @dataclass(frozen=True)
 class PhotoIndex:
-    """Where the photos of a checked zip lie."""
+    """Positions of the photos in a checked zip."""
 
     path: Path
     members: Mapping[str, zipfile.ZipInfo]  # by their views
 
     def names(self, views: Collection[str]) -> set[str]:
-        """Which of these views it has a photo of."""
+        """Return those of the views that have a photo."""
         return set(cameras_of_views(self.members, views).values())
 
     def open(self, view: str) -> tuple[str, int, Iterator[bytes]] | None:
-        """The media type, the size and the blocks of a view's photo; None when there is none.
+        """Return the media type, the size and the blocks of a view's photo; None when there is none.
 
         Raises:
             NotFound: the zip is gone, or damaged where the photo begins.
@@ -138,21 +138,21 @@ class PhotoIndex:
 
 
 class PhotoIndexes:
-    """Those of the zips that were asked for last, each read once, however many ask at the same time."""
+    """A cache of the indexes of the zips that were used last; concurrent callers read each zip once."""
 
     def __init__(self) -> None:
         self._turn = threading.Lock()
         self._of = lru_cache(KEPT_ZIPS)(_index)
 
     def of(self, path: Path) -> PhotoIndex:
-        """The index of a zip.
+        """Return the index of a zip.
 
         Raises:
             NotFound: it is not there, or no longer one.
         """
         try:
             with self._turn:
-                return self._of(path, path.stat().st_mtime_ns)  # an upload mends a damaged one in its place
+                return self._of(path, path.stat().st_mtime_ns)  # an upload replaces a damaged one in place
         except BROKEN_ZIP as error:
             raise _damaged(error) from None
 
@@ -163,7 +163,7 @@ def _damaged(error: Exception) -> NotFound:
     return NotFound("photos", expected="their zip in the data directory", got=got, hint=hint)
 
 
-def _index(path: Path, changed: int) -> PhotoIndex:
+def _index(path: Path, modified_ns: int) -> PhotoIndex:
     with open_zip(path) as archive:
         return PhotoIndex(path, _members(archive.infolist()))
 
@@ -171,13 +171,14 @@ def _index(path: Path, changed: int) -> PhotoIndex:
 def in_camera_orientation(
     photo: Iterator[bytes], camera_size: Callable[[], tuple[int, int] | None]
 ) -> tuple[Iterator[bytes], bool]:
-    """The blocks of a JPEG or PNG that a browser shows as its camera sees it, and whether they were changed for it.
+    """Make a browser show a JPEG or PNG as its camera sees it: return its blocks, and True if they were changed.
 
-    A browser turns a photo as its EXIF asks. Where the camera is of the stored pixels (`liftcore.io.photos`), the tag
+    A browser applies the EXIF orientation. If the camera is of the stored pixels (`liftcore.io.photos`), the tag
     becomes 1, and no other byte changes but a PNG's checksum.
 
     Args:
-        camera_size: width and height of the photo's camera; asked for where the photo has an orientation.
+        photo: the blocks of the file.
+        camera_size: returns width and height of the photo's camera; called only if the photo has an orientation.
     """
     from PIL import Image
 
@@ -197,7 +198,7 @@ def in_camera_orientation(
 
 
 def _orientation_place(photo: bytes) -> tuple[int, str] | None:
-    """Where the beginning of a JPEG or PNG has its EXIF orientation, of two bytes, and their order; None: nowhere."""
+    """Find the offset and byte order of the EXIF orientation in the head of a JPEG or PNG; None if it has none."""
     is_png = photo.startswith(b"\x89PNG")
     begin = photo.find(b"eXIf" if is_png else b"Exif\0\0")
     tiff = begin + (4 if is_png else 6)
@@ -212,11 +213,11 @@ def _orientation_place(photo: bytes) -> tuple[int, str] | None:
 
 
 def _with_upright_tag(photo: bytes, place: int, order: str) -> bytes:
-    changed = bytearray(photo)
-    struct.pack_into(f"{order}H", changed, place, UPRIGHT)
+    content = bytearray(photo)
+    struct.pack_into(f"{order}H", content, place, UPRIGHT)
     if photo.startswith(b"\x89PNG"):  # whose chunks end with a checksum of their name and content
         begin = photo.find(b"eXIf")
         end = begin + 4 + struct.unpack_from(">I", photo, begin - 4)[0]
         if end + 4 <= len(photo):
-            struct.pack_into(">I", changed, end, zlib.crc32(changed[begin:end]))
-    return bytes(changed)
+            struct.pack_into(">I", content, end, zlib.crc32(content[begin:end]))
+    return bytes(content)

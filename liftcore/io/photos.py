@@ -1,8 +1,8 @@
-"""Photos as files: what their headers say of size and orientation, and which photo of a folder a camera is of.
+"""Photos as files: size and orientation from their headers, and the photo of a camera in a folder.
 
-**Orientation.** EXIF may ask viewers to turn a photo. COLMAP, nerfstudio and Inria's code calibrate and train on the
-pixels as they are stored, so a photo is read as stored, unless the size of its camera or of its masks fits the turned
-photo alone (`PhotoHeader.turns_for`).
+**Orientation.** EXIF may ask viewers to rotate a photo. COLMAP, nerfstudio and Inria's code calibrate and train on
+the pixels as they are stored, so a photo is read as stored, unless the size of its camera or of its masks fits the
+rotated photo alone (`PhotoHeader.turns_for`).
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from PIL import Image
 
 ORIENTATION = 0x0112  # EXIF's tag
-NAMED = 3  # photos in a warning
-UPRIGHT, LARGEST_TAG, LEAST_SIDEWAYS = 1, 8, 5  # its values; from 5 on, turning a photo swaps its sides
+MAX_LISTED = 3  # photos in a warning
+UPRIGHT, LARGEST_TAG, LEAST_SIDEWAYS = 1, 8, 5  # its values; from 5 on, rotation swaps width and height
 UNREAD = {  # what to do with images that Pillow does not open
     **dict.fromkeys((".heic", ".heif"), "convert HEIC to JPEG, without a turn of its own: heif-convert IN OUT.jpg"),
     **dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw"), "develop raw photos to JPEG or PNG"),
@@ -35,15 +35,15 @@ FIRST_SUFFIXES = (".png", ".jpg", ".jpeg")  # of photos of one name, as Blender'
 
 
 class Reading(Enum):
-    """How a photo was read, in view of its EXIF orientation."""
+    """Orientation in which a photo was read."""
 
     UPRIGHT = "without a turn to make"
     STORED = "as stored"
-    TURNED = "turned as EXIF asks"
+    ORIENTED = "turned as EXIF asks"
 
 
 class PhotoHeader(NamedTuple):
-    """What a photo's header says, before it is turned as its EXIF asks."""
+    """Size and EXIF orientation of a photo."""
 
     width: int  # stored pixels
     height: int  # stored pixels
@@ -55,40 +55,40 @@ class PhotoHeader(NamedTuple):
         return self.width, self.height
 
     @property
-    def turned(self) -> tuple[int, int]:
-        """Width and height after the photo was turned as its EXIF asks."""
+    def oriented(self) -> tuple[int, int]:
+        """Width and height after rotation by the EXIF orientation."""
         return (self.height, self.width) if self.orientation >= LEAST_SIDEWAYS else self.stored
 
     def turns_for(self, size: tuple[int, int] | None) -> bool:
-        """Whether a map of a size (width, height), of any resolution, is of the photo as EXIF asks to turn it.
+        """Return True if a map of this size (width, height), of any resolution, fits only the rotated photo.
 
-        Where sizes do not tell, as of square photos and of those that are turned upside down, it is of stored pixels.
+        Where both fit, as for square photos and rotations by 180 degrees, it is of stored pixels.
         """
         (width, height), (across, down) = self.stored, size or self.stored
         return self.orientation >= LEAST_SIDEWAYS and (width - height) * (across - down) < 0
 
 
-def orientation_warnings(readings: Mapping[str, Reading], what: str) -> list[str]:
-    """Lines that say how photos with an EXIF orientation were read.
+def orientation_warnings(readings: Mapping[str, Reading], counterparts: str) -> list[str]:
+    """Return warnings of how photos with an EXIF orientation were read.
 
     Args:
-        readings: by view, of all photos. what: made of the same pixels: their cameras, or masks.
+        readings: of all photos, by view. what: made of the same pixels: their cameras, or masks.
     """
     advice = {
-        Reading.STORED: f"were read as stored, without the turn that their EXIF asks for: {what} must be of the "
-        "stored pixels too, as those of COLMAP are",
-        Reading.TURNED: f"were turned as their EXIF asks, as the sizes of {what} tell",
+        Reading.STORED: "were read as stored, without the turn that their EXIF asks for: "
+        f"{counterparts} must be of the stored pixels too, as those of COLMAP are",
+        Reading.ORIENTED: f"were turned as their EXIF asks, as the sizes of {counterparts} tell",
     }
     lines = []
     for reading, text in advice.items():
-        if views := [view for view, found in readings.items() if found is reading]:
-            some = ", ".join(views[:NAMED]) + (", ..." if len(views) > NAMED else "")
-            lines.append(f"{len(views)} of {len(readings)} photos ({some}) {text}")
+        if views := [view for view, value in readings.items() if value is reading]:
+            view_names = ", ".join(views[:MAX_LISTED]) + (", ..." if len(views) > MAX_LISTED else "")
+            lines.append(f"{len(views)} of {len(readings)} photos ({view_names}) {text}")
     return lines
 
 
 def read_header(photo: Path | IO[bytes], name: str = "") -> PhotoHeader:
-    """The size and the orientation of a photo; no pixel is decoded.
+    """Read the size and the orientation of a photo; no pixel is decoded.
 
     Raises:
         InvalidInput: it is no image, or one of a kind that Pillow does not read.
@@ -98,7 +98,7 @@ def read_header(photo: Path | IO[bytes], name: str = "") -> PhotoHeader:
     source = name or str(photo)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of large images, of which only the header is read, and of odd EXIF
+            warnings.simplefilter("ignore")  # about large images, whose header alone is read, and odd EXIF
             with Image.open(photo) as image:
                 return header_of(image)
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError, EOFError):
@@ -107,20 +107,20 @@ def read_header(photo: Path | IO[bytes], name: str = "") -> PhotoHeader:
 
 
 def header_of(image: Image.Image) -> PhotoHeader:
-    """The header of an image that Pillow has opened and not loaded."""
+    """Return the header of an image that Pillow has opened and not loaded."""
     tag = image.getexif().get(ORIENTATION, UPRIGHT)
     orientation = tag if isinstance(tag, int) and UPRIGHT <= tag <= LARGEST_TAG else UPRIGHT
     header = PhotoHeader(*image.size, orientation)
-    if image.format == "TIFF":  # whose size Pillow gives as it is after the turn
-        header = PhotoHeader(*header.turned, orientation)
+    if image.format == "TIFF":  # whose size Pillow gives after rotation
+        header = PhotoHeader(*header.oriented, orientation)
     return header
 
 
 class PhotosBeside:
-    """Photos in the folder of a camera file, or in the one above it, by the paths that the file has.
+    """Photos in the folder of a camera file, or in its parent, by the paths that the file has.
 
-    Nothing outside these two folders is looked at: where a path leads elsewhere, such as to another machine's disk,
-    its last parts are looked for here.
+    Nothing outside these two folders is read: of a path that leads elsewhere, such as to another machine's disk, the
+    last parts are searched in them.
 
     Args:
         folder: of the camera file, on the disk or in a zip.
@@ -131,7 +131,7 @@ class PhotosBeside:
         self._names: dict[str, dict[str, list[str]]] = {}
 
     def header(self, file_path: str) -> PhotoHeader | None:
-        """The header of the photo of such a path, with or without a suffix; None: not there.
+        """Read the header of the photo at a path, with or without a suffix; None if it does not exist.
 
         Raises:
             InvalidInput: it does not open as an image.
@@ -149,13 +149,13 @@ class PhotosBeside:
         return None
 
     def missing(self, file_path: str) -> str:
-        """The first place where a photo of such a path was looked for, for an error."""
+        """Return the first place that was searched for a photo, for an error."""
         folder, place = self._places(file_path)[0]
         without = "" if PurePosixPath(place).suffix.lower() in IMAGE_SUFFIXES else " (.png, .jpg, ...)"
         return f"{folder / place}{without}"
 
     def _places(self, file_path: str) -> list[tuple[Path | zipfile.Path, str]]:
-        """Folders and paths below them, the most likely first."""
+        """Return folders and paths below them, the most likely first."""
         folder, above = self._folder, self._folder.parent
         path = posixpath.normpath(file_path.replace("\\", "/"))
         parts = [part for part in path.split("/") if part not in ("", "..") and not part.endswith(":")] or [path]
@@ -167,7 +167,7 @@ class PhotosBeside:
         return [(below, end) for end in ends for below in nearer]
 
     def _photo(self, folder: Path | zipfile.Path, place: str) -> Path | zipfile.Path | None:
-        """The file of that path, or one of its name with the suffix of another image."""
+        """Return the file of that path, or one of its name with the suffix of another image."""
         inner, _, name = place.rpartition("/")
         within = folder / inner if inner else folder
         key = str(within)
@@ -175,19 +175,19 @@ class PhotosBeside:
             self._names[key] = _images_in(within)
         names = self._names[key].get(without_image_suffix(name), [])
         best = name if name in names else next(iter(names), None)
-        found = None if best is None else within / best
-        return found if found is not None and found.is_file() else None
+        photo = None if best is None else within / best
+        return photo if photo is not None and photo.is_file() else None
 
 
 def _images_in(folder: Path | zipfile.Path) -> dict[str, list[str]]:
-    """Images in a folder by their names without suffixes, of several the likely one first; none where it is none."""
-    found: dict[str, list[str]] = defaultdict(list)
+    """Return image files of a folder by their names without suffixes, the likeliest first; none without a folder."""
+    images: dict[str, list[str]] = defaultdict(list)
     if folder.is_dir():
         names = [entry.name for entry in folder.iterdir()]
         for name in sorted(names, key=_likely):
             if PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES:
-                found[without_image_suffix(name)].append(name)
-    return dict(found)
+                images[without_image_suffix(name)].append(name)
+    return dict(images)
 
 
 def _likely(name: str) -> tuple[int, str]:

@@ -1,6 +1,6 @@
-"""What formats of quantised splats share: fields decoded in blocks, and how bytes say opacities, colours, rotations.
+"""Shared parts of quantised splat formats: fields decoded in blocks, and opacities, colours and rotations as bytes.
 
-A reader gives the fields of `Splats` by their names: ``means`` [P, 3], f64 where they are decoded so, and f32
+A reader returns the fields of `Splats` by their names: ``means`` [P, 3], f64 if they are decoded so, and f32
 ``quats`` [P, 4] (w x y z), ``log_scales`` [P, 3], ``opacity_logits`` [P] and ``sh`` [P, K, 3]. A writer takes any
 splats as 3D Gaussians (`gaussian_rows`).
 """
@@ -19,25 +19,25 @@ if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
 
 BLOCK_ROWS = 1 << 16  # splats decoded at a time
-LEAST_ALPHA = 1e-6  # bytes say an opacity of 0 or 1 where the trained one was near: its logit stays finite
+LEAST_ALPHA = 1e-6  # a byte of 0 or 255 stands for an opacity near 0 or 1: its logit stays finite
 MOST_GROWTH = 100  # decoded bytes for a byte of a compressed file: real scenes have 2 to 10
 GREY = 0.6  # of splats that have no colours
 THIN = 0.01  # of a disc's smaller scale: the thickness that it is shown with
-OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # places of a quaternion but each
+REST_INDICES = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # indices of a quaternion without each one
 LARGEST_SCALE = 80.0  # log: its exponential is a float32
 
-Fields = dict[str, Any]  # arguments of `Splats` by their names: arrays, and what the file says of them
+Fields = dict[str, Any]  # arguments of `Splats` by their names
 
 
 def decoded(count: int, shapes: Mapping[str, tuple[int, ...]], decode: Callable[[slice], Fields]) -> Fields:
-    """Fields of ``count`` splats, decoded a block of rows at a time, so that memory stays near what they take.
+    """Decode the fields of ``count`` splats a block of rows at a time, so that memory stays near their size.
 
     Args:
         count: P. shapes: field -> its shape behind P.
         decode: rows -> those fields of these rows.
     """
     fields: Fields = {}
-    with np.errstate(over="ignore", invalid="ignore"):  # what is beyond float32 is infinite, and refused as such
+    with np.errstate(over="ignore", invalid="ignore"):  # values beyond float32 are infinite, and refused as such
         for first in range(0, count, BLOCK_ROWS):
             rows = slice(first, min(first + BLOCK_ROWS, count))
             for name, values in decode(rows).items():
@@ -49,63 +49,63 @@ def decoded(count: int, shapes: Mapping[str, tuple[int, ...]], decode: Callable[
 
 
 def field_shapes(sh_rows: int) -> dict[str, tuple[int, ...]]:
-    """The fields of splats with K rows of harmonics, none of which are read where K is 0."""
+    """Return field -> shape behind P, of splats with K rows of harmonics; without them if K is 0."""
     shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "opacity_logits": ()}
     return shapes | ({"sh": (sh_rows, 3)} if sh_rows else {})
 
 
 def joined_fields(parts: Sequence[Fields]) -> Fields:
-    """The fields of several sets of splats as those of one, in their order.
+    """Concatenate the fields of several sets of splats.
 
-    Harmonics have the largest degree, and further columns are 0 where a part has none. What the parts say of their
-    training is of the first.
+    Harmonics have the largest degree, and further columns are 0 where a part has none. The render mode is that of the
+    first part.
     """
     fields: Fields = {}
     for name in parts[0]:
-        own = [part[name] for part in parts]
+        values = [part[name] for part in parts]
         if name == "warnings":
-            fields[name] = tuple(dict.fromkeys(text for texts in own for text in texts))
+            fields[name] = tuple(dict.fromkeys(text for texts in values for text in texts))
         elif name == "render_mode":
-            fields[name] = own[0]
+            fields[name] = values[0]
         elif name == "extras":
             counts = [len(part["means"]) for part in parts]
-            names = dict.fromkeys(key for some in own for key in some)
+            names = dict.fromkeys(key for columns in values for key in columns)
             zeros = [np.zeros(count, np.int32) for count in counts]
             fields[name] = {
-                key: np.concatenate([some.get(key, none) for some, none in zip(own, zeros, strict=True)])
+                key: np.concatenate([columns.get(key, none) for columns, none in zip(values, zeros, strict=True)])
                 for key in names
             }
         else:
             if name == "sh":
-                most = max(sh.shape[1] for sh in own)
-                own = [np.pad(sh, ((0, 0), (0, most - sh.shape[1]), (0, 0))) for sh in own]
-            fields[name] = own[0] if len(own) == 1 else np.concatenate(own)
+                sh_rows = max(sh.shape[1] for sh in values)
+                values = [np.pad(sh, ((0, 0), (0, sh_rows - sh.shape[1]), (0, 0))) for sh in values]
+            fields[name] = values[0] if len(values) == 1 else np.concatenate(values)
     return fields
 
 
 def logits(alpha: np.ndarray) -> np.ndarray:
-    """The logits of opacities in 0..1, kept LEAST_ALPHA off both ends."""
+    """Return the logits of opacities in 0..1, clipped to LEAST_ALPHA from both ends."""
     alpha = np.clip(np.asarray(alpha, np.float64), LEAST_ALPHA, 1 - LEAST_ALPHA)
     return np.log(alpha / (1 - alpha))
 
 
 def smallest_three(parts: np.ndarray, largest: np.ndarray) -> np.ndarray:
-    """[n, 4]: unit quaternions of three of their parts, the others in their order, and which one was left out.
+    """Complete unit quaternions [n, 4] from three of their parts, in order, and the index of the largest one.
 
     Args:
-        parts: [n, 3]. largest: [n] of 0..3, the place of the part that is not among them; it is not negative.
+        parts: [n, 3]. largest: [n] of 0..3, the index of the missing part, which is not negative.
     """
-    places = OTHERS[largest]
+    places = REST_INDICES[largest]
     quats = np.empty((len(parts), 4))
     np.put_along_axis(quats, places, parts, axis=1)
-    left = np.sqrt(np.maximum(0.0, 1 - (parts**2).sum(axis=1)))
-    np.put_along_axis(quats, largest[:, None], left[:, None], axis=1)
+    remaining = np.sqrt(np.maximum(0.0, 1 - (parts**2).sum(axis=1)))
+    np.put_along_axis(quats, largest[:, None], remaining[:, None], axis=1)
     return quats
 
 
 @dataclass(frozen=True)
 class GaussianRows:
-    """Some splats after activation."""
+    """A block of splats after activation."""
 
     means: np.ndarray  # [n, 3] f32, about the splats' origin
     scales: np.ndarray  # [n, 3] f32, above zero or zero
@@ -116,7 +116,7 @@ class GaussianRows:
 
 
 def gaussian_rows(splats: Splats) -> Iterator[GaussianRows]:
-    """The splats as 3D Gaussians, in their order, a block at a time.
+    """Yield the splats as 3D Gaussians, in their order, a block at a time.
 
     A disc (2DGS) becomes a thin one, and a DBS kernel ``(1 - r^2)^beta`` the one of its variance in the image,
     ``1 / (2 (beta + 2))``. Splats without colours are grey; lobes of DBS are left out.

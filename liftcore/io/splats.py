@@ -142,7 +142,7 @@ def write_splats(path: Path | str, splats: Splats, columns: Mapping[str, Any] | 
 
 
 def _column(name: Any, values: Any, count: int) -> Tensor:
-    """A column [P] of a type that PLY has.
+    """Return a column [P] of a type that PLY has.
 
     Raises:
         InvalidSplats: the name or the values are none of a column.
@@ -221,7 +221,7 @@ def read_places(path: Path, kernel: Kernel | str = "auto") -> np.ndarray:
 
 
 def format_of(path: Path) -> SplatFormat | Plugin:
-    """The format of a file, by its content; else the plugin that reads files of its suffix.
+    """Return the format of a file, by its content; else the plugin that reads files of its suffix.
 
     Raises:
         InvalidSplats: it is of none; the error says what it is, if that can be told.
@@ -256,7 +256,7 @@ def quick_count(path: Path) -> int | None:
 
 
 def splat_files(path: Path) -> list[Path]:
-    """The files that splats are read from: one, or the several of a SOG that is not bundled.
+    """Return the files that splats are read from: one, or the several of a SOG that is not bundled.
 
     Raises:
         OSError: there is none.
@@ -306,7 +306,7 @@ def some_rows(path: Path, kept: np.ndarray, suffix: str = ".ply", world: WorldFr
 
 
 def with_columns(path: Path, columns: Mapping[str, np.ndarray]) -> Iterator[bytes]:
-    """A file with more properties a splat, as the bytes of a PLY in blocks; those that it has are replaced.
+    """Return a file with more properties a splat, as the bytes of a PLY in blocks; those that it has are replaced.
 
     Args:
         path: the file. columns: name -> [P] i32 or f32.
@@ -320,7 +320,7 @@ def with_columns(path: Path, columns: Mapping[str, np.ndarray]) -> Iterator[byte
 def labelled(
     path: Path, labels: Labels, suffix: str = ".ply", kept: np.ndarray | None = None, *, prims: bool = False
 ) -> Iterator[bytes]:
-    """A file with labels a splat, as the bytes of a PLY or of another format that holds columns, in blocks.
+    """Return a file with labels a splat, as the bytes of a PLY or of another format that holds columns, in blocks.
 
     A PLY of a PLY has all else of its own bytes; one of another format is of its kernel.
 
@@ -345,7 +345,7 @@ def labelled(
 
     splats = _of_count(path, len(next(iter(labels.columns.values()))))
     if kept is not None:
-        splats, labels = splats[kept], labels.chosen(kept)
+        splats, labels = splats[kept], labels.subset(kept)
     own = {name: torch.from_numpy(values) for name, values in labels.columns.items()}
     layout = (*splats.layout, *(name for name in own if name not in splats.layout)) if splats.layout else ()
     world = world_of(labels.document["world"]) if "world" in labels.document else splats.world
@@ -386,7 +386,7 @@ def _document_of(path: Path) -> dict[str, Any]:
 
 
 def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
-    """A file with one colour a splat, the same from everywhere, as the bytes of a PLY in blocks.
+    """Return a file with one colour a splat, the same from everywhere, as the bytes of a PLY in blocks.
 
     All else of a PLY is of its own bytes (`liftcore.io.ply.recoloured`); another format becomes a PLY of 3DGS.
 

@@ -26,7 +26,7 @@ from liftcore.errors import InvalidSplats
 from liftcore.io.labels import stored_columns
 from liftcore.io.quantised import (
     MOST_GROWTH,
-    OTHERS,
+    REST_INDICES,
     Fields,
     GaussianRows,
     decoded,
@@ -90,7 +90,7 @@ SH_AXES = (
 
 
 def begins_like_spz(head: bytes) -> bool:
-    """Whether these first bytes are of the format, of any version."""
+    """Return True if these first bytes are of the format, of any version."""
     if head[:2] != b"\x1f\x8b":
         return head[:4] == MAGIC
     try:
@@ -100,7 +100,7 @@ def begins_like_spz(head: bytes) -> bool:
 
 
 def read_spz(path: Path, *, colour: bool = True) -> Fields:
-    """The fields of an ``.spz`` file, in the frame of PLYs and cameras.
+    """Return the fields of an ``.spz`` file, in the frame of PLYs and cameras.
 
     Raises:
         InvalidSplats: the file is malformed, of a later version, or has more splats than its size can be of.
@@ -145,7 +145,7 @@ def read_spz_document(path: Path) -> dict[str, Any]:
 
 
 def spz_blocks(splats: Splats, document: Mapping[str, Any] | None = None) -> Iterator[bytes]:
-    """The bytes of an ``.spz`` file of any splats (`gaussian_rows`), in blocks, in the format's frame.
+    """Yield the bytes of an ``.spz`` file of any splats (`gaussian_rows`), in blocks, in the format's frame.
 
     Means have as many fractional bits as their reach leaves, 20 at most. Harmonics above degree 3 are left out.
     Splats with extras make a file of version 4, which holds these and what they mean.
@@ -192,7 +192,7 @@ def _version_4(head: tuple[Any, ...], extensions: bytes, sections: list[bytes]) 
 
 
 def _encoded(rows: GaussianRows, bits: int, higher: int) -> tuple[np.ndarray, ...]:
-    """The sections of some splats, as `_decoded` reads those of version 3."""
+    """Return the sections of some splats, as `_decoded` reads those of version 3."""
     means = np.round(rows.means * (1.0, -1.0, -1.0) * 2.0**bits).astype(np.int32)
     with np.errstate(divide="ignore"):
         scales = np.round((np.log(rows.scales.astype(np.float64)) + 10) * 16)
@@ -217,7 +217,7 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
     largest = np.abs(parts).argmax(axis=1)
     chosen = np.take_along_axis(parts, largest[:, None], axis=1)
     parts = np.where(chosen < 0, -parts, parts)
-    others = np.take_along_axis(parts, OTHERS[largest], axis=1)
+    others = np.take_along_axis(parts, REST_INDICES[largest], axis=1)
     sizes = np.round(np.abs(others) / np.sqrt(0.5) * 511).clip(0, 511).astype(np.uint32)
     words = sizes | np.where(others < 0, 512, 0).astype(np.uint32)
     return (largest.astype(np.uint32) << 30 | words[:, 0] << 20 | words[:, 1] << 10 | words[:, 2]).astype("<u4")
@@ -257,7 +257,7 @@ def _inflated(unpacking: zlib._Decompress, content: bytes, size: int, path: Path
 
 
 def _streams(content: bytes, table: int, streams: int, sizes: list[int], path: Path) -> list[np.ndarray]:
-    """The sections of version 4, each u8; those of no bytes have no stream."""
+    """Return the sections of version 4, each u8; those of no bytes have no stream."""
     import zstandard
 
     filled = [size for size in sizes if size]
@@ -284,7 +284,7 @@ def _streams(content: bytes, table: int, streams: int, sizes: list[int], path: P
 
 
 def _declared_frame(extensions: bytes, path: Path) -> int:
-    """The frame that one of these extensions declares; RUB if none does."""
+    """Return the frame that one of these extensions declares; RUB if none does."""
     for kind, payload in records(extensions):
         if kind == FRAME_EXTENSION and len(payload) == 4:
             (frame,) = struct.unpack("<I", payload)

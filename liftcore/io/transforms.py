@@ -211,7 +211,7 @@ def _size_of_photo(header: PhotoHeader, keys: Mapping[str, Any], where: str) -> 
     centre = [number(keys[key], f"{where} {key}") if key in keys else None for key in ("cx", "cy")]
     cx, cy = centre
     turns = cx is not None and cy is not None and cx > 0 < cy and header.turns_for((round(2 * cx), round(2 * cy)))
-    width, height = header.turned if turns else header.stored
+    width, height = header.oriented if turns else header.stored
     if (cx or 0) >= width or (cy or 0) >= height:
         expected, hint = f"a principal point within the photo of {width}x{height}", "the photo was made smaller: add"
         hint = f'{hint} "w" and "h" of the photos that the intrinsics are of at the top level of the file'

@@ -278,7 +278,7 @@ def readings_of(headers: Mapping[str, PhotoHeader], sizes: Mapping[str, tuple[in
 def _reading(header: PhotoHeader, size: tuple[int, int] | None) -> Reading:
     if header.orientation == UPRIGHT:
         return Reading.UPRIGHT
-    return Reading.TURNED if header.turns_for(size) else Reading.STORED
+    return Reading.ORIENTED if header.turns_for(size) else Reading.STORED
 
 
 def _turned(image: Image.Image, header: PhotoHeader, size: tuple[int, int] | None) -> Image.Image:

@@ -134,9 +134,9 @@ def test_a_photo_is_read_in_the_orientation_of_its_camera(tag: int, suffix: str,
         image, reading = read_image(path, size)
         assert np.abs(np.asarray(image).astype(int) - expected).max() < 20
         assert reading is (
-            Reading.UPRIGHT if tag == 1 else Reading.TURNED if expected is shown and across else Reading.STORED
+            Reading.UPRIGHT if tag == 1 else Reading.ORIENTED if expected is shown and across else Reading.STORED
         )
-    assert read_header(path).turned == (64, 48)
+    assert read_header(path).oriented == (64, 48)
     with Image.open(path) as image:
         assert np.abs(np.asarray(ImageOps.exif_transpose(image)).astype(int) - shown).max() < 20
 
@@ -158,7 +158,7 @@ def test_sizes_of_cameras_turn_the_photos_that_are_encoded(photos: Path, encode:
     upright.transpose(Image.Transpose.ROTATE_90).save(photos / "a.png", exif=exif)
     sizes = {"a": (600, 400)}
     done, grids = encode(photos, sizes=sizes)
-    assert done.readings == {"a": Reading.TURNED}
+    assert done.readings == {"a": Reading.ORIENTED}
     assert grids["a"].shape == (2, 3, 3) and int(grids["a"].sum(dim=-1).argmax()) == 2
 
 

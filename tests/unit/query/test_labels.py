@@ -116,7 +116,7 @@ def test_lines_and_masks_of_a_tree_have_its_parts(parted: Scene, tmp_path: Path)
 
 def test_rows_of_labels_keep_the_nodes_that_hold_theirs(parted: Scene) -> None:
     found = parted.labels(parted.tree())
-    some = found.chosen(found.columns["node_id"] == 4)
+    some = found.subset(found.columns["node_id"] == 4)
     assert [one["node_id"] for one in some.document["nodes"]] == [1, 4]
 
 
