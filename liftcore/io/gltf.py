@@ -4,8 +4,8 @@ Positions, linear scales, linear opacities, quaternions x y z w and spherical ha
 ordered and signed as 3DGS has them. The frame is +Y up, +Z forward, -X right (LUF); PLYs and cameras are in right,
 down, front (RDF): a rotation by 180 degrees about z, which is baked in, as few readers rotate harmonics by a node.
 The node's transform has the origin of scenes in map coordinates, and the transform to +Y up and metres, where these
-are known (`liftcore.scene.world`). ``asset.extras`` stores the same, by which our reader undoes that transform. In files
-of other programs +Y is up and a unit is a metre, as the format defines.
+are known (`liftcore.scene.world`). ``asset.extras`` stores the same, by which our reader undoes that transform. In
+files of other programs +Y is up and a unit is a metre, as the format defines.
 
 Labels are feature ids (``EXT_mesh_features``): ``_FEATURE_ID_0`` is the instance, ``_FEATURE_ID_1`` the class, 0 is
 none, and a property table of each (``EXT_structural_metadata``) has a row of each id. Other columns of splats are
@@ -162,7 +162,7 @@ class _Asset:
             place, above = queue.pop()
             node = self._at(nodes, place, "node")
             if place in visited or max(len(visited), len(primitives)) >= MAX_NODES:
-                got = "a node twice, or more nodes"
+                got = "one that meets a node twice, or more nodes"
                 raise self._broken(f"a tree of at most {MAX_NODES} nodes with splats", got)
             visited.add(place)
             matrix = above @ self._matrix(node, place) if TRANSFORM & node.keys() else above
