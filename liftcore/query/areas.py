@@ -111,7 +111,7 @@ def area_splats(scene: OpenedLift, area: Area) -> tuple[np.ndarray, np.ndarray]:
     """Return the splats on the rays of an area's pixels, [n] i32 with repeats, and their weights there, [n] f32.
 
     Raises:
-        NotFound, InvalidQuery, InvalidLift: as `feature_shown`.
+        NotFound, InvalidQuery, InvalidLift: as `area_feature`.
     """
     camera = _camera(scene, area)
     rays = _rays(scene, camera, area, _pixels(area, *camera.photo_size)[0])

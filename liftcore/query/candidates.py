@@ -26,7 +26,7 @@ def candidates(scene: OpenedLift, query: Query) -> tuple[Candidate, ...]:
     """Return the nested nodes that examples of places may mean, the smallest first; () for words and vectors.
 
     Raises:
-        InvalidQuery, NotFound, InvalidLift: as `liftcore.query.areas.feature_shown`.
+        InvalidQuery, NotFound, InvalidLift: as `liftcore.query.areas.area_feature`.
     """
     positives, negatives = query.positives, query.terms[len(query.positives) :]
     if (

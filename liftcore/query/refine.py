@@ -1,4 +1,4 @@
-"""A finished lift after the smoothness step, without its views: nobody lifts twice."""
+"""Smoothing of a finished lift, without its views and without lifting again."""
 
 from __future__ import annotations
 
@@ -21,24 +21,25 @@ if TYPE_CHECKING:
     AnyLift = TypeVar("AnyLift", bound=Lift)
 
 OF_FEATURES = ("residual", "surrogate", "beta", "bound")  # of the certificate: sampled rays against the features
-ROOM = 0.5  # of the free memory, that features may take before they lie in a mapped file
+MEMORY_SHARE = 0.5  # of the free memory: larger features are held in a mapped file
 
 
 @usual_modes()
 def refine(
     lift: AnyLift, splats: Splats, smoothness: float, progress: Progress = silent, threads: int | None = None
 ) -> AnyLift:
-    """Smooth the features of a lift, as `LiftSettings.smoothness` does it in a lift.
+    """Smooth the features of a lift, as `LiftSettings.smoothness` does during a lift.
 
-    Of grids the bits are the same. Masks weaken edges of the graph in a lift alone: it keeps no weights of its views.
+    Lifts of grids have the same bits in both. Masks weaken edges of the graph only during a lift, as a finished one
+    has no weights of its views.
 
     Args:
-        lift: of any engine; it stays as it is. splats: that were lifted. smoothness: lambda, above zero.
-        threads: None takes the cores that this process may use. The number changes no bit.
+        lift: of any engine; it is not changed. splats: that were lifted. smoothness: lambda, above zero.
+        threads: None takes the cores that this process may use. The result is bitwise identical for any value.
 
     Returns:
         The lift with other features, on the device of the lift. Settings and diagnostics have the step; measures of
-        rays against features are None, as no ray is walked.
+        rays against features are None, as no ray is traced.
 
     Raises:
         InvalidSplats: other splats than were lifted.
@@ -64,7 +65,7 @@ def refine(
     start, place = time.perf_counter(), lift.features.device
     lift = lift.cpu()
     free = free_memory()
-    in_file = free is not None and lift.features.nbytes > ROOM * free
+    in_file = free is not None and lift.features.nbytes > MEMORY_SHARE * free
     X = zeros(tuple(lift.features.shape), lift.features.dtype, name="features", in_file=in_file).copy_(lift.features)
     graph = SplatGraph.of(splats, threads)
     X, facts = smooth(X, graph, lift.evidence, lift.confidence, lift.seen, strength, progress, threads)

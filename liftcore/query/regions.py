@@ -1,4 +1,4 @@
-"""The regions of a lift's feature packs: those of a view, which of them cover a pixel, and their masks."""
+"""Regions of a lift's feature packs: those of a view, those that cover a pixel, and their masks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def regions_of(scene: OpenedLift, view: str, argument: str) -> Regions:
-    """The regions that the packs have of a view, which may be named as the pack or as its camera is.
+    """Return the regions of a view in the packs, by its name in the pack or that of its camera.
 
     Raises:
         NotFound: the packs lack the view. InvalidQuery: it is a grid. InvalidLift: a pack moved or changed.
@@ -33,25 +33,25 @@ def regions_of(scene: OpenedLift, view: str, argument: str) -> Regions:
             packs, name = pair(packs, {view: scene.cameras[view]})[0], view  # a face of a panorama
     if name is None:
         raise NotFound(argument, expected="a view of the lift's feature packs", got=repr(view))
-    found = packs[name]
-    if not isinstance(found, Regions):
+    view_regions = packs[name]
+    if not isinstance(view_regions, Regions):
         hint = "ask by a pixel, VIEW:x,y"
         raise InvalidQuery(argument, expected="a view with regions", got="a feature grid", hint=hint)
-    return found
+    return view_regions
 
 
 def codebook_row(regions: Regions, example: Region) -> np.ndarray:
-    """[F], the vector of a region.
+    """Return the vector of a region, [F].
 
     Raises:
-        NotFound: the view's map has no such level, or no such label there.
+        NotFound: the view's map has no such level, or the level has no such label.
     """
     _labelled(regions, example)
     return as_numpy(regions.codebook[example.region])
 
 
 def regions_at(scene: OpenedLift, view: str, x: int, y: int) -> tuple[CoveringRegion, ...]:
-    """The regions that cover pixel (x, y) of a view's photo, one a level at most, the smallest first.
+    """Return the regions that cover pixel (x, y) of a view's photo, one a level at most, the smallest first.
 
     Raises:
         InvalidQuery: the pixel is outside the photo; or as `regions_of`, like NotFound and InvalidLift.
@@ -61,17 +61,17 @@ def regions_at(scene: OpenedLift, view: str, x: int, y: int) -> tuple[CoveringRe
     if not (0 <= x < len(columns) and 0 <= y < len(rows)):
         expected = f"a pixel with x in 0..{len(columns) - 1} and y in 0..{len(rows) - 1}"
         raise InvalidQuery("x, y", expected=expected, got=f"{x},{y}")
-    found = [
+    regions = [
         CoveringRegion(example=str(region), **vars(region), share=float((labels[level] == region.region).mean()))
         for level, label in enumerate(labels[:, rows[y], columns[x]])
         if label >= 0
         for region in [Region(view, level, int(label))]
     ]
-    return tuple(sorted(found, key=lambda one: one.share))
+    return tuple(sorted(regions, key=lambda r: r.share))
 
 
 def region_mask(scene: OpenedLift, example: Region) -> np.ndarray:
-    """[H, W] bool, the pixels of the view's photo that a region covers.
+    """Return the pixels of the view's photo that a region covers, [H, W] bool.
 
     Raises:
         NotFound, InvalidQuery, InvalidLift: as `regions_of` and `codebook_row`.
@@ -82,7 +82,7 @@ def region_mask(scene: OpenedLift, example: Region) -> np.ndarray:
 
 
 def _labelled(regions: Regions, example: Region) -> np.ndarray:
-    """[h, w] bool, where a level of the map has the example's label."""
+    """Return the pixels with the example's label in its level of the map, [h, w] bool."""
     levels = regions.labels.shape[0]
     if example.level >= levels:
         raise NotFound(str(example), expected=f"a level in 0..{levels - 1}", got=str(example.level))
@@ -94,7 +94,7 @@ def _labelled(regions: Regions, example: Region) -> np.ndarray:
 
 
 def _map_places(scene: OpenedLift, view: str, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """[H] and [W], the row and column of the label map [L, h, w] that each row and column of the photo reads."""
+    """Return the row and column of the label map [L, h, w] for each row and column of the photo, [H] and [W]."""
     width, height = scene.cameras[view].photo_size
     rows, columns = ((np.arange(n) + 0.5) * m / n for n, m in zip((height, width), labels.shape[1:], strict=True))
     return rows.astype(np.int64), columns.astype(np.int64)

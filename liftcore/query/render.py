@@ -1,4 +1,4 @@
-"""A scene and its answers seen from a camera: masks, attention, colours and depths, in the pixels of the photo."""
+"""Images of a scene and its answers from a camera: masks, attention, colours and depths, in the photo's pixels."""
 
 import io
 from collections.abc import Callable, Mapping
@@ -20,29 +20,29 @@ from liftcore.runtime.one_line import one_line, value_text
 from liftcore.scene.cameras import Camera
 from liftcore.scene.compositing import CompositingParams
 
-LEAST_SHARE = 0.5  # of a ray's weight, that what was found must have in a mask
-MOST_GROUPED = 1 << 17  # selected splats whose strays a mask leaves out: they take .4 s of two cores
-_SHOWN = (0.01, 0.99)  # quantiles of the covered pixels' depths: a floater before the lens dims no picture
-_LEVELS = 254  # between the farthest covered pixel, at 1, and the nearest, at 255; 0 is for what no splat covers
-_DIM = 0.35  # brightness that an overlay leaves to what was not found
-_TINT = 0.25  # of the outline's colour, in what was found
-_OUTLINE = np.array([255, 209, 64], dtype=np.uint8)  # sRGB of the line around what was found
+LEAST_SHARE = 0.5  # of a ray's weight, that the objects need for the mask
+MOST_GROUPED = 1 << 17  # selected splats that are grouped for a mask: this many take .4 s of two cores
+_DEPTH_QUANTILES = (0.01, 0.99)  # of the covered pixels: a floater before the lens does not darken the picture
+_LEVELS = 254  # between the farthest covered pixel, at 1, and the nearest, at 255; 0 is for pixels without splats
+_DIM = 0.35  # brightness of an overlay outside the mask
+_TINT = 0.25  # share of the outline's colour inside the mask
+_OUTLINE = np.array([255, 209, 64], dtype=np.uint8)  # sRGB of the line around the mask
 
 
 @dataclass(frozen=True)
 class ViewMask:
-    """An answer seen from one camera."""
+    """Attention and mask of an answer from one camera."""
 
     view: str
     """the name of its camera"""
     attention: np.ndarray
-    """[H, W] f32, A s: scores rendered with the lift's scale of opacity; 0 of an absent thing"""
+    """[H, W] f32, A s: scores rendered with the lift's scale of opacity; 0 if the object is absent"""
     row_sums: np.ndarray
     """[H, W] f32, A 1"""
     mask: np.ndarray
-    """[H, W] bool, where at least half of a ray that meets the scene is of what was found"""
+    """[H, W] bool, pixels on which the objects have at least half of the weight of a ray that hits the scene"""
     explanation: str
-    """one sentence on what the mask shows"""
+    """one sentence on the meaning of the mask"""
 
     def __repr__(self) -> str:
         size = f"{list(self.mask.shape)} pixels, {self.mask.mean():.1%} of them in the mask"
@@ -50,71 +50,71 @@ class ViewMask:
 
     @staticmethod
     def overlay(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """[H, W, 3] u8: an image [H, W, 3] u8 with a mask [H, W] bool tinted and outlined, and the rest dimmed."""
+        """Tint and outline a mask [H, W] bool in an image [H, W, 3] u8, and dim the rest; [H, W, 3] u8."""
         return overlay(image, mask)
 
 
 @dataclass(frozen=True)
 class ShownDepth:
-    """Depths as a grey picture: a level of 1 is ``far`` or farther, 255 ``near`` or nearer, and 0 no depth."""
+    """Depths as a grey image: a level of 1 is ``far`` or farther, 255 ``near`` or nearer, and 0 no depth."""
 
     levels: np.ndarray  # [H, W] u8
     span: tuple[float, float] | None  # near and far, scene units; None when no pixel is covered
 
     def text(self) -> dict[str, str]:
-        """What a PNG of it says of itself: ``depth-near`` and ``depth-far``, in decimals that read back exactly."""
+        """Return the text chunks of a PNG: ``depth-near`` and ``depth-far``, in decimals that read back exactly."""
         return {} if self.span is None else dict(zip(("depth-near", "depth-far"), map(repr, self.span), strict=True))
 
 
 def view_mask(
     scene: OpenedLift, answer: Answer, view: str | Camera, group: Callable[[OpenedLift, Answer], Objects] = objects
 ) -> ViewMask:
-    """See an answer from a camera: attention, and a mask of the objects that were found.
+    """Render an answer from a camera: its attention, and a mask of its objects.
 
-    The mask is ``A m >= A 1 / 2``, with m = 1 for the splats of the answer's objects: what was found in the scene,
-    where nothing hides it. It has no threshold of its own, so a view that does not see it has an empty mask. Of more
-    than 131,072 selected splats strays are not told apart, unless the query keeps some of the objects.
+    The mask is ``A m >= A 1 / 2``, with m = 1 for the splats of the answer's objects: the pixels where they are
+    visible. It has no threshold of its own, so it is empty in a view that does not see them. Above 131,072 selected
+    splats, all of them are in the mask, also unassigned ones, unless the query keeps some of the objects.
 
     Args:
         scene: the opened lift. answer: of that lift.
         view: the name of a camera, lifted or not; or any camera in the frame of the splats.
-        group: makes the objects of an answer; who has them already gives them so.
+        group: returns the objects of an answer; a caller that has them passes them so.
 
     Raises:
         NotFound: no camera has this name.
         InvalidQuery: the view's image is larger than pictures may be; or the largest of more splats than are grouped.
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
-    camera = scene.camera(view)  # a name that is not there is told before anything is grouped
+    camera = scene.camera(view)  # first, so that an unknown name raises before the work
     if answer.count > MOST_GROUPED and not answer.query.keeps_some:
-        members, shown = answer.selected, f"all {answer.count} selected splats, too many to tell strays apart"
+        members, subject = answer.selected, f"all {answer.count} selected splats, too many to group into objects"
     else:
-        found = group(scene, answer)
-        members, count = found.numbers >= 0, len(found.found)
-        shown = f"the {count} object{'s' * (count != 1)} that {'were' if count != 1 else 'was'} found"
-    # A splat without a feature adds nothing to a ray; its score of -1 would count against its neighbours.
+        groups = group(scene, answer)
+        members, count = groups.numbers >= 0, len(groups.found)
+        subject = f"the {count} object{'s' * (count != 1)} that {'were' if count != 1 else 'was'} found"
+    # A splat without a feature has a score of -1, which would lower the attention of its neighbours: it counts as 0.
     scores = np.where(answer.seen & (not answer.dropped), answer.scores, np.float32(0.0))
     values = torch.from_numpy(np.stack([scores, members.astype(np.float32), np.ones_like(scores)], axis=1))
     image = scene.image(camera, lambda of: scene.raster.render(of, values, scene.compositing)).numpy()
     attention, weights, row_sums = (np.ascontiguousarray(image[..., column]) for column in range(3))
     mask = (row_sums >= MINIMUM_ROW_SUM) & (weights >= LEAST_SHARE * row_sums)
-    return ViewMask(camera.name, attention, row_sums, mask, f"at least half of the ray is of {shown}")
+    return ViewMask(camera.name, attention, row_sums, mask, f"at least half of the ray is of {subject}")
 
 
 def mask_png(mask: np.ndarray) -> bytes:
-    """A mask [H, W] bool as one 8-bit channel, white where it is."""
+    """Write a mask [H, W] bool as a PNG of one 8-bit channel, white inside."""
     return _png(mask.astype(np.uint8) * 255)
 
 
-def attention_png(seen: ViewMask) -> bytes:
-    """The attention through the colour map, RGB [H, W, 3]; black where the ray misses the scene."""
-    return _png(heat_colours(seen.attention, seen.row_sums > 0))
+def attention_png(in_view: ViewMask) -> bytes:
+    """Write the attention in colours of the map as a PNG, RGB [H, W, 3]; black where the ray misses the scene."""
+    return _png(heat_colours(in_view.attention, in_view.row_sums > 0))
 
 
 def render_png(scene: OpenedLift, view: str | Camera, what: str = "rgb") -> bytes:
-    """The scene as a camera sees it, RGB [H, W, 3] on black: its colours, features (``pca``) or clusters.
+    """Render the scene from a camera as a PNG, RGB [H, W, 3] on black: colours, features (``pca``) or clusters.
 
-    Its ``depth`` is one 8-bit channel [H, W], near bright, whose PNG tells its range as text (`ShownDepth`).
+    ``depth`` is one 8-bit channel [H, W], near bright; the PNG has its range as text (`ShownDepth`).
 
     Raises:
         NotFound, InvalidQuery, InvalidLift: as `render` does.
@@ -126,17 +126,16 @@ def render_png(scene: OpenedLift, view: str | Camera, what: str = "rgb") -> byte
 
 
 def render(scene: OpenedLift, view: str | Camera, what: str = "rgb") -> np.ndarray:
-    """The colours of a view, [H, W, 3] u8 sRGB on black, with the opacities as trained.
+    """Render the colours of a view, [H, W, 3] u8 sRGB on black, with the opacities as trained.
 
-    ``rgb`` takes the splats' own colours, ``pca`` the first three principal components of their features, and
-    ``cluster`` one colour a cluster: that of the most weight on each ray, as aggregation saw it. There, grey is where
-    unclustered splats have the most. ``confidence`` is the mean of the splats' on each ray through the colour map of
-    scores, which spans it from 0 to 1.
+    ``rgb`` takes the splats' colours, ``pca`` the first three principal components of their features, and ``cluster``
+    a colour a cluster: the cluster of the most weight on each ray, with the opacities of the lift. It is grey where
+    unclustered splats have the most. ``confidence`` is the mean confidence of the splats on each ray, in colours of
+    the map of scores, which spans it from 0 to 1.
 
     Raises:
         NotFound: no camera has this name.
-        InvalidQuery: clusters or confidence are asked for, and the lift has none; or the image is larger than
-            pictures may be.
+        InvalidQuery: the lift has no clusters, or no confidence; or the image is larger than pictures may be.
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
     if what == "cluster":
@@ -174,12 +173,12 @@ def _render_confidence(scene: OpenedLift, view: str | Camera) -> np.ndarray:
 
 
 def expected_depth(scene: OpenedLift, view: str | Camera) -> tuple[np.ndarray, np.ndarray]:
-    """The expected depth of the rays of a view, ``sum_j w_j z_j / sum_j w_j``.
+    """Render the expected depth of the rays of a view, ``sum_j w_j z_j / sum_j w_j``.
 
     z_j is the depth of a splat's centre along the camera's axis, not along the ray. Opacities are as trained.
 
     Returns:
-        Depths [H, W] f32 in scene units, 0 where no splat covers the pixel; and where one does, [H, W] bool.
+        Depths [H, W] f32 in scene units, 0 where no splat covers the pixel; and the covered pixels, [H, W] bool.
 
     Raises:
         NotFound, InvalidQuery, InvalidLift: as `render` does.
@@ -188,23 +187,23 @@ def expected_depth(scene: OpenedLift, view: str | Camera) -> tuple[np.ndarray, n
     depths = (scene.splats.means.double() @ pose[:3] + pose[3]).to(torch.float32)
     values = torch.stack([depths, torch.ones_like(depths)], dim=1)
     image = scene.image(view, lambda camera: scene.raster.render(camera, values, _as_trained(scene)))
-    covered = image[..., 1] > 0
-    return torch.where(covered, image[..., 0] / image[..., 1], 0.0).numpy(), covered.numpy()
+    hit = image[..., 1] > 0
+    return torch.where(hit, image[..., 0] / image[..., 1], 0.0).numpy(), hit.numpy()
 
 
 def shown_depth(scene: OpenedLift, view: str | Camera) -> ShownDepth:
-    """The expected depths of a view, near bright, from the 1st to the 99th percentile of the covered pixels.
+    """Map the expected depths of a view to grey, near bright, from the 1st to the 99th percentile of covered pixels.
 
     Raises:
         NotFound, InvalidQuery, InvalidLift: as `render` does.
     """
-    depths, covered = expected_depth(scene, view)
+    depths, hit = expected_depth(scene, view)
     levels = np.zeros(depths.shape, dtype=np.uint8)
-    if not covered.any():
+    if not hit.any():
         return ShownDepth(levels, None)
-    near, far = (float(depth) for depth in np.quantile(depths[covered], _SHOWN))
-    nearness = (far - depths[covered]) / (far - near) if far > near else np.ones(int(covered.sum()))
-    levels[covered] = 1 + np.round(_LEVELS * nearness.clip(0.0, 1.0))
+    near, far = (float(depth) for depth in np.quantile(depths[hit], _DEPTH_QUANTILES))
+    nearness = (far - depths[hit]) / (far - near) if far > near else np.ones(int(hit.sum()))
+    levels[hit] = 1 + np.round(_LEVELS * nearness.clip(0.0, 1.0))
     return ShownDepth(levels, (near, far))
 
 
@@ -213,19 +212,19 @@ def _as_trained(scene: OpenedLift) -> CompositingParams:
 
 
 def overlay_png(
-    scene: OpenedLift, seen: ViewMask, view: str | Camera, name: str, photo: Image.Image | None = None
+    scene: OpenedLift, in_view: ViewMask, view: str | Camera, name: str, photo: Image.Image | None = None
 ) -> bytes:
-    """What was found, in the photo of its view or else a render, with a caption that says its share of the picture.
+    """Overlay an answer's mask on the photo of its view or else a render, with its share of the image as a caption.
 
     Raises:
         NotFound, InvalidQuery, InvalidLift: as `render` does.
     """
-    height, width = seen.mask.shape
+    height, width = in_view.mask.shape
     image = render(scene, view) if photo is None else np.asarray(photo.convert("RGB").resize((width, height)))
     size = max(12, height // 30)
     canvas = Image.new("RGB", (width, height + 2 * size), "white")
-    canvas.paste(Image.fromarray(overlay(image, seen.mask)), (0, 0))
-    caption = f"{name}: {seen.mask.mean():.1%} of {seen.view}"
+    canvas.paste(Image.fromarray(overlay(image, in_view.mask)), (0, 0))
+    caption = f"{name}: {in_view.mask.mean():.1%} of {in_view.view}"
     ImageDraw.Draw(canvas).text(
         (size // 2, height + size // 2), caption, fill="black", font=ImageFont.load_default(size)
     )
@@ -233,9 +232,9 @@ def overlay_png(
 
 
 def overlay(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """[H, W, 3] u8: an image with a mask [H, W] bool tinted and outlined, and the rest dimmed.
+    """Tint and outline a mask [H, W] bool in an image, and dim the rest; [H, W, 3] u8.
 
-    The tint tells a mask of everything from none at all.
+    The tint distinguishes a full mask from an empty one.
     """
     tinted = (1 - _TINT) * image + _TINT * _OUTLINE
     picture = np.where(mask[..., None], tinted, _DIM * image).astype(np.uint8)
@@ -249,7 +248,7 @@ def overlay(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def _png(pixels: np.ndarray, text: Mapping[str, str] | None = None) -> bytes:
-    """A picture [H, W] or [H, W, 3] u8 with text chunks."""
+    """Write an image [H, W] or [H, W, 3] u8 as a PNG with text chunks."""
     buffer, chunks = io.BytesIO(), PngInfo()
     for name, value in (text or {}).items():
         chunks.add_text(name, value)

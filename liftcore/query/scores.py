@@ -1,10 +1,10 @@
-"""How well every splat answers a query: cosine to its positives, less where a negative is as near.
+"""Scores of splats for a query: the cosine to its positives, reduced where a negative is as near.
 
 Lifted rows are sums of unit vectors and not unit themselves, so their norms divide every score; they are computed
-once a lift. The products are summed by hand: float16 rows are widened one at a time into a buffer that stays in the
-first-level cache, so a million rows are read once and never copied. A blocked matrix product widens them by NumPy,
-which takes ten times as long. Rows go in fixed shares over threads, and the bits of a score depend on no other row
-and on no other direction.
+once a lift. The products are explicit loops: float16 rows are converted one at a time into a buffer that stays in the
+first-level cache, so a million rows are read once and never copied. A blocked matrix product converts them by NumPy,
+which takes ten times as long. Rows are divided into fixed shares over threads, and the bits of a score depend on no
+other row and no other direction.
 """
 
 from collections.abc import Callable
@@ -17,11 +17,11 @@ from liftcore.runtime.cores import cores
 from liftcore.runtime.jit import vectorised
 
 DEFAULT_NEGATIVES = ("object", "things", "stuff", "texture")  # LangSplat's canonical phrases
-LOWEST_COSINE = -1.0  # what a splat without a feature scores
-# An example's score is 1 for the same and 0 for what the scene is on the whole; words have no such scale.
-LEAST_LIKENESS = 0.4  # of an example, below which the automatic threshold is not sought
-LEAST_OFFSET = 1e-3  # from the mean, of unit features: what is nearer has no direction that float16 could tell
-FAINTEST = 1e-30  # of the squares that float32 adds up without loss
+LOWEST_COSINE = -1.0  # score of a splat without a feature
+# An example's score is 1 for an equal feature and 0 for the scene's mean; words have no such scale.
+LEAST_LIKENESS = 0.4  # to an example, the least value of the automatic threshold
+LEAST_OFFSET = 1e-3  # from the mean, of unit features: float16 cannot represent the direction of a smaller one
+FAINTEST = 1e-30  # least sum of squares that float32 adds without loss
 RELEVANCY_SHARPNESS = 10.0  # the softmax's inverse temperature in LERF and LangSplat
 
 # A float16 shifted to float32's place is the number times 2^-112, as the exponents' biases are 127 and 15.
@@ -33,7 +33,7 @@ _BLOCK, _BLOCK_FLOATS = 16_384, 1 << 25  # rows widened at once for means and co
 
 @vectorised
 def _widen(bits, half, words):
-    """The bits of a row as those of float32: of float16 shifted into place, of float32 as they are."""
+    """Write the bits of a row as float32: float16 shifted into place, float32 unchanged."""
     if half:
         for c in range(bits.shape[0]):
             words[c] = (np.int32(bits[c]) << np.int32(13)) & SIGN_AND_MAGNITUDE
@@ -82,7 +82,7 @@ def _measure(first, last, bits, half, scale, norms):
 
 
 def norms_of(features: np.ndarray) -> np.ndarray:
-    """Euclidean norms of the rows of features [P, F] f16 or f32, as [P] f32."""
+    """Compute Euclidean norms of the rows of features [P, F] f16 or f32, [P] f32."""
     norms = np.empty(len(features), np.float32)
     bits, half, scale = _bits(features)
     _over_rows(len(norms), lambda first, last: _measure(first, last, bits, half, scale, norms))
@@ -90,7 +90,7 @@ def norms_of(features: np.ndarray) -> np.ndarray:
 
 
 def cosines(features: np.ndarray, norms: np.ndarray, texts: np.ndarray) -> np.ndarray:
-    """Cosine to several texts in one pass over the features.
+    """Compute cosines to several texts in one pass over the features.
 
     Args:
         features: [P, F] f16 or f32, finite. norms: [P] f32, from `norms_of`.
@@ -112,28 +112,28 @@ def cosines(features: np.ndarray, norms: np.ndarray, texts: np.ndarray) -> np.nd
 
 
 def _cosines(features: np.ndarray, norms: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """The same to unit rows [n, F] f32."""
+    """Compute cosines as `cosines` to unit rows [n, F] f32."""
     bits, half, scale = _bits(features)
     columns = np.ascontiguousarray(directions * scale)
-    found = np.empty((len(bits), len(columns)), np.float32)
-    _over_rows(len(bits), lambda first, last: _compare(first, last, bits, half, norms, columns, found))
-    return found
+    output = np.empty((len(bits), len(columns)), np.float32)
+    _over_rows(len(bits), lambda first, last: _compare(first, last, bits, half, norms, columns, output))
+    return output
 
 
 def warm_up() -> None:
-    """Load what compares rows, before anyone waits for it."""
+    """Load or compile the kernels, before the first query."""
     for dtype in (np.float16, np.float32):
         row = np.ones((1, 1), dtype)
         cosines(row, norms_of(row), row.astype(np.float32))
 
 
 def rows_at_a_time(channels: int) -> int:
-    """How many rows of features are widened to float32 at once."""
+    """Return the number of rows of features that are converted to float32 at once."""
     return max(1, min(_BLOCK, _BLOCK_FLOATS // channels))
 
 
 def mean_direction(features: np.ndarray, norms: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """The weighted mean of the unit rows, [F] f32; of zero rows and weights nothing but zeros.
+    """Compute the weighted mean of the unit rows, [F] f32; zeros if all rows or weights are zero.
 
     Args:
         features: [P, F] f16 or f32. norms: [P] f32, from `norms_of`. weights: [P] f32, at least zero.
@@ -145,17 +145,17 @@ def mean_direction(features: np.ndarray, norms: np.ndarray, weights: np.ndarray)
     step = rows_at_a_time(features.shape[1])
     for first in range(0, len(features), step):
         block = slice(first, first + step)
-        # A plain loop and no product of the linear algebra library, whose sums vary with its threads.
+        # A loop, as sums of the linear algebra library vary with its number of threads.
         total += np.einsum("pf,p->f", features[block].astype(np.float32), shares[block], optimize=False)
     weight = float(weights[norms > 0].sum(dtype=np.float64))
     return (total / weight if weight > 0 else total).astype(np.float32)
 
 
 def cosines_about(features: np.ndarray, norms: np.ndarray, mean: np.ndarray, examples: np.ndarray) -> np.ndarray:
-    """Cosine to examples as seen from the scene's mean feature, ``cos(x_j / |x_j| - mean, e - mean)``.
+    """Compute cosines to examples about the scene's mean feature, ``cos(x_j / |x_j| - mean, e - mean)``.
 
-    Image features lie in a narrow cone: what they share says nothing about this thing or that, and drowns what
-    tells them apart. Words lie in another cone, so they are compared by plain cosines.
+    Image features lie in a narrow cone: their common part hides the differences between objects. Words lie in another
+    cone, so they are compared by uncentred cosines.
 
     Args:
         features: [P, F] f16 or f32. norms: [P] f32, from `norms_of`.
@@ -173,27 +173,27 @@ def cosines_about(features: np.ndarray, norms: np.ndarray, mean: np.ndarray, exa
     along = _cosines(features, norms, np.concatenate([offsets, mean[None]]) / lengths[:, None])
     products = along[:, :-1] * reaches - np.array([offset @ mean for offset in offsets])
     distances = np.sqrt(np.maximum(1 - 2 * length * along[:, -1:] + length**2, 0.0))
-    known = (distances > LEAST_OFFSET) & (reaches > LEAST_OFFSET)
+    valid = (distances > LEAST_OFFSET) & (reaches > LEAST_OFFSET)
     scale = np.maximum(distances * reaches, LEAST_OFFSET**2)
-    return np.where(known, np.clip(products / scale, -1.0, 1.0), np.float32(0.0))
+    return np.where(valid, np.clip(products / scale, -1.0, 1.0), np.float32(0.0))
 
 
 def combine(similarities: np.ndarray, positives: int) -> np.ndarray:
-    """One score a splat from its cosines to all terms of a query.
+    """Combine a splat's cosines to all terms of a query to one score.
 
     Without negatives it is the cosine to the nearest positive, and with negatives that cosine times the relevancy:
 
         s_j = max_p cos(x_j, p)
         s_j = max_p cos(x_j, p) sigmoid(10 (max_p cos(x_j, p) - max_n cos(x_j, n)))
 
-    Relevancy alone asks which of the two a splat is nearer to, and a wall may be nearer to an apple than to a table
-    without being like either: negatives must take away from what is found, not add to it. The largest and not the
-    mean cosine counts, so that positives may be different things; cosines to words and to examples differ in scale
-    (CLIP's words lie apart from its images), so among both the examples decide.
+    Relevancy alone compares the two sides, and a wall may be nearer to an apple than to a table without similarity to
+    either: negatives must reduce the selection and not extend it. The largest and not the mean cosine counts, so that
+    positives may be different objects. Cosines to words and to examples differ in scale (CLIP's words lie apart from
+    its images), so with both, the examples decide.
 
     Args:
-        similarities: [P, n] f32, cosines to the positives, then to the negatives; plain for words, and about the
-            scene's mean for examples (`cosines_about`).
+        similarities: [P, n] f32, cosines to the positives, then to the negatives; about the scene's mean for examples
+            (`cosines_about`).
         positives: how many of the n are positives, at least one.
 
     Returns:
@@ -204,9 +204,9 @@ def combine(similarities: np.ndarray, positives: int) -> np.ndarray:
 
 
 def relevancy(similarities: np.ndarray, positives: int) -> np.ndarray:
-    """LERF's and LangSplat's ``min_n softmax(10 [cos p, cos n])_0``, p the nearest positive: [P] f32 in 0..1.
+    """Compute LERF's and LangSplat's ``min_n softmax(10 [cos p, cos n])_0``, p the nearest positive, [P] f32.
 
-    Above 0.5 a splat is nearer to what is wanted than to anything unwanted.
+    Above 0.5 a splat is nearer to a positive than to all negatives.
 
     Args:
         similarities: [P, n] f32, cosines to the positives, then to the negatives, at least one of either.
@@ -217,7 +217,7 @@ def relevancy(similarities: np.ndarray, positives: int) -> np.ndarray:
 
 
 def _bits(features: np.ndarray) -> tuple[np.ndarray, bool, np.float32]:
-    """Rows as the kernels take them: their bits [P, F] i16 or i32, whether they are float16, and what they count."""
+    """Return rows for kernels: bits [P, F] i16 or i32, True if they are float16, and the scale of their values."""
     half = features.dtype == np.float16
     rows = features.view(np.int16) if half else features.astype(np.float32, copy=False).view(np.int32)
     return np.ascontiguousarray(rows), half, np.float32(HALF_SCALE if half else 1.0)

@@ -1,4 +1,4 @@
-"""Colours of splats: as a camera sees them, and of their features by three principal components."""
+"""Colours of splats: from a camera, and of their features by three principal components."""
 
 import math
 
@@ -20,20 +20,20 @@ NO_COLOUR = 0.6  # grey of splats whose file holds no colours
 _LOBE_SHARPNESS = 10 * math.log(2)
 _LARGEST_POWER = 1e30
 
-SAMPLE = 32_768  # rows that decide the principal components
-SAMPLE_FLOATS = 1 << 26  # of them at most: rows of very many channels are fewer
+SAMPLE = 32_768  # rows of which the principal components are computed
+SAMPLE_FLOATS = 1 << 26  # most numbers in them: there are fewer rows of very many channels
 SEED = 0
 COMPONENTS = 3
 _RANGE = (0.02, 0.98)  # weighted-sample quantiles that the colours span
 
 
 def view_colours(splats: Splats, camera: Camera) -> Tensor:
-    """The colours of splats from a camera, ``max(0, 0.5 + sum_k SH_k(d) c_k + lobes)`` with d from camera to splat.
+    """Compute colours of splats from a camera, ``max(0, 0.5 + sum_k SH_k(d) c_k + lobes)``, d from camera to splat.
 
     Args:
         splats: the scene, with spherical harmonics of degree 0 to 3; coefficients above are left out. The lobes of
             DBS are added where the file has them.
-        camera: where they are seen from.
+        camera: the viewpoint.
 
     Returns:
         [P, 3] f32, at least zero; grey for splats without colours.
@@ -50,7 +50,7 @@ def view_colours(splats: Splats, camera: Camera) -> Tensor:
 
 
 def _lobes(directions: Tensor, sb_params: Tensor) -> Tensor:
-    """Spherical beta lobes (DBS): ``sum_s softplus(rgb_s) max(0, mu_s d)^(4 exp(b_s))``.
+    """Compute spherical beta lobes (DBS), ``sum_s softplus(rgb_s) max(0, mu_s d)^(4 exp(b_s))``.
 
     Args:
         directions: [P, 3] f32, unit, from camera to splat.
@@ -64,14 +64,14 @@ def _lobes(directions: Tensor, sb_params: Tensor) -> Tensor:
     theta, phi, b = sb_params[..., 3:].unbind(dim=2)
     mu = torch.stack([theta.sin() * phi.cos(), theta.sin() * phi.sin(), theta.cos()], dim=2)
     facing = torch.einsum("psk,pk->ps", mu, directions)
-    # Powers by logarithms: the exponent may be infinite, and a lobe seen from behind gives nothing at any exponent.
+    # Powers by logarithms: the exponent may be infinite, and a lobe from behind is 0 at any exponent.
     exponent = (4.0 * b.exp()).clamp_max(_LARGEST_POWER)
     power = (exponent * facing.clamp(1e-30, 1.0).log()).exp()
     return torch.einsum("ps,psc->pc", torch.where(facing > 0, power, 0.0), colour)
 
 
 def _sh_basis(directions: Tensor, degree: int) -> Tensor:
-    """[P, 3] unit vectors -> [P, (degree + 1)^2] values of the real spherical harmonics."""
+    """Evaluate the real spherical harmonics at unit vectors [P, 3], [P, (degree + 1)^2]."""
     x, y, z = directions.unbind(dim=1)
     terms = [torch.full_like(x, SH_C0)]
     if degree >= 1:
@@ -94,11 +94,11 @@ def _sh_basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def principal_colours(features: np.ndarray, weights: np.ndarray) -> Tensor:
-    """The first three principal components of unit features as red, green and blue.
+    """Map the first three principal components of unit features to red, green and blue.
 
-    The components are those of a seeded sample of the rows, drawn with the weights as odds: splats that no ray
-    meets decide nothing. Signs are fixed (the largest entry of a component is positive), so the same lift has the
-    same colours at every run.
+    The components are those of a seeded sample of the rows with probabilities by the weights: splats that no ray hits
+    have no influence. Signs are fixed (the largest entry of a component is positive), so the same lift has the same
+    colours in every run.
 
     Args:
         features: [P, F] f16 or f32; zero rows stay black.
@@ -108,8 +108,8 @@ def principal_colours(features: np.ndarray, weights: np.ndarray) -> Tensor:
         [P, 3] f32 in 0..1.
     """
     rows_of, odds_of = torch.from_numpy(features), torch.from_numpy(weights)
-    known = (rows_of != 0).any(dim=1)
-    odds = torch.where(known, odds_of.to(torch.float32), 0.0)
+    has_feature = (rows_of != 0).any(dim=1)
+    odds = torch.where(has_feature, odds_of.to(torch.float32), 0.0)
     colours = torch.zeros(features.shape[0], COMPONENTS, dtype=torch.float32)
     if not bool((odds > 0).any()):
         return colours
@@ -117,18 +117,18 @@ def principal_colours(features: np.ndarray, weights: np.ndarray) -> Tensor:
     sample = _unit(rows_of[rows])
     centre = sample.mean(dim=0)
     axes = torch.from_numpy(principal_axes((sample - centre).numpy(), COMPONENTS))
-    shown = (sample - centre) @ axes
-    low, high = torch.quantile(shown, torch.tensor(_RANGE, dtype=torch.float32), dim=0)
+    projected = (sample - centre) @ axes
+    low, high = torch.quantile(projected, torch.tensor(_RANGE, dtype=torch.float32), dim=0)
     at_a_time = rows_at_a_time(features.shape[1])
     for first in range(0, features.shape[0], at_a_time):
         block = slice(first, first + at_a_time)
         levels = ((_unit(rows_of[block]) - centre) @ axes - low) / (high - low).clamp_min(1e-12)
-        colours[block, : axes.shape[1]] = levels.clamp(0.0, 1.0) * known[block, None]
+        colours[block, : axes.shape[1]] = levels.clamp(0.0, 1.0) * has_feature[block, None]
     return colours
 
 
 def _draw(odds: Tensor, count: int) -> Tensor:
-    """Seeded rows [count] i64 with probabilities proportional to the odds [P] (inverse of the running sum)."""
+    """Sample seeded rows [count] i64 with probabilities proportional to the odds [P] (inverse of the running sum)."""
     running = torch.cumsum(odds.double(), dim=0)
     marks = torch.rand(count, generator=torch.Generator().manual_seed(SEED), dtype=torch.float64) * running[-1]
     return torch.searchsorted(running, marks, right=True).clamp_max(len(odds) - 1)

@@ -1,19 +1,19 @@
-"""Terms of a question: words, and examples of what is looked for.
+"""Terms of a query: words, and examples of the target.
 
 Examples stand in place of words, "more of this":
 
 | notation | the feature |
 |---|---|
-| `VIEW:x,y` | what the lift shows at a pixel of a camera, ``sum_j A_ij x_j``; any camera, lifted or not |
-| `VIEW:box:x0,y0,x1,y1` | what most pixels of a box show and few around it: columns from x0 up to x1, without it |
-| `VIEW:stroke:x0,y0,x1,y1,...` | what most pixels show on the line through these, two or more |
-| `region:VIEW:LEVEL:ID` | the codebook row of a region, as the lift's feature packs hold it |
+| `VIEW:x,y` | of a pixel of a camera, ``sum_j A_ij x_j``; any camera, lifted or not |
+| `VIEW:box:x0,y0,x1,y1` | common to the pixels of a box, and not around it; columns x0 up to x1 without x1 |
+| `VIEW:stroke:x0,y0,x1,y1,...` | common to the pixels on the line through these corners, two or more |
+| `region:VIEW:LEVEL:ID` | the codebook row of a region of the lift's feature packs |
 | `splat:J` | the feature of a splat, by its row in the splat file |
 | `object:N` | the mean of an object's features, by its number in the lift (`liftcore.query.catalogue`) |
 | `selection:NAME` | the mean of the features of a selection (`liftcore.query.selections`) |
 
-How boxes and strokes are read: `liftcore.query.areas`. A vector has no notation. Names of views may hold colons and
-commas: the notation is read from its end.
+`liftcore.query.areas` computes features of boxes and strokes. A vector has no notation. Names of views may contain
+colons and commas: the notation is parsed from its end.
 """
 
 import re
@@ -26,7 +26,7 @@ NOTATIONS = f"VIEW:x,y, VIEW:box:x0,y0,x1,y1, VIEW:stroke:x0,y0,x1,y1,..., regio
 _PIXEL = re.compile(r"(.+):\s*(-?\d{1,9})\s*,\s*(-?\d{1,9})\s*", re.ASCII | re.DOTALL)
 _AREA = re.compile(r"(.+):(box|stroke):([^:]*)", re.ASCII | re.DOTALL)
 AREAS = (":box", ":stroke")  # ends of a pixel's view that look like an area without its corners
-_WHOLE = re.compile(r"\s*-?\d{1,9}\s*", re.ASCII)
+_INTEGER = re.compile(r"\s*-?\d{1,9}\s*", re.ASCII)
 _REGION = re.compile(r"region:(.+):(\d{1,9}):(\d{1,9})", re.ASCII | re.DOTALL)
 _SPLAT = re.compile(r"splat:(\d{1,18})", re.ASCII)
 _SET = re.compile(r"object:(?P<object>\d{1,9})|selection:(?P<selection>[^:,]{1,100})", re.ASCII)
@@ -34,7 +34,7 @@ _SET = re.compile(r"object:(?P<object>\d{1,9})|selection:(?P<selection>[^:,]{1,1
 
 @dataclass(frozen=True)
 class Pixel:
-    """What a camera's ray meets."""
+    """A pixel of a camera's image."""
 
     view: str  # the name of a camera
     x: int  # column of the camera's image, from the left
@@ -46,7 +46,7 @@ class Pixel:
 
 @dataclass(frozen=True)
 class PixelBox:
-    """What a camera sees in a box of its image, and not around it."""
+    """A box of a camera's image; what is also around it does not count."""
 
     view: str  # the name of a camera
     x0: int  # its first column, from the left
@@ -60,7 +60,7 @@ class PixelBox:
 
 @dataclass(frozen=True)
 class Stroke:
-    """What a camera sees along a line that is drawn on its image."""
+    """A line that is drawn on a camera's image."""
 
     view: str  # the name of a camera
     pixels: tuple[tuple[int, int], ...]  # column and row of its corners, two or more
@@ -83,7 +83,7 @@ class Region:
 
 @dataclass(frozen=True)
 class SplatTerm:
-    """A splat's own feature."""
+    """A splat as an example."""
 
     splat: int  # its row in the splat file
 
@@ -93,7 +93,7 @@ class SplatTerm:
 
 @dataclass(frozen=True)
 class SplatSet:
-    """Splats that belong together: an object of the lift, or a selection of the scene."""
+    """A set of splats: an object of the lift, or a selection of the scene."""
 
     kind: str  # object or selection
     name: str  # the object's number, or the selection's name
@@ -104,7 +104,7 @@ class SplatSet:
 
 @dataclass(frozen=True)
 class Vector:
-    """A feature from elsewhere, of the encoder that made the lift's."""
+    """A feature vector, of the same encoder as the lift's."""
 
     values: tuple[float, ...]  # [F], of any length above zero
 
@@ -120,14 +120,14 @@ Term = str | Example  # a text, or an example
 def parse_example(notation: str, argument: str = "like") -> Example:
     """Read the notation of an example.
 
-    A pixel's comma decides first, so a camera named "splat" or "v:box" can be asked too.
+    Pixels are tried first, so a camera may be called "splat" or "v:box".
 
     Args:
         notation: as in the table above.
-        argument: what to blame.
+        argument: that errors name.
 
     Raises:
-        InvalidQuery: it is none of them.
+        InvalidQuery: it is none of these notations.
     """
     if pixel := _PIXEL.fullmatch(notation):
         return Pixel(pixel[1], int(pixel[2]), int(pixel[3]))
@@ -143,7 +143,7 @@ def parse_example(notation: str, argument: str = "like") -> Example:
 
 
 def parse_set(notation: str, argument: str = "sets") -> SplatSet:
-    """Read the notation of a set of splats; InvalidQuery where it is none."""
+    """Parse the notation of a set of splats; InvalidQuery if it is none."""
     if members := _SET.fullmatch(notation):
         return _splat_set(members)
     raise InvalidQuery(argument, expected=SETS, got=repr(notation[:120]))
@@ -155,11 +155,11 @@ def _splat_set(parts: re.Match[str]) -> SplatSet:
 
 
 def _area(notation: str, parts: re.Match[str], argument: str) -> PixelBox | Stroke:
-    view, kind, listed = parts.groups()
-    numbers = [int(one) for one in listed.split(",") if _WHOLE.fullmatch(one)]
+    view, kind, coordinates = parts.groups()
+    numbers = [int(text) for text in coordinates.split(",") if _INTEGER.fullmatch(text)]
     corners = tuple(zip(numbers[::2], numbers[1::2], strict=False))
     if (
-        len(numbers) < listed.count(",") + 1
+        len(numbers) < coordinates.count(",") + 1
         or len(numbers) % 2
         or len(corners) < 2
         or (kind == "box" and len(corners) > 2)
