@@ -533,7 +533,7 @@ def _check_features(
     figures, wrong = {}, unlike_maps(grids)
     if grids:
         found = smoothness(grids)
-        figures |= {"neighbouring_cells": found.neighbours, "any_two_cells": found.anyone, **found.readings}
+        figures |= {"neighbouring_cells": found.neighbours, "any_two_cells": found.all_pairs, **found.readings}
     if rows:
         own, mirrored = np.median(np.array(rows), axis=0).tolist()
         figures |= {"edges": own, "edges_of_mirrored": mirrored}

@@ -1,4 +1,4 @@
-"""Folders in the field's formats of features and masks, and packs under other names, written as feature packs."""
+"""Packing: folders of features and masks in common formats, and packs under other names, written as feature packs."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from liftcore.values.pack import read_features, write_pack
 if TYPE_CHECKING:
     from liftcore.text.table import TableEncoder
 
-SHOWN = 6  # phrases in a warning
-OPTIONS = {  # of the kinds of files
+MAX_LISTED = 6  # phrases in a warning
+OPTIONS = {  # of each kind of files
     "langsplat": (),
     "npy": ("layout",),
     "masks": ("unlabelled", "encoder", "photos", "device"),
@@ -38,20 +38,20 @@ NAMES = ("encoder", "text_space")  # of a pack
 
 
 class PackOptions(TypedDict, total=False):
-    """How files of one format are read."""
+    """Options for reading files of one format."""
 
     layout: Layout
     """of ``npy``, the order of the axes: hwc or chw"""
     unlabelled: int | None
-    """of label pictures, the value that means no mask; None: 0 of ``masks``, and none of ``prompts``"""
+    """of label pictures, the value of pixels without a mask; None: 0 for ``masks``, no value for ``prompts``"""
     encoder: str | None
-    """of ``masks`` without vectors, what makes them of each mask's crop of its photo"""
+    """of ``masks`` without vectors, the encoder of each mask's crop of its photo"""
     photos: Path | str | Sequence[Path | str] | None
-    """of ``encoder``"""
+    """for ``encoder``"""
     device: str
     """of ``encoder``, as torch names it"""
     names: Path | str | None
-    """of ``prompts``, as `liftcore.features.prompts.prompt_views` has it; like ``folders`` and ``unannotated``"""
+    """of ``prompts``, as for `liftcore.features.prompts.prompt_views`, as are ``folders`` and ``unannotated``"""
     folders: Folders
     unannotated: Unannotated
 
@@ -67,22 +67,22 @@ def pack_folder(
     progress: Progress | bool | None = None,
     **options: Unpack[PackOptions],
 ) -> dict[str, Any]:
-    """Write a folder of features or masks as a feature pack, whole or not at all.
+    """Write a folder of features or masks as a feature pack, completely or not at all.
 
     Args:
-        folder: of the files. out: the pack to write.
-        kind: of the files, as the command ``pack`` tells them apart.
-        encoder_name, text_space, normalised: what the pack says of its vectors; None: what is known of them.
-        progress: as `liftcore.lift` has it.
+        folder: of the files. out: path of the pack.
+        kind: of the files, as for the command ``pack``.
+        encoder_name, text_space, normalised: metadata of the pack; None: as recorded by the files or the encoder.
+        progress: as for `liftcore.lift`.
         options: of the kind.
 
     Returns:
-        Plain facts, ready for JSON: ``folders`` that are part of names, views that were ``renamed``, ``words`` that
-        came along, and ``warnings``. `liftcore.evaluate.inspect_file` describes the pack.
+        A dictionary for JSON: ``folders`` that are part of view names, views that were ``renamed``, ``words`` in the
+        pack, and ``warnings``. `liftcore.evaluate.inspect_file` describes the pack.
 
     Raises:
-        InvalidInput: files are malformed or do not fit each other, the pack cannot be written, there is no such kind,
-            or an option is none of the kind.
+        InvalidInput: files are malformed or do not match each other, the pack cannot be written, an unknown kind, or
+            an option of another kind.
         Unavailable: the encoder's weights, or the device, are not on this machine.
     """
     names = {"encoder": encoder_name or None, "text_space": text_space or None, "normalised": normalised}
@@ -102,7 +102,7 @@ def pack_folder(
             names = own_names | {name: value for name, value in names.items() if value is not None}
             is_encoded = True
         elif options.get("photos"):
-            raise InvalidInput("encoder", expected="what makes vectors of the masks in the photos", got="none")
+            raise InvalidInput("encoder", expected="an encoder of the masks in the photos", got="none")
         else:
             views = mask_views(folder, options.get("unlabelled") or 0)
         check_output(out, views.inputs, "pack")
@@ -112,17 +112,17 @@ def pack_folder(
             metadata["levels"] = json.dumps(LANGSPLAT_LEVELS)
         with writing(out), landing(out) as file:
             write_pack(file, views, metadata, reporter, table)
-    keeps = kind in ("langsplat", "prompts") or is_encoded  # their files are not named after images
+    keeps_names = kind in ("langsplat", "prompts") or is_encoded  # names of their files have no image suffix
     return {
         "folders": folders_of(views),
-        "renamed": {} if keeps else _renamed(views, folder),
+        "renamed": {} if keeps_names else _renamed_views(views, folder),
         "words": list(table.words) if table else [],
         "warnings": warnings,
     }
 
 
 def _check_options(kind: str, options: PackOptions, names: Mapping[str, str | bool | None]) -> None:
-    """Refuse a kind that is none, an option of another, a choice that is none, and names that do not fit."""
+    """Check the kind, that each option belongs to it and is one of its choices, and the names of the pack."""
     check_choice("kind", kind, OPTIONS)
     for name, value in options.items():
         if name not in OPTIONS[kind]:
@@ -134,14 +134,16 @@ def _check_options(kind: str, options: PackOptions, names: Mapping[str, str | bo
         if value is None or (name == "normalised" and isinstance(value, bool) and kind != "prompts"):
             continue
         if kind == "prompts" and name != "encoder":
-            raise InvalidInput(name, expected="None for prompts, whose vectors are made here", got=repr(value)[:80])
+            raise InvalidInput(
+                name, expected="None for prompts, whose vectors are computed here", got=repr(value)[:80]
+            )
         if name == "normalised":
             raise InvalidInput(name, expected="True, False or None", got=repr(value)[:80])
         check_text("encoder_name" if name == "encoder" else name, value)
 
 
 def _prompt_views(folder: Path, options: PackOptions) -> tuple[ViewFolder[Any], TableEncoder, list[str]]:
-    """The views, the words that they bring, and warnings."""
+    """Open masks by prompt, the table of their phrases, and warnings."""
     names = options.get("names")
     prompts = prompt_views(
         folder,
@@ -151,46 +153,46 @@ def _prompt_views(folder: Path, options: PackOptions) -> tuple[ViewFolder[Any], 
         unannotated=options.get("unannotated", "skip"),
     )
     empty = [phrase for phrase, views in prompts.counts.items() if not views]
-    some = ", ".join(empty[:SHOWN]) + (f", ... ({len(empty)})" if len(empty) > SHOWN else "")
-    warnings = [f"no view has a mask of {some}: left out"] if empty else []
+    examples = ", ".join(empty[:MAX_LISTED]) + (f", ... ({len(empty)})" if len(empty) > MAX_LISTED else "")
+    warnings = [f"no view has a mask of {examples}: phrases omitted"] if empty else []
     return prompts.views, prompts.table, [*prompts.warnings, *warnings]
 
 
 def _encoded_masks(
     folder: Path, out: Path | str, options: PackOptions, normalised: bool | None, progress: Progress
 ) -> tuple[ViewFolder[Any], dict[str, Any], list[str]]:
-    """Masks with vectors of their crops, what is known of these, and warnings."""
+    """Encode crops of masks, and return their views, the metadata of the vectors, and warnings."""
     from liftcore.features.encoders import device_named
     from liftcore.features.encoders.crops import CropEncoder, crop_vectors
     from liftcore.features.encoders.encode import find_images
 
     photos, unlabelled = options.get("photos"), options.get("unlabelled") or 0
     if normalised is False:
-        raise InvalidInput("normalised", expected="unit vectors, which the encoder makes", got="False")
+        raise InvalidInput("normalised", expected="True or None: vectors of crops are unit vectors", got="False")
     if not photos:
-        raise InvalidInput("photos", expected="the photos that the masks are of, for the encoder", got="none")
+        raise InvalidInput("photos", expected="the photos of the masks, for the encoder", got="none")
     files, images = mask_files(folder), find_images(photos)
-    check_output(out, [*files.values(), *images.values()], "pack")  # before the work
+    check_output(out, [*files.values(), *images.values()], "pack")  # before the slow part
     encoder = CropEncoder.open(str(options.get("encoder")), device_named(options.get("device", "cpu")))
     vectors, readings = crop_vectors(files, images, encoder, unlabelled, progress)
     names = {"encoder": f"crops of masks, {encoder.name}", "text_space": encoder.text_space, "normalised": True}
     return mask_views(folder, unlabelled, vectors), names, orientation_warnings(readings, "masks and cameras")
 
 
-def _renamed(views: ViewFolder[Any], folder: Path) -> dict[str, str]:
-    """The views that lost the suffix of an image, by their files of vectors."""
+def _renamed_views(views: ViewFolder[Any], folder: Path) -> dict[str, str]:
+    """Return file of vectors -> view, of files whose name has an image suffix that the view does not have."""
     files = {path.relative_to(folder).as_posix(): view for view, path in views.files.items()}
     return {name: view for name, view in files.items() if Path(name).with_suffix("").suffix.lower() in IMAGE_SUFFIXES}
 
 
 def retag_pack(pack: Path | str, out: Path | str, names: Mapping[str, str]) -> None:
-    """Write a feature pack under other names of its encoder or its text space, whole or not at all.
+    """Write a feature pack with other names of its encoder or its text space, completely or not at all.
 
     Args:
         names: ``encoder`` and ``text_space``, or one of them.
 
     Raises:
-        InvalidInput: there is no name or an unknown one, the pack is none, or it cannot be written.
+        InvalidInput: no name or an unknown one, a file that is not a pack, or a path that cannot be written.
     """
     if not isinstance(names, Mapping) or not names:
         raise InvalidInput(
@@ -201,6 +203,6 @@ def retag_pack(pack: Path | str, out: Path | str, names: Mapping[str, str]) -> N
         check_text(name, value)
     pack = local_path(pack, "pack")
     check_output(out, [pack], "pack")
-    read_features(pack)  # what is no pack leaves no file
+    read_features(pack)  # so that an invalid pack is an error before a file is created
     with writing(out), landing(out) as file, whole_file(file) as handle:
         handle.writelines(with_metadata(pack, names))

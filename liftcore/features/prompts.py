@@ -1,21 +1,21 @@
-"""Masks that a text prompt made, as SAM 3 and Grounding DINO give them: regions whose vectors stand for phrases.
+"""Masks by text prompt, as of SAM 3 and Grounding DINO: regions whose vectors represent phrases.
 
-Phrase k of n has the k-th unit vector of n + 1 channels. What no phrase's mask covers has the last one: it was looked
-at, and is none of them. So a lifted splat's feature holds the share of its light that each phrase's masks took, and
-the cosine to a phrase is near 1 where nearly all of it lies in them. The vectors of the phrases go into the pack as a
-table, and a lift of it is asked in these words without an encoder.
+Phrase k of n has the k-th unit vector of n + 1 channels. Pixels outside of all masks have the last one, as they were
+searched and show no phrase. So a lifted feature is the fraction of a splat's weight within the masks of each phrase,
+and the cosine to a phrase is near 1 if nearly all of it is. The vectors of the phrases are stored in the pack as a
+table, so a lift of it can be queried by these words without an encoder.
 
-A folder holds, with sub-folders where views have some (``camA/000``), one of:
+A folder contains, with sub-folders if names of views have some (``camA/000``), one of:
 
 * binary pictures, ``PHRASE/VIEW.png`` or, by ``folders="views"``, ``VIEW/PHRASE.png``; ``_`` stands for a space.
   They are PNGs, or arrays [h, w] in ``.npy`` or ``.npz``;
-* JSON: COCO's data sets and their kin, records of one image, or objects by ids (`liftcore.features.mask_json`);
+* JSON: data sets of COCO and similar ones, records of one image, or objects by ids (`liftcore.features.mask_json`);
 * label pictures ``VIEW.png`` with the names of their values: in a file, or in the picture's text ``legend``, as
   ``splatlift segment --labels`` writes it.
 
-Masks of one phrase in a view are put together. A view counts once it has a file or a record, if only of an empty
-mask. A pixel has no label where nobody decided what it shows: what ``unlabelled`` marks, what lies in a box without a
-mask, and all that no mask covers in a view that was not searched for every phrase.
+Masks of one phrase in a view are merged. A view counts if it has a file or a record, also of an empty mask. These
+pixels have no label: those with the value ``unlabelled``, those within a box without a mask, and those outside of all
+masks in a view that was not searched for every phrase.
 """
 
 import csv
@@ -48,14 +48,14 @@ from liftcore.scene.views import composed, require_name, without_image_suffix
 from liftcore.text.table import TableEncoder, normalize_text
 from liftcore.values.views import NO_LABEL, Regions, label_levels
 
-MOST_PHRASES = 4_096
+MAX_PHRASES = 4_096
 LEGEND = "legend"  # the text of a label picture that names its values
 LAYOUTS = "PHRASE/VIEW.png, VIEW.json with run lengths or polygons, or label pictures VIEW.png with --names"
 PICTURE = ".png"
-LABELMAP = re.compile(r":[0-9]+,[0-9]+,[0-9]+:.*$")  # what CVAT writes behind a name: its colour, parts and actions
-NUMBERED = re.compile(r"([0-9]{1,6})(?:\s*[,:;=]\s*|\s+)(.*\S)")
-NAMED = re.compile(r"(.*\S)\s*[,:;=\t]\s*([0-9]{1,6})")
-TABLES = {".csv": ",", ".tsv": "\t"}  # files of names with columns, and what parts these
+LABELMAP = re.compile(r":[0-9]+,[0-9]+,[0-9]+:.*$")  # after a name in files of CVAT: its colour, parts and actions
+VALUE_THEN_NAME = re.compile(r"([0-9]{1,6})(?:\s*[,:;=]\s*|\s+)(.*\S)")
+NAME_THEN_VALUE = re.compile(r"(.*\S)\s*[,:;=\t]\s*([0-9]{1,6})")
+TABLES = {".csv": ",", ".tsv": "\t"}  # files of names with columns, and their separators
 VALUE_COLUMNS = ("id", "value", "pixel value", "idx", "index", "number", "label id")
 NAME_COLUMNS = ("name", "class", "class name", "label", "label name", "category", "phrase")
 NAME_LISTS = ("id2label", "categories", "classes", "labels", "names")  # of Hugging Face, COCO and others
@@ -63,10 +63,10 @@ OTHER_FILES = {
     **dict.fromkeys((".jpg", ".jpeg"), "JPEG blurs the edges of masks: write them as PNG"),
     **dict.fromkeys((".bmp", ".tif", ".tiff", ".webp", ".gif"), "convert them to PNG"),
     **dict.fromkeys((".pt", ".pth"), "save them as .npy: numpy.save(name, mask.cpu().numpy())"),
-    ".txt": f"of labels of YOLO {AS_COCO}",
-    ".xml": f"of annotations of CVAT or VOC {AS_COCO}",
+    ".txt": f"instead of labels of YOLO {AS_COCO}",
+    ".xml": f"instead of annotations of CVAT or VOC {AS_COCO}",
 }
-MASK_DATA = "mask_data"  # of Grounded SAM 2's tracking, beside json_data
+MASK_DATA = "mask_data"  # folder of Grounded SAM 2's tracking, next to json_data
 
 Folders = Literal["phrases", "views"]
 Unannotated = Literal["skip", "negative"]
@@ -76,7 +76,7 @@ class _Source(Protocol):
     """A file, or part of one, with masks of a view."""
 
     def masks(self) -> Iterator[tuple[str | None, np.ndarray]]:
-        """Phrases, or VOID for what nobody decided, with [h, w] bool; read when they are asked for."""
+        """Read and yield masks [h, w] bool with their phrase, or VOID for unlabelled pixels."""
         ...
 
 
@@ -104,13 +104,13 @@ class _Records:
 @dataclass(frozen=True)
 class _IdPicture:
     path: Path
-    phrases: Mapping[int, str | None]  # value -> phrase; values that are not here are none of the phrases
+    phrases: Mapping[int, str | None]  # value -> phrase; other values show none of the phrases
 
     def masks(self) -> Iterator[tuple[str | None, np.ndarray]]:
         values = _ids(self.path)
         for phrase in dict.fromkeys(self.phrases.values()):
-            own = [value for value, other in self.phrases.items() if other == phrase]
-            yield phrase, np.isin(values, own)
+            phrase_values = [value for value, name in self.phrases.items() if name == phrase]
+            yield phrase, np.isin(values, phrase_values)
 
 
 @dataclass
@@ -119,33 +119,33 @@ class _View:
 
     file: Path  # the first that names it
     sources: list[_Source] = field(default_factory=list)
-    phrases: set[str] = field(default_factory=set)  # plain, that have a pixel
-    decided: set[str] = field(default_factory=set)  # plain, that it was searched for
-    undecided: set[str] = field(default_factory=set)  # plain, that some document did not search it for
+    phrases: set[str] = field(default_factory=set)  # normalized, with a pixel
+    searched: set[str] = field(default_factory=set)  # normalized, that some document searched for
+    not_searched: set[str] = field(default_factory=set)  # normalized, that some document did not search for
     has_void: bool = False
-    filled: int = 0  # pictures of phrases that cover more than half of it
+    large_masks: int = 0  # pictures of phrases that cover more than half of it
 
     def was_searched(self, phrases: Iterable[str]) -> bool:
-        """Return whether each of these phrases is masked wherever it is."""
-        return not (self.undecided - self.decided).intersection(phrases)
+        """Return True if the view was searched for all of these phrases."""
+        return not (self.not_searched - self.searched).intersection(phrases)
 
 
 @dataclass
 class _MaskIndex:
-    """Where the masks of each view are, by phrase."""
+    """Sources of the masks of each view, by phrase."""
 
-    phrases: dict[str, str] = field(default_factory=dict)  # as tables compare them -> as it was said first
+    phrases: dict[str, str] = field(default_factory=dict)  # normalized -> as first written
     views: dict[str, _View] = field(default_factory=dict)
 
     def view(self, name: str, path: Path) -> _View:
-        """A view that a file names."""
+        """Return the view of this name, added if it is new."""
         require_name(name, f"the view of {str(path)!a}", InvalidFeatures)
         return self.views.setdefault(name, _View(path))
 
     def name(self, view: str, phrase: str) -> str:
-        """The plain form of a phrase of a view, which is known from then on."""
+        """Add a phrase of a view, and return its normalized form."""
         if not (key := normalize_text(phrase)):
-            raise InvalidFeatures(f"view {view!r}", expected="a phrase for each mask", got="an empty one")
+            raise InvalidFeatures(f"view {view!r}", expected="a phrase for each mask", got="an empty phrase")
         require_name(phrase, f"a phrase of the view {view!r}", InvalidFeatures)
         self.phrases.setdefault(key, " ".join(composed(phrase).replace("_", " ").split()))
         return key
@@ -157,8 +157,8 @@ class Prompts:
 
     views: ViewFolder[Regions]
     table: TableEncoder
-    counts: Mapping[str, int]  # in how many views each phrase has a mask; one that has none is not in the table
-    warnings: tuple[str, ...] = ()  # of what was left out, and of what no mask decides
+    counts: Mapping[str, int]  # number of views with a mask of each phrase; phrases with 0 are not in the table
+    warnings: tuple[str, ...] = ()  # of omitted images and unlabelled pixels
 
 
 def prompt_views(
@@ -169,44 +169,46 @@ def prompt_views(
     unlabelled: int | None = None,
     unannotated: Unannotated = "skip",
 ) -> Prompts:
-    """The regions of a folder of masks by phrase (above); each view is read when it is asked for.
+    """Open the regions of a folder of masks by phrase (see the module). Each view is read at every access.
 
     Args:
-        folder: the folder. folders: what its sub-folders of binary pictures are named by.
-        names: of label pictures, JSON from values to names, or a text whose k-th line names the value k.
-        unlabelled: of pictures, the value of pixels of which nobody decided what they show (255).
-        unannotated: whether images of a data set without an annotation are left out, or show none of its phrases.
+        folder: of the masks. folders: names of the sub-folders of binary pictures, phrases or views.
+        names: of label pictures, JSON from values to names, or a text whose k-th line is the name of value k.
+        unlabelled: value of unlabelled pixels in pictures (255).
+        unannotated: images of a data set without an annotation: ``skip`` them, or ``negative``, they show no phrase.
 
     Raises:
-        InvalidFeatures: there are no masks, kinds of them are mixed, a record has no phrase, or there are too many
-            phrases. Reading a view: a file is malformed, or its masks have several sizes.
+        InvalidFeatures: no masks, masks of several kinds, a record without a phrase, or too many phrases. When a view
+            is read: a file is malformed, or its masks have several sizes.
     """
     if not folder.is_dir():
         raise InvalidFeatures(str(folder), expected="a folder of masks", got="no such folder")
-    named = {} if names is None else _names(names)
+    value_names = {} if names is None else _read_names(names)
     files = [path for path in files_below(folder) if names is None or not path.samefile(names)]
     documents = [path for path in files if path.suffix.lower() == ".json"]
     pictures = [path for path in files if path.suffix.lower() == PICTURE]
     arrays = [path for path in files if path.suffix.lower() in ARRAYS]
     index, warnings = _MaskIndex(), list[str]()
     if documents:
-        read = _documents(documents, pictures, named, negative=unannotated == "negative")
-        if read is None:
-            got, hint = f"{documents[0].name} and {pictures[0].name}", "or keep kinds of masks apart"
+        parsed_documents = _documents(documents, pictures, value_names, negative=unannotated == "negative")
+        if parsed_documents is None:
+            got, hint = f"{documents[0].name} and {pictures[0].name}", "or use one folder for each kind of masks"
             raise InvalidFeatures(
                 str(folder),
                 expected=f"one of {LAYOUTS}",
                 got=got,
-                hint=f"name the file of names with --names (in Python names=), {hint}",
+                hint=f"give the file of names with --names (in Python names=), {hint}",
             )
         if unlabelled is not None:
-            raise InvalidFeatures("unlabelled", expected="pictures, whose values it is of", got=documents[0].name)
-        warnings += _add_documents(index, read, folder, [*arrays, *pictures])
+            raise InvalidFeatures(
+                "unlabelled", expected="None without pictures", got=f"{unlabelled} for {documents[0].name}"
+            )
+        warnings += _add_documents(index, parsed_documents, folder, [*arrays, *pictures])
     elif (arrays and not pictures and names is not None) or (
         pictures and (names is not None or LEGEND in label_texts(pictures[0]))
     ):
         for path in pictures or arrays:
-            _add_labels(index, path, _view_of(path, folder), named, unlabelled)
+            _add_labels(index, path, _view_of(path, folder), value_names, unlabelled)
     elif pictures or any(len(path.relative_to(folder).parts) > 1 for path in arrays):
         for path in pictures or arrays:
             _add_binary(index, path, path.relative_to(folder), folders, unlabelled)
@@ -215,7 +217,7 @@ def prompt_views(
         suffix, count = Counter(path.suffix.lower() for path in files).most_common(1)[0] if files else ("", 0)
         hint = OTHER_FILES.get(suffix, "")
         hint = (
-            "ids need their names: give --names (in Python names=), or the folder that holds json_data too"
+            "give names of ids with --names (in Python names=), or the folder that also contains json_data"
             if arrays
             else hint
         )
@@ -223,56 +225,60 @@ def prompt_views(
         raise InvalidFeatures(str(folder), expected=f"one of {LAYOUTS}", got=got, hint=hint)
     seen_in = Counter(phrase for view in index.views.values() for phrase in view.phrases)
     order = sorted(seen_in)
-    if not 1 <= len(order) <= MOST_PHRASES:
-        expected, got = f"1 to {MOST_PHRASES} phrases with masks", f"{len(order)} of {len(index.phrases)} phrases"
+    if not 1 <= len(order) <= MAX_PHRASES:
+        expected, got = f"1 to {MAX_PHRASES} phrases with masks", f"{len(order)} of {len(index.phrases)} phrases"
         raise InvalidFeatures(str(folder), expected=expected, got=got, hint="; ".join(warnings))
-    told = {name: one for name, one in index.views.items() if one.phrases or one.has_void or one.was_searched(order)}
-    partly = sum(not one.was_searched(order) for one in told.values())
+    labelled_views = {
+        name: view_masks
+        for name, view_masks in index.views.items()
+        if view_masks.phrases or view_masks.has_void or view_masks.was_searched(order)
+    }
+    partly = sum(not view_masks.was_searched(order) for view_masks in labelled_views.values())
     if partly:
         warnings.append(
-            f"{partly} of {len(told)} views were not searched for every phrase, as their files say: what no mask "
-            "covers has no label there"
+            f"{partly} of {len(labelled_views)} views were not searched for every phrase, according to their files: "
+            "pixels outside of all masks have no label there"
         )
     rows = {phrase: row for row, phrase in enumerate(order)}
     vectors = np.eye(len(order) + 1, dtype=np.float16)
 
     def read_view(name: str) -> Regions:
-        return _regions(name, told[name], rows, vectors)
+        return _regions(name, labelled_views[name], rows, vectors)
 
-    views = ViewFolder({name: one.file for name, one in told.items()}, read_view, files)
+    views = ViewFolder({name: view_masks.file for name, view_masks in labelled_views.items()}, read_view, files)
     table = TableEncoder("phrases", [index.phrases[phrase] for phrase in order], vectors[:-1])
-    counts = {said: seen_in[phrase] for phrase, said in sorted(index.phrases.items())}
+    counts = {text: seen_in[phrase] for phrase, text in sorted(index.phrases.items())}
     return Prompts(views, table, counts, tuple(warnings))
 
 
 def _exchanged_folders(index: _MaskIndex, folders: Folders) -> list[str]:
-    """A warning where phrases are numbered as photos are, and views are not."""
+    """Return a warning if phrases are numbered like photos, and views are not."""
     phrases, views = [*index.phrases.values()], [*index.views]
     if not _is_numbered(phrases) or _is_numbered(views):
         return []
     way, other = ("VIEW/PHRASE", "views") if folders == "phrases" else ("PHRASE/VIEW", "phrases")
-    some = f"phrases are {', '.join(phrases[:2])}, ... and views {', '.join(views[:2])}"
-    return [f"{some}: of {way}.png give --folders {other}"]
+    examples = f"phrases are {', '.join(phrases[:2])}, ... and views {', '.join(views[:2])}"
+    return [f"{examples}: for files {way}.png give --folders {other}"]
 
 
 def _inverted_masks(index: _MaskIndex) -> list[str]:
-    """A warning where several phrases fill most of most views at once, as masks in black on white do."""
-    inverted = sum(view.filled > 1 for view in index.views.values())
+    """Return a warning if several phrases cover most of most views, as masks in black on white do."""
+    inverted = sum(view.large_masks > 1 for view in index.views.values())
     if 2 * inverted <= len(index.views):
         return []
     return [
         f"in {inverted} of {len(index.views)} views two or more phrases cover over half of the picture each: a mask "
-        "is what is not black; invert masks that are black on white"
+        "is the pixels that are not black; invert masks that are black on white"
     ]
 
 
 def _is_numbered(names: Sequence[str]) -> bool:
-    """Return whether names differ by their numbers alone."""
+    """Return True if names differ only by their numbers."""
     return len(names) > 1 and len({re.sub(r"[0-9]+", "0", name) for name in names}) == 1
 
 
 def label_texts(path: Path) -> dict[str, str]:
-    """The texts of a label picture; none of what is no such picture."""
+    """Read the texts of a label picture; empty for other files."""
     try:
         return label_png(path)[1]
     except InvalidFeatures:
@@ -286,7 +292,9 @@ def _regions(name: str, view: _View, rows: Mapping[str, int], vectors: np.ndarra
         size = next(iter(masks.values()), mask if void is None else void).shape
         if mask.shape != size:
             got = f"{size[0]} x {size[1]} and {mask.shape[0]} x {mask.shape[1]}"
-            raise InvalidFeatures(f"view {name!r}", expected="masks of one size", got=got, hint="those of one photo")
+            raise InvalidFeatures(
+                f"view {name!r}", expected="masks of one size", got=got, hint="write the masks of one photo"
+            )
         if phrase is None:
             void = mask if void is None else void | mask
         elif (key := normalize_text(phrase)) in view.phrases:
@@ -306,39 +314,44 @@ def _view_of(path: Path, folder: Path) -> str:
 
 
 def _binary(path: Path, unlabelled: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """Where a mask of a picture or an array is, and where nobody decided, [h, w] bool both."""
+    """Read a picture or an array: [h, w] bool, the mask, and the unlabelled pixels."""
     if path.suffix.lower() == PICTURE:
         return binary_picture(path, unlabelled)
     values = _plane(open_array(path, kinds=NUMBERS + "b"), path)
     void = np.zeros(values.shape, bool) if unlabelled is None else values == unlabelled
     inside = (values != 0) & ~void
-    if len(told := np.unique(values[inside])) > 1:
-        got, hint = f"values from {told[0]} to {told[-1]} beside it", "of scores or logits save where they are high"
-        raise InvalidFeatures(str(path), expected="one value beside 0, a mask", got=got, hint=hint)
+    if len(inside_values := np.unique(values[inside])) > 1:
+        got, hint = (
+            f"values from {inside_values[0]} to {inside_values[-1]} besides 0",
+            "save scores or logits above a threshold",
+        )
+        raise InvalidFeatures(str(path), expected="one value besides 0, a mask", got=got, hint=hint)
     return inside, void
 
 
 def _ids(path: Path) -> np.ndarray:
-    """[h, w] integers of a picture or an array of ids."""
+    """Read a picture or an array of ids, [h, w] integers."""
     if path.suffix.lower() == PICTURE:
         return panoptic_png(path)
     return _plane(open_array(path, kinds=NUMBERS), path).astype(np.int64)
 
 
 def _plane(values: np.ndarray, path: Path) -> np.ndarray:
-    """[h, w] of an array with axes of length 1 before, or one behind."""
-    found = without_unit_axes(values, 3)
-    found = found[..., 0] if found.ndim == 3 and found.shape[-1] == 1 else without_unit_axes(found, 2)
-    if found.ndim != 2:
+    """Remove leading axes of length 1, or the last one, of an array: [h, w]."""
+    plane = without_unit_axes(values, 3)
+    plane = plane[..., 0] if plane.ndim == 3 and plane.shape[-1] == 1 else without_unit_axes(plane, 2)
+    if plane.ndim != 2:
         got = f"{values.dtype} {list(values.shape)}"
         raise InvalidFeatures(str(path), expected="a mask or ids [h, w]", got=got)
-    return found
+    return plane
 
 
 def _add_binary(index: _MaskIndex, path: Path, inner: Path, folders: Folders, unlabelled: int | None) -> None:
     parts = PurePosixPath(inner.with_suffix("").as_posix()).parts
     if len(parts) < 2:
-        raise InvalidFeatures(str(path), expected=LAYOUTS, got="a picture in no phrase's folder and without names")
+        raise InvalidFeatures(
+            str(path), expected=LAYOUTS, got="a picture outside of folders of phrases, without names"
+        )
     phrase, inside = (parts[0], parts[1:]) if folders == "phrases" else (parts[-1], parts[:-1])
     name = without_image_suffix("/".join(inside))
     view, key = index.view(name, path), index.name(name, phrase)
@@ -348,20 +361,22 @@ def _add_binary(index: _MaskIndex, path: Path, inner: Path, folders: Folders, un
         view.has_void = view.has_void or bool(void.any())
     if mask.any():
         view.phrases.add(key)
-    view.filled += bool(mask.mean() > 1 / 2)
+    view.large_masks += bool(mask.mean() > 1 / 2)
 
 
 def _add_labels(index: _MaskIndex, path: Path, name: str, names: Mapping[int, str], unlabelled: int | None) -> None:
     values, texts = label_png(path) if path.suffix.lower() == PICTURE else (_ids(path), {})
-    phrases: dict[int, str | None] = dict(names or _numbered(_parsed(texts.get(LEGEND, "null")), f"{path} legend"))
+    phrases: dict[int, str | None] = dict(
+        names or _names_of_json(_parse_json(texts.get(LEGEND, "null")), f"{path} legend")
+    )
     if unlabelled is not None:
         phrases[unlabelled] = VOID
-    known = [value for value in phrases if value]
+    named_values = [value for value in phrases if value]
     for value in np.unique(values[(values != 0) | (unlabelled == 0)]).tolist():
         if value not in phrases:
-            expected = f"a name for each value but 0 ({', '.join(map(str, known[:6]))})"
+            expected = f"a name for each value except 0 ({', '.join(map(str, named_values[:6]))})"
             option = f"--unlabelled {value} (in Python unlabelled={value})"
-            hint = f"where it marks pixels that nobody decided on, give {option}"
+            hint = f"if it marks unlabelled pixels, give {option}"
             raise InvalidFeatures(str(path), expected=expected, got=f"the value {value}", hint=hint)
     _add_ids(index, index.view(name, path), name, path, values, phrases)
 
@@ -377,38 +392,40 @@ def _add_ids(
     view.phrases.update(index.name(name, phrase) for phrase in present.values() if phrase is not None)
 
 
-def _names(path: Path) -> dict[int, str]:
+def _read_names(path: Path) -> dict[int, str]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise InvalidFeatures("names", expected="a file of names", got=str(error)[:120]) from None
     suffix = path.suffix.lower()
     if suffix in (".yml", ".yaml"):
-        hint = 'write its values and names as JSON, {"1": "red mug"}; 0 is what no mask covers'
+        hint = 'write its values and names as JSON, {"1": "red mug"}; 0 is outside of all masks'
         raise InvalidFeatures("names", expected="JSON, a table (.csv, .tsv) or a text", got=path.name, hint=hint)
     if suffix == ".json":
-        return _numbered(_parsed(text), str(path))
-    found = _tabled(text, TABLES[suffix], path) if suffix in TABLES else _listed(text.splitlines())
-    if not found:
+        return _names_of_json(_parse_json(text), str(path))
+    names = _names_of_table(text, TABLES[suffix], path) if suffix in TABLES else _names_of_lines(text.splitlines())
+    if not names:
         raise InvalidFeatures("names", expected="a file of names", got=f"none in {path.name}")
-    return found
+    return names
 
 
-def _tabled(text: str, separator: str, path: Path) -> dict[int, str]:
-    """Names by their values, of a table: columns that its first row calls so, or its only two, in any order.
+def _names_of_table(text: str, separator: str, path: Path) -> dict[int, str]:
+    """Read names by value from a table: its columns with such headers, or its only two, in any order.
 
-    Of a single column the k-th name is of the value k, as of lines.
+    In a single column, the k-th name belongs to value k, as for lines.
     """
     rows = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines(), delimiter=separator)]
     rows = [row for row in rows if any(row)]
     if all(len(row) == 1 for row in rows):
-        return _listed([row[0] for row in rows])
+        return _names_of_lines([row[0] for row in rows])
     has_header = bool(rows) and not any(map(str.isdecimal, rows[0]))
     header = [cell.lower().replace("_", " ") for cell in rows[0]] if has_header else []
     columns = [*zip(*rows[has_header:], strict=False)]
-    values = [place for place, column in enumerate(columns) if all(map(str.isdecimal, column))]
-    value = next((place for place in values if header and header[place] in VALUE_COLUMNS), None)
-    name = next((header.index(known) for known in NAME_COLUMNS if known in header[: len(columns)]), None)
+    values = [index for index, column in enumerate(columns) if all(map(str.isdecimal, column))]
+    value = next((index for index in values if header and header[index] in VALUE_COLUMNS), None)
+    name = next(
+        (header.index(header_name) for header_name in NAME_COLUMNS if header_name in header[: len(columns)]), None
+    )
     if len(columns) == 2 and len(values) == 1:
         value, name = values[0], 1 - values[0]
     if value is None or name is None or name == value:
@@ -417,95 +434,97 @@ def _tabled(text: str, separator: str, path: Path) -> dict[int, str]:
     return {int(row[value]): row[name] for row in zip(*columns, strict=True) if row[name]}
 
 
-def _listed(lines: Sequence[str]) -> dict[int, str]:
-    """Names by their values, of lines: the k-th names the value k, unless the lines have numbers of their own.
+def _names_of_lines(lines: Sequence[str]) -> dict[int, str]:
+    """Read names by value from lines: the k-th is the name of value k, unless the lines contain values.
 
-    A first line ``background`` (``_background_`` of LabelMe) names 0. Lines that begin with ``#`` are none, nor is
-    LabelMe's ``__ignore__``; of CVAT's ``labelmap.txt``, ``red mug:128,0,0::``, the name counts. Numbers stand before
-    the names or, behind a separator, after different ones; a first line without one is a header.
+    A first line ``background`` (``_background_`` of LabelMe) is the name of 0. Lines that begin with ``#`` and
+    LabelMe's ``__ignore__`` are skipped; in CVAT's ``labelmap.txt``, ``red mug:128,0,0::``, only the name counts.
+    Values are before the names or, with a separator, after distinct names; a first line without a value is a header.
     """
-    named = [line.strip() for line in lines if not line.lstrip().startswith("#") and line.strip() != "__ignore__"]
-    named = [LABELMAP.sub("", line) for line in named]
-    for pattern, value, name in ((NUMBERED, 1, 2), (NAMED, 2, 1)):
-        found = [pattern.fullmatch(line) for line in named if line]
-        pairs = {int(match[value]): match[name] for match in found if match}
-        is_whole = bool(found[1:]) and all(found[1:]) and len(pairs) >= len(found) - (found[0] is None)
-        if is_whole and (name > value or len({*pairs.values()}) == len(pairs)):
+    names = [line.strip() for line in lines if not line.lstrip().startswith("#") and line.strip() != "__ignore__"]
+    names = [LABELMAP.sub("", line) for line in names]
+    for pattern, value, name in ((VALUE_THEN_NAME, 1, 2), (NAME_THEN_VALUE, 2, 1)):
+        matches = [pattern.fullmatch(line) for line in names if line]
+        pairs = {int(match[value]): match[name] for match in matches if match}
+        is_numbered = bool(matches[1:]) and all(matches[1:]) and len(pairs) >= len(matches) - (matches[0] is None)
+        if is_numbered and (name > value or len({*pairs.values()}) == len(pairs)):
             return pairs
-    first = 0 if named and named[0].strip("_").lower() == "background" else 1
-    return {value: line for value, line in enumerate(named, start=first) if line}
+    first = 0 if names and names[0].strip("_").lower() == "background" else 1
+    return {value: line for value, line in enumerate(names, start=first) if line}
 
 
-def _parsed(text: str) -> Any:
+def _parse_json(text: str) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError):
         return None
 
 
-def _numbered(told: Any, where: str) -> dict[int, str]:
-    """Names by their values, of JSON from values to names or from names to values, or of a list.
+def _names_of_json(content: Any, location: str) -> dict[int, str]:
+    """Read names by value from JSON: from values to names or from names to values, or a list.
 
-    A list names values as lines do (`_listed`), unless it is of COCO's categories, ``id`` and ``name``. Of an object
-    with one of NAME_LISTS that counts.
+    A list is read like lines (`_names_of_lines`), unless it has COCO's categories, ``id`` and ``name``. Of an object
+    with one of NAME_LISTS, only this list is read.
     """
-    if isinstance(told, dict):
-        told = next((told[key] for key in NAME_LISTS if isinstance(told.get(key), dict | list)), told)
-    is_inverse = isinstance(told, dict) and not any(str(name).strip().isdecimal() for name in told)
-    if is_inverse and told and all(type(value) is int for value in told.values()):
-        told = {value: name for name, value in told.items()}
-    elif isinstance(told, list) and told and all(isinstance(one, dict) for one in told):
-        told = {one.get("id"): one.get("name") for one in told}
-    if isinstance(told, list):
-        told = _listed(told) if all(isinstance(name, str) for name in told) else {}
+    if isinstance(content, dict):
+        content = next((content[key] for key in NAME_LISTS if isinstance(content.get(key), dict | list)), content)
+    is_inverse = isinstance(content, dict) and not any(str(name).strip().isdecimal() for name in content)
+    if is_inverse and content and all(type(value) is int for value in content.values()):
+        content = {value: name for name, value in content.items()}
+    elif isinstance(content, list) and content and all(isinstance(entry, dict) for entry in content):
+        content = {entry.get("id"): entry.get("name") for entry in content}
+    if isinstance(content, list):
+        content = _names_of_lines(content) if all(isinstance(name, str) for name in content) else {}
     try:
-        named = {int(value): _name_in(name) for value, name in told.items()} if isinstance(told, dict) else {}
+        names = {int(value): _name_in(name) for value, name in content.items()} if isinstance(content, dict) else {}
     except (TypeError, ValueError):
-        named = {}
-    if not named or not all(isinstance(name, str) and name.strip() for name in named.values()):
-        raise InvalidFeatures(where, expected='JSON of values and names, {"1": "red mug"}', got="none")
-    return named
+        names = {}
+    if not names or not all(isinstance(name, str) and name.strip() for name in names.values()):
+        raise InvalidFeatures(location, expected='JSON of values and names, {"1": "red mug"}', got="none")
+    return names
 
 
 def _name_in(entry: Any) -> Any:
-    """The name of a value, which may be an object with it."""
+    """Return the name of an entry, which may be an object with a name."""
     return entry.get("name") if isinstance(entry, dict) else entry
 
 
 def _documents(
     paths: Sequence[Path], pictures: Sequence[Path], names: Mapping[int, str], *, negative: bool
 ) -> list[MaskDocument] | None:
-    """The documents; None where pictures lie beside them that may be masks as well."""
+    """Read the documents; None if there are also pictures that may be masks."""
     try:
-        read = [read_mask_document(path, names, unannotated_negative=negative) for path in paths]
+        documents = [read_mask_document(path, names, unannotated_negative=negative) for path in paths]
     except InvalidFeatures:
         if pictures:
             return None
         raise
-    # Documents that name their images lie beside photos (Roboflow) or pictures of ids.
-    own = all(image.image is not None or image.ids is not None for document in read for image in document.images)
-    return None if pictures and not own else read
+    # Documents that name their images are stored together with photos (Roboflow) or pictures of ids.
+    all_name_images = all(
+        image.image is not None or image.ids is not None for document in documents for image in document.images
+    )
+    return None if pictures and not all_name_images else documents
 
 
 def _add_documents(
     index: _MaskIndex, documents: Sequence[MaskDocument], folder: Path, ids: Sequence[Path]
 ) -> list[str]:
-    """Add the masks of all documents; what a user should know of them."""
+    """Add the masks of all documents, and return warnings."""
     views, id_files = _document_views(documents, folder), _id_files(documents, folder, ids)
-    own: dict[str, str] = {}  # view -> its file, of data sets
-    for document, image in ((one, image) for one in documents for image in one.images):
+    file_names: dict[str, str] = {}  # view -> its file, of data sets
+    for document, image in ((source, image) for source in documents for image in source.images):
         id_file = None if image.ids is None else _id_file(image.ids, document.path, id_files)
         if id_file is not None and image.image is None:
             name = tracked_view(id_file, document.path, folder, image.ids.name if image.ids else "")
         else:
             name = views[document.path, image.image]
-        if image.file and own.setdefault(name, image.file) != image.file:
-            got = f"{own[name]} and {image.file}, both of the view {name!r}"
-            hint = "copies that were turned, cut or mirrored do not lie on their photo: export without augmentation"
+        if image.file and file_names.setdefault(name, image.file) != image.file:
+            got = f"{file_names[name]} and {image.file}, both of the view {name!r}"
+            hint = "rotated, cropped or mirrored copies do not match their photo: export without augmentation"
             raise InvalidFeatures(str(document.path), expected="one image a photo", got=got, hint=hint)
         view = index.view(name, document.path)
-        view.decided |= image.decided
-        view.undecided |= image.undecided
+        view.searched |= image.searched
+        view.not_searched |= image.not_searched
         for phrase in image.phrases:
             index.name(name, phrase)
         if image.masks:
@@ -521,55 +540,57 @@ def _add_named_ids(index: _MaskIndex, view: _View, name: str, path: Path, object
     values = _ids(path)
     unknown = sorted({*np.unique(values).tolist()} - {0, *objects.phrases})
     if unknown:
-        known = ", ".join(map(str, list(objects.phrases)[:6]))
-        raise InvalidFeatures(str(path), expected=f"the ids of its JSON ({known}), and 0", got=f"the id {unknown[0]}")
+        known_ids = ", ".join(map(str, list(objects.phrases)[:6]))
+        raise InvalidFeatures(
+            str(path), expected=f"the ids of its JSON ({known_ids}), and 0", got=f"the id {unknown[0]}"
+        )
     _add_ids(index, view, name, path, values, objects.phrases)
 
 
 def _id_files(documents: Sequence[MaskDocument], folder: Path, files: Sequence[Path]) -> dict[str, list[Path]]:
-    """Name without suffix -> files that may hold ids of a document: below the folder, or in ``mask_data`` beside."""
-    beside = {document.path.parent.parent / MASK_DATA for document in documents if document.has_ids()}
-    outside = [path for path in sorted(beside) if path.is_dir() and not path.is_relative_to(folder)]
-    found: dict[str, list[Path]] = {}
-    for path in [*files, *(file for one in outside for file in visible_files(one))]:
+    """Return name without suffix -> files that may contain ids: below the folder, or in a sibling ``mask_data``."""
+    sibling_folders = {document.path.parent.parent / MASK_DATA for document in documents if document.has_ids()}
+    outside = [path for path in sorted(sibling_folders) if path.is_dir() and not path.is_relative_to(folder)]
+    by_stem: dict[str, list[Path]] = {}
+    for path in [*files, *(file for sibling in outside for file in visible_files(sibling))]:
         if path.suffix.lower() in (*ARRAYS, PICTURE):
-            found.setdefault(composed(path.stem), []).append(path)
-    return found
+            by_stem.setdefault(composed(path.stem), []).append(path)
+    return by_stem
 
 
 def _id_file(objects: IdObjects, document: Path, files: Mapping[str, Sequence[Path]]) -> Path:
-    """The file of a document's ids; of several of its name, the one that lies nearest."""
+    """Return the file of a document's ids; of several with its name, the nearest in the tree of folders."""
     stem = composed(PurePosixPath(objects.name.replace("\\", "/")).stem)
     if stem not in files:
-        hint = f"give the folder that holds both, or keep {MASK_DATA} beside the folder of the JSON"
+        hint = f"give the folder that contains both, or move {MASK_DATA} next to the folder of the JSON"
         expected = f"its ids in {stem}.npy, .npz or .png"
         raise InvalidFeatures(str(document), expected=expected, got="no such file", hint=hint)
     return min(files[stem], key=lambda path: sum(not path.is_relative_to(parent) for parent in document.parents))
 
 
 def _document_views(documents: Sequence[MaskDocument], folder: Path) -> dict[tuple[Path, str | None], str]:
-    """Document and image -> view.
+    """Return (document, image) -> view.
 
-    Images of data sets keep the folders of their relative paths. A document of one image is of the view that it is
-    named after, unless it names another image.
+    Images of data sets keep the folders of their relative paths. A document of one image belongs to the view with its
+    own name, unless it names another image.
     """
     views: dict[tuple[Path, str | None], str] = {}
     by_path: dict[tuple[Path, str], str] = {}
-    for document, image in ((one, image) for one in documents for image in one.images):
-        own, name = _view_of(document.path, folder), image.image
+    for document, image in ((source, image) for source in documents for image in source.images):
+        document_view, name = _view_of(document.path, folder), image.image
         if name is None:
-            views[document.path, None] = own
+            views[document.path, None] = document_view
             continue
         path = without_image_suffix(name)
-        if image.listed and not _is_absolute(path):
+        if image.in_data_set and not _is_absolute(path):
             views[document.path, name] = path
-        elif not image.listed and PurePosixPath(path).name == PurePosixPath(own).name:
-            views[document.path, name] = own
+        elif not image.in_data_set and PurePosixPath(path).name == PurePosixPath(document_view).name:
+            views[document.path, name] = document_view
         else:
             by_path[document.path, name] = name
     if by_path:
-        known = views_of_images([*by_path.values()])
-        views.update({key: known[name] for key, name in by_path.items()})
+        image_views = views_of_images([*by_path.values()])
+        views.update({key: image_views[name] for key, name in by_path.items()})
     return views
 
 
@@ -584,32 +605,40 @@ def _is_absolute(path: str) -> bool:
 def _document_warnings(documents: Sequence[MaskDocument], views: Mapping[tuple[Path, str | None], str]) -> list[str]:
     warnings = list[str]()
     for document in documents:
-        listed = {views[document.path, one.image] for one in document.images if one.listed and one.image}
-        come_to = {views[document.path, one.image] for one in document.images if one.annotated and one.listed}
-        if missing := len(listed - come_to):
+        data_set_views = {
+            views[document.path, image_masks.image]
+            for image_masks in document.images
+            if image_masks.in_data_set and image_masks.image
+        }
+        annotated_views = {
+            views[document.path, image_masks.image]
+            for image_masks in document.images
+            if image_masks.annotated and image_masks.in_data_set
+        }
+        if missing := len(data_set_views - annotated_views):
             warnings.append(
-                f"{missing} of {len(listed)} images of {document.path.name} have no annotation and are left out; "
-                "with --unannotated negative they show none of its phrases"
+                f"{missing} of {len(data_set_views)} images of {document.path.name} have no annotation and are "
+                "omitted; with --unannotated negative they show none of its phrases"
             )
     if boxes := [document for document in documents if document.boxes]:
-        count, some = sum(document.boxes for document in boxes), _names_of([document.path for document in boxes])
+        count, names = sum(document.boxes for document in boxes), _names_of([document.path for document in boxes])
         warnings.append(
-            f"{count} annotations of {some} have a box or less and no mask: what lies in the boxes has no label; "
-            "make masks of them, with SAM say"
+            f"{count} annotations of {names} have at most a box and no mask: pixels in the boxes have no label; "
+            "create masks from the boxes, for example with SAM"
         )
     beyond = {document.path: count for document in documents if (count := document.beyond())}
     if beyond:
         warnings.append(
-            f"{sum(beyond.values())} polygons of {_names_of([*beyond])} reach beyond their images, and are cut off "
-            "there: width and height must be those of the photos that were annotated"
+            f"{sum(beyond.values())} polygons of {_names_of([*beyond])} extend beyond their images and are "
+            "clipped: width and height must be those of the annotated photos"
         )
     several = Counter(view for (_, image), view in views.items() if image is not None)
-    alone = {
+    single_image_views = {
         views[document.path, image.image]
         for document in documents
         for image in document.images
-        if image.image is not None and not image.listed
+        if image.image is not None and not image.in_data_set
     }
-    for view in sorted(view for view in alone if several[view] > 1):
-        warnings.append(f"{several[view]} files are of one image, {view!r}: their masks are put together")
+    for view in sorted(view for view in single_image_views if several[view] > 1):
+        warnings.append(f"{several[view]} files are of one image, {view!r}: their masks are merged")
     return warnings

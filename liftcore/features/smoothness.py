@@ -1,6 +1,7 @@
-"""Do neighbouring cells of maps agree? Those of photos are smooth: neighbours are more alike than any two cells.
+"""Smoothness of feature maps, to find maps whose bytes have another order of axes than their shape says.
 
-Bytes that lie in another order of axes than their shape says are smooth in that order.
+In a map of a photo, neighbouring cells are more similar than any two cells. If the order of axes is wrong, the map is
+smooth only in the right order.
 """
 
 from __future__ import annotations
@@ -12,68 +13,72 @@ import numpy as np
 
 from liftcore.values.views import FeatureGrid, ViewFeatures
 
-LEAST_SMOOTHNESS = 0.1  # of neighbouring cells' agreement over that of any two, as a share of what is left to one
-READINGS = {"[F, h, w]": (1, 2, 0), "[w, h, F]": (1, 0, 2)}  # of the same bytes, and how their axes become h, w, F
-LOOKED_AT = 4  # views whose grids' order of axes is looked at; of fewer grids none
+MIN_SMOOTHNESS = 0.1  # least `Smoothness.share` of a map of a photo
+READINGS = {"[F, h, w]": (1, 2, 0), "[w, h, F]": (1, 0, 2)}  # shapes of the same bytes, and their axes h, w, F
+SAMPLED_VIEWS = 4  # views whose grids are checked; fewer grids are not
 
 
 @dataclass(frozen=True)
 class Smoothness:
-    """How alike the cells of maps are, means over them."""
+    """Mean cosines of the cells of maps, medians over the maps."""
 
-    neighbours: float  # cosine of neighbouring cells
-    anyone: float  # of any two
-    readings: dict[str, float]  # of neighbouring cells, were the bytes read so
+    neighbours: float  # of neighbouring cells
+    all_pairs: float  # of any two cells
+    readings: dict[str, float]  # of neighbouring cells, if the bytes are read in another order of axes
 
     @property
     def share(self) -> float:
-        """What neighbours agree more, as a share of what is left to one."""
-        return (self.neighbours - self.anyone) / max(1 - self.anyone, 1e-6)
+        """Excess of the neighbours' cosine over that of all pairs, as a fraction of the largest possible excess."""
+        return (self.neighbours - self.all_pairs) / max(1 - self.all_pairs, 1e-6)
 
 
 def smoothness(grids: Sequence[np.ndarray]) -> Smoothness:
-    """Of maps [h, w, F] f32, one at least."""
+    """Measure the smoothness of one or more maps [h, w, F] f32."""
     rows = []
     for grid in grids:
         readings = [
-            _agreement(grid.reshape(np.array(grid.shape)[np.argsort(axes)]).transpose(axes))[0]
+            _mean_cosines(grid.reshape(np.array(grid.shape)[np.argsort(axes)]).transpose(axes))[0]
             for axes in READINGS.values()
         ]
-        rows.append([*_agreement(grid), *readings])
-    neighbours, anyone, *others = np.median(np.array(rows), axis=0).tolist()
-    return Smoothness(neighbours, anyone, dict(zip(READINGS, others, strict=True)))
+        rows.append([*_mean_cosines(grid), *readings])
+    neighbours, all_pairs, *reading_means = np.median(np.array(rows), axis=0).tolist()
+    return Smoothness(neighbours, all_pairs, dict(zip(READINGS, reading_means, strict=True)))
 
 
 def unlike_maps(grids: Sequence[np.ndarray]) -> list[str]:
-    """What is wrong with maps [h, w, F] whose neighbouring cells are not alike."""
+    """Return warnings about maps [h, w, F] whose neighbouring cells are not similar."""
     if not grids:
         return []
-    found = smoothness(grids)
-    best = max(found.readings, key=lambda reading: found.readings[reading])
-    agree = f"neighbouring cells agree to {found.neighbours:.2f}"
-    if found.readings[best] - found.neighbours > LEAST_SMOOTHNESS:
-        told = f"read as {best} they would to {found.readings[best]:.2f}: the bytes lie in that order"
-        chosen = "--layout chw (in Python layout='chw')"
-        hint = f"pack maps of channels first with {chosen}, and write others from contiguous arrays"
-        return [f"features: {agree}, {told}; {hint}"]
-    if found.share < LEAST_SMOOTHNESS:
-        return [f"features: {agree}, as any two cells do: the maps show nothing of the photos"]
+    statistics = smoothness(grids)
+    best = max(statistics.readings, key=lambda reading: statistics.readings[reading])
+    cosine = f"neighbouring cells have a mean cosine of {statistics.neighbours:.2f}"
+    if statistics.readings[best] - statistics.neighbours > MIN_SMOOTHNESS:
+        reading_note = f"read as {best}, of {statistics.readings[best]:.2f}, so the bytes have that order"
+        option = "--layout chw (in Python layout='chw')"
+        hint = f"pack maps with channels first with {option}, and write others from contiguous arrays"
+        return [f"features: {cosine}, {reading_note}; {hint}"]
+    if statistics.share < MIN_SMOOTHNESS:
+        return [f"features: {cosine}, like any two cells, so the maps have no relation to the photos"]
     return []
 
 
-def _agreement(grid: np.ndarray) -> tuple[float, float]:
-    """The mean cosine of neighbouring cells of a grid [h, w, F], and of any two."""
-    grid = grid / np.maximum(np.abs(grid).max(axis=2, keepdims=True), 1e-30)  # no square overflows or vanishes
+def _mean_cosines(grid: np.ndarray) -> tuple[float, float]:
+    """Return the mean cosine of neighbouring cells of a grid [h, w, F], and that of any two cells."""
+    grid = grid / np.maximum(np.abs(grid).max(axis=2, keepdims=True), 1e-30)  # so that no square overflows
     unit = grid / np.maximum(np.linalg.norm(grid, axis=2, keepdims=True), 1e-30)
     down, across = (unit[1:] * unit[:-1]).sum(axis=2), (unit[:, 1:] * unit[:, :-1]).sum(axis=2)
     mean = unit.reshape(-1, unit.shape[2]).mean(axis=0)
     count = unit.shape[0] * unit.shape[1]
-    anyone = (count * float(mean @ mean) - 1) / max(count - 1, 1)
-    return float(np.concatenate([down.ravel(), across.ravel()]).mean()) if count > 1 else 1.0, anyone
+    all_pairs = (count * float(mean @ mean) - 1) / max(count - 1, 1)
+    return float(np.concatenate([down.ravel(), across.ravel()]).mean()) if count > 1 else 1.0, all_pairs
 
 
 def some_grids(features: Mapping[str, ViewFeatures], names: Sequence[str]) -> list[np.ndarray]:
-    """The maps [h, w, F] f32 of some of the views, evenly spread; none where fewer are grids."""
-    some = [names[int(place)] for place in np.linspace(0, len(names) - 1, min(LOOKED_AT, len(names)))]
-    grids = [read.grid.float().numpy() for view in some if isinstance(read := features[view], FeatureGrid)]
-    return grids if len(grids) == LOOKED_AT else []
+    """Return the maps [h, w, F] f32 of evenly spaced views; empty if fewer than SAMPLED_VIEWS of them are grids."""
+    sample = [names[int(index)] for index in np.linspace(0, len(names) - 1, min(SAMPLED_VIEWS, len(names)))]
+    grids = [
+        view_features.grid.float().numpy()
+        for view in sample
+        if isinstance(view_features := features[view], FeatureGrid)
+    ]
+    return grids if len(grids) == SAMPLED_VIEWS else []

@@ -1,11 +1,11 @@
 """CLIP's image towers as encoders whose features share a space with texts.
 
-CLIP itself gives one vector an image. MaskCLIP (Zhou, Loy and Dai, ECCV 2022) takes away the pooling: the last
-attention's values, each patch its own, go through the output layers alone, and stay in the space of the texts.
+CLIP itself gives one vector for an image. MaskCLIP (Zhou, Loy and Dai, ECCV 2022) removes the pooling: the value of
+each patch in the last attention goes through the output layers, and stays in the space of the texts.
 
-Towers whose trunk is timm's (SigLIP, SigLIP 2, MobileCLIP, ConvNeXt) pool after the trunk: there each cell alone goes
-through the tower's own pooling and head. Of SigLIP's attention pooling that is the value path, as in MaskCLIP; a mean
-over cells it leaves out.
+Towers with a trunk of timm (SigLIP, SigLIP 2, MobileCLIP, ConvNeXt) pool after the trunk: there each cell goes
+separately through the tower's own pooling and head. For SigLIP's attention pooling this is the value path, as in
+MaskCLIP; a mean over cells becomes the identity.
 """
 
 from collections.abc import Callable
@@ -24,15 +24,15 @@ RESNET_PATCH = 32  # pixels, the stride of a ResNet's last feature map
 
 
 class ClipImageEncoder:
-    """Dense features of open_clip models (``ImageEncoder``): ViT and ModifiedResNet, by MaskCLIP or plainly."""
+    """Dense features of open_clip models (``ImageEncoder``), by MaskCLIP or from the last block's tokens."""
 
-    def __init__(self, kind: str, opened: OpenedModel, text_space: str, device: torch.device) -> None:
-        self.name = f"{kind}:{opened.name.removeprefix('open_clip:')}"
+    def __init__(self, kind: str, clip_model: OpenedModel, text_space: str, device: torch.device) -> None:
+        self.name = f"{kind}:{clip_model.name.removeprefix('open_clip:')}"
         self.text_space = text_space
-        self._tower = opened.model.visual.to(device).float().eval()
+        self._tower = clip_model.model.visual.to(device).float().eval()
         self._device = device
-        self._dense = _dense(kind, opened.model_name, self._tower)
-        self.pixels = _pixels(opened.model, self._tower)
+        self._dense = _dense(kind, clip_model.model_name, self._tower)
+        self.pixels = _pixels(clip_model.model, self._tower)
         with torch.inference_mode():
             probe = self._dense(self._tower, torch.zeros(1, 3, self.pixels.patch, self.pixels.patch, device=device))
         self.channels = int(probe.shape[-1])
@@ -42,28 +42,28 @@ class ClipImageEncoder:
         """Load ``MODEL/PRETRAINED_TAG`` or ``MODEL@WEIGHTS_FILE`` for ``maskclip`` or ``clip``.
 
         Raises:
-            InvalidInput: an unknown model, one whose tower is neither, or a file that is not weights of it.
-            Unavailable: no weights were named, or they cannot be had here.
+            InvalidInput: an unknown model, an unsupported image tower, or a file without weights of the model.
+            Unavailable: the specification has no weights, or they are not available here.
         """
-        opened = open_model(kind, spec)
-        return cls(kind, opened, space_of(opened, spec), device)
+        clip_model = open_model(kind, spec)
+        return cls(kind, clip_model, space_of(clip_model, spec), device)
 
     @classmethod
     def _with_random_weights(cls, kind: str, model_name: str) -> Self:
-        """A model of the right shape that knows nothing: tests of plumbing only."""
-        opened = OpenedModel(f"open_clip:{model_name} (random)", model_name, create_model(model_name, None))
-        return cls(kind, opened, "none", torch.device("cpu"))
+        """Create an encoder with random weights of the right shapes, for tests only."""
+        clip_model = OpenedModel(f"open_clip:{model_name} (random)", model_name, create_model(model_name, None))
+        return cls(kind, clip_model, "none", torch.device("cpu"))
 
     def encode(self, images: Tensor) -> Tensor:
-        """Images [n, 3, h p, w p] f32 -> grids [n, h, w, F] f32 on the CPU."""
+        """Encode images [n, 3, h p, w p] f32 as grids [n, h, w, F] f32 on the CPU."""
         with torch.inference_mode():
             return self._dense(self._tower, images.to(self._device)).to("cpu", torch.float32).clone()
 
 
-def space_of(opened: OpenedModel, spec: str) -> str:
-    """The text space of a model: its name, and of weights from a file their path, by which queries open it again."""
+def space_of(clip_model: OpenedModel, spec: str) -> str:
+    """Return the text space of a model: its name, with the path of a file of weights, as queries open it."""
     _, at, file = spec.partition("@")
-    return f"{opened.name}@{Path(file).resolve()}" if at else opened.name
+    return f"{clip_model.name}@{Path(file).resolve()}" if at else clip_model.name
 
 
 def _dense(kind: str, model_name: str, tower: Any) -> Callable[[Any, Tensor], Tensor]:
@@ -83,9 +83,9 @@ def _dense(kind: str, model_name: str, tower: Any) -> Callable[[Any, Tensor], Te
                 hint=f"maskclip:{model_name}... gives a ResNet's dense features",
             )
         return resnet_values
-    # Exactly these classes: their subclasses put other things where the value path would be read.
-    plain = type(tower) is VisionTransformer and tower.attn_pool is None
-    if not plain or any(type(block) is not ResidualAttentionBlock for block in tower.transformer.resblocks):
+    # Exactly these classes, as subclasses have other layers on the value path.
+    is_standard_vit = type(tower) is VisionTransformer and tower.attn_pool is None
+    if not is_standard_vit or any(type(block) is not ResidualAttentionBlock for block in tower.transformer.resblocks):
         raise InvalidInput(
             "encoder",
             expected="a CLIP model with open_clip's own ViT or ResNet as image tower, without an attention pooler",
@@ -95,7 +95,7 @@ def _dense(kind: str, model_name: str, tower: Any) -> Callable[[Any, Tensor], Te
 
 
 def _trunk(kind: str, model_name: str, tower: Any) -> Callable[[Any, Tensor], Tensor]:
-    """`trunk_cells`, once the tower is known to give a cell a patch for images of other sizes than its own."""
+    """Return `trunk_cells` after a check that the tower gives one cell a patch for images of any size."""
     if kind == "maskclip" and getattr(tower.trunk, "global_pool", "") == "token":
         hint = f"clip:{model_name}... takes the patches' tokens through the class token's layers"
         expected, got = "a tower that pools its cells for maskclip:", f"{model_name}, which reads its class token"
@@ -114,9 +114,9 @@ def _trunk(kind: str, model_name: str, tower: Any) -> Callable[[Any, Tensor], Te
         got = str(error)
     raise InvalidInput(
         "encoder",
-        expected="a tower that gives a cell a patch of images of any size",
+        expected="a tower that gives one cell a patch for images of any size",
         got=f"{model_name} ({got[:120]})",
-        hint="encode crops of masks with it, and pack them: 'splatlift pack masks'",
+        hint="encode crops of masks with it: 'splatlift pack masks'",
     )
 
 
@@ -129,12 +129,12 @@ def _place(tower: Any) -> torch.device:
 
 
 def training_pixels(model: Any, tower: Any) -> tuple[int, tuple[float, ...], tuple[float, ...], str]:
-    """The shorter side that a model was trained at, the mean and deviation of its colours, and how it resizes."""
+    """Return the shorter side of a model's training images, mean and deviation of its colours, and interpolation."""
     from open_clip.transform import PreprocessCfg
 
-    told = library().get_model_preprocess_cfg(model)
-    size = told.get("size") or tower.image_size
-    settings = vars(PreprocessCfg()) | told  # open_clip's defaults where the weights say nothing
+    config = library().get_model_preprocess_cfg(model)
+    size = config.get("size") or tower.image_size
+    settings = vars(PreprocessCfg()) | config  # with open_clip's defaults
     shorter = size if isinstance(size, int) else min(size)
     return int(shorter), tuple(settings["mean"]), tuple(settings["std"]), settings["interpolation"] or "bicubic"
 
@@ -148,11 +148,11 @@ def _pixels(model: Any, tower: Any) -> Pixels:
 def vit_values(tower: Any, images: Tensor) -> Tensor:
     """MaskCLIP on open_clip's ViT: ``proj(ln_post(W_o (W_v ln_1(x) + b_v) + b_o))`` of the last block's input x.
 
-    The last block's residual and its MLP are left out with the attention: they were trained on the class token's
-    mixture, and the values alone stay local.
+    The last block's residual and MLP are omitted with its attention: they were trained on the class token, and only
+    the values are local.
 
     Args:
-        tower: open_clip's VisionTransformer of plain blocks, without an attention pooler.
+        tower: open_clip's VisionTransformer of standard blocks, without an attention pooler.
         images: [n, 3, h p, w p] f32.
 
     Returns:
@@ -170,9 +170,9 @@ def vit_values(tower: Any, images: Tensor) -> Tensor:
 
 
 def vit_patches(tower: Any, images: Tensor) -> Tensor:
-    """Plain CLIP on open_clip's ViT: ``proj(ln_post(x))`` of every patch's token x after the last block.
+    """CLIP on open_clip's ViT: ``proj(ln_post(x))`` of every patch's token x after the last block.
 
-    Nothing in the training asks these tokens to answer for their patch; they mix in what the class token needs.
+    The training does not tie these tokens to their patch, so they also contain information for the class token.
     Shapes are those of `vit_values`.
     """
     tokens = _embed(tower, images)
@@ -194,11 +194,11 @@ def resnet_values(tower: Any, images: Tensor) -> Tensor:
 
 
 def trunk_cells(tower: Any, images: Tensor) -> Tensor:
-    """Each cell of a timm trunk through the pooling and the head that the tower has for all of them.
+    """Encode each cell of a timm trunk separately by the tower's pooling and head.
 
-    A softmax over one cell is one, so that an attention pooling gives ``x + mlp(norm(x))`` of
-    ``x = W_o (W_v cell + b_v) + b_o``. Where the tower takes a mean and then linear layers, the mean over the cells
-    is the image's vector.
+    A softmax over one cell is one, so an attention pooling gives ``x + mlp(norm(x))`` of
+    ``x = W_o (W_v cell + b_v) + b_o``. If the tower has a mean and then linear layers, the mean over the cells is the
+    image's vector.
 
     Args:
         tower: open_clip's TimmModel. images: [n, 3, h p, w p] f32.
@@ -207,19 +207,19 @@ def trunk_cells(tower: Any, images: Tensor) -> Tensor:
         [n, h, w, F] f32.
     """
     trunk, patch = tower.trunk, _trunk_patch(tower)
-    found = trunk.forward_features(images)
+    feature_map = trunk.forward_features(images)
     rows, columns = (side // patch for side in images.shape[-2:])
-    if found.ndim == 4:  # a feature map
-        alone = found.permute(0, 2, 3, 1).reshape(-1, found.shape[1], 1, 1)
-    else:  # tokens; the pooling skips as many as have no patch, so a cell stands for these too
+    if feature_map.ndim == 4:  # a feature map
+        single_cells = feature_map.permute(0, 2, 3, 1).reshape(-1, feature_map.shape[1], 1, 1)
+    else:  # tokens; the pooling skips the prefix tokens, so copies of the cell are in their place
         before = trunk.num_prefix_tokens
-        alone = found[:, before:].reshape(-1, 1, found.shape[-1]).expand(-1, before + 1, -1)
-    cells = tower.head(trunk.forward_head(alone))
+        single_cells = feature_map[:, before:].reshape(-1, 1, feature_map.shape[-1]).expand(-1, before + 1, -1)
+    cells = tower.head(trunk.forward_head(single_cells))
     return cells.reshape(len(images), rows, columns, -1)
 
 
 def _embed(tower: Any, images: Tensor) -> Tensor:
-    """[n, 1 + h w, C], the tokens before the first block; positions are resampled to the images' grid."""
+    """Embed images as tokens [n, 1 + h w, C] before the first block, with positions resampled to the images' grid."""
     patches = tower.conv1(images)
     rows, columns = patches.shape[-2:]
     patches = patches.flatten(2).transpose(1, 2)

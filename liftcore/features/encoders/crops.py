@@ -1,7 +1,7 @@
-"""Vectors of masks: each mask's crop of its photo, alone on black, through an open_clip model's whole image tower.
+"""Vectors of masks: the crop of each mask from its photo, on black, encoded by the image tower of an open_clip model.
 
-That is what LangSplat and its followers do. The vectors share a space with the model's texts, and any tower will do,
-also those that give no dense features.
+LangSplat and related methods do the same. The vectors share a space with the model's texts, and any tower is
+supported, also those without dense features.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from liftcore.text.open_clip import OpenedModel, open_model
 from liftcore.values.views import check_finite
 
 SPEC = "open_clip:MODEL/TAG or open_clip:MODEL@FILE"
-BATCH = 32  # crops that are encoded together
+BATCH = 32  # crops encoded at once
 
 
 class CropEncoder:
-    """An open_clip model's vector of a whole image."""
+    """Encoder of whole images by an open_clip model."""
 
-    def __init__(self, opened: OpenedModel, text_space: str, device: torch.device) -> None:
-        self.name = opened.name
+    def __init__(self, clip_model: OpenedModel, text_space: str, device: torch.device) -> None:
+        self.name = clip_model.name
         self.text_space = text_space
-        self._tower = opened.model.visual.to(device).float().eval()
+        self._tower = clip_model.model.visual.to(device).float().eval()
         self._device = device
-        side, mean, std, interpolation = training_pixels(opened.model, self._tower)
+        side, mean, std, interpolation = training_pixels(clip_model.model, self._tower)
         self.pixels = Pixels(side, side, mean, std, interpolation)  # a crop is one patch
 
     @classmethod
@@ -48,17 +48,17 @@ class CropEncoder:
         """Load ``open_clip:MODEL/TAG`` or ``open_clip:MODEL@FILE``.
 
         Raises:
-            InvalidInput: another specification, an unknown model, or a file that is not weights of it.
-            Unavailable: no weights were named, or they cannot be had here.
+            InvalidInput: another specification, an unknown model, or a file without weights of the model.
+            Unavailable: the specification has no weights, or they are not available here.
         """
         kind, _, rest = spec.partition(":")
         if kind != "open_clip" or not rest:
             raise InvalidInput("encoder", expected=SPEC, got=repr(spec))
-        opened = open_model(kind, rest)
-        return cls(opened, space_of(opened, rest), device)
+        clip_model = open_model(kind, rest)
+        return cls(clip_model, space_of(clip_model, rest), device)
 
     def encode(self, images: Tensor) -> Tensor:
-        """Images [n, 3, side, side] f32, prepared as `pixels` says -> unit vectors [n, F] f32 on the CPU."""
+        """Encode images [n, 3, side, side] f32, prepared by `pixels`, as unit vectors [n, F] f32 on the CPU."""
         with torch.inference_mode():
             return functional.normalize(self._tower(images.to(self._device)).float(), dim=-1).cpu().clone()
 
@@ -70,35 +70,35 @@ def crop_vectors(
     unlabelled: int = 0,
     progress: Progress = silent,
 ) -> tuple[dict[str, np.ndarray], dict[str, Reading]]:
-    """View -> [M, F] f16, a unit vector for each of its masks; and view -> how its photo was read for them.
+    """Encode the crops of masks: view -> unit vectors [M, F] f16; and view -> the orientation its photo was read in.
 
     Args:
-        masks: view -> file, as `liftcore.features.masks.mask_files` gives them. photos: view -> image.
-        unlabelled: what pixels without a mask have in label pictures. progress: told about "encode", in views.
+        masks: view -> file, from `liftcore.features.masks.mask_files`. photos: view -> image.
+        unlabelled: value of pixels without a mask in label pictures. progress: called for "encode", in views.
 
     Raises:
         InvalidInput: a view has no photo, or a photo cannot be read. InvalidFeatures: masks that cannot be read.
     """
-    lost = [view for view in masks if view not in photos]
-    if lost:
-        got = f"none of {len(lost)} views with masks, such as {lost[0]!r}"
-        raise InvalidInput("photos", expected="a photo of each view that has masks, named like it", got=got)
-    found, readings = {}, {}
-    for done, (view, path) in enumerate(masks.items(), start=1):
+    missing_photos = [view for view in masks if view not in photos]
+    if missing_photos:
+        got = f"none of {len(missing_photos)} views with masks, such as {missing_photos[0]!r}"
+        raise InvalidInput("photos", expected="a photo with the name of each view of masks", got=got)
+    vectors, readings = {}, {}
+    for count, (view, path) in enumerate(masks.items(), start=1):
         labels, rows = labels_alone(path, unlabelled)
         side = encoder.pixels.shorter
         image, readings[view] = read_image(photos[view], labels.shape[:0:-1])
         crops = (prepare(crop, encoder.pixels, side) for crop in _crops(np.asarray(image), labels, rows, side))
         batches = (torch.stack(list(islice(crops, BATCH))) for _ in range(0, rows, BATCH))
-        whole = torch.cat([encoder.encode(batch) for batch in batches])
-        check_finite(whole, f"vectors of the masks of {view!r}")
-        found[view] = whole.half().numpy()
-        progress("encode", done, len(masks), "views")
-    return found, readings
+        features = torch.cat([encoder.encode(batch) for batch in batches])
+        check_finite(features, f"vectors of the masks of {view!r}")
+        vectors[view] = features.half().numpy()
+        progress("encode", count, len(masks), "views")
+    return vectors, readings
 
 
 def _crops(image: np.ndarray, labels: np.ndarray, rows: int, side: int) -> Iterator[Image.Image]:
-    """The square picture of each mask of an image [H, W, 3] u8, in the order of their rows."""
+    """Yield the square crop of each mask of an image [H, W, 3] u8, in the order of their rows."""
     (height, width), (h, w) = image.shape[:2], labels.shape[1:]
     down = (np.arange(height) * h) // height
     across = (np.arange(width) * w) // width
@@ -109,10 +109,10 @@ def _crops(image: np.ndarray, labels: np.ndarray, rows: int, side: int) -> Itera
                 boxes[row] = level, box
     for row in range(rows):
         level, (tall, wide) = boxes.get(row, (0, (slice(0), slice(0))))
-        here = np.flatnonzero((down >= tall.start) & (down < tall.stop))
-        there = np.flatnonzero((across >= wide.start) & (across < wide.stop))
-        inside = labels[level][np.ix_(down[here], across[there])] == row
-        alone = np.where(inside[..., None], image[np.ix_(here, there)], 0).astype(np.uint8)
-        if not alone.size:  # no pixels of the mask, or none of the photo
-            alone = np.zeros((1, 1, 3), np.uint8)
-        yield ImageOps.pad(Image.fromarray(alone), (side, side))
+        lines = np.flatnonzero((down >= tall.start) & (down < tall.stop))
+        columns = np.flatnonzero((across >= wide.start) & (across < wide.stop))
+        inside = labels[level][np.ix_(down[lines], across[columns])] == row
+        masked_crop = np.where(inside[..., None], image[np.ix_(lines, columns)], 0).astype(np.uint8)
+        if not masked_crop.size:  # the mask has no pixels, or covers no pixel of the photo
+            masked_crop = np.zeros((1, 1, 3), np.uint8)
+        yield ImageOps.pad(Image.fromarray(masked_crop), (side, side))

@@ -1,4 +1,4 @@
-"""Photos to a feature pack: in three colours, resized to whole patches, in batches of one size.
+"""Encoding of photos as a feature pack: in RGB, resized to whole patches, in batches of one size.
 
 Photos are read in the orientation of their cameras (`liftcore.io.photos`).
 """
@@ -29,14 +29,14 @@ from liftcore.values.pack import write_pack
 from liftcore.values.views import check_finite
 
 LARGEST_F16 = 65_504.0
-MAX_CELLS = 65_536  # of a grid: attention over more patches takes more memory than a photo is worth
-PAPER = (255, 255, 255)  # what shows through transparent pixels: white, as captures without a background have it
+MAX_CELLS = 65_536  # of a grid: attention over more patches needs too much memory
+PAPER = (255, 255, 255)  # the colour behind transparent pixels: white, as in captures without a background
 _TURN = Image.Transpose
-TURNS = {  # what EXIF's orientation asks for
+TURNS = {  # by EXIF's orientation
     2: _TURN.FLIP_LEFT_RIGHT, 3: _TURN.ROTATE_180, 4: _TURN.FLIP_TOP_BOTTOM, 5: _TURN.TRANSPOSE,
     6: _TURN.ROTATE_270, 7: _TURN.TRANSVERSE, 8: _TURN.ROTATE_90,
 }  # fmt: skip
-BACK = {_TURN.ROTATE_90: _TURN.ROTATE_270, _TURN.ROTATE_270: _TURN.ROTATE_90}  # the others undo themselves
+BACK = {_TURN.ROTATE_90: _TURN.ROTATE_270, _TURN.ROTATE_270: _TURN.ROTATE_90}  # the others are their own inverse
 _FILTERS = {
     "bicubic": Image.Resampling.BICUBIC,
     "bilinear": Image.Resampling.BILINEAR,
@@ -47,20 +47,20 @@ _FILTERS = {
 
 @dataclass(frozen=True)
 class EncodeSettings:
-    """How images become grids."""
+    """Settings of encoding images as grids."""
 
-    size: int | None = None  # pixels of the shorter side; None = the encoder's own
-    batch: int = 1  # images of one size that go through the model together
-    normalised: bool = True  # whether cells become unit vectors (a cell of zeros stays zero)
+    size: int | None = None  # pixels of the shorter side; None = the encoder's default
+    batch: int = 1  # images of one size encoded at once
+    normalised: bool = True  # True: cells become unit vectors (a cell of zeros stays zero)
 
 
 @dataclass(frozen=True)
 class Encoded:
-    """What was written."""
+    """Summary of a written pack."""
 
     views: int
-    readings: Mapping[str, Reading]  # by view, how its photo was read
-    wide: tuple[str, ...]  # views that float16 cannot hold, stored as float32
+    readings: Mapping[str, Reading]  # by view, the orientation its photo was read in
+    wide: tuple[str, ...]  # views with values beyond float16, stored as float32
 
 
 def write_encoded(
@@ -71,20 +71,20 @@ def write_encoded(
     progress: Progress = silent,
     sizes: Mapping[str, tuple[int, int]] | None = None,
 ) -> Encoded:
-    """Encode images and write them as a feature pack, whole or not at all.
+    """Encode images and write them as a feature pack, completely or not at all.
 
-    Grids wait for the pack on the disk beside it, so memory holds one batch.
+    Grids are stored in a temporary folder next to the pack first, so memory holds one batch.
 
     Args:
-        images: view name -> image, as `find_images` gives them.
+        images: view name -> image, from `find_images`.
         encoder: of dense features.
-        out: the pack to write.
+        out: path of the pack.
         settings: of the resizing and the batches.
-        progress: told about the stages "encode", "check" and "pack", in views.
-        sizes: view name -> width and height of its camera, which tell the orientation of photos.
+        progress: called for the stages "encode", "check" and "pack", in views.
+        sizes: view name -> width and height of its camera, which give the orientation of photos.
 
     Raises:
-        InvalidInput: a file is no image, the size is too large or too small, or a feature is not finite.
+        InvalidInput: a file is not an image, the size is too large or too small, or a feature is not finite.
     """
     patch = encoder.pixels.patch
     if settings.size is not None and settings.size < patch:
@@ -95,15 +95,15 @@ def write_encoded(
     out.parent.mkdir(parents=True, exist_ok=True)
     with scratch_folder(f".{out.name}.", out.parent) as scratch:
         files = {name: scratch / f"{number}.npy" for number, name in enumerate(images)}
-        done = 0
+        count = 0
         for names, batch in _batches(images, encoder, settings, sizes or {}, readings):
             for name, grid in zip(names, encoder.encode(batch), strict=True):
                 stored = _stored(grid, name, settings)
                 if stored.dtype == torch.float32:
                     wide.append(name)
                 np.save(files[name], stored.numpy())
-            done += len(names)
-            progress("encode", done, len(images), "views")
+            count += len(names)
+            progress("encode", count, len(images), "views")
         metadata = {
             "encoder": encoder.name,
             "text_space": encoder.text_space,
@@ -120,7 +120,7 @@ def _batches(
     sizes: Mapping[str, tuple[int, int]],
     readings: dict[str, Reading],
 ) -> Iterator[tuple[list[str], Tensor]]:
-    """Names and images [n, 3, H, W] of neighbours that share a size; ``readings`` takes how each was read."""
+    """Yield names and images [n, 3, H, W] of consecutive images of one size; fills ``readings``."""
     shorter = settings.size or encoder.pixels.shorter
     names: list[str] = []
     waiting: list[Tensor] = []
@@ -136,7 +136,7 @@ def _batches(
 
 
 def _stored(grid: Tensor, name: str, settings: EncodeSettings) -> Tensor:
-    """[h, w, F] f16, or f32 where a value is beyond float16."""
+    """Convert a grid to [h, w, F] f16, or f32 if a value is beyond float16."""
     check_finite(grid, f"features of image {name!r}")
     if settings.normalised:
         grid = torch.nn.functional.normalize(grid, dim=-1)
@@ -155,24 +155,24 @@ def encode_images(
     normalised: bool = True,
     progress: Progress | bool | None = None,
 ) -> dict[str, Any]:
-    """Encode photos and write them as a feature pack, whole or not at all.
+    """Encode photos and write them as a feature pack, completely or not at all.
 
     Args:
-        images: images, and folders of them; a view is named after its image.
-        out: the pack to write.
-        encoder: or its specification, as `open_image_encoder` takes it.
-        device: where a model that is opened runs, as torch names it.
-        cameras: of the photos, or where they lie: their sizes tell whether photos with an EXIF orientation are read
-            as stored or turned.
-        size, batch, normalised: as `EncodeSettings` has them.
-        progress: as `liftcore.lift` has it.
+        images: images, and folders of them; a view has the name of its image.
+        out: path of the pack.
+        encoder: the encoder, or its specification as for `open_image_encoder`.
+        device: of an encoder opened by its specification, as torch names it.
+        cameras: of the photos, or their file: their sizes decide whether photos with an EXIF orientation are read as
+            stored or rotated.
+        size, batch, normalised: as for `EncodeSettings`.
+        progress: as for `liftcore.lift`.
 
     Returns:
-        Plain facts of the pack, ready for JSON, with ``warnings``.
+        A dictionary for JSON that describes the pack, with ``warnings``.
 
     Raises:
-        InvalidInput: a file is no image, the size is too large or too small, a feature is not finite, the pack cannot
-            be written, or the encoder's specification is none.
+        InvalidInput: a file is not an image, the size is too large or too small, a feature is not finite, the pack
+            cannot be written, or the specification is invalid.
         Unavailable: the weights, or the device, are not on this machine.
     """
     photos = find_images(images)
@@ -190,7 +190,7 @@ def encode_images(
     if pack.wide:
         warnings.append(f"{len(pack.wide)} views have features beyond float16 and are stored as float32")
     if model.text_space == "none":
-        warnings.append("these features have no words: a lift of them is asked by example")
+        warnings.append("these features have no text space: query a lift of them by example")
     return {
         "out": str(out),
         "bytes": size_bytes,
@@ -207,10 +207,10 @@ def encode_images(
 
 
 def find_images(paths: Path | str | Sequence[Path | str]) -> dict[str, Path]:
-    """View name -> image, of files and folders, sorted by name; an image of a sub-folder is of the view ``camA/000``.
+    """Return view name -> image of files and folders, sorted by name; views of sub-folders are named ``camA/000``.
 
     Raises:
-        InvalidInput: nothing is there, a folder has no image, or two images would be the same view.
+        InvalidInput: a path that does not exist, a folder without images, or two images of one view.
     """
     images: dict[str, Path] = {}
     for path in local_paths(paths, "images"):
@@ -220,14 +220,14 @@ def find_images(paths: Path | str | Sequence[Path | str]) -> dict[str, Path]:
             if images.get(name, file) != file:
                 got = f"{images[name]} and {file}"
                 raise InvalidInput(
-                    "images", expected="one image a view", got=got, hint="a view is named after its image"
+                    "images", expected="one image a view", got=got, hint="a view has the name of its image"
                 )
             images[name] = file
     return dict(sorted(images.items()))
 
 
 def _images_of(path: Path) -> list[Path]:
-    """The images of a folder and its sub-folders, or the one image that is no folder."""
+    """List the images of a folder and its sub-folders, or the image itself."""
     if path.is_file():
         return [path]
     if not path.is_dir():
@@ -240,38 +240,38 @@ def _images_of(path: Path) -> list[Path]:
 
 
 def read_image(path: Path | str, size: tuple[int, int] | None = None) -> tuple[Image.Image, Reading]:
-    """An image in red, green and blue, as it is stored or as its EXIF turns it (`liftcore.io.photos`), and which.
+    """Read an RGB image as stored or as rotated by its EXIF orientation (`liftcore.io.photos`), and return which.
 
-    Grey images have three equal colours, of 16 bits the upper 8 count, and transparent pixels show white.
+    Grey images have three equal colours, of 16 bits the upper 8 are used, and transparent pixels become white.
 
     Args:
-        path: of the image. size: width and height of its camera or masks, of any resolution; None: nothing tells.
+        path: of the image. size: width and height of its camera or masks, of any resolution; None: unknown.
 
     Raises:
-        InvalidInput: the file is no image, is cut off, or has more pixels than Pillow opens.
+        InvalidInput: the file is not an image, is truncated, or has more pixels than Pillow opens.
     """
     path = Path(path)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of images between one and two times Pillow's limit, and of odd EXIF
+            warnings.simplefilter("ignore")  # about images between one and two times Pillow's limit, and invalid EXIF
             with Image.open(path) as image:
                 header = header_of(image)
                 image.load()
-                return _colours(_turned(image, header, size)), _reading(header, size)
+                return _colours(_apply_orientation(image, header, size)), _reading(header, size)
     except Image.DecompressionBombError:
-        most = 2 * (Image.MAX_IMAGE_PIXELS or 0)
-        raise InvalidInput(str(path), expected=f"an image of at most {most} pixels", got="a larger one") from None
+        limit = 2 * (Image.MAX_IMAGE_PIXELS or 0)
+        raise InvalidInput(str(path), expected=f"an image of at most {limit} pixels", got="a larger one") from None
     except UnidentifiedImageError:
         hint = UNREAD.get(path.suffix.lower(), "")
         raise InvalidInput(
-            str(path), expected="an image", got="a file that Pillow does not know", hint=hint
+            str(path), expected="an image", got="a file that Pillow cannot identify", hint=hint
         ) from None
-    except (OSError, SyntaxError, ValueError, EOFError) as error:  # Pillow's kinds for files that are cut or broken
-        raise InvalidInput(str(path), expected="a whole image", got=str(error)[:160]) from None
+    except (OSError, SyntaxError, ValueError, EOFError) as error:  # Pillow's errors for truncated or broken files
+        raise InvalidInput(str(path), expected="a complete image", got=str(error)[:160]) from None
 
 
 def readings_of(headers: Mapping[str, PhotoHeader], sizes: Mapping[str, tuple[int, int]]) -> dict[str, Reading]:
-    """How photos are read whose cameras have these sizes, by view."""
+    """Return the orientation that photos are read in by view, for cameras of these sizes."""
     return {view: _reading(header, sizes.get(view)) for view, header in headers.items()}
 
 
@@ -281,11 +281,11 @@ def _reading(header: PhotoHeader, size: tuple[int, int] | None) -> Reading:
     return Reading.ORIENTED if header.turns_for(size) else Reading.STORED
 
 
-def _turned(image: Image.Image, header: PhotoHeader, size: tuple[int, int] | None) -> Image.Image:
-    """A loaded image with the pixels that a map of that size is of."""
+def _apply_orientation(image: Image.Image, header: PhotoHeader, size: tuple[int, int] | None) -> Image.Image:
+    """Rotate a loaded image if needed for a camera of this size."""
     if header.orientation == UPRIGHT:
         return image
-    # Pillow turns TIFFs itself as it loads them, and then takes the tag away.
+    # Pillow rotates TIFFs itself when it loads them, and then removes the tag.
     is_turned = image.getexif().get(ORIENTATION, UPRIGHT) == UPRIGHT
     if is_turned == header.turns_for(size):
         return image
@@ -299,7 +299,7 @@ def _colours(image: Image.Image) -> Image.Image:
         high = 255 if wide.max(initial=0) <= 255 else 65_535
         return Image.fromarray((wide.clip(0, high) * 255 // high).astype(np.uint8), "L").convert("RGB")
     if image.mode == "F":
-        raise ValueError("grey values as floats, whose white nobody knows")
+        raise ValueError("grey values as floats, whose white level is unknown")
     if image.has_transparency_data:
         layered = image.convert("RGBA")
         return Image.alpha_composite(Image.new("RGBA", layered.size, (*PAPER, 255)), layered).convert("RGB")
@@ -307,7 +307,7 @@ def _colours(image: Image.Image) -> Image.Image:
 
 
 def grid_size(width: int, height: int, shorter: int, patch: int) -> tuple[int, int]:
-    """Columns and rows of the grid of an image [pixels], its shorter side resized to ``shorter`` pixels.
+    """Return columns and rows of the grid of an image [pixels] whose shorter side is resized to ``shorter`` pixels.
 
     Sides are rounded to whole patches, at least one, so that cells tile the image exactly.
 
@@ -323,7 +323,7 @@ def grid_size(width: int, height: int, shorter: int, patch: int) -> tuple[int, i
 
 
 def prepare(image: Image.Image, pixels: Pixels, shorter: int) -> Tensor:
-    """[3, rows p, columns p] f32: resized to whole patches and normalised."""
+    """Resize an image to whole patches and normalize its colours, [3, rows p, columns p] f32."""
     columns, rows = grid_size(*image.size, shorter, pixels.patch)
     size = (columns * pixels.patch, rows * pixels.patch)
     if size != image.size:

@@ -1,4 +1,4 @@
-"""Backbones of timm (DINO, DINOv2, ViT, ResNet and their kin): features that have no words."""
+"""Backbones of timm (DINO, DINOv2, ViT, ResNet and others), whose features have no text space."""
 
 import logging
 import sys
@@ -17,16 +17,16 @@ from liftcore.text.open_clip import WEIGHT_SUFFIXES
 from liftcore.text.torchvision_ops import import_torchvision
 from liftcore.text.weights import fetch_weights
 
-# What checkpoints hold beside the backbone: classifiers, and what only the training needed.
+# Tensors of checkpoints besides the backbone, needed in training only.
 _LEFT_OVER = ("mask_token",)
-_PROBE = (2, 3)  # rows and columns of the grid that a new encoder must give
+_PROBE = (2, 3)  # rows and columns of the grid that every encoder is tested with
 _STRIDED = (nn.Conv2d, nn.MaxPool2d, nn.AvgPool2d)
 
 log = logging.getLogger(__name__)
 
 
 class TimmEncoder:
-    """Normed patch tokens of the last block, or the last feature map (``ImageEncoder``)."""
+    """Normalized patch tokens of the last block, or the last feature map (``ImageEncoder``)."""
 
     text_space = "none"
 
@@ -42,11 +42,11 @@ class TimmEncoder:
     def open(cls, spec: str, device: torch.device) -> Self:
         """Load ``NAME`` (cached or downloaded by timm) or ``NAME@WEIGHTS_FILE`` (tensors only).
 
-        A file that has none of timm's names is taken for the same network in another program's, `in_order`.
+        A file with none of timm's names is read as the same network of another program, by `in_order`.
 
         Raises:
-            InvalidInput: an unknown model, one that takes a single image size, or a file that is not its weights.
-            Unavailable: there are no weights of that name, or they cannot be had here.
+            InvalidInput: an unknown model, one that takes a single image size, or a file without its weights.
+            Unavailable: there are no weights of that name, or they are not available here.
         """
         name, at, file = spec.partition("@")
         label = f"encoder timm:{spec}"
@@ -56,11 +56,11 @@ class TimmEncoder:
 
     @classmethod
     def _with_random_weights(cls, name: str) -> Self:
-        """A model of the right shape that knows nothing: tests of plumbing only."""
+        """Create an encoder with random weights of the right shapes, for tests only."""
         return cls(f"{name} (random)", _create(name, pretrained=False), torch.device("cpu"))
 
     def encode(self, images: Tensor) -> Tensor:
-        """Images [n, 3, h p, w p] f32 -> grids [n, h, w, F] f32 on the CPU."""
+        """Encode images [n, 3, h p, w p] f32 as grids [n, h, w, F] f32 on the CPU."""
         with torch.inference_mode():
             images = images.to(self._device)
             if self._shift == 0:
@@ -68,9 +68,9 @@ class TimmEncoder:
             return self._shifted_cells(images)
 
     def _shifted_cells(self, images: Tensor) -> Tensor:
-        """The cells of images whose border's colours go on outside, but the row and column that do not stand on them.
+        """Encode images padded with their border's colours, without the row and column of cells outside of them.
 
-        So the others look where they stand.
+        The padding shifts the cells onto their patches (`cell_shift`).
         """
         patch = self.pixels.patch
         before = round(-self._shift) % patch
@@ -83,7 +83,7 @@ class TimmEncoder:
         return cells.permute(0, 2, 3, 1).to("cpu", torch.float32).clone(memory_format=torch.contiguous_format)
 
     def _probe(self) -> int:
-        """F; a model that does not give a cell a patch for images of any size is refused here."""
+        """Return F after a check that the model gives one cell a patch for images of any size."""
         rows, columns = _PROBE
         try:
             images = torch.zeros(1, 3, rows * self.pixels.patch, columns * self.pixels.patch, device=self._device)
@@ -107,17 +107,19 @@ def _check_name(label: str, name: str) -> None:
     timm = _library()
     if not timm.is_model(name):
         hint = nearest(name, timm.list_models(), 3)
-        raise InvalidInput(label, expected="a model that timm knows", got=repr(name), hint=hint)
+        raise InvalidInput(label, expected="a model of timm", got=repr(name), hint=hint)
 
 
 def _by_name(label: str, name: str) -> Any:
-    known = _library().models.get_pretrained_cfg(name, allow_unregistered=False)
-    if known is None or not known.has_weights:
+    config = _library().models.get_pretrained_cfg(name, allow_unregistered=False)
+    if config is None or not config.has_weights:
         raise Unavailable(
-            label, expected="weights: a name that timm has them for, or a file", got="none", hint=f"timm:{name}@FILE"
+            label, expected="weights: a name with weights in timm, or a file", got="none", hint=f"timm:{name}@FILE"
         )
     return fetch_weights(
-        label, lambda: _create(name, pretrained=True), f"download them elsewhere and use timm:{name}@FILE"
+        label,
+        lambda: _create(name, pretrained=True),
+        f"download the weights on another machine and use timm:{name}@FILE",
     )
 
 
@@ -130,49 +132,48 @@ def _from_file(label: str, name: str, path: Path) -> Any:
     try:
         stored = _library().models.load_state_dict(str(path), device="cpu", weights_only=True)
         if not isinstance(stored, dict) or not all(isinstance(value, Tensor) for value in stored.values()):
-            raise ValueError("it holds something else than tensors by their names")
-        # Each family of timm translates the names of its authors' checkpoints.
+            raise ValueError("not a mapping of names to tensors")
+        # Modules of timm translate the names of the authors' checkpoints.
         translate = getattr(sys.modules[type(model).__module__], "checkpoint_filter_fn", None)
         state = translate(dict(stored), model) if translate else stored
         if not state.keys() & model.state_dict().keys():
             if path.suffix == ".safetensors":
                 raise ValueError(
-                    "other names, and this format sorts by name: bring a file that keeps the order (.pth)"
+                    "other names, and this format sorts by name: give a file in the original order (.pth)"
                 )
             state = in_order(stored, model.state_dict())
-            log.warning("%s: %s has other names; its tensors are taken in their order", label, path.name)
+            log.warning("%s: %s has other names; its tensors are matched by their order", label, path.name)
         missing, unexpected = model.load_state_dict(state, strict=False)
-    except Exception as error:  # unpickling and state dicts fail in many kinds; all mean "not these weights"
+    except Exception as error:  # readers of pickles and state dicts raise many types for files of other content
         raise _not_weights(label, name, path, str(error)) from None
     unexpected = _unexplained(model, unexpected)
     if missing or unexpected:
-        part = ", ".join([*(f"no {key}" for key in missing[:2]), *(f"a strange {key}" for key in unexpected[:2])])
+        part = ", ".join([*(f"no {key}" for key in missing[:2]), *(f"an unexpected {key}" for key in unexpected[:2])])
         raise _not_weights(label, name, path, part)
     return model
 
 
-def in_order(stored: Mapping[str, Tensor], named: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors of a file under a model's names, for a file that names the same network in another way.
+def in_order(stored: Mapping[str, Tensor], target: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors of a file by a model's names, for a file with other names of the same network.
 
-    Tensor k of the one is taken for tensor k of the other if their shapes and the last parts of their names
-    (`weight`, `running_var`) are the same. A classifier may follow in the file, and either may lack the counters of
-    batch norm.
+    Tensor k of the file becomes tensor k of the model if their shapes and the last parts of their names (`weight`,
+    `running_var`) are the same. The file may have a classifier at its end, and counters of batch norm are ignored.
 
     Args:
-        stored: the file's, in its order. named: the model's, in its order.
+        stored: the file's tensors, in order. target: the model's, in order.
 
     Raises:
-        ValueError: a tensor differs, which is named.
+        ValueError: a tensor differs. The message has its number and shape.
     """
-    theirs, ours = ([*_without_counters(tensors).items()] for tensors in (stored, named))
-    classifier = [tuple(tensor.shape[:1]) for _, tensor in theirs[len(ours) :]]
+    stored_entries, target_entries = ([*_without_counters(tensors).items()] for tensors in (stored, target))
+    classifier = [tuple(tensor.shape[:1]) for _, tensor in stored_entries[len(target_entries) :]]
     if len(classifier) == 2 and classifier[0] == classifier[1]:
-        theirs = theirs[: len(ours)]
-    for number, (their, our) in enumerate(zip_longest(theirs, ours)):
+        stored_entries = stored_entries[: len(target_entries)]
+    for number, (their, our) in enumerate(zip_longest(stored_entries, target_entries)):
         if their is None or our is None or _kind(their) != _kind(our):
-            got = f"tensor {number} is {_told(their)} where the model has {_told(our)}"
+            got = f"tensor {number} is {_describe(their)} where the model has {_describe(our)}"
             raise ValueError(f"other names, and in order {got}")
-    return {name: tensor for (name, _), (_, tensor) in zip(ours, theirs, strict=True)}
+    return {name: tensor for (name, _), (_, tensor) in zip(target_entries, stored_entries, strict=True)}
 
 
 def _without_counters(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -183,25 +184,25 @@ def _kind(entry: tuple[str, Tensor]) -> tuple[str, tuple[int, ...]]:
     return entry[0].rpartition(".")[2], tuple(entry[1].shape)
 
 
-def _told(entry: tuple[str, Tensor] | None) -> str:
+def _describe(entry: tuple[str, Tensor] | None) -> str:
     return f"{entry[0]} {list(entry[1].shape)}" if entry else "nothing"
 
 
 def _not_weights(label: str, name: str, path: Path, got: str) -> InvalidInput:
-    return InvalidInput(label, expected=f"tensors of {name} and nothing else in {path.name}", got=got[:200])
+    return InvalidInput(label, expected=f"only tensors of {name} in {path.name}", got=got[:200])
 
 
 def _unexplained(model: Any, keys: Iterable[str]) -> list[str]:
     heads = model.pretrained_cfg.get("classifier") or ()
     heads = (heads,) if isinstance(heads, str) else tuple(heads)
-    explained = (*_LEFT_OVER, *(f"{head}." for head in heads), "fc_norm.")
-    return [key for key in keys if not key.startswith(explained)]
+    expected_prefixes = (*_LEFT_OVER, *(f"{head}." for head in heads), "fc_norm.")
+    return [key for key in keys if not key.startswith(expected_prefixes)]
 
 
 def _create(name: str, *, pretrained: bool) -> Any:
     timm = _library()
     try:
-        # Vision transformers resample their positions to the images' grid when they are told so.
+        # With this option vision transformers resample their positions to the images' grid.
         return timm.create_model(name, pretrained=pretrained, num_classes=0, dynamic_img_size=True)
     except TypeError:
         return timm.create_model(name, pretrained=pretrained, num_classes=0)
@@ -231,24 +232,24 @@ def _library() -> Any:
 
 
 def cell_shift(model: nn.Module, images: Tensor) -> float:
-    """Pixels that the cells' middles lie up and left of their patches' middles; negative = down and right.
+    """Measure the shift of cells up and left of the centres of their patches, in pixels; negative = down and right.
 
-    A strided layer of kernel k, stride s and padding p before it reads around ``s i + (k - 1) / 2 - p``, while the
-    middle of the pixels that output i covers is ``s i + (s - 1) / 2``. A 3 x 3 convolution of stride 2 and padding 1
-    so looks half a pixel up and left, and five of them, as in a ResNet, add up to 15.5 pixels: half a cell. Layers
-    without a stride are taken as centred, which is what their paddings are for.
+    Output i of a strided layer of kernel k, stride s and padding p is centred at ``s i + (k - 1) / 2 - p``, while the
+    pixels that it covers are centred at ``s i + (s - 1) / 2``. So a 3 x 3 convolution of stride 2 and padding 1 is
+    shifted by half a pixel up and left, and five of them, as in a ResNet, by 15.5 pixels: half a cell. Layers without
+    a stride are assumed to be centred, as their padding makes them.
 
-    Where layers stand side by side (a block and its shortcut), their mean counts.
+    For parallel layers (a block and its shortcut), the mean is used.
 
     Args:
-        model: called through ``forward_intermediates``, as timm's models are.
+        model: of timm, called by ``forward_intermediates``.
         images: [n, 3, H, W] f32, of any content; H a multiple of the stride of every layer.
     """
     at_scale: dict[int, list[float]] = {}  # input pixels a cell -> shifts of the strided layers there, in cells
 
     def note(module: Any, inputs: tuple[Tensor, ...], _: object) -> None:
         kernel, stride, padding = (_first(part) for part in (module.kernel_size, module.stride, module.padding))
-        if type(module).__name__.endswith("Same"):  # TensorFlow's padding, which timm adds as the layer is called
+        if type(module).__name__.endswith("Same"):  # TensorFlow's padding, which timm adds in the layer's call
             padding = max(kernel - stride, 0) // 2
         if stride > 1:
             scale = round(images.shape[-2] / inputs[0].shape[-2])

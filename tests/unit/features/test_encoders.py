@@ -418,7 +418,7 @@ def test_weights_from_a_file_give_the_same_features(tmp_path: Path) -> None:
     save_file({**state, "blocks.99.weight": torch.zeros(1)}, str(tmp_path / "more.safetensors"))
     del state["cls_token"]
     save_file(state, str(tmp_path / "less.safetensors"))
-    for name, what in (("more", "a strange blocks.99"), ("less", "cls_token")):
+    for name, what in (("more", "an unexpected blocks.99"), ("less", "cls_token")):
         with pytest.raises(InvalidInput, match=what):
             open_image_encoder(f"timm:test_vit@{tmp_path / name}.safetensors")
 
@@ -457,7 +457,7 @@ def test_weights_under_other_names_are_taken_in_their_order(tmp_path: Path) -> N
         ("timm:resnet19", "resnet18"),
         (f"timm:resnet18@{__file__}", "ending in"),
         ("maskclip:ViT-S-32-alt@{code}", "only tensors of"),
-        ("timm:resnet18@{code}", "nothing else"),
+        ("timm:resnet18@{code}", "only tensors of"),
     ],
 )
 def test_what_is_no_encoder_is_refused_and_no_code_is_run(spec: str, message: str, tmp_path: Path) -> None:
@@ -487,7 +487,7 @@ def test_weights_are_asked_of_the_cache_and_once_of_the_network(
         monkeypatch.setattr(constants, "ENDPOINT", f"http://127.0.0.1:{silent.getsockname()[1]}")
         monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
         monkeypatch.setattr(weights, "SECONDS", 0.3)
-        with pytest.raises(Unavailable, match=r"not answer within 0.3 s; download them elsewhere and use .*@FILE"):
+        with pytest.raises(Unavailable, match=r"within 0.3 s; .* use .*@FILE"):
             open_image_encoder(spec)
         silent.accept()[0].close()
         with pytest.raises(BlockingIOError):

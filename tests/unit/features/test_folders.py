@@ -52,7 +52,7 @@ def test_langsplat_folder_becomes_a_pack(ids: str, features: str, tmp_path: Path
 @pytest.mark.parametrize(
     ("ids", "message"),
     [
-        (np.full((1, 2, 2), 4), r"ids in -1\.\.3, got ids from 4 to 4.*counted on over the levels"),
+        (np.full((1, 2, 2), 4), r"ids in -1\.\.3, got ids from 4 to 4.*number ids through all levels"),
         (np.full((1, 2, 2), -2), r"ids in -1\.\.3"),
         (np.full((1, 2, 2), np.nan), r"ids from nan"),
         (np.full((1, 2, 2), 0.5), "whole numbers"),
@@ -103,7 +103,7 @@ def test_folder_without_arrays_says_why(tmp_path: Path) -> None:
     with pytest.raises(InvalidFeatures, match="0 other files"):
         array_views(tmp_path)
     (tmp_path / "a.pkl").write_bytes(b"never opened")
-    with pytest.raises(InvalidFeatures, match=r"1 pickles \(a\.pkl\), which may run code.*numpy\.save"):
+    with pytest.raises(InvalidFeatures, match=r"1 pickles \(a\.pkl\), which can run code.*numpy\.save"):
         array_views(tmp_path)
 
 

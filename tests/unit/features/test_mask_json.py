@@ -180,10 +180,10 @@ def test_what_is_no_polygon_is_refused(polygon: Any) -> None:
 def test_polygons_beyond_their_image_are_told(tmp_path: Path) -> None:
     corner = [[6, 4, 8.1, 4, 8.1, 6.1]]  # as drawn over the edge by hand
     tall = write(tmp_path / "tall", a=coco((0, 1, BOWL_POLYGON), image_0={"width": HEIGHT, "height": WIDTH}))
-    with pytest.raises(InvalidFeatures, match=r"within images of 6 x 8 pixels, got 1 of 1.*exchanged"):
+    with pytest.raises(InvalidFeatures, match=r"within images of 6 x 8 pixels, got 1 of 1.*swapped"):
         prompt_views(tall)
     small = write(tmp_path / "small", a=coco((0, 1, BOWL_POLYGON), image_0={"width": 4, "height": 3}))
-    with pytest.raises(InvalidFeatures, match=r"1 polygons of a.json reach beyond their images"):
+    with pytest.raises(InvalidFeatures, match=r"1 polygons of a.json extend beyond their images"):
         prompt_views(small)  # which leaves no mask
     found = prompt_views(write(tmp_path / "whole", a=coco((0, 1, corner), (1, 2, BOWL_POLYGON))))
     assert not any("beyond" in warning for warning in found.warnings)
@@ -195,7 +195,7 @@ def test_boxes_without_a_mask_are_told_and_decide_nothing(tmp_path: Path) -> Non
     box = [line[:1] + UNDECIDED * 3 + line[4:] for line in drawing(MUG & BOWL, BOWL)]
     assert shown(found, "0") == [box[k] if 1 <= k < 4 else line for k, line in enumerate(drawing(MUG & BOWL, BOWL))]
     assert any("1 annotations of a.json" in warning for warning in found.warnings)
-    with pytest.raises(InvalidFeatures, match=r"0 of 1 phrases; .*a box or less and no mask"):
+    with pytest.raises(InvalidFeatures, match=r"0 of 1 phrases; .*at most a box and no mask"):
         prompt_views(write(tmp_path / "boxes", a=coco((0, 1, []), (1, 1, []))))
 
 

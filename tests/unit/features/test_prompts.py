@@ -303,12 +303,12 @@ def test_tables_without_values_are_no_names(name: str, content: str, message: st
     [
         ({}, "no such folder"),
         ({"a.txt": "x"}, "got 1 other files"),
-        ({"a.png": MASKS["left"]["Lamp"]}, "in no phrase's folder and without names"),
-        ({"mug/a.png": numbered("left")}, r"one value beside 0, a mask, got values from 7 to 14"),
+        ({"a.png": MASKS["left"]["Lamp"]}, "outside of folders of phrases"),
+        ({"mug/a.png": numbered("left")}, r"one value besides 0, a mask, got values from 7 to 14"),
         ({"mug/a.png": np.full((2, 2, 4), 9, np.uint8)}, "colours with transparency"),
-        ({"mug/a.png": "x"}, "no PNG"),
+        ({"mug/a.png": "x"}, "not a PNG"),
         ({"mug/a.png": np.zeros((2, 2), np.uint8)}, "1 to 4096 phrases with masks, got 0 of 1"),
-        ({"mug/a.png": MASKS["left"]["Lamp"], "a.json": "[]"}, "got a.json and a.png; name the file of names"),
+        ({"mug/a.png": MASKS["left"]["Lamp"], "a.json": "[]"}, "got a.json and a.png; .*--names"),
         ({"a.json": '[{"segmentation": {"size": [1, 2], "counts": [0, 2]}}]'}, r"a phrase \(phrase, .*got none"),
         (
             {"a.json": '[{"phrase": "mug", "segmentation": [[0, 0, 4, 0, 4, 4]]}]'},
@@ -316,7 +316,7 @@ def test_tables_without_values_are_no_names(name: str, content: str, message: st
         ),
         (
             {"a.json": [{"phrase": "mug", "segmentation": [[0, 0, 0.4, 0, 0.4, 0.4]]}]},
-            "a polygon in pixels, got one in shares of the image",
+            "a polygon in pixels, got one in fractions of the image",
         ),
         ({"a.json": [{"category_id": 1, "segmentation": [[0, 0, 4, 0, 4, 4]]}]}, "beside|its 'images'|size"),
         ({"a.json": {"a.jpg1": {"filename": "a.jpg", "regions": []}}}, "VGG Image Annotator.*COCO"),
