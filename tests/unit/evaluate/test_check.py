@@ -305,5 +305,5 @@ def test_views_that_show_one_region_alone_blame_no_camera(scene: StillLife) -> N
         lifted = LiftViews.of(as_views(views), scene.cameras, settings)
         return contradictions.agreement_of_views(CpuRaster(scene.splats), lifted, settings, rays=0).agreement
 
-    assert len(names) == contradictions.FEWEST
+    assert len(names) == contradictions.MIN_VIEWS
     assert agreement(1) is None and agreement(2) is None and agreement(4) is not None
