@@ -1,4 +1,4 @@
-"""Answers beside plain JSON: files with ranges and entity tags, drafts, long lists, and events."""
+"""Answers other than plain JSON: files with ranges and entity tags, drafts, long lists, and events."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from service.store.files import require_whole
 from service.store.jobs import Event, EventKind
 
 BLOCK_BYTES = 256 << 10  # of a draft that is read and sent at a time
-STREAMED = 50  # records of a list that are in memory at a time: of a job of 10,000 packs there are 700 KB
-FAR_DIGITS = 20  # of a number beyond every file; int() takes no number of thousands of digits
+STREAMED_RECORDS = 50  # records of a list in memory at a time: those of a job with 10,000 packs take 700 KB
+FAR_DIGITS = 20  # of a number beyond every file; int() refuses numbers of thousands of digits
 RANGE = re.compile(r"\s*bytes\s*=\s*(\d*)\s*-\s*(\d{0,19})\s*", re.ASCII | re.IGNORECASE)
 BINARY = "application/octet-stream"
 BYTES = {BINARY: {"schema": {"type": "string", "format": "binary"}}}
 
-# For OpenAPI: what a route answers beside 200 when its answers have tags, and all that one that gives a file does.
+# For OpenAPI: the statuses beside 200 of answers with entity tags, and of answers that are files.
 TAGGED: dict[int | str, dict[str, Any]] = {304: {"description": "The client has it already (If-None-Match)"}}
 FILE: dict[int | str, dict[str, Any]] = TAGGED | {
     200: {"description": "The whole of it", "content": BYTES},
@@ -47,7 +47,7 @@ Limit = Annotated[int, Query(ge=1, le=models.PAGE, description="how many to list
 Cursor = Annotated[str | None, Query(pattern=CURSOR, description="the `next` of the page before")]
 
 
-def unchanged(request: Request, etag: str, *, found: bool = True) -> Response | None:
+def unchanged(request: Request, etag: str, *, exists: bool = True) -> Response | None:
     """304 when the client has this entity already, else None.
 
     Args:
@@ -59,19 +59,19 @@ def unchanged(request: Request, etag: str, *, found: bool = True) -> Response | 
     if header is None:
         return None
     tags = {tag.strip().removeprefix("W/") for tag in header.split(",")}
-    is_same = etag in tags or (found and "*" in tags)
+    is_same = etag in tags or (exists and "*" in tags)
     return Response(status_code=304, headers={"ETag": etag}) if is_same else None
 
 
 def cache_headers(etag: str) -> dict[str, str]:
-    """Headers of what a client may keep and must ask about."""
+    """Return the headers of an answer that clients may keep but must revalidate."""
     return {"ETag": etag, "Cache-Control": "private, no-cache"}
 
 
 def file_answer(
     request: Request, path: Path, size: int, sha256: str, name: str, header: bytes | None = None
 ) -> Response:
-    """A stored file, whose bytes never change: 200, 206 for one range, 304 when the client has it.
+    """Return a stored file, whose bytes never change: 200, 206 for one range, 304 if the client has it.
 
     Args:
         path: of the file. size: in bytes, when it was stored. sha256: of the bytes. name: for who saves it.
@@ -95,13 +95,13 @@ def file_answer(
     part = _range_of(range_header, size) if range_header is not None and condition == etag else None
     try:
         return _FilePart(path, header or b"", offset, part, size, cache_headers(etag) | _saved_as(name))
-    except FileNotFoundError:  # deleted since it was looked at
+    except FileNotFoundError:  # deleted in the meantime
         require_whole(path, stored)
         raise
 
 
 def _range_of(header: str, size: int) -> tuple[int, int] | None:
-    """The first and the last byte that a Range header asks for; None for what is as none: several ranges, malformed
+    """Return the first and the last byte of a Range header; None if it must be ignored: several ranges, or malformed
     ones (RFC 9110, 14.2).
 
     Raises:
@@ -120,7 +120,7 @@ def _range_of(header: str, size: int) -> tuple[int, int] | None:
 
 
 class _OpenFile(StreamingResponse):
-    """An answer from a file that is closed with it, however it ends."""
+    """Answer from a file, which is closed after the answer."""
 
     file: BinaryIO
 
@@ -129,11 +129,11 @@ class _OpenFile(StreamingResponse):
             await super().__call__(scope, receive, send)
         finally:
             with anyio.CancelScope(shield=True):
-                await anyio.to_thread.run_sync(self.file.close)  # gigabytes of a draft take their time to go
+                await anyio.to_thread.run_sync(self.file.close)  # closing a draft of gigabytes may block
 
 
 class _FilePart(_OpenFile):
-    """A header before all that lies behind an offset in a file, or a part of that; a file as it is has neither."""
+    """Answer with a header and the bytes behind an offset of a file, or with a range of these."""
 
     def __init__(
         self, path: Path, header: bytes, offset: int, part: tuple[int, int] | None, size: int, headers: dict[str, str]
@@ -155,7 +155,7 @@ class _FilePart(_OpenFile):
 
 
 class Draft(_OpenFile):
-    """A file that was made for this answer alone, perhaps to be saved under a name.
+    """Answer from a temporary file, which may be saved under a name.
 
     It is held open, so its entry may go as soon as this is made; its room goes with the answer, however that ends.
     """
@@ -182,16 +182,15 @@ def page_response(
     limit: int,
     cursor: str | None,
 ) -> Response:
-    """A page of a list, newest first, with ``next``, the cursor of the page after it or null. It is streamed, so that
-    no page is ever in memory whole.
+    """Return a page of a list, newest first, as a stream, so that no page is in memory whole.
 
     Args:
-        name: of the list in the JSON object.
-        page: so many records after a cursor.
-        shape: a record as clients get it.
-        limit, cursor: as the client gave them.
+        name: of the list in the JSON object; ``next`` beside it is the cursor of the next page, or null.
+        page: returns so many records after a cursor.
+        shape: converts a record to the model that clients get.
+        limit, cursor: of the request.
     """
-    first = page(min(limit, STREAMED), cursor)  # before the answer begins: the cursor may be none
+    first = page(min(limit, STREAMED_RECORDS), cursor)  # before the answer begins: the cursor may be invalid
 
     def pieces() -> Iterator[str]:
         page_records, remaining = first, limit
@@ -201,25 +200,25 @@ def page_response(
             remaining -= len(page_records.records)
             if page_records.cursor is None or remaining == 0:
                 break
-            page_records = page(min(remaining, STREAMED), page_records.cursor)
+            page_records = page(min(remaining, STREAMED_RECORDS), page_records.cursor)
             yield "," if page_records.records else ""
         yield f'],"next":{json.dumps(page_records.cursor)}}}'
 
     return StreamingResponse(pieces(), media_type="application/json")
 
 
-# Events of a job as a stream (server-sent events), for a bounded number of clients at a time
+# Events of a job as a stream (server-sent events), for a limited number of clients at a time
 
-LOOK_SECONDS = 0.25  # between looks for new events
-BREATH_SECONDS = 15.0  # of silence, then a comment shows that the line is open
-LOOKERS = 2  # threads that look, however many follow: streams must not starve the other routes
+POLL_SECONDS = 0.25  # between polls for new events
+KEEPALIVE_SECONDS = 15.0  # of silence, then a comment keeps the connection open
+POLL_THREADS = 2  # threads for polls, whatever the number of streams: other routes keep theirs
 
-Look = Callable[[int], list[Event]]  # the events after a number
-Shape = Callable[[Event], str]  # the JSON of an event
+EventSource = Callable[[int], list[Event]]  # returns the events after a number
+Shape = Callable[[Event], str]  # returns the JSON of an event
 
 
 class EventStreams:
-    """All open streams, of which a key has a share. Used from the event loop only.
+    """Open streams, with a limit for each key. Used from the event loop only.
 
     Args:
         limit: how many there may be.
@@ -230,20 +229,20 @@ class EventStreams:
         self._limit = limit
         self._share = max(1, min(of_a_key, limit - 1))
         self._closing = False
-        self._lookers = anyio.CapacityLimiter(LOOKERS)
+        self._poll_threads = anyio.CapacityLimiter(POLL_THREADS)
         self._open: Counter[str | None] = Counter()
 
     @property
     def open(self) -> int:
-        """How many there are."""
+        """Number of open streams."""
         return self._open.total()
 
     def close(self) -> None:
-        """Let every stream end soon: the server stops."""
+        """End every stream soon: the server stops."""
         self._closing = True
 
-    def answer(self, look: Look, shape: Shape, after: int, key: str | None) -> EventSourceResponse:
-        """The events after a number as they come, until the last state.
+    def answer(self, source: EventSource, shape: Shape, after: int, key: str | None) -> EventSourceResponse:
+        """Return the events after a number as they come, until the last state.
 
         Raises:
             ServiceUnavailable: as many streams are open as may be.
@@ -254,13 +253,13 @@ class EventStreams:
                 "events", expected=f"at most {self._limit} open streams", got="more", hint="GET the job instead"
             )
         require_share("events", self._open[key], None if key is None else self._share)
-        return _Stream(self._open, key, self._follow(look, shape, after))
+        return _Stream(self._open, key, self._follow(source, shape, after))
 
-    async def _follow(self, look: Look, shape: Shape, after: int) -> AsyncIterator[bytes]:
+    async def _follow(self, source: EventSource, shape: Shape, after: int) -> AsyncIterator[bytes]:
         spoke = time.monotonic()
         while not self._closing:
             try:
-                events = await anyio.to_thread.run_sync(look, after, limiter=self._lookers)
+                events = await anyio.to_thread.run_sync(source, after, limiter=self._poll_threads)
             except NotFound:  # deleted meanwhile, or the key was revoked
                 return
             for event in events:
@@ -268,19 +267,19 @@ class EventStreams:
                 yield format_sse_event(id=str(event.number), event=event.kind, data_str=shape(event))
                 if is_last(event):
                     return
-            if time.monotonic() - spoke > BREATH_SECONDS:
+            if time.monotonic() - spoke > KEEPALIVE_SECONDS:
                 spoke = time.monotonic()
                 yield format_sse_event(comment="still here")
-            await anyio.sleep(LOOK_SECONDS)
+            await anyio.sleep(POLL_SECONDS)
 
 
 def is_last(event: Event) -> bool:
-    """Whether nothing comes after this event."""
+    """Return True if no event follows this one."""
     return event.kind is EventKind.STATE and event.data["state"] in ENDED
 
 
 class _Stream(EventSourceResponse):
-    """Counts as open while it is being sent, and lets go however that ends."""
+    """Stream that counts as open while it is sent."""
 
     def __init__(self, count: Counter[str | None], key: str | None, events: AsyncIterator[bytes]) -> None:
         super().__init__(events, headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"})

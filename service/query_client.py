@@ -1,4 +1,4 @@
-"""The HTTP process's side of the query worker: turns at one process that keys share fairly, and that outlive it."""
+"""Client of the query process, for the HTTP process: a queue with fair turns between keys; restarts the process."""
 
 from __future__ import annotations
 
@@ -20,56 +20,56 @@ from liftcore.errors import SplatliftError
 from service.child import ONE_THREAD, error_of, is_stopped
 from service.errors import ClientDisconnected, ProcessDied, ServiceUnavailable, TimedOut, require_share
 
-# Without the first two each array of a query is mapped anew and its pages are faulted in one by one: a fifth of its
-# time. A query is a row of small operations, each of which would wait for a team of threads of its library to meet,
-# late beside a lift: more than half of its time. The kernels bring threads of their own.
+# Without the first two, each array of a query is mapped anew and its pages fault one by one: a fifth of its time.
+# A query is many small operations, each of which would wait for its library's threads to synchronise; beside a lift
+# that took more than half of its time. The kernels have threads of their own.
 ENVIRONMENT = {
     "MALLOC_MMAP_THRESHOLD_": str(64 << 20), "MALLOC_TRIM_THRESHOLD_": str(256 << 20), **ONE_THREAD
 }  # fmt: skip
-STDERR = 2  # where what libraries of the worker print goes
-PIPE_BYTES = 256 << 10  # of an answer; the HTTP process holds it in memory while a client reads it: more is a file
-AHEAD_BYTES = 1 << 20  # of requests that are sent along with the one before them
+STDERR = 2  # for the output of the worker's libraries
+PIPE_BYTES = 256 << 10  # of an answer, which the HTTP process holds in memory; larger ones go to a file
+AHEAD_BYTES = 1 << 20  # of later requests that are sent with the current one
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Frame:
-    """An answer of the worker: what is told of it, with an optional picture or array."""
+    """Answer of the worker: a JSON header, with an optional picture or array."""
 
     header: dict[str, Any]
     body: bytes = field(default=b"", repr=False)
 
 
 def send_frame(worker: Connection, frame: Frame) -> None:
-    """Send an answer, as the worker does; it gets requests as a JSON list."""
+    """Send an answer, from the worker; requests come as a JSON list."""
     worker.send_bytes(json.dumps(frame.header, allow_nan=False).encode())
     worker.send_bytes(frame.body)
 
 
 @dataclass(frozen=True)
 class QueryLimits:
-    """What queries may take."""
+    """Limits of queries."""
 
     waiting: int  # calls that wait or run
-    seconds: float  # from a call to its answer, however many are before it
-    scenes: int  # lifts kept open
-    cache_bytes: int  # of answers and views kept
-    encoder: str  # specification of the text encoder that is loaded before it is asked for
-    of_a_key: int | None = None  # calls of one key that wait or run; never so many that it has all places
+    seconds: float  # from a call to its answer, with the time in the queue
+    scenes: int  # open lifts
+    cache_bytes: int  # of cached answers and views
+    encoder: str  # specification of the text encoder that is loaded at the start
+    of_a_key: int | None = None  # calls of one key that wait or run; always fewer than `waiting`
 
 
 @dataclass(eq=False)
 class Waiter:
-    """Who asks, and whether they still wait for the answer."""
+    """Client of a call: its key, and whether it is still connected."""
 
-    key: str = ""  # the id of a key; empty while there are none: then all share one line
+    key: str = ""  # the id of a key; empty while there are no keys: all calls share one queue
     disconnected: bool = False
 
 
 @dataclass(eq=False)
 class _Call:
-    """A request in the line."""
+    """A request in the queue."""
 
     line: bytes  # the request as JSON
     waiter: Waiter
@@ -77,7 +77,7 @@ class _Call:
 
 
 class QueryClient:
-    """A process that answers queries, and the line in front of it; any thread may call any method.
+    """Process that answers queries, with a queue; any thread may call any method.
 
     Callers take turns at the process, each key in its turn and within a key the oldest first. What waits is sent
     along with each call, so that questions to one lift share a pass over its features. Who leaves the line before its
@@ -86,25 +86,25 @@ class QueryClient:
 
     def __init__(self, limits: QueryLimits) -> None:
         self._limits = limits
-        self._condition = threading.Condition()  # guards all below but the process; notified when any of it changes
+        self._condition = threading.Condition()  # guards everything below except the process; notified of each change
         self._line: list[_Call] = []
-        self._busy_with: object | None = None  # the call that speaks with the process, or whoever revives it
+        self._busy_with: object | None = None  # the call that uses the process, or this client while it restarts it
         self._turns: dict[str, int] = {}  # key -> the number of its last turn
-        self._stopped = False
-        self._process: subprocess.Popen[bytes] | None = None  # of whose turn it is, but for a look and a kill
-        self._worker: Connection | None = None  # to it, likewise
-        self._cuda: dict[str, Any] | None = None  # what the worker says of the device
+        self._is_stopped = False
+        self._process: subprocess.Popen[bytes] | None = None  # used by the current call; others poll or kill it
+        self._worker: Connection | None = None  # likewise
+        self._cuda: dict[str, Any] | None = None  # the device, as the worker reports it
         self._callback: Callable[[str, str, float], None] | None = None
         self._spawned = 0
 
     def start(self) -> None:
-        """Start the process, so that the first query finds it warm."""
+        """Start the process, so that the first query finds it ready."""
         self.revive()
 
     def stop(self) -> None:
-        """End the process, and with it a query that still runs; those that wait are told to ask elsewhere."""
+        """End the process and its current query; waiting calls are refused."""
         with self._condition:
-            self._stopped = True
+            self._is_stopped = True
             self._condition.notify_all()
             process = self._process
             if process is not None:
@@ -113,48 +113,48 @@ class QueryClient:
         self._reap()
 
     def on_call_finished(self, callback: Callable[[str, str, float], None]) -> None:
-        """Call this after each call, with its operation, what came of it and the seconds that it took."""
+        """Call `callback` after each call, with its operation, outcome and seconds."""
         self._callback = callback
 
     @property
     def restarts(self) -> int:
-        """Processes after the first."""
+        """Processes started after the first one."""
         return max(0, self._spawned - 1)
 
     @property
     def waiting(self) -> int:
-        """Calls that wait for their turn."""
+        """Calls in the queue."""
         return len(self._line)
 
     def alive(self) -> bool:
-        """Whether the process lives, and is not stopped."""
+        """Return True if the process lives and is not stopped."""
         process = self._process
         return process is not None and process.poll() is None and not is_stopped(process.pid)
 
     def revive(self) -> bool:
-        """Whether the process lives; when it does not, a new one starts."""
+        """Return True if the process lives; else start a new one."""
         if self.alive():
             return True
         with self._condition:
-            if self._busy_with is not None or self._stopped:
-                return False  # whoever speaks with it will see
+            if self._busy_with is not None or self._is_stopped:
+                return False  # the call that uses it will notice
             self._busy_with = self
         try:
             self._spawn()
-        except OSError:  # a machine without room for a process; whoever asks next tries again
+        except OSError:  # no room for a process; the next call tries again
             log.exception("the query worker could not be started")
         finally:
             self._end_turn()
         return False
 
     def cancel(self, waiter: Waiter) -> None:
-        """Say that nobody waits for the answers of this one any more. Never waits."""
+        """Note that the client no longer waits for an answer. Does not block."""
         waiter.disconnected = True
         with self._condition:
             self._condition.notify_all()
 
     def call(self, request: dict[str, Any], waiter: Waiter | None = None) -> Frame:
-        """Ask the worker.
+        """Send a request to the worker and return its answer.
 
         Args:
             request: what is asked, as JSON takes it.
@@ -171,9 +171,9 @@ class QueryClient:
         start, outcome = time.monotonic(), "crashed"
         call = _Call(json.dumps(request, allow_nan=False).encode(), waiter or Waiter(), start + self._limits.seconds)
         try:
-            ahead = self._wait_for_turn(call)
+            lookahead = self._wait_for_turn(call)
             try:
-                reply = self._ask(call, ahead)
+                reply = self._ask(call, lookahead)
             finally:
                 self._end_turn()
             if "fault" in reply.header:
@@ -190,7 +190,7 @@ class QueryClient:
         return reply
 
     def require_device(self, device: str) -> None:
-        """Refuse a device that is not there; ``auto`` and ``cpu`` always are.
+        """Refuse a device that is not available; ``auto`` and ``cpu`` always are.
 
         The worker looks, once, as this process never loads torch. When it cannot be asked the device is let through:
         the job looks again, and fails in the same words.
@@ -209,20 +209,20 @@ class QueryClient:
             raise error_of(self._cuda["lack"])
 
     def _wait_for_turn(self, call: _Call) -> list[bytes]:
-        """Wait until nobody is to be asked before this call; what waits behind it."""
+        """Wait for the call's turn; return the requests behind it in the queue."""
         with self._condition:
             self._require_place(call.waiter.key)
             self._line.append(call)
             try:
                 self._condition.wait_for(
-                    lambda: self._stopped or call.waiter.disconnected or self._next() is call,
+                    lambda: self._is_stopped or call.waiter.disconnected or self._next() is call,
                     _remaining_seconds(call),
                 )
-                came = not self._stopped and self._next() is call
+                came = not self._is_stopped and self._next() is call
             finally:
                 self._line.remove(call)
                 self._condition.notify_all()
-            if self._stopped:
+            if self._is_stopped:
                 raise ServiceUnavailable(
                     "query", expected="a running server", got="one that stops", hint="ask the next one"
                 )
@@ -240,7 +240,7 @@ class QueryClient:
             self._condition.notify_all()
 
     def _next(self) -> _Call | None:
-        """Whose turn it is: the oldest call of the key that had its last turn before all others."""
+        """Return the next call: the oldest of the key whose last turn is longest ago."""
         if self._busy_with is not None:
             return None
         waiting = (call for call in self._line if not call.waiter.disconnected)
@@ -249,10 +249,10 @@ class QueryClient:
     def _require_place(self, key: str) -> None:
         speaking = self._busy_with if isinstance(self._busy_with, _Call) else None
         calls = [*self._line, *([] if speaking is None else [speaking])]
-        if self._stopped or len(calls) >= self._limits.waiting:
+        if self._is_stopped or len(calls) >= self._limits.waiting:
             raise self._busy()
         limit = self._limits.of_a_key
-        if key and limit is not None:  # with one place in all there are no shares
+        if key and limit is not None:  # with one place in all there is nothing to share
             limit = max(1, min(limit, self._limits.waiting - 1))
             require_share("query", sum(call.waiter.key == key for call in calls), limit)
 
@@ -260,36 +260,36 @@ class QueryClient:
         line = f"at most {self._limits.waiting} waiting queries"
         return ServiceUnavailable("query", expected=line, got="more", hint="try again soon")
 
-    def _ask(self, call: _Call, ahead: list[bytes]) -> Frame:
-        """Ask the process; when it dies over that, a new one."""
-        for _ in range(2):  # it may have died while idle, so the first silence is no call's fault
+    def _ask(self, call: _Call, lookahead: list[bytes]) -> Frame:
+        """Send the request to the process; restart the process once if it dies."""
+        for _ in range(2):  # it may have died while idle, which is not the fault of this call
             if not self.alive():
                 self._spawn()
-            reply = self._exchange(call, ahead)
+            reply = self._exchange(call, lookahead)
             if reply is not None:
                 return reply
-            if self._stopped:
+            if self._is_stopped:
                 raise ServiceUnavailable(
                     "query", expected="a running server", got="one that stops", hint="ask the next one"
                 )
             log.error("the query worker died; a new one starts")
             self._spawn()
-            ahead = []
+            lookahead = []
         raise ProcessDied("query", expected="an answer", got="a query process that died twice over it")
 
-    def _exchange(self, call: _Call, ahead: list[bytes]) -> Frame | None:
-        """What the process says, None when it dies.
+    def _exchange(self, call: _Call, lookahead: list[bytes]) -> Frame | None:
+        """Return the process' answer; None if it dies.
 
         Raises:
             TimedOut: it takes too long; a new one starts.
         """
         process, worker = self._process, self._worker
         assert process is not None and worker is not None
-        sizes = itertools.accumulate(map(len, ahead))
-        lines = [call.line, *(line for line, size in zip(ahead, sizes, strict=True) if size <= AHEAD_BYTES)]
+        sizes = itertools.accumulate(map(len, lookahead))
+        lines = [call.line, *(line for line, size in zip(lookahead, sizes, strict=True) if size <= AHEAD_BYTES)]
         deadline = threading.Timer(
             _remaining_seconds(call), process.kill
-        )  # it may be stopped, and neither read nor write
+        )  # a stopped process neither reads nor writes
         deadline.start()
         try:
             worker.send_bytes(b"[" + b", ".join(lines) + b"]")
@@ -315,14 +315,14 @@ class QueryClient:
                 env=ENVIRONMENT | os.environ,
             )  # fmt: skip
             self._worker = Connection(near_end.detach())
-        if self._stopped:  # whoever stopped us may have looked before there was a process
+        if self._is_stopped:  # the stop may have come before there was a process
             self._process.kill()
 
     def _reap(self) -> None:
         process, self._process = self._process, None
         if process is not None:
             process.kill()
-            process.communicate()  # closes its lifeline, and waits
+            process.communicate()  # this closes its lifeline and waits for it
         if self._worker is not None:
             self._worker.close()
             self._worker = None

@@ -1,4 +1,4 @@
-"""The query process: answers, scores, masks, maps, renders and splats over open scenes, as its server asks for them.
+"""Answer the requests of the query process: answers, scores, masks, maps, renders and splats over open scenes.
 
 Run as ``python -m service.query_worker SOCKET SCENES CACHE_BYTES ENCODER``. The socket, a connection of
 multiprocessing's, brings JSON lists of requests: the first of each is answered, the others wait behind it. When its
@@ -52,17 +52,17 @@ from service.query_client import PIPE_BYTES, Frame, send_frame
 from service.settings import encoder_version
 
 WARM_UP_TEXT = "something"
-EDITED = "edited"  # the name of a selection while it is edited; those of questions are hexadecimal
-WORD_FILES = {"word_labels": "splat_labels", "word_map": "labels", "word_picture": "picture"}  # of `blocks_of`
+EDITED = "edited"  # the name of a selection during an edit; names of questions are hexadecimal
+WORD_FILES = {"word_labels": "splat_labels", "word_map": "labels", "word_picture": "picture"}  # for `blocks_of`
 SPLATS_FILES = {"object": "object", "scores": "coloured"}
-PRODUCT_BYTES = 128 << 20  # of the cosines that one pass over a lift's features may give
+PRODUCT_BYTES = 128 << 20  # of cosines in one pass over a lift's features
 COSINE_BYTES = 4  # of a splat and a direction
-ANSWER_BYTES = 6  # of a splat: its score, whether it was seen, whether it was selected
-ENTRY_BYTES = 2 << 10  # of what is kept, beside its tensors and its question
-WORD_COSINES = 1 << 31  # of splats and the words that may name them: about a minute and a half of a core
-MASK_PIXELS = 1 << 26  # of the views of an export: a minute, as of the largest picture
-RELATION_BYTES = 512  # of two objects: a pydantic model with its dictionary
-NUMBER_BYTES = 32  # of a number of a question: a Python float and the place in its tuple
+ANSWER_BYTES = 6  # of a splat: score, whether it has a feature, whether it is selected
+ENTRY_BYTES = 2 << 10  # of a cache entry, beside its tensors and its question
+WORD_COSINES = 1 << 31  # of splats times words: about a minute and a half on one core
+MASK_PIXELS = 1 << 26  # of all views of an export: a minute, as for the largest picture
+RELATION_BYTES = 512  # of a relation: a pydantic model with its dictionary
+NUMBER_BYTES = 32  # of a number in a question: a Python float and its place in a tuple
 
 
 Cached = Answer | Objects | ViewMask | Segmentation | Catalogue | SceneTree
@@ -70,7 +70,7 @@ K = TypeVar("K", bound=Cached)
 
 
 class Answers:
-    """Replies to requests; a lift is known by its path, a text encoder by its specification.
+    """Answer requests; a lift is identified by its path, a text encoder by its specification.
 
     Args:
         scenes: lifts that are kept open.
@@ -82,14 +82,14 @@ class Answers:
         limit = max(1, cache_bytes)
         self._cache = LRUCache[object, Cached](limit, lambda value: min(bytes_of(value), limit))
         self._encoders: dict[str, tuple[object, TextEncoder]] = {}  # spec -> version of its file, encoder
-        self._opening = threading.RLock()  # of encoders, which the warm-up opens too
-        self._warm: set[Kernel] = set()  # kernels of splats whose compiled code is loaded, or being loaded
+        self._opening = threading.RLock()  # for opening encoders, which the warm-up does too
+        self._warm: set[Kernel] = set()  # kernels of splats whose compiled code is loaded or being loaded
         self._operations: dict[str, Callable[[dict[str, Any]], Frame]] = {
             "query": self._query,
             "objects": self._objects,
             "views": self._views,
             "segment": self._segment,
-            "what": self._what,
+            "what": self._nearest_words,
             "askable": self._askable,
             "catalogue": self._catalogue,
             "tree": self._tree,
@@ -102,11 +102,11 @@ class Answers:
 
     @property
     def kept_bytes(self) -> int:
-        """The size of the answers, objects and views that are kept."""
+        """Bytes of the cached answers, objects and views."""
         return int(self._cache.currsize)
 
     def warm_up(self, encoder: str, version: object) -> None:
-        """Load what the first query would wait for: an encoder, and the compiled kernels.
+        """Load what the first query would wait for: an encoder and the compiled kernels.
 
         An encoder that does not open is told to whoever asks for it.
         """
@@ -115,8 +115,8 @@ class Answers:
         Scene.warm_up()
         self._warm_kernel(Kernel.GAUSSIAN_3D)
 
-    def reply(self, request: dict[str, Any], ahead: Sequence[dict[str, Any]] = ()) -> Frame:
-        """The reply to one request; ``operation`` says which.
+    def reply(self, request: dict[str, Any], lookahead: Sequence[dict[str, Any]] = ()) -> Frame:
+        """Return the reply to one request, by its ``operation``.
 
         Args:
             request: what is asked.
@@ -126,14 +126,14 @@ class Answers:
         Raises:
             SplatliftError: what was asked cannot be answered.
         """
-        if request.get("lift") in self._scenes:  # a selection is what each request says of it, whatever others said
+        if request.get("lift") in self._scenes:  # each request describes its selection, whatever another request set
             self._scenes[request["lift"]].selections.clear()
         if "query" in request and _key(request) not in self._cache:
-            self._answer_together([request, *ahead])
+            self._answer_together([request, *lookahead])
         return self._operations.get(request["operation"], self._file)(request)
 
     def _answer_together(self, requests: Sequence[dict[str, Any]]) -> None:
-        """Answer the first question, and more to its lift as far as one pass goes; errors wait for their turn."""
+        """Answer the first question, and others about its lift in the same pass; their errors are raised later."""
         scene = self._scene(requests[0])
         splats = len(scene.features)
         capacity = min(
@@ -154,7 +154,7 @@ class Answers:
                 self._cache[key] = answer
 
     def _cached(self, kind: type[K], key: object, make: Callable[[], K]) -> K:
-        """The value that the cache has of a key, made where it has none."""
+        """Return the cached value of a key; compute it if there is none."""
         if key not in self._cache:
             self._cache[key] = make()
         value = self._cache[key]
@@ -163,7 +163,7 @@ class Answers:
 
     def _scene(self, request: dict[str, Any]) -> Scene:
         if request["lift"] not in self._scenes:
-            if self._scenes.currsize == self._scenes.maxsize:  # the old and the new are never here together
+            if self._scenes.currsize == self._scenes.maxsize:  # never hold both the old and the new scene
                 self._scenes.popitem()
             self._scenes[request["lift"]] = self._open(request)
         scene, world = self._scenes[request["lift"]], WorldFrame(**request.get("world", {}))
@@ -176,7 +176,7 @@ class Answers:
         return scene
 
     def _open(self, request: dict[str, Any]) -> Scene:
-        # Pictures come after numbers, so what draws them is loaded meanwhile.
+        # Load the renderer meanwhile: pictures follow numbers.
         threading.Thread(target=self._warm_kernel, args=(Kernel(request["kernel"]),), daemon=True).start()
         return open_scene(request)
 
@@ -188,7 +188,7 @@ class Answers:
     def _encoder(self, spec: str, version: object) -> TextEncoder:
         with self._opening:
             entry = self._encoders.get(spec)
-            if entry is None or entry[0] != version:  # a table that the operator replaced is another table
+            if entry is None or entry[0] != version:  # the operator may have replaced the file of a table
                 entry = self._encoders[spec] = (version, open_encoder(spec, remembers=True))
             return entry[1]
 
@@ -201,7 +201,7 @@ class Answers:
     def _answer(self, request: dict[str, Any]) -> Answer:
         return self._cached(Answer, _key(request), lambda: self._scene(request).answer([self._question(request)])[0])
 
-    def _look(self, request: dict[str, Any]) -> ViewMask:
+    def _view_mask(self, request: dict[str, Any]) -> ViewMask:
         answer = self._answer(request)
 
         def make() -> ViewMask:
@@ -219,7 +219,7 @@ class Answers:
     def _query(self, request: dict[str, Any]) -> Frame:
         scene, answer = self._scene(request), self._answer(request)
         if request["view"] is not None:
-            scene.cameras[request["view"]]  # links to pictures of a view that is not there help nobody
+            scene.cameras[request["view"]]  # refuse an unknown view now rather than at its picture
         return Frame(scene.locate(answer, request["top"]).model_dump(mode="json"))
 
     def _objects(self, request: dict[str, Any]) -> Frame:
@@ -227,7 +227,7 @@ class Answers:
         return Frame(document | self._grouped(request).model_dump(mode="json"))
 
     def _file(self, request: dict[str, Any]) -> Frame:
-        """A file of an answer, of named splats, of an object or of the scene."""
+        """Return a file of an answer, of named splats, of an object or of the scene."""
         scene, operation, kind_asked = self._scene(request), request["operation"], request.get("what", "")
         view = view_of(request) if "view" in request or "camera" in request else None
         if operation == "layer":
@@ -236,9 +236,9 @@ class Answers:
             mask = scene.region_mask(request["view"], request["level"], request["region"])
             blocks = scene.blocks_of(mask, "mask")
         elif operation in WORD_FILES:
-            blocks = scene.blocks_of(self._named(request), WORD_FILES[operation], view=view)
+            blocks = scene.blocks_of(self._segmentation(request), WORD_FILES[operation], view=view)
         elif "query" in request:
-            view_mask = self._look(request) if operation in ("mask", "attention") else None
+            view_mask = self._view_mask(request) if operation in ("mask", "attention") else None
             kind = SPLATS_FILES[kind_asked] if operation == "splats" else operation
             blocks = scene.blocks_of(self._answer(request), kind, view=view, seen=view_mask)
         else:  # one of its objects, its splats or a picture of it
@@ -265,11 +265,11 @@ class Answers:
         return lift_table or self._encoder(request["encoder"], request["encoder_version"])
 
     def _words(self, request: dict[str, Any]) -> tuple[list[str], TextEncoder]:
-        """The words of a request, all of its table where it names none."""
+        """Return the words of a request, or all of its table."""
         encoder = self._text_encoder(request)
         return self._scene(request).words(encoder) if request["words"] is None else request["words"], encoder
 
-    def _named(self, request: dict[str, Any]) -> Segmentation:
+    def _segmentation(self, request: dict[str, Any]) -> Segmentation:
         def make() -> Segmentation:
             words, encoder = self._words(request)
             limit = max(1, WORD_COSINES // len(self._scene(request).features))
@@ -281,10 +281,10 @@ class Answers:
         return self._cached(Segmentation, (_key(request), "words"), make)
 
     def _segment(self, request: dict[str, Any]) -> Frame:
-        document = self._named(request).summary.model_dump(mode="json")
+        document = self._segmentation(request).summary.model_dump(mode="json")
         return _json(request, document, "found", document.pop("found"))
 
-    def _what(self, request: dict[str, Any]) -> Frame:
+    def _nearest_words(self, request: dict[str, Any]) -> Frame:
         words, encoder = self._words(request)
         best = self._scene(request).what(request["example"], words, top=request["top"], encoder=encoder)
         return Frame({"words": [word.model_dump(mode="json") for word in best]})
@@ -303,7 +303,7 @@ class Answers:
             first, last = self._object_of(request)
         labels = {number: {"name": name, "hidden": is_hidden} for number, (name, is_hidden) in request["things"]}
         objects = (
-            item.model_dump(mode="json") | {"hidden": False} | _given(labels.get(item.id))
+            item.model_dump(mode="json") | {"hidden": False} | _object_label(labels.get(item.id))
             for item in catalogue.iterate_objects(first, last, features=request["means"])
         )
         after = last if last < len(catalogue.objects) else None
@@ -316,7 +316,7 @@ class Answers:
         )
 
     def _object_of(self, request: dict[str, Any]) -> tuple[int, int]:
-        """The place of a splat's object among all, and the one after it; nothing where it has none."""
+        """Return the rank of a splat's object and the next one, as a slice's ends; both equal if it has no object."""
         numbers, splat = self._scene(request).object, request["splat"]
         if numbers is None or splat >= len(numbers) or numbers[splat] < 0:
             return 0, 0
@@ -348,7 +348,7 @@ class Answers:
         return Frame({"lack": None})
 
     def _edit(self, request: dict[str, Any]) -> Frame:
-        """A selection after an edit: what it holds, and zlib of its bits."""
+        """Return a selection after an edit: its count, and its bits compressed by zlib."""
         scene = self._scene(request)
         answer = self._answer(request) if "query" in request else None
         edit = Edit.model_validate(request["edit"])
@@ -358,7 +358,7 @@ class Answers:
         return Frame({"edit": edit.described(), "count": count, "box": corners}, zlib.compress(selection.bits))
 
     def _export(self, request: dict[str, Any]) -> Frame:
-        """A ZIP of answers, of words or of things, in the draft."""
+        """Write a ZIP of answers, of words or of objects, as the draft."""
         scene = self._scene(request)
         views = scene.metadata.views if request["of_view"] is None else (request["of_view"],)
         pixels = sum(math.prod(scene.cameras[view].photo_size) for view in views)
@@ -368,18 +368,18 @@ class Answers:
         source: Any
         if request["of"] == "questions":
             source = {part["name"]: self._answer(part["request"]) for part in request["parts"]}
-            for part in request["parts"]:  # their sets, of answers that were kept too
+            for part in request["parts"]:  # sets of answers, cached too
                 self._scene(part["request"])
         elif request["of"] == "words":
-            source = self._named(request)
+            source = self._segmentation(request)
         else:
-            source = self._named_things(request)
+            source = self._labelled_objects(request)
         blocks = scene.blocks_of(source, "bundle", view=request["of_view"])
         write_draft(blocks, Path(request["draft"]))
         return Frame({})
 
-    def _named_things(self, request: dict[str, Any]) -> Catalogue | SceneTree:
-        """The objects of a lift by the names that they were given, with their parts where it has any."""
+    def _labelled_objects(self, request: dict[str, Any]) -> Catalogue | SceneTree:
+        """Return the named objects of a lift by their names, with their parts."""
         labels = {number: {"name": name} for number, (name, _) in request["things"] if name is not None}
         if self._scene(request).node is None:
             catalogue = self._named_objects(request)
@@ -395,18 +395,18 @@ class Answers:
         views = self._scene(request).object_views
         return Frame({"count": 0 if views is None else len(views)})
 
-    def _named_tree(self, request: dict[str, Any], **lying: Any) -> SceneTree:
+    def _named_tree(self, request: dict[str, Any], **options: Any) -> SceneTree:
         words, encoder = ([], None) if request["encoder"] is None else self._words(request)
-        return self._scene(request).tree(words, encoder=encoder, **lying)
+        return self._scene(request).tree(words, encoder=encoder, **options)
 
     def _named_objects(self, request: dict[str, Any]) -> Catalogue:
-        """The objects of a lift; all words of the table that the request names, if it does, name them."""
+        """Return the objects of a lift, named by the words of a table if the request has one."""
         words, encoder = ([], None) if request["encoder"] is None else self._words(request)
         return self._scene(request).catalogue(words, encoder=encoder)
 
 
 def _selected(scene: Scene, name: str, bits: str) -> Any:
-    """A selection of these splats, without the history of one of the same name."""
+    """Return a selection of these splats; drop the history of a selection with the same name."""
     scene.selections.pop(name, None)
     return scene.select(name).edit(Edit(how="set", bits=bits))
 
@@ -418,15 +418,15 @@ def _direction(up: str | None) -> tuple[float, float, float] | Literal["cameras"
     return x, y, z
 
 
-def _given(label: dict[str, Any] | None) -> dict[str, Any]:
-    """What somebody gave an object: whether it is hidden, and a name, which no score belongs to."""
+def _object_label(label: dict[str, Any] | None) -> dict[str, Any]:
+    """Return the label of an object: whether it is hidden, and its name, which has no score."""
     if label is None or label["name"] is None:
         return {} if label is None else {"hidden": label["hidden"]}
     return label | {"score": None}
 
 
 def _small_file(content: bytes, request: dict[str, Any]) -> Frame:
-    """An array or a picture: through the pipe, or in the draft."""
+    """Return an array or a picture: through the pipe, or as the draft."""
     if len(content) <= PIPE_BYTES:
         return Frame({}, content)
     write_draft([content], Path(request["draft"]))
@@ -434,14 +434,14 @@ def _small_file(content: bytes, request: dict[str, Any]) -> Frame:
 
 
 def _json(request: dict[str, Any], document: dict[str, Any], name: str, items: Iterable[dict[str, Any]]) -> Frame:
-    """A JSON object with a list of many, whole: the HTTP process passes it on, through the pipe or in the draft."""
+    """Return a long JSON list whole, which the HTTP process passes on: through the pipe or as the draft."""
     dumps = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode
     head = dumps(request["head"] | document).removesuffix("}")
     return _small_file(f"{head},{dumps(name)}:[{','.join(map(dumps, items))}]}}".encode(), request)
 
 
 def write_draft(blocks: Iterable[bytes], draft: Path) -> None:
-    """Write what is too much for a pipe where the HTTP process finds it, and removes it.
+    """Write a large answer to the file that the HTTP process reads and removes.
 
     Raises:
         NoSpace: the disk is full.
@@ -457,14 +457,14 @@ def write_draft(blocks: Iterable[bytes], draft: Path) -> None:
 
 
 def _key(request: dict[str, Any]) -> str:
-    """What an answer is kept by: a digest, as a question may be as long as a body."""
+    """Return the key of an answer in the cache: a digest, as a question may be as long as a body."""
     names = ("lift", "encoder", "encoder_version", "query" if "query" in request else "words")
     values = [*(request[name] for name in names), request.get("selections")]
     return hashlib.sha256(json.dumps(values).encode()).hexdigest()
 
 
 def bytes_of(value: Cached) -> int:
-    """The memory that an answer, with its question, the objects of one, a view of one or named splats take."""
+    """Return the bytes that an answer takes, with its question; or its objects, a view of it, or named splats."""
     if isinstance(value, Answer):
         tensors = value.scores.nbytes + value.seen.nbytes + value.selected.nbytes
         return ENTRY_BYTES + tensors + sum(map(_term_bytes, value.query.terms))
@@ -486,7 +486,7 @@ def _term_bytes(term: Any) -> int:
 
 
 def view_of(request: dict[str, Any]) -> str | Camera:
-    """The camera of a picture: the name of one of the scene, or one that came with the request.
+    """Return the camera of a picture: a view of the scene, or the camera in the request.
 
     Raises:
         InvalidCameras: what came is none.
@@ -495,7 +495,7 @@ def view_of(request: dict[str, Any]) -> str | Camera:
 
 
 def open_scene(request: dict[str, Any]) -> Scene:
-    """The lift, with its splats and cameras where the store has them now: data directories may move."""
+    """Open a lift with its splats and cameras at their present paths: data directories may move."""
     splats, cameras = Path(request["splats"]), Path(request["cameras"])
     return Scene(Path(request["lift"]), splats=splats, cameras=cameras)
 
@@ -505,7 +505,7 @@ def _camera(camera: Camera, name: str) -> dict[str, Any]:
 
 
 def reply_to(requests: list[dict[str, Any]], answers: Answers) -> Frame:
-    """The answer to the first request, or the error as a header; the others are those that come next."""
+    """Return the answer to the first request, or its error as a header; the others are the next ones."""
     try:
         return answers.reply(requests[0], requests[1:])
     except SplatliftError as error:
@@ -518,12 +518,12 @@ def reply_to(requests: list[dict[str, Any]], answers: Answers) -> Frame:
 def _warm_up(answers: Answers, encoder: str) -> None:
     try:
         answers.warm_up(encoder, encoder_version(encoder))
-    except Exception:  # whoever asks will meet it again, and is told
+    except Exception:  # the next request gets the same error
         traceback.print_exc()
 
 
 def main() -> None:
-    """Answer until the server is gone."""
+    """Answer requests until the server has ended."""
     end_with_parent(sys.stdin.fileno())
     server = Connection(int(sys.argv[1]))
     answers = Answers(scenes=int(sys.argv[2]), cache_bytes=int(sys.argv[3]))

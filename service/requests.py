@@ -1,4 +1,4 @@
-"""How requests are read: parameters that are known, JSON bodies of a bounded size, parsed beside the event loop."""
+"""Read requests: known parameters, JSON bodies of a limited size, parsed in threads."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ from service.errors import (
 )
 from service.problems import CLOSE, refusal
 
-NAME_CHARACTERS = 80  # of a name or a value that came, told back
+NAME_CHARACTERS = 80  # of a name or a value of a request, in an answer
 M = TypeVar("M", bound=BaseModel)
 F = TypeVar("F", bound=Callable[..., Any])
 BODY = "in the body of the request"
-JSON = re.compile(r"\s*application/([^;\s]+\+)?json\s*(;|$)", re.IGNORECASE)  # what the framework takes for it
-PARTS = re.compile(r"\s*multipart/", re.IGNORECASE)  # as forms send files
-LET_GO = 16  # times the limit of a body: an upload sent to the wrong route ends there
+JSON = re.compile(r"\s*application/([^;\s]+\+)?json\s*(;|$)", re.IGNORECASE)  # as the framework has it
+PARTS = re.compile(r"\s*multipart/", re.IGNORECASE)  # the form of file uploads by HTML
+LET_GO = 16  # times the limit of a body: an upload to the wrong route ends there
 
 
 # Async: a sync dependency waits for a thread of the pool, and every route with it.
 async def _known_only(request: Request) -> None:
-    """Refuse query parameters that the route does not know: passed over, they would seem to have been heard."""
+    """Refuse query parameters that the route does not know, rather than ignore them."""
     parameters = request.query_params
     if not parameters:
         return
@@ -57,7 +57,7 @@ async def _known_only(request: Request) -> None:
                 name[:NAME_CHARACTERS], expected=f"one of {', '.join(names)}" if names else "no parameters",
                 got=repr(name[:NAME_CHARACTERS]), hint="in the query of the request",
             )  # fmt: skip
-        if len(values := parameters.getlist(name)) > 1 and name not in lists:  # the last would win
+        if len(values := parameters.getlist(name)) > 1 and name not in lists:  # the framework would take the last one
             raise InvalidRequest(
                 name, expected="one value", got=f"{len(values)} of them", hint="in the query of the request"
             )
@@ -67,7 +67,7 @@ KnownParameters = Depends(_known_only)
 
 
 def _names(route: APIRoute) -> Iterator[str]:
-    """The query parameters that a route declares, one by one or as the fields of a model."""
+    """Return the query parameters that a route declares, one by one or as the fields of a model."""
     for field in route.dependant.query_params:
         annotation = field.field_info.annotation
         if isinstance(annotation, type) and issubclass(annotation, BaseModel):
@@ -77,12 +77,13 @@ def _names(route: APIRoute) -> Iterator[str]:
 
 
 class JsonRoute(APIRoute):
-    """A route whose body is bounded, and parsed and validated in a thread: on the event loop a megabyte of odd JSON
-    would keep everybody waiting. What comes of it is all that is kept of a body while its request waits.
+    """A route with a limited body, parsed and validated in a thread, as odd JSON of a megabyte takes long.
+
+    While a request waits, only the validated model is in memory, not the body.
     """
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
-        """The framework's, after the body."""
+        """Return the framework's handler, after the body is read."""
         handle, body = super().get_route_handler(), self.body_field
         if body is None:
             return handle
@@ -97,20 +98,20 @@ class JsonRoute(APIRoute):
 
 
 class OrderRoute(JsonRoute):
-    """A route for bodies of JSON alone, beside one of the same path for files: it comes before that."""
+    """A route for JSON bodies, beside a route for files with the same path: it must come first."""
 
     def matches(self, scope: Scope) -> tuple[Match, Scope]:
-        """The framework's, of requests whose Content-Type is JSON."""
+        """Match requests whose Content-Type is JSON."""
         return super().matches(scope) if is_json(Headers(scope=scope)) else (Match.NONE, {})
 
 
 def is_json(headers: Headers) -> bool:
-    """Whether a body is said to be JSON."""
+    """Return True if a body is declared as JSON."""
     return JSON.match(headers.get("content-type", "")) is not None
 
 
 def require_file(headers: Headers) -> None:
-    """See that a body is a file as it is: neither compressed nor a part of a form.
+    """Require that a body is a plain file: neither compressed nor a part of a form.
 
     Raises:
         UnsupportedEncoding: its Content-Encoding says that it is compressed.
@@ -126,10 +127,10 @@ def require_file(headers: Headers) -> None:
 
 
 class _BoundedRequest(Request):
-    """A request with its body read within the limit, and as a model where it is JSON."""
+    """A request whose body is read within the limit, and validated if it is JSON."""
 
     async def read(self, model: TypeAdapter[Any]) -> None:
-        """Read and validate it.
+        """Read and validate the body.
 
         Raises:
             UnsupportedEncoding: it is compressed.
@@ -156,11 +157,11 @@ class _BoundedRequest(Request):
                 raise self._value
 
     async def body(self) -> bytes:
-        """What it begins with: the framework asks whether there is one, and shows what is no JSON."""
+        """Return the first bytes of the body: the framework checks that there is one, and quotes malformed JSON."""
         return self._begin
 
     async def json(self) -> Any:
-        """The model, which the framework takes as it is."""
+        """Return the validated model, which the framework uses as it is."""
         return self._value
 
 
@@ -169,7 +170,7 @@ def _too_large(limit: int, headers: Mapping[str, str] | None = None) -> TooLarge
 
 
 def require_plain(content_encodings: Sequence[str]) -> None:
-    """See that a body comes as it is.
+    """Require that a body is not compressed.
 
     Raises:
         UnsupportedEncoding: its Content-Encoding says that it is compressed.
@@ -183,8 +184,8 @@ def require_plain(content_encodings: Sequence[str]) -> None:
 
 
 def _validated(request: Request, model: TypeAdapter[Any], content: bytearray) -> Any:
-    """A body as a model, or what is wrong with it: raised here, an error would hold the body for a while."""
-    # To parse them takes a tenth of a second of everybody's time, whatever they are.
+    """Return a body as a model, or its error; an exception raised here would keep the body in memory."""
+    # Parsing these takes a tenth of a second of the event loop, whatever they are.
     if content.count(b"[") + content.count(b"{") > models.BODY_BRACKETS or content.count(b",") > models.BODY_COMMAS:
         expected = f"JSON of at most {models.BODY_COMMAS} values and {models.BODY_BRACKETS} lists and objects"
         return InvalidRequest("body", expected=expected, got="more", hint=BODY)
@@ -205,7 +206,7 @@ def _validated(request: Request, model: TypeAdapter[Any], content: bytearray) ->
 
 @dataclass(frozen=True)
 class Parameters(Generic[M]):
-    """A dependency that gives a model of the parameters of a request.
+    """Return a dependency that gives a model of the parameters of a request.
 
     Args:
         model: what is asked. names: its fields that are parameters. needs: those that must be there.
@@ -234,15 +235,15 @@ class Parameters(Generic[M]):
 
     @cached_property
     def schema(self) -> dict[str, Any]:
-        """The fields as JSON schema has them."""
+        """The fields as JSON schema."""
         return self.model.model_json_schema()
 
-    def described(self) -> dict[str, Any]:
-        """What OpenAPI tells of them."""
+    def openapi_schema(self) -> dict[str, Any]:
+        """The parameters as OpenAPI describes them."""
         parameters = []
         for name in self.names:
             schema = {key: value for key, value in self.schema["properties"][name].items() if key != "description"}
-            if "anyOf" in schema.get("items", {}):  # of an example, what a URL can hold
+            if "anyOf" in schema.get("items", {}):  # the part of an example that a URL can hold
                 schema["items"] = next(part for part in schema["items"]["anyOf"] if part["type"] == "string")
             about = self.schema["properties"][name].get("description", "")
             parameter = {"name": name, "in": "query", "required": name in self.needs, "schema": schema}
@@ -251,11 +252,11 @@ class Parameters(Generic[M]):
 
 
 def get_and_post(router: APIRouter, path: str, parameters: Parameters[Any], **route: Any) -> Callable[[F], F]:
-    """Register an endpoint for a GET by parameters, and for a POST of the same as JSON: its argument ``asked``."""
+    """Register an endpoint for a GET with parameters and for a POST with the same as JSON: its argument ``asked``."""
 
     def register(endpoint: F) -> F:
         answers = {"responses": route["responses"] | TAGGED} if "responses" in route else {}
-        get = router.get(path, openapi_extra=parameters.described(), **route | answers)
+        get = router.get(path, openapi_extra=parameters.openapi_schema(), **route | answers)
         get(_reading(endpoint, Annotated[parameters.model, Depends(parameters)]))
         post = router.post(path, name=f"{endpoint.__name__}_by_body", **route)
         post(_reading(endpoint, Annotated[parameters.model, Body()]))
@@ -265,7 +266,7 @@ def get_and_post(router: APIRouter, path: str, parameters: Parameters[Any], **ro
 
 
 def _reading(endpoint: F, source: Any) -> F:
-    """The endpoint, whose argument ``asked`` comes from there."""
+    """Return the endpoint, with the argument ``asked`` from there."""
 
     @wraps(endpoint)
     def reading(**arguments: Any) -> Any:

@@ -1,5 +1,7 @@
-"""What the operator decides, and which text encoders answer. A field may be an environment variable: SPLATLIFT_ and
-its name; empty is not set."""
+"""Settings of the service, and the text encoder for each text space.
+
+Each field may be set by an environment variable, SPLATLIFT_ and its name in capitals; empty means not set.
+"""
 
 from __future__ import annotations
 
@@ -22,14 +24,14 @@ GiB = 1 << 30
 ORIGIN = re.compile(r"https?://[a-z0-9.-]+(:\d{1,5})?|https?://\[[0-9a-f:.]+\](:\d{1,5})?")  # RFC 6454, 6.2
 
 
-# Of releases before; a proxy bounds slow clients now.
+# Settings of earlier releases; a proxy limits slow clients now.
 REMOVED_VARIABLES = frozenset(
     {"SPLATLIFT_HEADER_SECONDS", "SPLATLIFT_MIN_BYTES_PER_SECOND", "SPLATLIFT_SLOW_GRACE_SECONDS"}
 )
 
 
 class ServiceSettings(BaseSettings):
-    """Settings of the service; nothing here can be changed over HTTP."""
+    """Settings of the service; none can be changed over HTTP."""
 
     model_config = SettingsConfigDict(env_prefix="SPLATLIFT_", env_ignore_empty=True, frozen=True, extra="forbid")
 
@@ -151,15 +153,15 @@ class ServiceSettings(BaseSettings):
 
     @field_validator("allowed_hosts", "cors_origins", mode="before")
     @classmethod
-    def _names(cls, given: Any) -> Any:
-        return [name.strip() for name in given.split(",") if name.strip()] if isinstance(given, str) else given
+    def _names(cls, value: Any) -> Any:
+        return [name.strip() for name in value.split(",") if name.strip()] if isinstance(value, str) else value
 
     @field_validator("cors_origins")
     @classmethod
-    def _origins(cls, origins: tuple[str, ...], known: ValidationInfo) -> tuple[str, ...]:
-        """See that origins are as browsers send them, and that not every page reads what needs no key."""
+    def _origins(cls, origins: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
+        """Require origins in the form of RFC 6454, and refuse `*` while routes need no key."""
         for origin in origins:
-            if origin == "*" and known.data.get("keys") != "required":
+            if origin == "*" and info.data.get("keys") != "required":
                 expected = "origins by their names, or SPLATLIFT_KEYS=required"
                 raise Misconfigured("cors_origins", expected=expected, got="*")
             if origin != "*" and not ORIGIN.fullmatch(origin):
@@ -168,12 +170,12 @@ class ServiceSettings(BaseSettings):
         return origins
 
     def max_upload_bytes(self, kind: str) -> int:
-        """The size limit of an asset kind, or of a ``lift``."""
+        """Return the size limit of an asset kind, or of a ``lift``."""
         return getattr(self, f"max_{kind}_bytes")
 
 
 def variables() -> Iterator[tuple[str, str, str]]:
-    """Name of the environment variable, default and meaning of each setting, in order."""
+    """Return the environment variable, default and description of each setting, in order."""
     for name, field in ServiceSettings.model_fields.items():
         default = field.get_default(call_default_factory=True)
         unit, size = ("GiB", GiB) if name.endswith("bytes") and default and default % GiB == 0 else ("MiB", MiB)
@@ -184,7 +186,7 @@ def variables() -> Iterator[tuple[str, str, str]]:
 
 
 def read_settings(**values: Any) -> ServiceSettings:
-    """Settings as a command line gives them, else of the environment, else their defaults.
+    """Return the settings: of a command line, else of the environment, else the defaults.
 
     Args:
         values: field -> value; None is not set.
@@ -194,7 +196,7 @@ def read_settings(**values: Any) -> ServiceSettings:
     """
     try:
         return ServiceSettings(**{name: value for name, value in values.items() if value is not None})
-    except SettingsError as error:  # of a variable that is to hold JSON, and does not
+    except SettingsError as error:  # malformed JSON in a variable
         raise _no_json(error) from None
     except ValidationError as error:
         first = error.errors()[0]
@@ -212,13 +214,12 @@ def _no_json(error: SettingsError) -> Misconfigured:
     )  # fmt: skip
 
 
-# Which text encoder answers for a text space, and the files that encoders are read from. The process that queries
-# opens an encoder at the first question to it, and an error is then told to whoever asked, who can do nothing about
-# it: so `require_encoder_files` looks before the service starts.
+# The text encoder for each text space, and its files. The query process opens an encoder at its first question. Its
+# error would then go to a client, who cannot mend it: so `require_encoder_files` checks the files before the start.
 
 
-def encoder_spec(settings: ServiceSettings, text_space: str, asked: str | None) -> str:
-    """The text encoder of a query: the one of the space asked for, else of the lift's.
+def encoder_spec(settings: ServiceSettings, text_space: str, requested: str | None) -> str:
+    """Return the specification of a query's text encoder: of the requested space, else of the lift's.
 
     The default stands in for a space that has none only where the operator chose it: scores of an encoder of
     another space look like any others, and mean nothing. Encoders that need no file answer for their own spaces,
@@ -228,18 +229,18 @@ def encoder_spec(settings: ServiceSettings, text_space: str, asked: str | None) 
     Raises:
         InvalidRequest: no encoder was set up under the name asked for, or for the lift's text space.
     """
-    if asked == "default":
+    if requested == "default":
         return settings.encoder
-    if asked in (None, text_space) and text_space == OWN_WORDS:
+    if requested in (None, text_space) and text_space == OWN_WORDS:
         return OWN_WORDS
-    if asked not in (None, text_space):
-        if asked not in settings.text_spaces:
+    if requested not in (None, text_space):
+        if requested not in settings.text_spaces:
             names = ", ".join(["default", *sorted(settings.text_spaces)])
             raise InvalidRequest(
-                "encoder", expected="the name of a text space that the operator set up", got=repr(asked),
+                "encoder", expected="the name of a text space that the operator set up", got=repr(requested),
                 hint=f"known here: {names}",
             )  # fmt: skip
-        return settings.text_spaces[asked]
+        return settings.text_spaces[requested]
     if text_space in settings.text_spaces:
         return settings.text_spaces[text_space]
     if text_space == settings.encoder or (text_space != NO_WORDS and "encoder" in settings.model_fields_set):
@@ -268,12 +269,12 @@ def _no_encoder(settings: ServiceSettings, text_space: str) -> InvalidRequest:
 
 
 def encoder_label(spec: str) -> str:
-    """An encoder as clients may know it: its specification without a file of the server."""
+    """Return the specification of an encoder without private paths."""
     return "table" if spec.startswith("table:") or spec.endswith(".safetensors") else spec.partition("@")[0]
 
 
 def encoder_version(spec: str) -> list[int] | None:
-    """What changes when the file of an encoder does: its time and size; None without a file."""
+    """Return the time and size of an encoder's file, which change with it; None without a file."""
     file = encoder_file(spec)
     try:
         status = file.stat() if file is not None else None
@@ -283,7 +284,7 @@ def encoder_version(spec: str) -> list[int] | None:
 
 
 def require_encoder_files(settings: ServiceSettings) -> None:
-    """See that every file that a text encoder of the settings names is there, and that tables look like ones.
+    """Require that every file of a text encoder is there, and that tables look like tables.
 
     Raises:
         Misconfigured: there is no such encoder, a file is missing or does not open, or a table is none. The setting

@@ -1,4 +1,4 @@
-"""What an application carries: the parts that routes call, whether it can work, and how it stops."""
+"""State of an application: the parts that routes call, its readiness, and its stop."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from service.store.owners import Owner
 from service.store.store import Store
 from service.supervisor import Supervisor
 
-PATIENCE_SECONDS = 2.0  # for all checks of readiness; a disk that takes longer is no disk to work with
-FRESH_SECONDS = 1.0  # a look counts for so long: however many ask, the disk is written once a second
-HURRY_SECONDS = 0.1  # between two looks at whether somebody is in a hurry
+PATIENCE_SECONDS = 2.0  # for all checks of readiness; a disk that takes longer is not usable
+FRESH_SECONDS = 1.0  # a result is kept so long: the disk is written once a second, whatever the number of probes
+HURRY_SECONDS = 0.1  # between two polls for a forced exit
 PROBE_BYTES = 4096
 CHECKS = ("database", "disk", "supervisor", "queries", "uploads")
 
@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 
 
 class Stopping:
-    """The orderly stop: work is refused, streams end, running jobs go back in line, and only then the port closes.
+    """The orderly stop: refuse work, end streams, requeue running jobs, and then close the port.
 
     Begun once, from the event loop; anybody may ask whether it has.
     """
@@ -51,7 +51,7 @@ class Stopping:
         self.begun = False
 
     async def begin(self, hurried: Callable[[], bool]) -> None:
-        """Stop taking work; returns when no job runs any more and those in front of us had their notice.
+        """Stop taking work; return when no job runs and proxies had `notice_seconds` to notice.
 
         Args:
             hurried: whether the notice is to end now; asked a few times a second.
@@ -66,8 +66,7 @@ class Stopping:
 
 
 class Readiness:
-    """What ``/readyz`` asks. The checks run in a thread of their own: they neither wait behind slow routes nor hold
-    up the event loop."""
+    """Checks behind ``/readyz``, in a thread of their own: independent of slow routes and of the event loop."""
 
     def __init__(self, store: Store, runner: Supervisor, queries: QueryClient, stopping: Stopping) -> None:
         self._stopping = stopping
@@ -88,7 +87,7 @@ class Readiness:
         self._found: dict[str, str] = {}
 
     async def require(self) -> None:
-        """Return when all is well.
+        """Return if all checks pass.
 
         Raises:
             NotReady: the service stops, or a check failed; it says which.
@@ -96,18 +95,18 @@ class Readiness:
         if self._stopping.begun:
             raise NotReady("stopping", expected="a service that goes on", got="one that stops")
         failures = self._found if self._fresh() else await self._look_in_time()
-        if failures:  # why, is for the log: it may name files of the server
+        if failures:  # the reasons go to the log only: they may name private files
             failed = ", ".join(failures)
             raise NotReady(failed, expected="checks that pass", got=f"{failed} failed", hint="the log says why")
 
     async def _look_in_time(self) -> dict[str, str]:
         with anyio.move_on_after(PATIENCE_SECONDS):
-            # A look that hangs keeps its turn: those after it wait in vain, and no second thread hangs beside it.
+            # A check that hangs keeps the lock: later probes time out, and no second thread hangs.
             return await anyio.to_thread.run_sync(self._look, limiter=self._turn, abandon_on_cancel=True)
         return {self._looking_at: f"no answer within {PATIENCE_SECONDS:g} s"}
 
     def _look(self) -> dict[str, str]:
-        if not self._fresh():  # the one before us may just have looked
+        if not self._fresh():  # another probe may just have run the checks
             results = {}
             for name, check in self._checks.items():
                 self._looking_at = name
@@ -123,7 +122,7 @@ class Readiness:
 
 
 def _prove_disk(store: Store) -> None:
-    """See that there is room, and that a file can be written as far as the disk."""
+    """Require free space, and that a file can be written to the disk."""
     store.files.require_room()
     with store.files.draft(".probe") as path, path.open("wb") as probe:
         probe.write(bytes(PROBE_BYTES))
@@ -141,7 +140,7 @@ def _complaint(check: Callable[[], None]) -> str | None:
 
 @dataclass(frozen=True)
 class AppState:
-    """What `create_app` was given and made, and for whom a route uses it."""
+    """Parts of the application, and the caller of the current request."""
 
     settings: ServiceSettings
     version: Version
@@ -153,22 +152,22 @@ class AppState:
     photos: PhotoIndexes
     metrics: Metrics
     readiness: Readiness
-    checks: anyio.CapacityLimiter  # threads of their own, so that who waits for them keeps nobody else waiting
+    checks: anyio.CapacityLimiter  # separate thread limits, so that slow operations do not starve others
     planning: anyio.CapacityLimiter
     writing: anyio.CapacityLimiter
     parsing: anyio.CapacityLimiter
     ordering: anyio.CapacityLimiter
     scrapes: anyio.CapacityLimiter
-    ending: threading.Event = field(default_factory=threading.Event)  # set when what still runs must end
+    ending: threading.Event = field(default_factory=threading.Event)  # set when running checks must end
 
     @property
     def check_limits(self) -> SandboxLimits:
-        """What the check of an upload, or a plan, may take."""
+        """Return the limits of an upload's check or of a plan."""
         return SandboxLimits(self.settings.check_seconds, self.settings.check_memory_bytes, self.ending)
 
     @property
     def owner(self) -> Owner:
-        """For whom a route works."""
+        """Return the owner for which a route works."""
         return self.caller.owner
 
 

@@ -36,8 +36,8 @@ IDLE_SECONDS = 5.0  # a forgotten wake-up costs at most this
 TROUBLED_SECONDS = (1.0, 30.0)  # first and longest pause after an attempt that the server could not keep up
 ROOM_SECONDS = 60.0  # how long an attempt waits for room on the disk before it tries without
 TICK_SECONDS = 0.2  # how soon a cancel, a stop or a limit is seen
-AGAIN_SECONDS = 1.0  # between tries to note what could not be noted
-LOOKS = 4  # a child that is silent for this part of its lease is looked at
+RETRY_SECONDS = 1.0  # between tries to note what could not be noted
+LEASE_POLLS = 4  # a child that is silent for this part of its lease is looked at
 BUSY_SECONDS = 0.1  # of a processor: a silent child that takes so much meanwhile is alive
 CHILD = (sys.executable, "-m", "service.job_child")
 DRAFTS = {JobKind.LIFT: ".safetensors", JobKind.TRADEOFF: ".png"}  # what a child writes
@@ -47,7 +47,7 @@ MARK = "SPLATLIFT_JOB_PROCESS"  # a job's processes carry its id under this name
 TRANSIENT_ERRORS = (OSError, sqlite3.OperationalError)  # of the server: a full disk, a locked database
 
 log = logging.getLogger(__name__)
-printed = logging.getLogger("service.jobs.process")  # what their processes print
+process_log = logging.getLogger("service.jobs.process")  # what their processes print
 
 Clock = Callable[[], float]  # seconds
 
@@ -183,13 +183,13 @@ class Lease:
     def __init__(self, seconds: float, clock: Clock = time.monotonic) -> None:
         self._seconds = seconds
         self._clock = clock
-        self._looked = clock()
+        self._polled_at = clock()
         self.renew()
 
     def renew(self) -> None:
         """The child gave a sign of life."""
         self._alive = self._clock()
-        self._spent: float | None = None  # processor seconds when it was found silent
+        self._cpu_seconds: float | None = None  # processor seconds when it was found silent
 
     def over(self, processor_seconds: Callable[[], float]) -> bool:
         """Whether the child is given up; called several times in a lease.
@@ -199,14 +199,16 @@ class Lease:
                 all its threads from speaking.
         """
         now = self._clock()
-        if now - self._looked > self._seconds / 2:
+        if now - self._polled_at > self._seconds / 2:
             self.renew()  # it was the server that slept: the child has a lease from now on
-        self._looked = now
-        if now - self._alive > self._seconds / LOOKS:
+        self._polled_at = now
+        if now - self._alive > self._seconds / LEASE_POLLS:
             seconds = processor_seconds()
-            if self._spent is None or seconds < self._spent:  # less when one that it had started has ended
-                self._spent = seconds
-            elif seconds - self._spent > BUSY_SECONDS:
+            if (
+                self._cpu_seconds is None or seconds < self._cpu_seconds
+            ):  # less when one that it had started has ended
+                self._cpu_seconds = seconds
+            elif seconds - self._cpu_seconds > BUSY_SECONDS:
                 self.renew()
         return now - self._alive > self._seconds
 
@@ -222,7 +224,7 @@ class AttemptLog:
             EventKind.PROGRESS: store.jobs.advance,
         }
         self._waiting: deque[tuple[EventKind, Any]] = deque(maxlen=LOG_LINES)
-        self._again = 0.0
+        self._retry_at = 0.0
 
     def add(self, kind: EventKind, data: Any) -> None:
         """Note a line of the log, the plan or how far the work is; of the last two the latest counts."""
@@ -234,13 +236,13 @@ class AttemptLog:
 
     def write(self) -> None:
         """Write what waits, unless that failed a moment ago."""
-        if not self._waiting or time.monotonic() < self._again:
+        if not self._waiting or time.monotonic() < self._retry_at:
             return
         try:
             self.flush()
         except TRANSIENT_ERRORS as error:
             log.warning("what job %s tells cannot be noted yet: %s", self._job.id, error)
-            self._again = time.monotonic() + AGAIN_SECONDS
+            self._retry_at = time.monotonic() + RETRY_SECONDS
 
     def flush(self) -> None:
         """Write what waits.
@@ -271,7 +273,7 @@ class Attempt:
         self._limits = limits
         self._command = command
         self._lease = Lease(limits.lease_seconds, clock)
-        self._begun = time.monotonic()
+        self._begin = time.monotonic()
         self._notes = AttemptLog(job, store)
         self._pace = StagePace()
         self._answer: dict[str, Any] | None = None  # the child's last word
@@ -329,7 +331,7 @@ class Attempt:
             return "it is canceled"
         if silent:
             return f"its process was silent for {limits.lease_seconds:g} s"
-        if time.monotonic() - self._begun > limits.seconds:
+        if time.monotonic() - self._begin > limits.seconds:
             return OverLimit(
                 kind, expected=f"a {kind} that takes at most {limits.seconds:g} s", got="one that takes more"
             )
@@ -450,7 +452,7 @@ def retry_until_committed(note: Callable[[], None], stopping: threading.Event) -
             log.warning("the end of a job cannot be noted yet: %s", error)
             if stopping.is_set():
                 raise
-            stopping.wait(AGAIN_SECONDS)
+            stopping.wait(RETRY_SECONDS)
 
 
 def _describe_exit(status: int) -> str:
@@ -491,7 +493,7 @@ class JobProcess:
             env=os.environ | dict(environment) | {MARK: job},
         )
         assert self._process.stdout is not None and self._process.stderr is not None
-        self._printed = log_lines(self._process.stderr, job)
+        self._output = log_lines(self._process.stderr, job)
         self.listen = Messages(self._process.stdout.fileno()).read
         self._status: int | None = None
 
@@ -528,7 +530,7 @@ class JobProcess:
             os.killpg(self.pid, signal.SIGKILL)
             self._status = self._process.wait()
             self._await_group()
-            self._printed.join(GONE_SECONDS)
+            self._output.join(GONE_SECONDS)
             for pipe in (self._process.stdin, self._process.stdout):
                 assert pipe is not None
                 pipe.close()
@@ -554,7 +556,7 @@ def log_lines(pipe: IO[bytes], job: str) -> threading.Thread:
             while line := pipe.readline(LONGEST):
                 text = line.decode("utf-8", "replace").strip()
                 if text:
-                    printed.warning("%s", text, extra={"fields": {"job": job}})
+                    process_log.warning("%s", text, extra={"fields": {"job": job}})
 
     thread = threading.Thread(target=listen, name=f"printed-{job}", daemon=True)
     thread.start()

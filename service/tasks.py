@@ -46,7 +46,7 @@ SHOWN_DIGITS = 12  # of the splats' digest, by which the chart of a trade-off na
 log = logging.getLogger(__name__)
 
 
-def _described(path: Path, kind: AssetKind) -> dict[str, Any]:
+def _describe(path: Path, kind: AssetKind) -> dict[str, Any]:
     """What a file of that kind holds, read whole; of none that may run code as it is read."""
     description = inspect_file(path, kind, trusted=False)
     return {name: value for name, value in description.items() if name not in ("kind", "bytes")}
@@ -54,12 +54,12 @@ def _described(path: Path, kind: AssetKind) -> dict[str, Any]:
 
 def check_splats(path: Path) -> dict[str, Any]:
     """Read and describe every splat; checkpoints are pickles, and are not opened here."""
-    return {"found": _described(path, AssetKind.SPLATS), "suffix": identify(path).suffix}
+    return {"found": _describe(path, AssetKind.SPLATS), "suffix": identify(path).suffix}
 
 
 def check_cameras(path: Path) -> dict[str, Any]:
     """Read and describe every camera."""
-    description = _described(path, AssetKind.CAMERAS)
+    description = _describe(path, AssetKind.CAMERAS)
     return {"suffix": ".zip" if zipfile.is_zipfile(path) else ".json", "found": description}
 
 
@@ -85,23 +85,23 @@ def check_features(path: Path) -> dict[str, Any]:
         if len(text := getattr(packs, name)) > models.WORD_CHARACTERS:
             expected = f"at most {models.WORD_CHARACTERS} characters"
             raise InvalidFeatures(name, expected=expected, got=f"{len(text)}: {text[:40]!r}...")
-    return {"suffix": ".safetensors", "found": _described(path, AssetKind.FEATURES)}
+    return {"suffix": ".safetensors", "found": _describe(path, AssetKind.FEATURES)}
 
 
 def check_masks(path: Path) -> dict[str, Any]:
     """Read and describe every mask."""
-    return {"suffix": ".safetensors", "found": _described(path, AssetKind.MASKS)}
+    return {"suffix": ".safetensors", "found": _describe(path, AssetKind.MASKS)}
 
 
 def check_table(path: Path) -> dict[str, Any]:
     """Read every row, and keep all words: orders are held to them."""
     words = list(TableEncoder.open(path).words)
-    return {"suffix": ".safetensors", "found": _described(path, AssetKind.TABLE) | {"words": words}}
+    return {"suffix": ".safetensors", "found": _describe(path, AssetKind.TABLE) | {"words": words}}
 
 
 def check_photos(path: Path) -> dict[str, Any]:
     """Read every photo."""
-    return {"suffix": ".zip", "found": _described(path, AssetKind.PHOTOS)}
+    return {"suffix": ".zip", "found": _describe(path, AssetKind.PHOTOS)}
 
 
 def check_lift(path: Path, cameras: Path | None = None) -> dict[str, Any]:
@@ -148,7 +148,7 @@ CHECKS: dict[UploadKind, Callable[..., dict[str, Any]]] = {
 }
 
 
-def check(named: str, file: str, *more: str) -> dict[str, Any]:
+def check(named: str, file: str, *arguments: str) -> dict[str, Any]:
     """Check one file of a kind: ``valid`` with what was found, or ``invalid`` with the error.
 
     Args:
@@ -157,7 +157,7 @@ def check(named: str, file: str, *more: str) -> dict[str, Any]:
     kind: UploadKind = LIFT if named == LIFT else AssetKind(named)
     path = Path(file)
     try:
-        result = CHECKS[kind](path, *map(Path, more))
+        result = CHECKS[kind](path, *map(Path, arguments))
         require_texts("view name", result["found"].get("names", ()), models.VIEW_CHARACTERS, INVALID[kind])
         require_texts("word", result["found"].get("words", ()), models.WORD_CHARACTERS, INVALID[kind])
     except SplatliftError as error:

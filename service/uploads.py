@@ -47,10 +47,10 @@ def require_size(kind: UploadKind, count: int, limit: int) -> None:
         raise TooLarge("body", expected=f"at most {limit} bytes", got="more", hint=HINTS.get(kind, ""))
 
 
-Taken = TypeVar("Taken", AssetRecord, LiftRecord)
+Record = TypeVar("Record", AssetRecord, LiftRecord)
 
 
-class Intake(ABC, Generic[Taken]):
+class Intake(ABC, Generic[Record]):
     """One upload. All methods work on files: call them in threads, one at a time.
 
     Args:
@@ -64,7 +64,7 @@ class Intake(ABC, Generic[Taken]):
         self._owner = owner
         self._kind: UploadKind = kind
         self._limit = limit
-        self._received = self._permitted = 0
+        self._received_bytes = self._permitted_bytes = 0
         self._digest = hashlib.sha256()
         self._open = contextlib.ExitStack()
         self._draft: Path | None = None
@@ -93,16 +93,16 @@ class Intake(ABC, Generic[Taken]):
             NoSpace, OverQuota: they may not be stored.
         """
         assert self._file is not None
-        self._received += len(chunk)
-        require_size(self._kind, self._received, self._limit)
-        if self._received > self._permitted:  # a body may come without its length
+        self._received_bytes += len(chunk)
+        require_size(self._kind, self._received_bytes, self._limit)
+        if self._received_bytes > self._permitted_bytes:  # a body may come without its length
             self._store.files.require_room(len(chunk))
-            self._store.assets.require_quota(self._owner, self._received)
-            self._permitted = self._received + STEP
+            self._store.assets.require_quota(self._owner, self._received_bytes)
+            self._permitted_bytes = self._received_bytes + STEP
         self._digest.update(chunk)
         self._file.write(chunk)
 
-    def finish(self, promised: str | None) -> Taken | None:
+    def finish(self, declared_digest: str | None) -> Record | None:
         """Call once after the last byte.
 
         Args:
@@ -117,8 +117,8 @@ class Intake(ABC, Generic[Taken]):
         assert self._file is not None
         self._file.flush()
         digest = self._digest.hexdigest()
-        if promised is not None and digest != promised.lower():
-            raise DigestMismatch("sha256", expected=promised, got=digest, hint="upload the file again")
+        if declared_digest is not None and digest != declared_digest.lower():
+            raise DigestMismatch("sha256", expected=declared_digest, got=digest, hint="upload the file again")
         return self._find_same(digest)
 
     def check(self, limits: SandboxLimits) -> CheckedUpload:
@@ -130,19 +130,19 @@ class Intake(ABC, Generic[Taken]):
         """
         assert self._draft is not None
         with self._store.files.scratch() as scratch:
-            report = check(self._kind, self._draft, scratch, limits, *self._beside())
+            report = check(self._kind, self._draft, scratch, limits, *self._files_beside())
         digest = self._digest.hexdigest()
         return CheckedUpload(self._draft, self._kind, digest, report.suffix, report.counts, report.warnings)
 
-    def _beside(self) -> tuple[Path, ...]:
+    def _files_beside(self) -> tuple[Path, ...]:
         """Files that it is checked beside."""
         return ()
 
     @abstractmethod
-    def _find_same(self, digest: str) -> Taken | None: ...
+    def _find_same(self, digest: str) -> Record | None: ...
 
     @abstractmethod
-    def keep(self, upload: CheckedUpload) -> tuple[Taken, bool]:
+    def keep(self, upload: CheckedUpload) -> tuple[Record, bool]:
         """Make of it what it is for; whether its owner did not have it before.
 
         Raises:
@@ -155,7 +155,7 @@ class AssetIntake(Intake[AssetRecord]):
     """The upload of an asset."""
 
     def _find_same(self, digest: str) -> AssetRecord | None:
-        record = self._store.assets.find(self._owner, f"sha256:{digest}", most=SHOWN_CHARACTERS)
+        record = self._store.assets.find(self._owner, f"sha256:{digest}", limit=SHOWN_CHARACTERS)
         return record if record is not None and record.kind == self._kind and record.whole else None
 
     def keep(self, upload: CheckedUpload) -> tuple[AssetRecord, bool]:
@@ -170,11 +170,11 @@ class LiftIntake(Intake[LiftRecord]):
         cameras: an asset that has the lift's cameras, in place of that digest: of a folder there is no such file.
     """
 
-    def __init__(self, *given: Any, cameras: str | None = None) -> None:
-        super().__init__(*given)
+    def __init__(self, *arguments: Any, cameras: str | None = None) -> None:
+        super().__init__(*arguments)
         self._cameras = cameras
 
-    def _beside(self) -> tuple[Path, ...]:
+    def _files_beside(self) -> tuple[Path, ...]:
         if self._cameras is None:
             return ()
         return (self._store.assets.get(self._owner, self._cameras, AssetKind.CAMERAS).path,)
@@ -193,7 +193,7 @@ class LiftIntake(Intake[LiftRecord]):
             got = f"{counts['count']} for {splats.counts['splats']} splats"
             raise InvalidLift("lift", expected="a row for each splat", got=got)
         try:
-            cameras = assets.get(self._owner, order.cameras, AssetKind.CAMERAS, most=ALL)
+            cameras = assets.get(self._owner, order.cameras, AssetKind.CAMERAS, limit=ALL)
         except NotFound as error:
             hint = "PUT its file of cameras first; in place of a folder a zip of it, named here as ?cameras=ID"
             raise NotFound(error.argument, expected=error.expected, got=error.got, hint=hint) from None
@@ -212,7 +212,7 @@ class Report:
     warnings: list[str]
 
 
-def check(kind: UploadKind, path: Path, scratch: Path, limits: SandboxLimits, *beside: Path) -> Report:
+def check(kind: UploadKind, path: Path, scratch: Path, limits: SandboxLimits, *others: Path) -> Report:
     """Read a whole file in a process of its own, which unpacks into ``scratch`` and ends with this process.
 
     Args:
@@ -223,8 +223,8 @@ def check(kind: UploadKind, path: Path, scratch: Path, limits: SandboxLimits, *b
         ProcessDied: the process did not get as far as opening the file.
         ServiceUnavailable: as `run_sandboxed` has it.
     """
-    memory = min(limits.memory_bytes, CHECK_BASE_BYTES + CHECK_FACTOR * sum(map(_size, (path, *beside))))
-    arguments = [kind, str(path), *map(str, beside)]
+    memory = min(limits.memory_bytes, CHECK_BASE_BYTES + CHECK_FACTOR * sum(map(_size, (path, *others))))
+    arguments = [kind, str(path), *map(str, others)]
     result = run_sandboxed("service.tasks.check", arguments, scratch, replace(limits, memory_bytes=memory))
     if result is None:
         raise too_slow(kind, limits)

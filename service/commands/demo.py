@@ -1,4 +1,4 @@
-"""``splatlift demo``: the whole job on published splat objects or a scene of yours, through the real service."""
+"""``splatlift demo``: run the main job through the real service, on the published example or on a scene of yours."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ from liftcore.text import BUILT_IN, NO_WORDS, OWN_WORDS
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-LISTENING = "listening on "  # what the service says first
+LISTENING = "listening on "  # the begin of the service's first line
 STOP_SECONDS = 20
-LAST_WORDS = 3_000  # characters of its log, when it fails
+LAST_WORDS = 3_000  # characters of the service's log, after a failure
 POLL_SECONDS = 0.25
 TIMEOUT = httpx.Timeout(600.0, connect=10.0)  # the first query loads an encoder
-ENDED = ("succeeded", "failed", "canceled")
+FINAL_STATES = ("succeeded", "failed", "canceled")
 
 
 def add_arguments(parser: Parser) -> None:
-    """The options of the command."""
+    """Add the options of the command."""
     cameras = "cameras.json, transforms.json, cameras.zip or sparse/0"
     holds = f"its .ply, .sog, .spz or .splat; {cameras}; a feature pack; text_table.safetensors if any"
     parser.add_argument("--scene", type=Path, metavar="DIR", help=f"a scene of yours ({holds}); else the shipped one")
@@ -50,7 +50,7 @@ def add_arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Find the scene, run the service as a user would, and say what it found."""
+    """Find the scene, run the service as a user would, and report the results."""
 
     def say(line: str) -> None:
         if not options.json:
@@ -79,7 +79,7 @@ def run(options: argparse.Namespace) -> int:
 
 @contextmanager
 def serving(data: Path, encoder: str, log: Path) -> Iterator[str]:
-    """``splatlift serve`` on a free port while the block runs; its address.
+    """Run ``splatlift serve`` on a free port during the block; yield its address.
 
     Args:
         data: the service's directory. encoder: its text encoder. log: where what it says goes.
@@ -118,7 +118,7 @@ def _last_words(log: Path) -> str:
 
 
 class Client:
-    """A conversation with a service on this machine. Answers of 4xx and 5xx become errors with the service's words.
+    """HTTP client of a service on this machine. Answers of 4xx and 5xx become errors with the service's message.
 
     Raises:
         InvalidInput: the service refused a request.
@@ -128,24 +128,24 @@ class Client:
     def __init__(self, url: str) -> None:
         key = os.environ.get("SPLATLIFT_KEY")
         headers = {"Authorization": f"Bearer {key}"} if key else {}
-        # A proxy of the environment has no part in it.
+        # ignore a proxy of the environment
         self._http = httpx.Client(base_url=url, timeout=TIMEOUT, trust_env=False, headers=headers)
 
     def close(self) -> None:
-        """End the conversation."""
+        """Close the connection."""
         self._http.close()
 
     def upload(self, kind: str, path: Path) -> dict[str, Any]:
-        """``PUT /assets/KIND``: the asset, with its id and counts."""
+        """Upload a file by ``PUT /assets/KIND``; return the asset, with its id and counts."""
         with path.open("rb") as file:
             return self._call("PUT", f"/assets/{kind}", content=file).json()
 
     def lift(
         self, order: dict[str, Any], progress: Callable[[dict[str, Any]], None]
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """``POST /lift`` and wait: the ended job and its lift."""
+        """Send ``POST /lift`` and wait; return the job and its lift."""
         job = self._call("POST", "/lift", json=order).json()
-        while job["state"] not in ENDED:
+        while job["state"] not in FINAL_STATES:
             progress(job)
             time.sleep(POLL_SECONDS)
             job = self.get(f"/jobs/{job['id']}")
@@ -155,16 +155,16 @@ class Client:
         return job, self.get(f"/lifts/{job['id']}")
 
     def get(self, path: str, **parameters: str) -> dict[str, Any]:
-        """The JSON of any route."""
+        """Return the JSON of any route."""
         return self._call("GET", path, params=parameters).json()
 
     def picture(self, path: str, **parameters: str) -> bytes:
-        """A PNG of the service."""
+        """Return a PNG of the service."""
         return self._call("GET", path, params=parameters).content
 
-    def _call(self, method: str, path: str, **how: Any) -> httpx.Response:
+    def _call(self, method: str, path: str, **options: Any) -> httpx.Response:
         try:
-            response = self._http.request(method, path, **how)
+            response = self._http.request(method, path, **options)
         except httpx.HTTPError as error:
             raise Unavailable("service", expected=f"an answer to {method} {path}", got=repr(error)) from None
         if response.is_success:
@@ -174,36 +174,36 @@ class Client:
         raise _refusal(f"{method} {path}", problem, str(response.status_code))
 
 
-def _refusal(what: str, problem: dict[str, Any], status: str) -> SplatliftError:
-    """The service's problem as an error of ours: field by field where it has the fields, else its sentence."""
+def _refusal(operation: str, problem: dict[str, Any], status: str) -> SplatliftError:
+    """Return the service's problem as an error: with its fields if it has them, else with its sentence."""
     kind = Unavailable if problem.get("status", 0) >= 500 else InvalidInput
     if problem.get("expected") and problem.get("got"):
-        argument = problem.get("argument") or what
+        argument = problem.get("argument") or operation
         return kind(argument, expected=problem["expected"], got=problem["got"], hint=problem.get("hint") or "")
-    return kind(what, expected="success", got=problem.get("detail") or problem.get("title") or status)
+    return kind(operation, expected="success", got=problem.get("detail") or problem.get("title") or status)
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What one phrase found."""
+    """Result of one phrase."""
 
     phrase: str
-    there: bool | None  # whether the scene has it; None: not known, or not sure
-    why: str  # how that is known
-    object: str | None  # what the masks show most of, where somebody knows
+    there: bool | None  # True if the scene has it; None: unknown or uncertain
+    why: str  # the evidence for `there`
+    object: str | None  # name of the object that the masks show most, if names are known
     splats: int  # selected
     score: float  # the best cosine
-    threshold: float | None  # on the splats' scores
+    threshold: float | None  # for the splats' scores
     explanation: str
-    objects: list[dict[str, Any]]  # the things found, with their places
+    objects: list[dict[str, Any]]  # the selected objects, with their places
     query_ms: float
-    mask_ms: float  # the mean over views, query excluded
-    iou: float | None  # the mean over views with truth
-    pictures: dict[str, str]  # what -> file name
+    mask_ms: float  # mean over views, without the query
+    iou: float | None  # mean over views with labels
+    pictures: dict[str, str]  # kind -> file name
 
 
 def show(subject: DemoScene, url: str, out: Path, say: Callable[[str], None]) -> dict[str, Any]:
-    """Upload, lift and ask; pictures go to ``out``, sentences to ``say``.
+    """Upload, lift and query; write pictures to ``out`` and sentences to ``say``.
 
     Returns:
         What was done and found, as plain numbers.
@@ -228,7 +228,7 @@ def show(subject: DemoScene, url: str, out: Path, say: Callable[[str], None]) ->
             kind, phrases = "like", (_middle(out / pictures["rgb"], subject.views[0]),)
             for line in _why_no_words(subject, phrases[0]):
                 say(line)
-        # The first question opens the lift; it is asked once apart, so that times are of warm queries.
+        # The first query opens the lift and is not timed.
         client.get("/query", lift=lift["id"], **{kind: phrases[0]}, threshold="0")
         findings = []
         for phrase in phrases:
@@ -253,7 +253,7 @@ def show(subject: DemoScene, url: str, out: Path, say: Callable[[str], None]) ->
 
 
 def _counts(kind: str, asset: dict[str, Any]) -> str:
-    names = ("splats", "views", "channels")  # counts that people care about
+    names = ("splats", "views", "channels")  # counts to show
     numbers = ", ".join(f"{value} {name}" for name, value in asset["counts"].items() if name in names)
     return f"{kind} ({numbers})" if numbers else kind
 
@@ -263,12 +263,12 @@ def _show_progress(job: dict[str, Any]) -> None:
         return
     step = job.get("progress") or {}
     parts = f" {step['done']}/{step['total']} {step['unit']}" if step and step["total"] > 1 else ""
-    text = f"{job['state']}  {step['stage'] if step else ''}{parts}" if job["state"] not in ENDED else ""
+    text = f"{job['state']}  {step['stage'] if step else ''}{parts}" if job["state"] not in FINAL_STATES else ""
     print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
 
 
 def _middle(render: Path, view: str) -> str:
-    """The pixel in the middle of a view, as an example of what to look for."""
+    """Return the pixel in the middle of a view, as an example to search for."""
     with Image.open(render) as picture:
         return f"{view}:{picture.width // 2},{picture.height // 2}"
 
@@ -340,23 +340,23 @@ def _lines(finding: Finding) -> list[str]:
     return [*lines, f"      {finding.pictures['found']}"]
 
 
-# What a scene folder holds: splats, cameras, a feature pack, words, and the truth where somebody knows it
+# Content of a scene folder: splats, cameras, a feature pack, words, and labels if there are any
 
 SHIPPED = Path(__file__).with_name("tabletop")
 _CAMERA_FILES = ("cameras.json", "transforms.json", "cameras.zip")
 _TABLE = "text_table.safetensors"
 _ENCODERS = {space: encoder for encoder, space in BUILT_IN.items()}
-_PHRASES = 3  # asked when nobody says which
+_PHRASES = 3  # queries if nobody names any
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What is really there."""
+    """Labels of a scene."""
 
     names: tuple[str, ...]  # object names
     masks: Mapping[str, np.ndarray]  # view -> [H, W] integers, rows of names; -1 = none
-    meant: Mapping[str, tuple[str, ...]]  # phrase, no article -> the objects that it means, none where nothing here
-    asked: tuple[str, ...]  # phrases that the scene is to be asked
+    meant: Mapping[str, tuple[str, ...]]  # phrase, no article -> names of its objects; empty if the scene has none
+    asked: tuple[str, ...]  # phrases to query
 
     def mask_of(self, phrase: str, view: str) -> np.ndarray | None:
         """[H, W] bool, where the phrase's objects are; None when the phrase or the view has no truth."""
@@ -367,13 +367,13 @@ class Truth:
         return np.isin(self.masks[view], rows)
 
     def name_of(self, masks: Mapping[str, np.ndarray]) -> str | None:
-        """The object that most pixels of these masks [H, W] bool show; None where they show none."""
+        """Return the name of the object with most pixels in these masks [H, W] bool; None if there is none."""
         labels = np.concatenate([self.masks[view][mask] for view, mask in masks.items() if view in self.masks])
         objects = labels[labels >= 0]
         return self.names[int(np.bincount(objects).argmax())] if len(objects) else None
 
     def mean_iou(self, phrase: str, masks: Mapping[str, np.ndarray]) -> float | None:
-        """Mean intersection over union of masks [H, W] bool, over the views that show what the phrase means."""
+        """Return the mean intersection over union of masks [H, W] bool, over the views with the phrase's objects."""
         pairs = [(mask, self.mask_of(phrase, view)) for view, mask in masks.items()]
         visible = [(mask, target) for mask, target in pairs if target is not None and target.any()]
         values = [(mask & target).sum() / (mask | target).sum() for mask, target in visible]
@@ -382,22 +382,22 @@ class Truth:
 
 @dataclass(frozen=True)
 class DemoScene:
-    """A scene ready for the service."""
+    """A scene ready for upload."""
 
     name: str
     splats: Path
     cameras: Path
     features: Path
-    other_packs: tuple[str, ...]  # file names of packs beside it that were not taken
+    other_packs: tuple[str, ...]  # file names of other packs, which are not used
     encoder: str  # specification of the text encoder
-    text_space: str  # of the features; "none" when no text encoder shares it, "" when the pack does not say
-    phrases: tuple[str, ...]  # empty = nothing can be asked, or nobody knows what
-    views: tuple[str, ...]  # to look from, the pictured one first; views with truth where there are any
+    text_space: str  # of the features; "none" if no text encoder shares it, "" if unknown
+    phrases: tuple[str, ...]  # empty: no text queries, or no words known
+    views: tuple[str, ...]  # the view of the picture first; views with labels if there are any
     truth: Truth | None
 
 
 def unpack_tabletop(folder: Path) -> Path:
-    """Write the scene that ships as plain files: splats, cameras, a pack of 18 views, truth; the folder.
+    """Write the example as plain files: splats, cameras, a pack of 18 views, labels; return the folder.
 
     It is 12 published splat objects on a table. No photo went through CLIP: a region's vector is the text vector of
     its word with noise, moved so far from all words as vectors of photos are (cosine .29 to its own word, .22 to
@@ -417,7 +417,7 @@ def unpack_tabletop(folder: Path) -> Path:
 
 
 def find_scene(folder: Path, phrases: Sequence[str], scratch: Path, pack: Path | None = None) -> DemoScene:
-    """A scene folder as it is: the files are found by name, a COLMAP model is zipped for the upload.
+    """Return a scene folder: files are found by name, a COLMAP model is zipped for the upload.
 
     Args:
         folder: holds splats (``.ply``, ``.sog``, ``.spz`` or ``.splat``), cameras (``cameras.json``,
@@ -460,7 +460,7 @@ def find_scene(folder: Path, phrases: Sequence[str], scratch: Path, pack: Path |
 
 
 def _splats(folder: Path) -> Path:
-    """The splats of a folder, or of the last iteration that a 3DGS trainer kept in it."""
+    """Return the splats of a folder, or of the last iteration that a 3DGS trainer wrote."""
     kind = identify(folder)
     if not kind.sent:
         got = f"{kind.splats[0]} alone" if kind.splats else "none"
@@ -469,7 +469,7 @@ def _splats(folder: Path) -> Path:
 
 
 def _cameras(folder: Path, scratch: Path) -> Path:
-    """The one file of the cameras; of several, such as a COLMAP model's, a zip in ``scratch``."""
+    """Return the file of the cameras; a COLMAP model of several files as a zip in ``scratch``."""
     from liftcore.files import camera_files
 
     candidates = [folder / name for name in _CAMERA_FILES if (folder / name).is_file()]
@@ -488,7 +488,7 @@ def _cameras(folder: Path, scratch: Path) -> Path:
 
 
 def _packs(folder: Path) -> list[Path]:
-    """The feature packs of a folder, ``features.safetensors`` first."""
+    """Return the feature packs of a folder, ``features.safetensors`` first."""
     packs = [path for path in visible_files(folder, "*.safetensors") if identify(path).kind == "features"]
     if not packs:
         raise InvalidInput(f"features of {folder.name}", expected="a feature pack (.safetensors)", got="none")
@@ -496,7 +496,7 @@ def _packs(folder: Path) -> list[Path]:
 
 
 def _read_truth(folder: Path) -> Truth | None:
-    """``truth.json``: the objects, what to ask, what phrases mean; ``truth.safetensors``: ``VIEW/mask``."""
+    """Read ``truth.json`` (objects, queries, meaning of phrases) and ``truth.safetensors`` (``VIEW/mask``)."""
     from safetensors.numpy import load_file
 
     names_file, arrays_file = folder / "truth.json", folder / "truth.safetensors"
@@ -517,12 +517,12 @@ def _read_truth(folder: Path) -> Truth | None:
 
 
 def _bare(phrase: str) -> str:
-    """A phrase without its article, in small letters."""
+    """Return a phrase without its article, in lower case."""
     return re.sub(r"^(an?|the)\s+", "", phrase.strip().casefold())
 
 
 def _in_view(names: Sequence[str], masks: Mapping[str, np.ndarray], document: Mapping) -> list[str]:
-    """The objects that fill most of the pictured view."""
+    """Return the names of the objects that fill most of the pictured view."""
     labels = next((masks[view] for view in document.get("held_out_views", masks) if view in masks), np.empty(0, int))
     counts = np.bincount(labels[(labels >= 0) & (labels < len(names))], minlength=len(names))
     return [names[int(row)] for row in np.argsort(-counts, kind="stable")[:_PHRASES] if counts[row]]

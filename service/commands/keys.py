@@ -1,4 +1,4 @@
-"""``splatlift keys``: make, list, rotate and revoke keys, beside a server that runs or without one."""
+"""``splatlift keys``: create, list, rotate and revoke keys, with or without a running server."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
 
 
 def add_arguments(parser: Parser, shared: Parser) -> None:
-    """The options of the command."""
+    """Add the options of the command."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=Parser)
     create = actions.add_parser("create", parents=[shared], help="make a key and show it, once")
     create.add_argument("--name", required=True, metavar="NAME", help="whose it is, or what for")
@@ -62,16 +62,16 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Do what the command line says."""
+    """Run the command."""
     action = {"create": _create, "list": _list, "rotate": _rotate, "revoke": _revoke}[options.action]
-    with data_directory_errors(), opened(read_settings(data=options.data).data, make=action is _create) as keys:
+    with data_directory_errors(), open_keys(read_settings(data=options.data).data, make=action is _create) as keys:
         action(keys, options)
     return 0
 
 
 @contextmanager
-def opened(data: Path, *, make: bool) -> Iterator[KeyStore]:
-    """The keys of a data directory, whether a server holds it or not.
+def open_keys(data: Path, *, make: bool) -> Iterator[KeyStore]:
+    """Open the keys of a data directory, also while a server holds it.
 
     Raises:
         NotFound: there is no database, and none is to be made.
@@ -110,19 +110,19 @@ def _rotate(keys: KeyStore, options: argparse.Namespace) -> None:
         print(f"The secret before ends{_with(shares)}. With --keep-shares they would stay.", file=sys.stderr)
 
 
-def _show(key: KeyRecord, secret: str, options: argparse.Namespace, **more: Any) -> None:
+def _show(key: KeyRecord, secret: str, options: argparse.Namespace, **fields: Any) -> None:
     if options.json:
-        print(json.dumps({**_document(key), **more, "key": secret}))
+        print(json.dumps({**_document(key), **fields, "key": secret}))
         return
     print(secret)
-    until = "" if key.expires is None else f", until {_when(key.expires)}"
+    until = "" if key.expires is None else f", until {_format_time(key.expires)}"
     print(
         f"key {key.id} of {key.name}: {', '.join(sorted(key.scopes))}{until}. It is shown this once.", file=sys.stderr
     )
 
 
 def _seconds(argument: str, text: str, alternative: str = "") -> float:
-    """A time such as 30d."""
+    """Parse a duration such as 30d; return seconds."""
     match = re.fullmatch(r"(\d{1,6})([smhd])", text.strip(), re.ASCII)
     if match is None:
         expected = f"a number of at most 6 digits with d, h, m or s, such as 30d or 12h{alternative}"
@@ -131,7 +131,7 @@ def _seconds(argument: str, text: str, alternative: str = "") -> float:
 
 
 def _moment(text: str) -> float:
-    """A time from now, or a date, in seconds since 1970."""
+    """Parse a duration from now, or a date; return seconds since 1970."""
     now = time.time()
     try:
         date = datetime.fromisoformat(text.strip())
@@ -150,7 +150,7 @@ def _list(keys: KeyStore, options: argparse.Namespace) -> None:
         return
     for key in records:
         scopes = ",".join(sorted(key.scopes)) + ("" if key.maker is None else f" by {key.maker}")
-        print("  ".join([key.id, _when(key.created), _state(key), scopes, _limits(key), key.name]))
+        print("  ".join([key.id, _format_time(key.created), _state(key), scopes, _limits(key), key.name]))
     if not records:
         closed = "no keys, but there were some: nobody is let in until one is made"
         none = "no keys: the service is open to this machine, and to no other"
@@ -166,7 +166,7 @@ def _revoke(keys: KeyStore, options: argparse.Namespace) -> None:
 
 
 def _with(shares: Sequence[KeyRecord]) -> str:
-    """The keys that end with one; nothing where there are none."""
+    """Revoke the keys shared by a key; print nothing if there are none."""
     if not shares:
         return ""
     return f", and with it {len(shares)} that it made: " + ", ".join(
@@ -182,10 +182,10 @@ def _document(key: KeyRecord) -> dict[str, Any]:
 
 def _state(key: KeyRecord) -> str:
     if key.revoked is not None:
-        return f"revoked {_when(key.revoked)}"
+        return f"revoked {_format_time(key.revoked)}"
     if key.expires is None:
         return "valid"
-    return f"{'expired' if key.expires <= time.time() else 'valid until'} {_when(key.expires)}"
+    return f"{'expired' if key.expires <= time.time() else 'valid until'} {_format_time(key.expires)}"
 
 
 def _limits(key: KeyRecord) -> str:
@@ -193,6 +193,6 @@ def _limits(key: KeyRecord) -> str:
     return ",".join(f"{name}={value}" for name, value in limits.items() if value is not None) or "-"
 
 
-def _when(seconds: float) -> str:
+def _format_time(seconds: float) -> str:
     moment = datetime.fromtimestamp(within_calendar(seconds), UTC)
     return moment.replace(tzinfo=None).isoformat(" ", "minutes") + "Z"

@@ -1,4 +1,4 @@
-"""``splatlift serve``, which is ``python -m service``: the service on this machine."""
+"""``splatlift serve`` and ``python -m service``: run the service on this machine."""
 
 from __future__ import annotations
 
@@ -36,20 +36,20 @@ from service.store.database import DATABASE, keys_were_made, require_database
 from service.store.keys import any_key
 from service.store.store import Store
 
-FILES_A_CONNECTION = 2  # itself, and what it is sent
-SWITCH_SECONDS = 0.0005  # that a thread may compute on while the event loop waits; Python's own is ten times that
-MARGIN = " " * 6  # of what --help says of a variable
-# That a connection is kept after an answer: longer than the pools of clients and proxies keep theirs (httpx 5 s,
-# aiohttp 15 s, nginx 60 s). At the same number one sends its next request in the moment in which it is closed.
+FILES_A_CONNECTION = 2  # its socket, and a file that is sent over it
+SWITCH_SECONDS = 0.0005  # of computation by a thread while the event loop waits; a tenth of Python's default
+MARGIN = " " * 6  # before the description of a variable in --help
+# Seconds that a connection is kept after an answer: more than in the pools of clients and proxies (httpx 5 s, aiohttp
+# 15 s, nginx 60 s). With an equal number a client may send its next request while the server closes the connection.
 KEEP_ALIVE_SECONDS = 75
-IDLE_SECONDS = 1.0  # without a request in progress; then a connection may be closed for one that comes
+IDLE_SECONDS = 1.0  # without a request in progress; then the connection may be closed for a new one
 FILES_BESIDE = 128  # of the database, checks, jobs and the query worker
 
 log = logging.getLogger(__name__)
 
 
 class AnnouncingServer(uvicorn.Server):
-    """Says on stdout where it listens, once it does, and stops in order: what it is told to stop by is no failure.
+    """Announce the address after the start, and stop in order: a stop by a signal is no failure.
 
     Connections without a request in progress make room for others: uvicorn's own limit looks at requests alone, and
     waits for ever for who sends nothing.
@@ -62,38 +62,38 @@ class AnnouncingServer(uvicorn.Server):
         self._max_connections = max_connections
         self._stopping = stopping
         self._announce = announce
-        # Connection and the last request of it, which is over -> seconds of the monotonic clock
+        # Connection and its last completed request -> seconds of the monotonic clock
         self._idle_since: dict[tuple[Any, Any], float] = {}
 
     async def on_tick(self, counter: int) -> bool:
-        """Close the connections that are idle the longest where the next one would be too many. uvicorn calls this
+        """Close the connections that are idle the longest if there is no room for the next one. uvicorn calls this
         ten times a second.
         """
         now, connections = time.monotonic(), self.server_state.connections
         requests = ((each, getattr(each, "cycle", None)) for each in connections)
         self._idle_since = {
-            last: self._idle_since.get(last, now)  # another request since the last look: idle from now on
+            last: self._idle_since.get(last, now)  # a new request since the last tick resets the time
             for last in requests
             if last[1] is None or last[1].response_complete
         }
-        surplus = len(connections) - self._max_connections + 1  # with the next one
+        surplus = len(connections) - self._max_connections + 1  # including the next one
         for last in sorted(self._idle_since, key=self._idle_since.__getitem__)[: max(0, surplus)]:
             if now - self._idle_since[last] >= IDLE_SECONDS and not last[0].transport.is_closing():
                 last[0].shutdown()
         return await super().on_tick(counter)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Stop at the first signal; at a second SIGINT at once. uvicorn would die of the signal after the stop."""
+        """Stop at the first signal, at once at a second SIGINT. uvicorn would raise the signal after the stop."""
         self.force_exit = self.force_exit or (self.should_exit and sig == signal.SIGINT)
         self.should_exit = True
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Refuse work and put back what runs while the port still answers, then close it."""
+        """Refuse work and requeue running jobs while the port still answers, then close the port."""
         await self._stopping.begin(lambda: self.force_exit)
         await super().shutdown(sockets)
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Start, then say so."""
+        """Start, then announce the address."""
         await super().startup(sockets)
         if self.started and sockets:
             host, port = sockets[0].getsockname()[:2]
@@ -101,19 +101,19 @@ class AnnouncingServer(uvicorn.Server):
             self._announce(f"http://{name}:{port}")
 
 
-def say(address: str) -> None:
-    """Tell people where the server listens."""
+def print_address(address: str) -> None:
+    """Print where the server listens, for people."""
     print(f"listening on {address}", flush=True)
 
 
-def say_in_json(address: str, data: Path) -> None:
-    """Tell programs, and where everything lies."""
+def print_json(address: str, data: Path) -> None:
+    """Print the address and the data directory as JSON, for programs."""
     print(json.dumps({"address": address, "data": str(data.absolute())}), flush=True)
 
 
 def add_arguments(parser: Parser) -> None:
-    """The options of the command; the end of its help lists all settings."""
-    parser.formatter_class, parser.epilog = argparse.RawDescriptionHelpFormatter, told_variables()
+    """Add the options of the command; the end of its help lists all settings."""
+    parser.formatter_class, parser.epilog = argparse.RawDescriptionHelpFormatter, list_variables()
     parser.add_argument("--host", help="the address to bind; beyond loopback only with keys")
     parser.add_argument("--port", type=int, help="the port to bind; 0 picks a free one")
     parser.add_argument("--data", type=Path, metavar="DIR", help="the directory for the database and all files")
@@ -146,9 +146,9 @@ def run(options: argparse.Namespace) -> int:
             log.warning("SPLATLIFT_KEYS is none: nobody needs a key, though keys were made for %s", settings.data)
         try:
             app = assemble(settings, store)
-            app.state.documents.get(keys=False)  # for whoever comes first, and for all who come at once
+            app.state.documents.get(keys=False)  # made before the first requests, which may come at once
             keep_pauses_short()
-            announce = partial(say_in_json, data=settings.data) if options.json else say
+            announce = partial(print_json, data=settings.data) if options.json else print_address
             server_of(app, settings, announce).run(sockets=[listener])
         finally:
             store.close()
@@ -157,7 +157,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def settings_of(options: argparse.Namespace) -> ServiceSettings:
-    """Settings from the command line, else from the environment, else their defaults.
+    """Return the settings: of the command line, else of the environment, else the defaults.
 
     Raises:
         Misconfigured: a value that a setting does not take.
@@ -172,7 +172,7 @@ def settings_of(options: argparse.Namespace) -> ServiceSettings:
 
 @contextmanager
 def data_directory_errors() -> Iterator[None]:
-    """Tell in one line of a disk that is full, may only be read or fails, and of a database that does.
+    """Convert errors of the disk and the database to one line: full, read-only or failing.
 
     Raises:
         Misconfigured: in place of OSError and sqlite3.Error.
@@ -183,8 +183,8 @@ def data_directory_errors() -> Iterator[None]:
         raise Misconfigured("data", expected="a directory to read and write", got=str(error)) from error
 
 
-def told_variables() -> str:
-    """All settings, as ``--help`` tells them."""
+def list_variables() -> str:
+    """Return the list of all settings for ``--help``."""
     rows = (
         f"  {name}, default {default}\n{fill(meaning, 78, initial_indent=MARGIN, subsequent_indent=MARGIN)}"
         for name, default, meaning in variables()
@@ -193,7 +193,7 @@ def told_variables() -> str:
 
 
 def require_keys(settings: ServiceSettings) -> None:
-    """See that nobody beyond this machine comes in without a key.
+    """Require keys if the service is reachable from other machines.
 
     Raises:
         Misconfigured: the address is not loopback, and there is no key.
@@ -212,7 +212,7 @@ def require_keys(settings: ServiceSettings) -> None:
 
 
 def require_files(settings: ServiceSettings) -> None:
-    """Raise the number of files that we may open as far as we may, and see that every connection can have its own.
+    """Raise the limit of open files as far as allowed, and require enough for every connection.
 
     Raises:
         Misconfigured: there would be too few of them.
@@ -226,18 +226,18 @@ def require_files(settings: ServiceSettings) -> None:
         )  # fmt: skip
     try:
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-    except (ValueError, OSError):  # a kernel that has a limit of its own below the one it tells
+    except (ValueError, OSError):  # some kernels have a lower limit than they report
         resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, required) if soft >= 0 else soft, hard))
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """A listening socket.
+    """Return a listening socket.
 
     Raises:
         Misconfigured: the address is not of this machine, or it is taken.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # Only where TCP is named does asyncio send at once; else answers on kept connections wait 40 ms for the client.
+    # asyncio disables Nagle's algorithm only if TCP is named; else answers on kept connections wait 40 ms.
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -249,12 +249,14 @@ def bind(host: str, port: int) -> socket.socket:
     return listener
 
 
-def server_of(app: FastAPI, settings: ServiceSettings, announce: Callable[[str], None] = say) -> AnnouncingServer:
-    """The server of an application, which announces the address at which it listens."""
+def server_of(
+    app: FastAPI, settings: ServiceSettings, announce: Callable[[str], None] = print_address
+) -> AnnouncingServer:
+    """Return the server of an application, which announces its address."""
     proxies = settings.forwarded_allow
     config = uvicorn.Config(
         app, http="h11", ws="none", log_config=None, log_level="warning", access_log=False, server_header=False,
-        limit_concurrency=settings.max_connections + 1,  # with the one that asks
+        limit_concurrency=settings.max_connections + 1,  # including the current one
         timeout_keep_alive=KEEP_ALIVE_SECONDS,
         timeout_graceful_shutdown=math.ceil(settings.stop_seconds),
         proxy_headers=bool(proxies), forwarded_allow_ips=proxies,
@@ -263,8 +265,8 @@ def server_of(app: FastAPI, settings: ServiceSettings, announce: Callable[[str],
 
 
 def keep_pauses_short() -> None:
-    """Let no thread, and no collection of cycles, hold up the event loop for long."""
+    """Keep threads and the collector of cycles from blocking the event loop for long."""
     sys.setswitchinterval(SWITCH_SECONDS)
-    gc.set_threshold(700, 10, 10)  # Python's own: other commands collect less often
+    gc.set_threshold(700, 10, 10)  # Python's default: other commands collect less often
     gc.collect()
-    gc.freeze()  # modules and routes are most of what there ever is: looking through them took 20 to 40 ms
+    gc.freeze()  # skip modules and routes in later collections: they took 20 to 40 ms

@@ -15,14 +15,14 @@ from service.store.database import DATABASE
 from service.store.recovery import back_up, rebuild, restore, verify
 from service.store.store import Store
 
-LOST = (
+LOST_FILES_HINT = (
     "what the database alone held is not made again: keys, owners (what was added is of admins alone), trade-offs,"
     " selections, names of things, jobs without a lift, histories of jobs"
 )
 
 
 def add_arguments(parser: Parser, shared: Parser) -> None:
-    """The options of the command."""
+    """Add the options of the command."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=Parser)
     rebuild = actions.add_parser("rebuild", parents=[shared], help="rows for files that the database does not know")
     backup = actions.add_parser("backup", parents=[shared], help="copy a data directory, beside a server that runs")
@@ -35,7 +35,7 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Do what the command line says; the exit status: 1 where `verify` finds damage."""
+    """Run the command; return 1 if `verify` finds damage."""
     with data_directory_errors():
         settings = read_settings(data=options.data)
         if options.action == "restore":
@@ -68,7 +68,7 @@ def _rebuild(options: argparse.Namespace, settings: ServiceSettings) -> int:
     lines = [f"added to {DATABASE}: {sum(document['assets'].values())} assets{kinds}, {document['lifts']} lifts"]
     for file in document["left"]:
         lines.append(f"left out, and moved to quarantine, now or by the server: {file['file']}: {file['why']}")
-    return _reply(options, {**document, "lost": LOST}, "\n".join([*lines, LOST]))
+    return _reply(options, {**document, "lost": LOST_FILES_HINT}, "\n".join([*lines, LOST_FILES_HINT]))
 
 
 def _reply(options: argparse.Namespace, document: dict[str, Any], text: str) -> int:

@@ -1,4 +1,4 @@
-"""``splatlift view`` and ``result.show()``: one lift on the service's page, on a local port, until Ctrl-C.
+"""``splatlift view`` and ``result.show()``: show one lift on the service's page, on a local port, until Ctrl-C.
 
 A temporary data directory holds links to the lift and to the files that it was made of: nothing is copied, and what
 is deleted on the page is a link. What a lift of Python has in memory alone is written to another one beside it.
@@ -36,7 +36,7 @@ from service.store.assets import CheckedUpload
 from service.store.files import sha256_of
 from service.store.lifts import FinishedLift, order_of
 from service.store.owners import SERVICE
-from service.store.recovery import checked, header_of
+from service.store.recovery import check_file, header_of
 from service.store.store import Store
 
 if TYPE_CHECKING:
@@ -45,13 +45,13 @@ if TYPE_CHECKING:
     from liftcore import Camera, LiftResult, Splats
 
 LAST_PORT = 65_535
-ENDING_SECONDS = 10.0  # for a server that was interrupted
+ENDING_SECONDS = 10.0  # for a server that was interrupted to end
 FOLDER_PREFIX = "splatlift-show-"
-FOLDER_VARIABLE = "SPLATLIFT_SHOW_FOLDER"  # from `show` to the process that removes it; no option reaches it
+FOLDER_VARIABLE = "SPLATLIFT_SHOW_FOLDER"  # from `show` to the process that removes the folder; not an option
 
 
 def add_arguments(parser: Parser) -> None:
-    """The options of the command."""
+    """Add the options of the command."""
     parser.add_argument(
         "lift", type=place, help="a lift (.safetensors), whose splats and cameras are where they were"
     )
@@ -60,7 +60,7 @@ def add_arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Show the lift until Ctrl-C; a folder of `show` goes with whoever holds the other end of stdin.
+    """Show the lift until Ctrl-C; a folder of `show` is removed when the other end of stdin closes.
 
     Raises:
         InvalidInput: the environment names a folder that `show` did not make for this lift.
@@ -72,7 +72,7 @@ def run(options: argparse.Namespace) -> int:
     if not (options.lift.parent == Path(folder) and options.lift.parent.name.startswith(FOLDER_PREFIX)):
         expected = f"the folder {FOLDER_PREFIX}... of the lift"
         raise InvalidInput(FOLDER_VARIABLE, expected=expected, got=repr(folder)[:80], hint="unset it")
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # in order, until the server takes signals itself
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # exit in order until the server handles signals itself
     threading.Thread(target=stop_when_stdin_closes, daemon=True).start()
     try:
         _serve(options.lift, options.port, browser=not options.no_browser)
@@ -92,15 +92,15 @@ def show(
         path = lift.save_scene(Path(folder), splats, cameras)
         command = [sys.executable, "-m", "liftcore.cli", "view", str(path), "--port", str(port)]
         command += ["--no-browser"] * (not browser)
-        environment = os.environ | {FOLDER_VARIABLE: folder}  # to the server: a notebook's kernel may be killed
+        environment = os.environ | {FOLDER_VARIABLE: folder}  # the server removes it: a kernel may be killed
         with subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
         ) as server:
             assert server.stdout is not None
             try:
                 for line in server.stdout:
-                    print(line, end="", flush=True)  # into a notebook's cell, too
-            except KeyboardInterrupt:  # which the server heard as well, or will now
+                    print(line, end="", flush=True)  # flushed for the cell of a notebook
+            except KeyboardInterrupt:  # the server received it too
                 server.terminate()
                 with suppress(subprocess.TimeoutExpired):
                     server.wait(ENDING_SECONDS)
@@ -112,7 +112,7 @@ def show(
 
 
 def adopt(store: Store, settings: ServiceSettings, path: Path) -> str:
-    """Give a store a lift and what it was made of, by links; the lift's id there.
+    """Add a lift and the files that it was made of to a store, by links; return the lift's id.
 
     Packs that moved are left out: only examples of regions need them.
 
@@ -136,7 +136,7 @@ def adopt(store: Store, settings: ServiceSettings, path: Path) -> str:
 
 
 def metadata_of(path: Path) -> tuple[dict[str, Any], list[int]]:
-    """What a lift file tells of itself, and the shape of its features.
+    """Return the metadata of a lift file and the shape of its features.
 
     Raises:
         InvalidLift: it is none.
@@ -154,7 +154,7 @@ def _link(store: Store, settings: ServiceSettings, kind: AssetKind, file: dict[s
     if not file["path"] or not source.exists():
         got = "nothing there" if file["path"] else "a lift of values in memory"
         raise InvalidLift(str(lift), expected=f"its {kind} at {file['path'] or 'a path'}", got=got)
-    report = checked(store, settings, kind, source)
+    report = check_file(store, settings, kind, source)
     path = store.files.blob(file["sha256"], report.suffix)
     path.parent.mkdir(exist_ok=True)
     path.symlink_to(source.resolve() if source.is_file() else source)
@@ -164,7 +164,7 @@ def _link(store: Store, settings: ServiceSettings, kind: AssetKind, file: dict[s
 
 
 def settings_of(folder: Path, port: int, text_space: str) -> ServiceSettings:
-    """Settings of a server for this machine alone, with the encoder of the lift's text space, if it is here.
+    """Return the settings of a server for this machine only, with the encoder of the lift's text space if known.
 
     Spaces of encoders that ship, and those that the environment names, are answered as by any server.
     """
@@ -181,7 +181,7 @@ def settings_of(folder: Path, port: int, text_space: str) -> ServiceSettings:
 
 
 def _serve(path: Path, port: int, *, browser: bool) -> None:
-    """Show the lift at a port, over a data directory that goes with the server."""
+    """Show the lift on a port, over a data directory that is removed with the server."""
     with tempfile.TemporaryDirectory(prefix="splatlift-view-") as folder:
         settings = settings_of(Path(folder), port, metadata_of(path)[0].get("text_space", ""))
         listener = bind(settings.host, settings.port)
@@ -196,14 +196,14 @@ def _serve(path: Path, port: int, *, browser: bool) -> None:
 
 
 def stop_when_stdin_closes() -> None:
-    """Stop this process in order once nobody holds the other end of the pipe, however that one ended."""
-    while os.read(0, 1 << 16):  # not by sys.stdin, whose lock a thread that waits would keep beyond the end
+    """Stop this process in order once the other end of the pipe is closed."""
+    while os.read(0, 1 << 16):  # not sys.stdin: the thread would hold its lock at the exit
         pass
     os.kill(os.getpid(), signal.SIGTERM)
 
 
 def announce(address: str, *, lift: str, browser: bool) -> None:
-    """Tell where the page is, and open it."""
+    """Print the address of the page, and open it."""
     page = f"{address}/?lift={lift}"
     print(f"{page} (Ctrl-C ends it)", flush=True)
     if browser:

@@ -19,7 +19,7 @@ from service.sandbox import run_sandboxed
 from service.state import AppState, Deps
 from service.store.assets import SHOWN_CHARACTERS, AssetRecord
 from service.store.files import require_whole
-from service.uploads import AssetIntake, Intake, Taken, require_size, too_slow
+from service.uploads import AssetIntake, Intake, Record, require_size, too_slow
 
 T = TypeVar("T")
 BATCH = 1 << 20  # bytes gathered before a thread writes them
@@ -61,16 +61,16 @@ async def create_asset(kind: KindParameter, request: Request, deps: Deps, sha256
 
 
 async def receive_upload(
-    into: Callable[..., Intake[Taken]], kind: models.UploadKind, request: Request, deps: AppState, sha256: str | None
-) -> tuple[Taken, bool]:
+    into: Callable[..., Intake[Record]], kind: models.UploadKind, request: Request, deps: AppState, sha256: str | None
+) -> tuple[Record, bool]:
     """Take the body of an upload in, check it whole and keep it; whether its owner did not have it before."""
     require_file(request.headers)
     limit = deps.settings.max_upload_bytes(kind)
-    require_size(kind, _announced(request), limit)  # before a byte of it is asked for with 100 Continue
+    require_size(kind, _declared_size(request), limit)  # before a byte of it is asked for with 100 Continue
     intake = into(deps.store, deps.owner, kind, limit)
 
-    async def write(step: Callable[..., T], *given: Any) -> T:
-        return await anyio.to_thread.run_sync(step, *given, limiter=deps.writing)
+    async def write(step: Callable[..., T], *arguments: Any) -> T:
+        return await anyio.to_thread.run_sync(step, *arguments, limiter=deps.writing)
 
     try:
         await write(intake.open)
@@ -85,7 +85,7 @@ async def receive_upload(
             await write(intake.close)
 
 
-def _announced(request: Request) -> int:
+def _declared_size(request: Request) -> int:
     """The bytes that a body is said to have, 0 when nothing is said."""
     length = request.headers.get("content-length", "")
     return int(length[:MAX_DIGITS]) if length.isascii() and length.isdigit() else 0
@@ -110,7 +110,7 @@ def list_assets(deps: Deps, limit: Limit = models.PAGE, cursor: Cursor = None) -
 @router.get("/{asset}", response_model=models.Asset)
 def get_asset(asset: AssetId, deps: Deps) -> Response:
     """One asset. Where its names or words are very many, they are at ``links.names`` alone."""
-    return _reply(deps.store.assets.get(deps.owner, asset, most=SHOWN_CHARACTERS), 200)
+    return _reply(deps.store.assets.get(deps.owner, asset, limit=SHOWN_CHARACTERS), 200)
 
 
 @router.get("/{asset}/names", response_model=models.Names)

@@ -62,13 +62,13 @@ EVENTS: dict[int | str, dict[str, Any]] = {
     },
     204: {"description": "The job has ended, and the client has its last event"},
 }
-REPEATED: dict[int | str, dict[str, Any]] = {
+REPEATED_ORDER: dict[int | str, dict[str, Any]] = {
     200: {"model": models.Job, "description": "The job that the same key made before"}
 }
 
 
 @router.post(
-    "/lift", response_model=models.Job, status_code=202, responses=REPEATED, tags=["jobs"],
+    "/lift", response_model=models.Job, status_code=202, responses=REPEATED_ORDER, tags=["jobs"],
 )  # fmt: skip
 async def order_lift(order: models.LiftRequest, deps: Deps, key: Key = None) -> Response:
     """Lift features onto splats. The job is on the disk before this answers."""
@@ -88,7 +88,7 @@ async def plan_lift(order: models.LiftRequest, deps: Deps) -> models.Plan:
 
 
 @router.post(
-    "/tradeoff", response_model=models.Job, status_code=202, responses=REPEATED, tags=["trade-offs"],
+    "/tradeoff", response_model=models.Job, status_code=202, responses=REPEATED_ORDER, tags=["trade-offs"],
 )  # fmt: skip
 async def order_tradeoff(order: models.TradeoffRequest, deps: Deps, key: Key = None) -> Response:
     """Compare the dial and the presets on a scene within a budget. The job is on the disk before this answers."""
@@ -141,12 +141,18 @@ def _compare(order: models.TradeoffRequest, deps: AppState, key: str | None) -> 
     )  # an order without labels reads as before there were any
     parameters = {name: document[name] for name in ("budget_s", "labels") if name in document}
     return _take(
-        order, deps, key, sent=document, settings=order.settings, kind=models.JobKind.TRADEOFF, parameters=parameters
+        order,
+        deps,
+        key,
+        sent=document,
+        settings=order.settings,
+        kind=models.JobKind.TRADEOFF,
+        parameters=parameters,
     )
 
 
 def _take(order: models.LiftInputs, deps: AppState, key: str | None, *, sent: dict[str, Any], **of: Any) -> Response:
-    """The answer to an order: the job that it makes, or made before. By what was ``sent`` it is known again."""
+    """Return the answer to an order: its new job, or that of the same order before, by the JSON ``sent``."""
     job_order = JobOrder(
         splats=order.splats, cameras=order.cameras, features=tuple(order.features),
         key=key, fingerprint=None if key is None else fingerprint(sent), request_id=current_id(), **of,
@@ -162,7 +168,7 @@ def _take(order: models.LiftInputs, deps: AppState, key: str | None, *, sent: di
 
 def _require_fit(order: JobOrder, deps: AppState) -> None:
     """Refuse an order that cannot be lifted, or that there is no room for."""
-    get = partial(deps.store.assets.get, deps.owner, most=ALL)  # names are compared with names
+    get = partial(deps.store.assets.get, deps.owner, limit=ALL)  # names are compared with names
     cameras = get(order.cameras, models.AssetKind.CAMERAS)
     packs = [get(pack, models.AssetKind.FEATURES) for pack in order.features]
     splats = get(order.splats, models.AssetKind.SPLATS)
@@ -342,7 +348,7 @@ def check_labels(
         raise InvalidRequest(
             "labels.masks",
             expected="masks of views named like the cameras",
-            got=f"masks of {_some(masks.counts['names'])} and cameras {_some(camera_names)}, none in common",
+            got=f"masks {_first_names(masks.counts['names'])}, cameras {_first_names(camera_names)}: none in common",
         )
     view_names = [view for pack in features for view in pack.counts["names"]]
     views = sorted(cameras_of_views(view_names, camera_names).values())
@@ -370,6 +376,6 @@ def scratch_bytes(kind: models.JobKind, splats: AssetRecord, features: Sequence[
     return splats.counts.get("splats", 0) * (1 + features[0].counts["channels"]) * FLOAT_BYTES
 
 
-def _some(names: Sequence[str]) -> str:
+def _first_names(names: Sequence[str]) -> str:
     """The first few names, for an error."""
     return ", ".join(map(repr, sorted(names)[:3]))

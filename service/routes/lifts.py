@@ -319,13 +319,13 @@ def get_tree(lift: str, deps: Deps, ask: Ask, asked: Annotated[models.AskedForTr
     return _nodes("tree", lift, deps, ask, asked, relations=asked.relations or asked.up is not None, up=asked.up)
 
 
-def _nodes(operation: str, lift: str, deps: Deps, ask: Ask, asked: models.AskedForNodes, **more: Any) -> Response:
+def _nodes(operation: str, lift: str, deps: Deps, ask: Ask, asked: models.AskedForNodes, **options: Any) -> Response:
     record = deps.store.lifts.get(deps.owner, lift)
     request: dict[str, Any] = scene_request(operation, record, deps) | NO_ENCODER | {"words": None}
     if asked.table is not None or asked.encoder is not None:
         request = with_encoder(request, asked, record, deps)
     encoder = None if request["encoder"] is None else encoder_label(request["encoder"])
-    request |= {"first": asked.cursor, "count": asked.limit, **more}
+    request |= {"first": asked.cursor, "count": asked.limit, **options}
     return binary_response(deps, request | {"head": {"lift": record.id, "encoder": encoder}}, record, ask, {})
 
 

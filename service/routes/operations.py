@@ -34,7 +34,7 @@ METRICS: dict[int | str, dict[str, Any]] = {
 }
 
 
-def _policy(scripts: str, styles: str, **more: str) -> dict[str, str]:
+def _policy(scripts: str, styles: str, **sources: str) -> dict[str, str]:
     """The header of a page that runs these scripts and no others, whatever comes to be in it."""
     rules = {
         "default-src": "'none'",
@@ -45,14 +45,14 @@ def _policy(scripts: str, styles: str, **more: str) -> dict[str, str]:
         "form-action": "'none'",
         "base-uri": "'none'",
         "frame-ancestors": "'none'",
-    } | {name.replace("_", "-"): value for name, value in more.items()}
+    } | {name.replace("_", "-"): value for name, value in sources.items()}
     return {"Content-Security-Policy": "; ".join(f"{name} {value}" for name, value in rules.items())}
 
 
 # The page asks this service, and sorts and unpacks splats, which is done by WebAssembly in workers.
 PAGE_HEADERS = _policy("'self' 'wasm-unsafe-eval'", "'self'", worker_src="blob:", font_src="data:")
 PAGE_HEADERS |= {"Cache-Control": "no-cache"}
-KEPT = {"Cache-Control": "public, max-age=31536000, immutable"}  # the page asks for them by their digest
+IMMUTABLE = {"Cache-Control": "public, max-age=31536000, immutable"}  # the page asks for them by their digest
 
 router = APIRouter(tags=["operations"])
 
@@ -107,15 +107,15 @@ class Documents:
     def __init__(self, app: FastAPI) -> None:
         self._app = app
         self._turn = threading.Lock()
-        self._made: tuple[bytes, ...] = ()
+        self._bodies: tuple[bytes, ...] = ()
 
     def get(self, *, keys: bool) -> bytes:
         """The one of the two, as JSON."""
         with self._turn:
-            if not self._made:
+            if not self._bodies:
                 document = with_summaries(self._app.openapi())
-                self._made = tuple(bytes(JSONResponse(variant).body) for variant in (document, with_keys(document)))
-        return self._made[keys]
+                self._bodies = tuple(bytes(JSONResponse(variant).body) for variant in (document, with_keys(document)))
+        return self._bodies[keys]
 
 
 @router.get("/openapi.json", include_in_schema=False)
@@ -162,8 +162,8 @@ def _read_example(name: str) -> bytes:
 
 for name in ("point_cloud.spz", "cameras.json", "features.safetensors"):
     _serve(f"/web/example/{name}", partial(_read_example, name), BINARY)
-_serve("/web/page.js", (WEB / "page.js").read_bytes, "text/javascript", KEPT)
-_serve("/web/page.css", (WEB / "page.css").read_bytes, "text/css", KEPT)
+_serve("/web/page.js", (WEB / "page.js").read_bytes, "text/javascript", IMMUTABLE)
+_serve("/web/page.css", (WEB / "page.css").read_bytes, "text/css", IMMUTABLE)
 _serve("/web/LICENSES.txt", (WEB / "LICENSES.txt").read_bytes, "text/plain; charset=utf-8")
 _serve("/docs/swagger-ui-bundle.js", (SWAGGER / "swagger-ui-bundle.js").read_bytes, "text/javascript")
 _serve("/docs/swagger-ui.css", (SWAGGER / "swagger-ui.css").read_bytes, "text/css")

@@ -91,7 +91,7 @@ def tagged_answer(
     decides = {name: value for name, value in worker_request.items() if name != "names"}
     decides |= {"lift": lift.sha256, "version": __version__}
     etag = f'"{hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()}"'
-    not_modified = unchanged(request, etag, found=False)  # nobody has looked whether the view is there
+    not_modified = unchanged(request, etag, exists=False)  # nobody has looked whether the view is there
     if not_modified is not None:
         return not_modified
     answer = binary_response(deps, worker_request, lift, ask, cache_headers(etag))

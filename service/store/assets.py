@@ -59,7 +59,7 @@ VISIBLE = (
     "SELECT assets.*, created FROM (SELECT asset, min(created) AS created"
     f" FROM asset_owners WHERE {SEEN} GROUP BY asset) JOIN assets ON asset = id"
 )
-ONE = VISIBLE.replace(f"{SEEN} GROUP", f"{SHOWN_ASSETS} AND asset = :asset GROUP")
+ONE_ASSET = VISIBLE.replace(f"{SEEN} GROUP", f"{SHOWN_ASSETS} AND asset = :asset GROUP")
 
 
 SHOWN_CHARACTERS = 256 << 10  # of counts; of more the names, or words, are told apart, in pages
@@ -89,17 +89,17 @@ class AssetStore:
             OverQuota: it would be more than the owner may store.
         """
         asset = f"sha256:{upload.sha256}"
-        with self._files.blobs_changing, self._database.write(counted=True) as connection:
+        with self._files.blobs_changing, self._database.write(is_counted=True) as connection:
             row = connection.execute(
                 "SELECT 1 FROM asset_owners WHERE asset = ? AND owner = ?", (asset, owner.key)
             ).fetchone()
             if row is None:
                 require_quota(connection, owner, upload.draft.stat().st_size)
                 self._publish(connection, asset, upload)
-                own(connection, asset, owner.key)
+                add_owner(connection, asset, owner.key)
             elif not self.get(owner, asset).whole:
                 self._publish(connection, asset, upload)
-        return self.get(owner, asset, most=SHOWN_CHARACTERS), row is None
+        return self.get(owner, asset, limit=SHOWN_CHARACTERS), row is None
 
     def _publish(self, connection: sqlite3.Connection, asset: str, upload: CheckedUpload) -> None:
         """The bytes and the row; both may be there, and then the bytes are replaced by equal ones."""
@@ -116,7 +116,7 @@ class AssetStore:
             "counts_bytes": len(json.dumps(upload.counts)),
             "warnings": json.dumps(upload.warnings),
         }
-        insert(connection, "assets", row, known="IGNORE")
+        insert(connection, "assets", row, on_conflict="IGNORE")
         connection.executemany(
             "INSERT OR IGNORE INTO asset_names (asset, place, name) VALUES (?, ?, ?)",
             ((asset, place, name) for place, name in enumerate(upload.counts.get(long, ()))),
@@ -131,15 +131,15 @@ class AssetStore:
         with self._database.read() as connection:
             require_quota(connection, owner, coming)
 
-    def find(self, owner: Owner, asset: str, *, most: int = 0) -> AssetRecord | None:
+    def find(self, owner: Owner, asset: str, *, limit: int = 0) -> AssetRecord | None:
         """The asset of that id, None when there is none; its counts with names, or words, if they are of at most so
         many characters."""
         with self._database.read() as connection:
-            row = connection.execute(ONE, owner.terms(asset=asset)).fetchone()
+            row = connection.execute(ONE_ASSET, owner.terms(asset=asset)).fetchone()
             if row is None:
                 return None
             record = self._record(row)
-            if record.kind is not AssetKind.SPLATS and row["counts_bytes"] <= most:
+            if record.kind is not AssetKind.SPLATS and row["counts_bytes"] <= limit:
                 record.counts[_long(record.kind)] = _names(connection, asset, 0, -1)
             return record
 
@@ -149,13 +149,13 @@ class AssetStore:
         with self._database.read() as connection:
             return _names(connection, asset, first, limit)
 
-    def get(self, owner: Owner, asset: str, kind: AssetKind | None = None, *, most: int = 0) -> AssetRecord:
+    def get(self, owner: Owner, asset: str, kind: AssetKind | None = None, *, limit: int = 0) -> AssetRecord:
         """The asset of that id, as `find` has it.
 
         Raises:
             NotFound: there is none, or it is of another kind.
         """
-        record = self.find(owner, asset, most=most)
+        record = self.find(owner, asset, limit=limit)
         name = f"{kind or 'asset'}"
         if record is None:
             raise NotFound(name, expected="the id of an asset that is here", got=asset, hint="PUT /assets/... first")
@@ -229,6 +229,6 @@ def _names(connection: sqlite3.Connection, asset: str, first: int, limit: int) -
     return [name for (name,) in rows]
 
 
-def own(connection: sqlite3.Connection, asset: str, owner: str) -> None:
+def add_owner(connection: sqlite3.Connection, asset: str, owner: str) -> None:
     """Within a write transaction: let an owner have an asset that is here."""
-    insert(connection, "asset_owners", {"asset": asset, "owner": owner, "created": time.time()}, known="IGNORE")
+    insert(connection, "asset_owners", {"asset": asset, "owner": owner, "created": time.time()}, on_conflict="IGNORE")

@@ -110,7 +110,7 @@ class Database:
             raise StaleDatabase(self._path.parent, f"an older one (generation {generation}, not {least})")
 
     @contextmanager
-    def write(self, *, counted: bool = False) -> Iterator[sqlite3.Connection]:
+    def write(self, *, is_counted: bool = False) -> Iterator[sqlite3.Connection]:
         """One write transaction: committed when the block ends, rolled back when it raises.
 
         Args:
@@ -123,11 +123,11 @@ class Database:
             raise _error("database is locked", "SQLITE_BUSY")
         try:
             self.require_same_file()
-            if counted:
+            if is_counted:
                 self._require_readable()
             self._writer.execute("BEGIN IMMEDIATE")
             try:
-                generation = self._next_generation() if counted and not self._rebuilding else None
+                generation = self._next_generation() if is_counted and not self._rebuilding else None
                 yield self._writer
                 self._writer.execute("COMMIT")
             except BaseException:
@@ -148,13 +148,13 @@ class Database:
                 files that the collection of garbage finds, and never a row without its file.
         """
         try:
-            with self.write(counted=True) as connection:
+            with self.write(is_counted=True) as connection:
                 paths = list(work(connection))
         except sqlite3.OperationalError as error:
             if getattr(error, "sqlite_errorcode", 0) & 0xFF not in (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR):
                 raise
             (self._path.parent / RESERVE).unlink(missing_ok=True)
-            with self.write(counted=True) as connection:
+            with self.write(is_counted=True) as connection:
                 paths = list(work(connection))
         for path in paths:
             remove(path)
@@ -239,7 +239,7 @@ class Database:
     def catch_up(self) -> None:
         """Say that this is the newest database of its directory: what was lost of it was made again."""
         self._rebuilding = False
-        with self.write(counted=True) as connection:
+        with self.write(is_counted=True) as connection:
             expected = expected_generation(self._path.parent)
             connection.execute("UPDATE generation SET number = max(number, ?)", (expected or 0,))
 
@@ -270,7 +270,7 @@ def expected_generation(data: Path) -> int | None:
     Raises:
         Misconfigured: the marker is there and holds no number.
     """
-    marker = _marked(data)
+    marker = _marker_version(data)
     if marker is None and (any(data.glob("blobs/*/*")) or any(data.glob("lifts/*"))):
         return 0  # files of a release without the marker
     return marker
@@ -278,7 +278,7 @@ def expected_generation(data: Path) -> int | None:
 
 def remember_generation(data: Path, number: int) -> None:
     """Keep the number of a transaction that is on the disk; a larger one, of another process, stays."""
-    if (_marked(data) or 0) < number:
+    if (_marker_version(data) or 0) < number:
         _write(data / GENERATION, f"{number}\n")
 
 
@@ -293,7 +293,7 @@ def remember_keys(data: Path) -> None:
         _write(data / KEYS_REQUIRED, "A key was made for this data directory: without one nobody is let in.\n")
 
 
-def _marked(data: Path) -> int | None:
+def _marker_version(data: Path) -> int | None:
     path = data / GENERATION
     try:
         return int(path.read_text("ascii"))
@@ -364,7 +364,9 @@ def unusable(path: Path, error: sqlite3.Error) -> Misconfigured:
     return Misconfigured("data", expected="a database of this service", got=f"{path}: {error}", hint=hint)
 
 
-def insert(connection: sqlite3.Connection, table: str, values: Mapping[str, Any], *, known: str = "ABORT") -> None:
+def insert(
+    connection: sqlite3.Connection, table: str, values: Mapping[str, Any], *, on_conflict: str = "ABORT"
+) -> None:
     """Add a row within a write transaction.
 
     Args:
@@ -374,7 +376,7 @@ def insert(connection: sqlite3.Connection, table: str, values: Mapping[str, Any]
         known: what to do with a row that is there already: ``ABORT`` or ``IGNORE``.
     """
     columns, places = ", ".join(values), ", ".join("?" * len(values))
-    connection.execute(f"INSERT OR {known} INTO {table} ({columns}) VALUES ({places})", list(values.values()))
+    connection.execute(f"INSERT OR {on_conflict} INTO {table} ({columns}) VALUES ({places})", list(values.values()))
 
 
 def record_of(kind: type[R], row: sqlite3.Row, /, **made: Any) -> R:
@@ -398,7 +400,7 @@ class Page(Generic[R]):
 
 def page_of(
     connection: sqlite3.Connection,
-    listed: str,
+    query: str,
     terms: Mapping[str, Any],
     limit: int,
     cursor: str | None,
@@ -421,7 +423,7 @@ def page_of(
         raise InvalidRequest("cursor", expected="the next of a page", got=repr(cursor[:80]))
     created, _, ident = ("inf", "", "") if cursor is None else cursor.partition("~")
     rows = connection.execute(
-        f"SELECT * FROM ({listed}) WHERE created <= :created AND (created < :created OR id > :after)"
+        f"SELECT * FROM ({query}) WHERE created <= :created AND (created < :created OR id > :after)"
         " ORDER BY created DESC, id LIMIT :most",
         {**terms, "created": float(created), "after": ident, "most": limit + 1},
     ).fetchall()

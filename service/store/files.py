@@ -21,8 +21,8 @@ from liftcore.errors import NotFound
 from service.errors import Misconfigured, NoSpace
 
 LOCK_SECONDS = 0.5  # for another process to let go of the directory
-ROOMS = ("blobs", "lifts", "work")
-MOVED = "%Y%m%dT%H%M%SZ"  # how a folder of the quarantine tells since when it is there
+FOLDERS = ("blobs", "lifts", "work")
+QUARANTINE_TIME = "%Y%m%dT%H%M%SZ"  # how a folder of the quarantine tells since when it is there
 
 
 class DataDirectory:
@@ -58,7 +58,7 @@ class DataDirectory:
 
     def make_folders(self) -> None:
         """Make the folders of files and drafts that are missing: somebody may tidy up while the server runs."""
-        for name in (*ROOMS, "tmp"):
+        for name in (*FOLDERS, "tmp"):
             (self.root / name).mkdir(exist_ok=True)
 
     @contextmanager
@@ -148,7 +148,7 @@ class DataDirectory:
             What was moved, where it was.
         """
         # A folder for each time that something is moved, so that nothing replaces what is there.
-        now = datetime.now(UTC).strftime(MOVED)
+        now = datetime.now(UTC).strftime(QUARANTINE_TIME)
         folder = self.root / "quarantine" / f"{now}-{secrets.token_hex(4)}"
         sources = []
         for path in paths:
@@ -166,7 +166,7 @@ class DataDirectory:
         folders = []
         for folder in (self.root / "quarantine").glob("*-*"):
             try:
-                since = datetime.strptime(folder.name.partition("-")[0], MOVED).replace(tzinfo=UTC)
+                since = datetime.strptime(folder.name.partition("-")[0], QUARANTINE_TIME).replace(tzinfo=UTC)
             except ValueError:
                 continue
             folders.append((folder, since.timestamp()))
@@ -174,7 +174,7 @@ class DataDirectory:
 
     def begin_anew(self, database: str, marker: str) -> None:
         """Move all that is here to quarantine, with the database and what is remembered of its generation."""
-        names = (*ROOMS, *(f"{database}{part}" for part in ("", "-wal", "-shm")))
+        names = (*FOLDERS, *(f"{database}{part}" for part in ("", "-wal", "-shm")))
         # The marker last: as long as it is here, a start that was cut off is refused and not half done.
         self.quarantine(path for name in (*names, marker) if (path := self.root / name).exists())
         self.make_folders()

@@ -22,7 +22,7 @@ from liftcore.errors import NotFound
 from service.child import fault_of
 from service.errors import Conflict, KeyReused, ProcessDied, ServiceUnavailable, Unauthorized
 from service.models import ENDED, AssetKind, JobKind, JobState
-from service.store.assets import own
+from service.store.assets import add_owner
 from service.store.database import Database, Page, insert, page_of, parsed, record_of
 from service.store.files import DataDirectory
 from service.store.owners import ENDED_KEYS, QUEUE_RETRY_SECONDS, SEEN, SHOWN_JOBS, Owner, require_quota, require_turn
@@ -130,7 +130,7 @@ class JobStore:
             KeyReused: the key came with another order before.
         """
         job = secrets.token_hex(16)
-        with self._database.write(counted=True) as connection:
+        with self._database.write(is_counted=True) as connection:
             earlier = _of_key(connection, order, owner)
             if earlier is not None:
                 return earlier, False
@@ -274,7 +274,7 @@ class JobStore:
 
         self._database.write_freeing(forget)
 
-    def forget_ended(self, before: float, most: int) -> int:
+    def forget_ended(self, before: float, limit: int) -> int:
         """Forget jobs that have ended without a result, or whose result was deleted; lifts and trade-offs stay.
 
         Args:
@@ -295,7 +295,7 @@ class JobStore:
                     " FROM jobs WHERE state IN ('succeeded', 'failed', 'canceled')"
                     " AND id NOT IN (SELECT id FROM lifts UNION ALL SELECT id FROM tradeoffs))"
                     " WHERE since < :before OR place > :most LIMIT :at_once) RETURNING id",
-                    {"before": before, "most": most, "at_once": FORGOTTEN_AT_ONCE},
+                    {"before": before, "most": limit, "at_once": FORGOTTEN_AT_ONCE},
                 ).fetchall()
                 batch[:] = [row["id"] for row in rows]
                 return [self._files.work(job) for job in batch]
@@ -354,19 +354,19 @@ class JobStore:
     def log(self, job: str, attempt: int, text: str) -> None:
         """Add a line to the job's log."""
         with self._database.write() as connection:
-            if _owned(connection, job, attempt) is not None:
+            if _owned_row(connection, job, attempt) is not None:
                 note(connection, job, EventKind.LOG, log_line(text))
 
     def fail(self, job: str, attempt: int, error: Mapping[str, str]) -> None:
         """End an attempt, and its job, with a problem; a job that was to be canceled is canceled."""
         with self._database.write() as connection:
-            row = _owned(connection, job, attempt)
+            row = _owned_row(connection, job, attempt)
             if row is not None and row["state"] == JobState.CANCELING:
                 move(connection, row, JobState.CANCELED)
             elif row is not None:
                 move(connection, row, JobState.FAILED, error)
 
-    def lose(self, job: str, attempt: int, why: str, error: Mapping[str, str] | None = None) -> None:
+    def lose(self, job: str, attempt: int, reason: str, error: Mapping[str, str] | None = None) -> None:
         """End an attempt that gave no answer: the job goes back in line, or fails after its last attempt.
 
         Args:
@@ -376,27 +376,27 @@ class JobStore:
             error: what the job fails with in the end, instead of having crashed.
         """
         with self._database.write() as connection:
-            row = _owned(connection, job, attempt)
+            row = _owned_row(connection, job, attempt)
             if row is None:
                 return
-            note(connection, job, EventKind.LOG, log_line(f"attempt {attempt} is lost: {why}"))
+            note(connection, job, EventKind.LOG, log_line(f"attempt {attempt} is lost: {reason}"))
             if row["state"] == JobState.RUNNING and attempt - row["released"] >= MAX_ATTEMPTS:
-                move(connection, row, JobState.FAILED, error or _gave_up(why))
+                move(connection, row, JobState.FAILED, error or _gave_up(reason))
             else:
                 move(connection, row, _without_answer(row))
 
-    def release(self, job: str, attempt: int, why: str) -> None:
+    def release(self, job: str, attempt: int, reason: str) -> None:
         """Put the job of an attempt that the server ended or could not keep up back in line: it counts as none."""
         with self._database.write() as connection:
-            row = _owned(connection, job, attempt)
+            row = _owned_row(connection, job, attempt)
             if row is not None:
-                _release(connection, row, why)
+                _release(connection, row, reason)
 
-    def release_all(self, why: str) -> None:
+    def release_all(self, reason: str) -> None:
         """At start-up: put all of these back in line. A server's death is no job's fault."""
         with self._database.write() as connection:
             for row in connection.execute("SELECT * FROM jobs WHERE state IN ('running', 'canceling')").fetchall():
-                _release(connection, row, why)
+                _release(connection, row, reason)
 
 
 def find(connection: sqlite3.Connection, job: str, owner: Owner) -> sqlite3.Row | None:
@@ -462,7 +462,7 @@ def _take_assets(connection: sqlite3.Connection, order: JobOrder, owner: Owner) 
         )
         if visible.fetchone() is None:
             raise NotFound(kind, expected=f"the id of an asset of kind {kind}", got=asset)
-        own(connection, asset, owner.key)
+        add_owner(connection, asset, owner.key)
 
 
 def note(connection: sqlite3.Connection, job: str, kind: EventKind, data: Mapping[str, Any]) -> None:
@@ -518,7 +518,7 @@ def succeed(connection: sqlite3.Connection, job: str, attempt: int) -> bool:
     Returns:
         False when it is no longer the job's running one, or is to be canceled; then nothing changes.
     """
-    row = _owned(connection, job, attempt)
+    row = _owned_row(connection, job, attempt)
     if row is None or row["state"] == JobState.CANCELING:
         return False
     move(connection, row, JobState.SUCCEEDED)
@@ -534,7 +534,7 @@ def stop_waiting(connection: sqlite3.Connection) -> None:
         move(connection, row, JobState.CANCELED, fault_of(error))
 
 
-def _owned(connection: sqlite3.Connection, job: str, attempt: int) -> sqlite3.Row | None:
+def _owned_row(connection: sqlite3.Connection, job: str, attempt: int) -> sqlite3.Row | None:
     return connection.execute(f"SELECT * FROM jobs WHERE {OWNS}", {"job": job, "attempt": attempt}).fetchone()
 
 
@@ -542,15 +542,15 @@ def _without_answer(row: sqlite3.Row) -> JobState:
     return JobState.CANCELED if row["state"] == JobState.CANCELING else JobState.QUEUED
 
 
-def _release(connection: sqlite3.Connection, row: sqlite3.Row, why: str) -> None:
-    note(connection, row["id"], EventKind.LOG, log_line(f"attempt {row['attempt']} does not count: {why}"))
+def _release(connection: sqlite3.Connection, row: sqlite3.Row, reason: str) -> None:
+    note(connection, row["id"], EventKind.LOG, log_line(f"attempt {row['attempt']} does not count: {reason}"))
     connection.execute("UPDATE jobs SET released = released + 1 WHERE id = ?", (row["id"],))
     move(connection, row, _without_answer(row))
 
 
-def _gave_up(why: str) -> dict[str, str]:
+def _gave_up(reason: str) -> dict[str, str]:
     crashed = ProcessDied(
-        "job", expected="an answer from the job's process", got=f"none in {MAX_ATTEMPTS} attempts; the last: {why}",
+        "job", expected="an answer from the job's process", got=f"none in {MAX_ATTEMPTS} attempts, last {reason}",
         hint="signal 9 is mostly a lack of memory; the server's log has what the process printed",
     )  # fmt: skip
     return fault_of(crashed)

@@ -105,7 +105,7 @@ class KeyStore:
             raise InvalidRequest("scopes", expected="shared alone, with the lifts that the key is given", got=got)
         secret = _new_secret()
         remember_keys(self._data)  # first: a key whose database is lost must not leave the door open
-        with self._database.write(counted=True) as connection:
+        with self._database.write(is_counted=True) as connection:
             sharer = None if maker is None else _key_of(connection, maker)
             if maker is not None and sharer is None:  # a rotation ends what the secret before has made, and no more
                 raise Unauthorized(
@@ -140,7 +140,7 @@ class KeyStore:
         return key, secret
 
     def rotate(
-        self, named: str, *, grace: float = 0.0, keep_shares: bool = False
+        self, name: str, *, grace: float = 0.0, keep_shares: bool = False
     ) -> tuple[KeyRecord, str, list[KeyRecord]]:
         """Give a key a new secret; what it made stays its own.
 
@@ -158,16 +158,16 @@ class KeyStore:
             InvalidRequest: several are.
         """
         secret, now = _new_secret(), time.time()
-        with self._database.write(counted=True) as connection:
+        with self._database.write(is_counted=True) as connection:
             rows = connection.execute(
                 f"{KEYS} WHERE (id = :named OR name = :named) AND id NOT IN ({ENDED_KEYS})",
-                {"named": named, "now": now},
+                {"named": name, "now": now},
             ).fetchall()
             if not rows:
-                raise NotFound("key", expected="the id or name of a valid key", got=named, hint="see keys list")
+                raise NotFound("key", expected="the id or name of a valid key", got=name, hint="see keys list")
             if len(rows) > 1:
                 ids = ", ".join(row["id"] for row in rows)
-                raise InvalidRequest("key", expected="a name that one key has", got=named, hint=f"name one of {ids}")
+                raise InvalidRequest("key", expected="a name that one key has", got=name, hint=f"name one of {ids}")
             key, old_until = _record(rows[0]), rows[0]["old_until"]
             shares = [] if keep_shares else _shares_of(connection, key, now)
             for share in shares:  # what ends as the secret before, or sooner, may have been made with it
@@ -192,7 +192,7 @@ class KeyStore:
             NotFound: there is none of that id.
         """
         now = time.time()
-        with self._database.write(counted=True) as connection:
+        with self._database.write(is_counted=True) as connection:
             row = connection.execute(f"{KEYS} WHERE id = ?", (key,)).fetchone()
             if row is None:
                 raise NotFound("key", expected="the id of a key", got=key, hint="keys list shows them")
@@ -224,7 +224,7 @@ class KeyStore:
         Raises:
             NotFound: it was not given to that key.
         """
-        with self._database.write(counted=True) as connection:
+        with self._database.write(is_counted=True) as connection:
             if not connection.execute("DELETE FROM key_lifts WHERE key = ? AND lift = ?", (key, lift)).rowcount:
                 hint = "GET /lifts/{lift}/shares lists them"
                 raise NotFound("share", expected="the id of a share of the lift", got=key, hint=hint)

@@ -19,7 +19,7 @@ from safetensors import SafetensorError, safe_open
 from liftcore.errors import NotFound
 from liftcore.files import whole_file, with_metadata
 from service.errors import InvalidRequest
-from service.store.assets import own
+from service.store.assets import add_owner
 from service.store.database import Database, Page, insert, page_of, parsed, record_of
 from service.store.files import DataDirectory, sync_directory
 from service.store.jobs import JobOrder, record_state, succeed
@@ -153,28 +153,28 @@ class LiftStore:
         self._database = database
         self._files = files
 
-    def finish(self, job: str, attempt: int, made: FinishedLift) -> bool:
+    def finish(self, job: str, attempt: int, result: FinishedLift) -> bool:
         """End an attempt with its lift: the file, the lift and the job's last state become true together.
 
         Returns:
             False when the attempt may not (`succeed`); then nothing changes.
         """
-        path, size, published = self._files.lift(job), made.draft.stat().st_size, False
+        path, size, published = self._files.lift(job), result.draft.stat().st_size, False
         try:
-            with self._database.write(counted=True) as connection:
+            with self._database.write(is_counted=True) as connection:
                 if not succeed(connection, job, attempt):
                     return False
-                self._files.publish(made.draft, path)
+                self._files.publish(result.draft, path)
                 published = True
-                self._insert(connection, job, made, size, time.time())
+                self._insert(connection, job, result, size, time.time())
         except BaseException:
             if published:  # but not recorded: whoever tries again finds the draft where it was
                 with contextlib.suppress(OSError):
-                    path.replace(made.draft)
+                    path.replace(result.draft)
             raise
         return True
 
-    def take(self, owner: Owner, order: JobOrder, made: FinishedLift) -> LiftRecord:
+    def take(self, owner: Owner, order: JobOrder, result: FinishedLift) -> LiftRecord:
         """Keep a lift that was made elsewhere, as the result of a job that nobody waited for.
 
         Args:
@@ -188,12 +188,12 @@ class LiftStore:
         """
         job = secrets.token_hex(16)
         try:
-            self.adopt(owner, job, order, made)
+            self.adopt(owner, job, order, result)
         except sqlite3.IntegrityError:
             raise NotFound("lift", expected="its splats and cameras", got="one was deleted a moment ago") from None
         return self.get(owner, job)
 
-    def adopt(self, owner: Owner, job: str, order: JobOrder, made: FinishedLift) -> None:
+    def adopt(self, owner: Owner, job: str, order: JobOrder, result: FinishedLift) -> None:
         """Keep a lift that has no row, and perhaps no job, from a draft or from where it belongs.
 
         Args:
@@ -202,9 +202,9 @@ class LiftStore:
             order: what it was made of; the assets are here.
             made: of the draft, or of the file itself.
         """
-        path, status = self._files.lift(job), made.draft.stat()
-        with self._database.write(counted=True) as connection:
-            if made.draft != path:
+        path, status = self._files.lift(job), result.draft.stat()
+        with self._database.write(is_counted=True) as connection:
+            if result.draft != path:
                 require_quota(connection, owner, status.st_size)
             row = connection.execute(
                 "INSERT INTO jobs (id, owner, state, attempt, splats, cameras, settings, created, started, ended)"
@@ -222,11 +222,11 @@ class LiftStore:
             for place, asset in enumerate(order.features):
                 connection.execute("INSERT OR IGNORE INTO job_features VALUES (?, ?, ?)", (job, place, asset))
             for asset, _ in order.assets():
-                own(connection, asset, row["owner"])
+                add_owner(connection, asset, row["owner"])
             record_state(connection, row)
-            self._insert(connection, job, made, status.st_size, status.st_mtime)
-            if made.draft != path:
-                self._files.publish(made.draft, path)
+            self._insert(connection, job, result, status.st_size, status.st_mtime)
+            if result.draft != path:
+                self._files.publish(result.draft, path)
 
     def change(self, owner: Owner, lift: str, changes: Mapping[str, Any]) -> LiftRecord:
         """Give a lift another ``name``, other ``photos``, an asset that is here, or ``world``; None takes them away.
@@ -234,7 +234,7 @@ class LiftStore:
         Raises:
             NotFound: there is no such lift, or there are no such photos.
         """
-        with self._database.write(counted=True) as connection:
+        with self._database.write(is_counted=True) as connection:
             self.get(owner, lift)  # here, where nobody deletes it
             photos = changes.get("photos")
             if photos is not None:
@@ -264,7 +264,7 @@ class LiftStore:
         if row is None:
             hint = "PUT /assets/photos first"
             raise NotFound("photos", expected="an asset of kind photos that is here", got=photos, hint=hint)
-        own(
+        add_owner(
             connection, photos, connection.execute("SELECT owner FROM jobs WHERE id = ?", (lift,)).fetchone()["owner"]
         )
 
@@ -276,19 +276,19 @@ class LiftStore:
         return None if row is None else self._record(row)
 
     def _insert(
-        self, connection: sqlite3.Connection, job: str, made: FinishedLift, size: int, created: float
+        self, connection: sqlite3.Connection, job: str, result: FinishedLift, size: int, created: float
     ) -> None:
-        metadata, views = json.dumps(made.metadata), made.metadata["views"]
+        metadata, views = json.dumps(result.metadata), result.metadata["views"]
         if len(metadata) > SHOWN_BYTES:
-            certificate = _without(made.metadata["certificate"], *NAMES_OF_VIEWS)
-            metadata = json.dumps(_without(made.metadata, *LONG) | {"certificate": certificate})
+            certificate = _without(result.metadata["certificate"], *NAMES_OF_VIEWS)
+            metadata = json.dumps(_without(result.metadata, *LONG) | {"certificate": certificate})
         row = {
             "id": job,
             "bytes": size,
-            "sha256": made.sha256,
+            "sha256": result.sha256,
             "file": self._files.relative(self._files.lift(job)),
-            "count": made.count,
-            "channels": made.channels,
+            "count": result.count,
+            "channels": result.channels,
             "metadata": metadata,
             "view_count": len(views),
             "first_view": next(iter(views), None),
@@ -368,23 +368,23 @@ class TradeoffStore:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def finish(self, job: str, attempt: int, made: FinishedTradeoff) -> bool:
+    def finish(self, job: str, attempt: int, result: FinishedTradeoff) -> bool:
         """End an attempt with its trade-off: it and the job's last state become true together.
 
         Returns:
             False when the attempt may not (`succeed`); then nothing changes.
         """
-        document = json.dumps(made.document)
+        document = json.dumps(result.document)
         row = {
             "id": job,
-            "bytes": len(document) + len(made.page.encode()) + len(made.chart),
+            "bytes": len(document) + len(result.page.encode()) + len(result.chart),
             "document": document,
-            "page": made.page,
-            "chart": made.chart,
-            "sha256": hashlib.sha256(made.chart).hexdigest(),
+            "page": result.page,
+            "chart": result.chart,
+            "sha256": hashlib.sha256(result.chart).hexdigest(),
             "created": time.time(),
         }
-        with self._database.write(counted=True) as connection:
+        with self._database.write(is_counted=True) as connection:
             if not succeed(connection, job, attempt):
                 return False
             insert(connection, "tradeoffs", row)

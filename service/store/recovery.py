@@ -194,7 +194,7 @@ def rebuild(store: Store, settings: ServiceSettings) -> dict[str, Any]:
     Returns:
         ``assets`` by kind and ``lifts``: how many were added; ``left``: files that could not be, and why.
     """
-    root, refused, counts = store.files.root, list[dict[str, str]](), Counter[UploadKind]()
+    root, failures, counts = store.files.root, list[dict[str, str]](), Counter[UploadKind]()
     recorded = {record.path for record in (*store.assets.all(SERVICE), *store.lifts.all(SERVICE))}
     changes = {path for path in root.glob("lifts/*.json") if store.files.lift(path.stem).exists()}
     for add, pattern in ((_add_asset, "blobs/*/*"), (_add_lift, "lifts/*")):  # lifts are of assets
@@ -202,15 +202,15 @@ def rebuild(store: Store, settings: ServiceSettings) -> dict[str, Any]:
             try:
                 counts[add(store, settings, path)] += 1
             except SplatliftError as error:
-                refused.append({"file": store.files.relative(path), "why": str(error)})
+                failures.append({"file": store.files.relative(path), "why": str(error)})
     for path in sorted(changes):
         try:
             _change_lift(store, path)
         except SplatliftError as error:
-            refused.append({"file": store.files.relative(path), "why": str(error)})
+            failures.append({"file": store.files.relative(path), "why": str(error)})
     store.database.catch_up()
     lifts = counts.pop(LIFT, 0)
-    return {"assets": dict(counts), "lifts": lifts, "left": refused}
+    return {"assets": dict(counts), "lifts": lifts, "left": failures}
 
 
 def _add_asset(store: Store, settings: ServiceSettings, path: Path) -> AssetKind:
@@ -221,13 +221,13 @@ def _add_asset(store: Store, settings: ServiceSettings, path: Path) -> AssetKind
     if path != store.files.blob(digest, path.suffix):
         raise NotFound("asset", expected="a file named after its sha256", got=f"one whose sha256 is {digest}")
     kind = _kind_of(path)
-    report = checked(store, settings, kind, path)
+    report = check_file(store, settings, kind, path)
     # The file is its own draft: it stays where it is.
     store.assets.add(SERVICE, CheckedUpload(path, kind, digest, path.suffix, report.counts, report.warnings))
     return kind
 
 
-def checked(store: Store, settings: ServiceSettings, kind: UploadKind, *paths: Path) -> Report:
+def check_file(store: Store, settings: ServiceSettings, kind: UploadKind, *paths: Path) -> Report:
     """What the check of an upload finds in a file, beside others."""
     limits = SandboxLimits(settings.check_seconds, settings.check_memory_bytes, threading.Event())
     with store.files.scratch() as scratch:
@@ -282,7 +282,7 @@ def _cameras_of(store: Store, settings: ServiceSettings, lift: Path) -> str | No
     for asset in store.assets.all(SERVICE):
         if asset.kind is AssetKind.CAMERAS:
             with suppress(InvalidInput):
-                checked(store, settings, LIFT, lift, asset.path)
+                check_file(store, settings, LIFT, lift, asset.path)
                 return asset.id
     return None
 

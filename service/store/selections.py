@@ -78,7 +78,7 @@ class SelectionStore:
             OverQuota, NoSpace: there is no room for it.
         """
         selection, now = secrets.token_hex(8), time.time()
-        with _lift_there(lift), self._database.write(counted=True) as connection:
+        with _lift_there(lift), self._database.write(is_counted=True) as connection:
             number = connection.execute("SELECT count(*) FROM selections WHERE lift = ?", (lift,)).fetchone()[0]
             if number >= MOST:
                 raise OverLimit("selection", expected=f"at most {MOST} of a lift", got="more", hint=NO_USE)
@@ -97,7 +97,7 @@ class SelectionStore:
             VersionMismatch: it has another version than these.
             OverQuota, NoSpace: there is no room for it.
         """
-        with self._database.write(counted=True) as connection:
+        with self._database.write(is_counted=True) as connection:
             record = _expected(connection, owner, lift, selection, versions)
             step = record.step + 1
             terms = (selection, record.step, step - HISTORY)
@@ -118,7 +118,7 @@ class SelectionStore:
             VersionMismatch: it has another version than these.
             InvalidRequest: there is no such step.
         """
-        with self._database.write(counted=True) as connection:
+        with self._database.write(is_counted=True) as connection:
             record = _expected(connection, owner, lift, selection, versions)
             step = changes.get("step", record.step)
             if not record.first <= step <= record.last:
@@ -135,7 +135,7 @@ class SelectionStore:
             NotFound: there is no such selection.
             VersionMismatch: it has another version than these.
         """
-        with self._database.write(counted=True) as connection:
+        with self._database.write(is_counted=True) as connection:
             _expected(connection, owner, lift, selection, versions)
             connection.execute("DELETE FROM selections WHERE id = ?", (selection,))
 
@@ -192,12 +192,12 @@ class SelectionStore:
             NotFound: the lift was deleted meanwhile.
             OverLimit: too many others of the lift have been changed.
         """
-        with _lift_there(lift), self._database.write(counted=True) as connection:
+        with _lift_there(lift), self._database.write(is_counted=True) as connection:
             select = "SELECT count(*) FROM things WHERE lift = ? AND thing != ?"
             number = connection.execute(select, (lift, thing)).fetchone()[0]
             if number >= MOST_THINGS:
                 raise OverLimit("thing", expected=f"at most {MOST_THINGS} changed objects of a lift", got="more")
-            insert(connection, "things", {"lift": lift, "thing": thing, "hidden": 0}, known="IGNORE")
+            insert(connection, "things", {"lift": lift, "thing": thing, "hidden": 0}, on_conflict="IGNORE")
             for column in changes.keys() & {"name", "hidden"}:
                 connection.execute(
                     f"UPDATE things SET {column} = ? WHERE lift = ? AND thing = ?", (changes[column], lift, thing)

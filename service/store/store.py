@@ -138,22 +138,24 @@ def collect(store: Store, older_than: float) -> list[Path]:
     files.make_folders()
     with files.blobs_changing, store.database.read() as connection:  # so no upload is between its blob and its row
         recorded = {row["file"] for row in connection.execute("SELECT file FROM assets")}
-        quarantined += _lost(files, (files.root / "blobs").glob("*/*"), recorded, older_than)
+        quarantined += _lost_paths(files, (files.root / "blobs").glob("*/*"), recorded, older_than)
     with store.database.write() as connection:  # so no lift is between its file and its row
         rows = connection.execute("SELECT id, file FROM lifts").fetchall()
         recorded = {file for row in rows for file in (row["file"], files.relative(files.lift_changes(row["id"])))}
-        quarantined += _lost(files, (files.root / "lifts").iterdir(), recorded, older_than)
+        quarantined += _lost_paths(files, (files.root / "lifts").iterdir(), recorded, older_than)
     finished, unknown = _unused_work(store)
-    quarantined += files.quarantine(path for path in unknown if _changed(path) < older_than)
-    garbage = [path for path in finished + files.left_over() if _changed(path) < older_than]
+    quarantined += files.quarantine(path for path in unknown if _changed_at(path) < older_than)
+    garbage = [path for path in finished + files.left_over() if _changed_at(path) < older_than]
     for path in garbage:
         shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
     return quarantined + garbage
 
 
-def _lost(files: DataDirectory, paths: Iterable[Path], recorded: Container[str], older_than: float) -> list[Path]:
+def _lost_paths(
+    files: DataDirectory, paths: Iterable[Path], recorded: Container[str], older_than: float
+) -> list[Path]:
     """Move files that have no row to quarantine."""
-    garbage = [path for path in paths if files.relative(path) not in recorded and _changed(path) < older_than]
+    garbage = [path for path in paths if files.relative(path) not in recorded and _changed_at(path) < older_than]
     return files.quarantine(garbage)
 
 
@@ -180,7 +182,7 @@ def _unused_work(store: Store) -> tuple[list[Path], list[Path]]:
     return finished, [folder for folder, state in states.items() if state is None]
 
 
-def _changed(path: Path) -> float:
+def _changed_at(path: Path) -> float:
     try:
         return path.stat().st_mtime
     except FileNotFoundError:  # its owner was quicker

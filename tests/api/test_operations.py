@@ -495,7 +495,7 @@ def test_page_of_long_names_is_no_longer_than_others(client: TestClient) -> None
 
 
 def test_small_pages_together_are_the_large_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.content.STREAMED", 2)
+    monkeypatch.setattr("service.content.STREAMED_RECORDS", 2)
     with guarded(tmp_path / "data") as house:
         for _ in range(3):
             house.store.jobs.submit(SERVICE, house.order)

@@ -274,8 +274,8 @@ def test_database_of_release_0_4_opens_with_all_that_it_holds(tmp_path: Path) ->
     assert {job.kind for job in store.jobs.all(SERVICE)} == {JobKind.LIFT}
     assert store.jobs.get(SERVICE, "a").features == ("f",) and store.jobs.get(SERVICE, "a").plan is None
     assert store.assets.get(SERVICE, "c").counts == {"views": 2}
-    assert store.assets.get(SERVICE, "c", most=ALL).counts == {"views": 2, "names": ["w", "v"]}
-    assert store.assets.get(SERVICE, "t", most=ALL).counts == {"channels": 1, "words": ["apple"]}
+    assert store.assets.get(SERVICE, "c", limit=ALL).counts == {"views": 2, "names": ["w", "v"]}
+    assert store.assets.get(SERVICE, "t", limit=ALL).counts == {"channels": 1, "words": ["apple"]}
     assert store.assets.names(SERVICE, "c", 1, 9) == ["v"]
     assert store.lifts.lifted(SERVICE, "d", ["w", "v"]) == {"v"}
     lift = store.lifts.get(SERVICE, "d")

@@ -30,7 +30,7 @@ Trouble = Callable[[Store], AbstractContextManager[None]]
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """The same waits, shorter."""
-    monkeypatch.setattr(supervisors, "AGAIN_SECONDS", 0.05)
+    monkeypatch.setattr(supervisors, "RETRY_SECONDS", 0.05)
     monkeypatch.setattr(supervisors, "TROUBLED_SECONDS", (0.05, 0.2))
     monkeypatch.setattr(database, "BUSY_SECONDS", 0.2)
 
