@@ -789,7 +789,7 @@ class AskedForSceneObjects(AskedForNodes):
 
 
 class LiftTree(SceneTree, OfLift):
-    """Some of the nodes of a lift's tree: objects first, those with the most evidence first.
+    """Some of the nodes of a lift's tree: objects first, those with the largest total weight first.
 
     Of the relations those whose `node` is on the page.
     """
@@ -805,7 +805,7 @@ class NamedObject(SceneObject):
 
 
 class SceneObjects(ListedObjects, OfLift):
-    """Some of the objects of a lift, those with the most evidence first."""
+    """Some of the objects of a lift, those with the largest total weight first."""
 
     objects: tuple[NamedObject, ...]  # pyright: ignore[reportIncompatibleVariableOverride]
 

@@ -149,7 +149,7 @@ def _tree_lines(answer: dict[str, Any], files: dict[str, str]) -> Iterable[str]:
         name = "" if one["name"] is None else f" {one['name']} ({one['score']:.3f})"
         yield (
             f"{'  ' * len(one['path'])}{one['id']}{name}, {one['kind']}: {one['splats']} splats, {one['share']:.1%} "
-            f"of the evidence, {sides_of(one['size'], answer['unit'])}, a mask of it in "
+            f"of the total weight, {sides_of(one['size'], answer['unit'])}, a mask of it in "
             f"{one['confidence']:.0%} of the views that see it"
         )
         waiting += one["parts"][::-1]
@@ -174,7 +174,7 @@ def _lines(document: dict[str, Any]) -> Iterable[str]:
         low, high = one["box"]
         name = "" if one["name"] is None else f" {one['name']} ({one['score']:.3f})"
         yield (
-            f"  {one['id']}{name}: {one['splats']} splats, {one['share']:.1%} of the evidence, at "
+            f"  {one['id']}{name}: {one['splats']} splats, {one['share']:.1%} of the total weight, at "
             f"{place_of(one['centre'])}, from {place_of(low)} to {place_of(high)}, "
             f"{sides_of(one['size'], document['answer']['unit'])}, best in {', '.join(one['views'])}"
         )

@@ -100,7 +100,7 @@ def smoothing_line(facts: Mapping[str, Any]) -> str:
     by += f", but where masks part them ({parted:.1%} of affinity)" if parted else ""
     return (
         f"smoothness {facts['smoothness']:g}{reason}: features moved {moved} towards their neighbours' in {by}; "
-        f"{facts['filled']} splats without evidence took their neighbours' "
+        f"{facts['filled']} splats without weight took their neighbours' "
         f"({facts['steps']} steps, {facts['residual']:.1g} of the gradient left)"
     )
 

@@ -100,7 +100,8 @@ def _lines(document: dict[str, Any]) -> Iterable[str]:
     for named in document["found"]:
         low, high = named["box"]
         yield (
-            f"  {named['value']} {named['word']}: {named['splats']} splats, {named['share']:.1%} of the evidence, "
-            f"score {named['score']:.3f}, margin {named['margin']:.3f}, from {place_of(low)} to {place_of(high)}"
+            f"  {named['value']} {named['word']}: {named['splats']} splats, {named['share']:.1%} of the "
+            f"total weight, score {named['score']:.3f}, margin {named['margin']:.3f}, "
+            f"from {place_of(low)} to {place_of(high)}"
         )
     yield from (f"  {kind.replace('_', ' ')}: {path}" for kind, path in document["files"].items())

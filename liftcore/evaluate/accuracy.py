@@ -20,11 +20,11 @@ LOW_QUANTILE = 0.05
 ROWS = 1 << 16  # of features, compared at a time
 
 
-def cosine_figures(features: Tensor, exact: Tensor, evidence: Tensor) -> dict[str, float | None]:
+def cosine_figures(features: Tensor, exact: Tensor, total_weight: Tensor) -> dict[str, float | None]:
     """How near the features [P, F] are to the exact ones, over the splats that the exact run saw.
 
-    The mean weighted by evidence, the plain mean, the quantile below which LOW_QUANTILE of the splats lie, and the
-    share that has lost its feature, which counts zero. None where the exact run saw nothing.
+    The mean weighted by total weight, the plain mean, the quantile below which LOW_QUANTILE of the splats lie, and
+    the share that has lost its feature, which counts zero. None where the exact run saw nothing.
     """
     nothing: dict[str, float | None] = dict.fromkeys(("cosine", "cosine_plain", "cosine_q05", "lost_share"))
     if not exact.shape[0]:
@@ -36,7 +36,7 @@ def cosine_figures(features: Tensor, exact: Tensor, evidence: Tensor) -> dict[st
         seen.append((other != 0).any(dim=1))
         lost += int((seen[-1] & (one == 0).all(dim=1)).sum())
     chosen = torch.cat(seen)
-    cosines, weights = torch.cat(parts)[chosen], evidence[chosen].double()
+    cosines, weights = torch.cat(parts)[chosen], total_weight[chosen].double()
     if not float(weights.sum()) > 0:
         return nothing
     return {

@@ -319,7 +319,7 @@ def describe_lift(lift: Lift) -> dict[str, Any]:
         "channels": channels,
         "dtype": str(lift.features.dtype).removeprefix("torch."),
         "seen_share": float(lift.seen.float().mean()),
-        "evidence": _ends(lift.evidence),
+        "total_weight": _ends(lift.total_weight),
         "agreement": _ends(lift.agreement[lift.seen]),
         "encoder": metadata.encoder,
         "text_space": metadata.text_space,

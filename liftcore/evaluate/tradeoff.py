@@ -355,16 +355,16 @@ def evenly_spaced(items: Sequence[Any], most: int) -> list[Any]:
 
 
 def _reference(spec: RunSpec, made: LiftResult) -> tuple[Tensor, Tensor]:
-    """Features [P, F] and evidence [P] of the exact run; empty before it."""
+    """Features [P, F] and total weight [P] of the exact run; empty before it."""
     from safetensors.torch import load_file, save_file
 
     path = spec.reference / "exact.safetensors"
     if spec.exact:
-        save_file({"features": made.features, "evidence": made.evidence}, path)
+        save_file({"features": made.features, "total_weight": made.total_weight}, path)
     if not path.is_file():
-        return made.features[:0], made.evidence[:0]
+        return made.features[:0], made.total_weight[:0]
     kept = load_file(path)
-    return kept["features"], kept["evidence"]
+    return kept["features"], kept["total_weight"]
 
 
 def _resized(labels: Tensor, mask: Tensor) -> Tensor:

@@ -29,8 +29,9 @@ HEADS = ("run", "views", "wall s", "CPU s", "faster by CPU", "peak MiB", "cosine
 KEY = (
     "*exact* is your settings as they are (`default` where they name no preset), which the dial and *aggregation* "
     "keep. Seconds are of the lift without reading its files. *cosine* is against the exact run, over the splats "
-    "that it saw: the mean by evidence, and what 5 % of the splats stay below; *lost* is the share of them without a "
-    "feature. *centred* is the cosine of what is rendered into views that no run lifted with what these observe, "
+    "that it saw: the mean by total weight, and what 5 % of the splats stay below; *lost* is the share of them "
+    "without a feature. *centred* is the cosine of what is rendered into views that no run lifted "
+    "with what these observe, "
     "both less the mean of what is observed, a region at a time. *95 %* is the interval of what runs are judged by, "
     "over draws of its views."
 )
@@ -223,7 +224,7 @@ def _faithful(axes: Axes, runs: Sequence[Mapping[str, Any]]) -> None:
     dial = sorted((run for run in runs if run["kind"] == "dial"), key=lambda run: run["cpu_ratio"])
     ratios = [run["cpu_ratio"] for run in dial]
     for name, label, style in (
-        ("cosine", "mean by evidence", "o-"),
+        ("cosine", "mean by total weight", "o-"),
         ("cosine_plain", "mean over splats", "^--"),
         ("cosine_q05", "5 % of splats below", "v:"),
     ):

@@ -45,7 +45,7 @@ class SplatSupport:
     """Weights and confidence behind X, a value a splat."""
 
     sums: np.ndarray  # [P] f64, of rows of W before any reweighting
-    evidence: Tensor  # [P] f32, sums of plain weights over all views, each ray once
+    total_weight: Tensor  # [P] f32, sums of plain weights over all views, each ray once
     agreement: Tensor  # [P] f32, norm of the weighted mean of unit codebook rows
     confidence: Tensor | None  # [P] f32; None where W was not reweighted
 

@@ -41,10 +41,10 @@ class Geometry:
         """The codebook E [M, F] of every view."""
         return [view.rows for view in self.codebook.views]
 
-    def evidence(self) -> Tensor:
+    def total_weight(self) -> Tensor:
         """Return [P] f32 on the CPU: sums of unweighted A over all views, each ray once."""
         sums = torch.zeros(self.weights.splats.shape[0], dtype=torch.float32)
-        sums[self.weights.evidence_splats.cpu().long()] = self.weights.evidence.cpu()
+        sums[self.weights.total_weight_splats.cpu().long()] = self.weights.total_weight.cpu()
         return sums
 
 
@@ -58,10 +58,10 @@ class WeightRequest:
     levels: np.ndarray  # [M] i8, as `Geometry` has them
 
     def weights(self, answer: ViewWeights) -> RegionWeights:
-        """Return W of the view, with evidence scaled by the stride to all rays of the photo."""
+        """Return W of the view, with total weight scaled by the stride to all rays of the photo."""
         part = self.codebook.counted(answer.weights)
         rays = float(self.request.params.stride**2)
-        return replace(part, views=(self.request.camera.name,), evidence=part.evidence * rays)
+        return replace(part, views=(self.request.camera.name,), total_weight=part.total_weight * rays)
 
 
 def weight_request(views: LiftViews, number: int, settings: LiftSettings, by_rows: bool) -> WeightRequest:
@@ -151,7 +151,7 @@ class _ViewBlock(NamedTuple):
 def _stacked_views(views: list[_ViewBlock], splats: int, threads: int | None) -> Geometry:
     """Stack W of some views, and empty the list, so that memory is freed early."""
     samples, codebook = tuple(view.sample for view in views), Codebook(tuple(view.codebook for view in views))
-    blind = tuple(view.weights.views[0] for view in views if not view.weights.evidence.numel())
+    blind = tuple(view.weights.views[0] for view in views if not view.weights.total_weight.numel())
     levels = np.concatenate([view.levels for view in views])
     parts = [view.weights for view in views]
     views.clear()

@@ -128,8 +128,8 @@ class InMemory(LiftSteps[SceneWeights]):
         return W, WeightStatistics(plans[-1], geometry.levels, W.weights.region.shape[0], geometry.blind)
 
     def find_objects(self, W: SceneWeights) -> RegionObjects:
-        evidence = W.geometry.evidence().numpy()
-        return region_objects(W.on_processor, W.geometry.levels, evidence, self.threads, members=W.members)
+        total_weight = W.geometry.total_weight().numpy()
+        return region_objects(W.on_processor, W.geometry.levels, total_weight, self.threads, members=W.members)
 
     def node_vectors(self, W: SceneWeights, objects: RegionObjects) -> NodeVectors:
         codebook = W.geometry.codebook
@@ -172,7 +172,9 @@ class InMemory(LiftSteps[SceneWeights]):
             means=self.splats.means, threads=self.threads, device=W.device, memory=W.memory,
         )  # fmt: skip
         confidence = W.agreement.confidence if W.agreement else None
-        return solution.features, SplatSupport(W.row_sums(), W.geometry.evidence(), solution.agreement, confidence)
+        return solution.features, SplatSupport(
+            W.row_sums(), W.geometry.total_weight(), solution.agreement, confidence
+        )
 
     def refine(self, W: SceneWeights, X: Tensor, visible: np.ndarray) -> tuple[Tensor, dict[str, Any]]:
         settings, progress, books, facts = self.settings, self.timings.progress, W.geometry.books, dict[str, Any]()
@@ -205,8 +207,8 @@ class InMemory(LiftSteps[SceneWeights]):
             strength, choice = best.smoothness, {"candidates": best.facts()}
         visible = torch.from_numpy(support.sums > 0)
         X, facts = smooth(
-            X, graph, support.evidence, support.confidence, visible, strength, self.timings.progress, self.threads,
-            device=W.device,
+            X, graph, support.total_weight, support.confidence, visible, strength, self.timings.progress,
+            self.threads, device=W.device,
         )  # fmt: skip
         return X, facts | {"parted": weakened_edges} | choice
 
@@ -215,7 +217,7 @@ class InMemory(LiftSteps[SceneWeights]):
         if settings.aggregation_guard and agreement and agreement.explained is not None:
             consistency = W.on_processor, agreement.directions, agreement.explained
         X, aggregation = aggregate(
-            X, W.geometry.evidence().numpy(), self.splats, W.raster, W.views, settings, self.timings.progress,
+            X, W.geometry.total_weight().numpy(), self.splats, W.raster, W.views, settings, self.timings.progress,
             self.threads, things=clusters, judged=consistency,
         )  # fmt: skip
         if not settings.aggregation_resolve:

@@ -75,8 +75,8 @@ def lift(
         settings: fields of `LiftSettings` that differ from the preset's.
 
     Returns:
-        Features [P, F] f16 (or f32) with evidence, agreement and diagnostics, on the device that computed them, or on
-        the CPU where that device has too little memory.
+        Features [P, F] f16 (or f32) with total weight, agreement and diagnostics, on the device that computed them,
+        or on the CPU where that device has too little memory.
 
     Raises:
         InvalidSplats, InvalidCameras: splats or cameras are of another type, such as a path.
@@ -159,7 +159,7 @@ def _run(
     table = views.features.table
     lift = LiftResult(
         features=X,
-        evidence=support.evidence,
+        total_weight=support.total_weight,
         agreement=support.agreement,
         confidence=support.confidence,
         seen=torch.from_numpy(support.sums > 0),
@@ -251,7 +251,7 @@ def diagnose(
     warnings = lift_warnings(inputs.splats, inputs.views.lifted, support.sums, settings.dtype, dtype, facts)
     warnings += [part["warning"] for part in steps.values() if "warning" in part]
     facts["warnings"] = [*warnings, *plan.told]
-    return certify(measures, support.sums, support.evidence, settings) | dict(steps) | facts
+    return certify(measures, support.sums, support.total_weight, settings) | dict(steps) | facts
 
 
 @usual_modes()

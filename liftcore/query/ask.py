@@ -66,7 +66,7 @@ if TYPE_CHECKING:
 
 MOST_RIVALS = 3  # words that are named as nearer than what was asked
 MOST_OF_IT = 0.5  # the same where an answer is clear
-LEAST_RIVAL = 0.1  # of what is looked at, by evidence, to which such a word is the nearest
+LEAST_RIVAL = 0.1  # of what is looked at, by total weight, to which such a word is the nearest
 WHOLE = 0.9  # of a thing's splats, from which what is found of it is no part
 _OF_ANSWER = ("rivals", "candidates", "threshold", "clear", "statistics", "present", "presence", "why")
 _QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
@@ -127,8 +127,8 @@ class VectorAnswer:
 def ask(scene: OpenedLift, query: Query | str, encoder: TextEncoder | None = None) -> Answer:
     """Score every splat for a query and choose those that answer it.
 
-    A splat counts in the histogram by its evidence: what hardly a ray met scores by the chance of a few pixels. It is
-    still selected by its score. With ``weigh`` its confidence counts too. The threshold `auto` is held to other
+    A splat counts in the histogram by its total weight: what hardly a ray met scores by the chance of a few pixels.
+    It is still selected by its score. With ``weigh`` its confidence counts too. The threshold `auto` is held to other
     words, and things of the region graph may be taken whole (`liftcore.query.selection`); any other selects by the
     score alone. Scores that are all equal or zero select nothing. A word for what is not there
     (`liftcore.query.presence`) is left out of the scores, and where no other positive is left nothing is selected,
@@ -438,7 +438,7 @@ def _selected(
         return found, np.zeros_like(scene.seen)
     in_words = (asked.plain & kept)[:positives]
     least = -math.inf if in_words.any() else LEAST_LIKENESS
-    counted = "evidence" if query.weigh == "evidence" else "evidence times confidence"
+    counted = "total weight" if query.weigh == "evidence" else "total weight times confidence"
     alone = scene.weights if query.weigh == "evidence" else scene.weights_with_feature(weights)
     found = find_threshold(known, query.threshold, alone, least, counted)
     selected = scene.seen & (scores >= np.float32(found.value))

@@ -54,12 +54,13 @@ def parts_of(scene: OpenedLift, objects: np.ndarray) -> tuple[Candidate, ...]:
     """Return at most `MOST_PARTS` parts of some objects [N] bool, the largest first, with their shares of these."""
     if scene.node_parents is None or scene.object is None:
         return ()
-    total = scene.evidence[np.append(objects, False)[scene.object]].sum() or 1.0
+    total = scene.total_weight[np.append(objects, False)[scene.object]].sum() or 1.0
     nodes = np.flatnonzero(
         np.append(objects, np.zeros(len(scene.node_parents) - len(objects) + 1, np.bool_))[scene.node_parents]
     )
     parts = [
-        _candidate(scene, node, float(scene.evidence[scene.members(node)].sum() / total)) for node in nodes.tolist()
+        _candidate(scene, node, float(scene.total_weight[scene.members(node)].sum() / total))
+        for node in nodes.tolist()
     ]
     return tuple(sorted(parts, key=lambda c: (-c.share, c.id))[:MOST_PARTS])
 

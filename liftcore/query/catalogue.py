@@ -1,8 +1,9 @@
 """Objects and parts of a lift: position, size, views and name of each.
 
 Objects are found at lift time by masks alone (`liftcore.solve.objects`); the lift stores one number a splat. They are
-numbered from 0, the one with the most evidence first, the same for the same lift. An object's feature is the mean of
-its splats' unit features by evidence. Its name is the nearest word, even if that is far; its score is the cosine.
+numbered from 0, the one with the largest total weight first, the same for the same lift. An object's feature is the
+mean of its splats' unit features by total weight. Its name is the nearest word, even if that is far; its score is the
+cosine.
 
 Parts and groups are numbered after the objects. Their features are those of their own masks, without their parts
 (`liftcore.solve.objects.NodeVectors`), as a splat's feature is the sum over all levels.
@@ -135,7 +136,7 @@ def tree(
     up_axis = upright(scene.cameras.values()) if up == "cameras" else up
     world = WorldFrame(up=up_axis).known_or(scene.world)
     members = [np.flatnonzero(scene.members(node)) for node in range(objects)]
-    node_relations = related(scene.splats, members, scene.evidence, world)
+    node_relations = related(scene.splats, members, scene.total_weight, world)
     return answer.model_copy(update={"world": world, "relations": node_relations})
 
 
@@ -171,21 +172,21 @@ def _describe_nodes(
     for node in range(len(views) - 1, -1, -1):
         if 0 <= above[node] < node:
             rows_of[above[node]] = np.concatenate([rows_of[above[node]], rows_of[node]])
-    evidence = scene.evidence.astype(np.float64)
-    total, view_names = evidence.sum() or 1.0, scene.metadata.views
+    total_weight = scene.total_weight.astype(np.float64)
+    total, view_names = total_weight.sum() or 1.0, scene.metadata.views
     entries = []
     for index, (name, score, unsorted_rows) in enumerate(zip(*naming, rows_of, strict=True)):
         if not unsorted_rows.size:
             continue
         rows = np.sort(unsorted_rows)
-        weights = evidence[rows] if evidence[rows].any() else np.ones(rows.size)
+        weights = total_weight[rows] if total_weight[rows].any() else np.ones(rows.size)
         key = int(nodes[index]), rows.size
         if key not in scene.node_boxes:
             scene.node_boxes[key] = object_box(scene.splats, rows, weights)
         box = scene.node_boxes[key]
         x, y, z = np.mean(box, axis=0).tolist()
         visible_views = tuple(view_names[view] for view in views[index] if 0 <= view < len(view_names))
-        share = float(evidence[rows].sum() / total)
+        share = float(total_weight[rows].sum() / total)
         entries.append(
             {"id": index, "name": name, "score": score, "splats": int(rows.size), "share": share, "centre": (x, y, z)}
             | {"box": box, "size": size_of(scene.world, box), "views": visible_views}
@@ -194,7 +195,7 @@ def _describe_nodes(
 
 
 def object_features(scene: OpenedLift) -> np.ndarray:
-    """Return the unit mean [N, F] f32 of each object's unit features by evidence; zeros if no splat has a feature."""
+    """Return the unit mean [N, F] f32 of unit features of each object by total weight; zeros without a feature."""
     if scene.object_features is None:
         scene.object_features = _compute_object_features(scene)
     return scene.object_features
@@ -206,7 +207,7 @@ def _compute_object_features(scene: OpenedLift) -> np.ndarray:
     assert scene.object is not None and scene.object_views is not None
     number = len(scene.object_views)
     sums = np.zeros((number, scene.channels))
-    weights = np.where(scene.seen, scene.evidence / np.where(scene.seen, scene.norms, 1.0), 0.0)
+    weights = np.where(scene.seen, scene.total_weight / np.where(scene.seen, scene.norms, 1.0), 0.0)
     indices = np.flatnonzero((scene.object >= 0) & (weights > 0))
     for first in range(0, indices.size, _BLOCK):
         rows = indices[first : first + _BLOCK]

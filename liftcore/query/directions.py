@@ -92,7 +92,7 @@ def askable_words(scene: OpenedLift, encoder: TextEncoder, text: str, count: int
 
 
 def object_words(scene: OpenedLift, words: Sequence[str], vectors: np.ndarray) -> tuple[str, ...]:
-    """Return the nearest word of each of the lift's objects, without repeats, the one with the most evidence first.
+    """Return the nearest word of each of the lift's objects, without repeats, the largest total weight first.
 
     An object is left out if its word is not among the nearest hundredth also about the scene's mean: the word may be
     near to the whole scene.

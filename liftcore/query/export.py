@@ -242,7 +242,7 @@ def splats_as(scene: OpenedLift, suffix: str) -> Iterator[bytes]:
 def layer_colours(scene: OpenedLift, layer: str) -> np.ndarray:
     """Colour all splats by a layer, [P, 3] u8 sRGB.
 
-    ``pca`` are three principal components of the features, ``cluster`` a colour a cluster; ``evidence`` (by its
+    ``pca`` are three principal components of the features, ``cluster`` a colour a cluster; ``total_weight`` (by its
     logarithm), ``agreement`` and ``confidence`` go through the colour map of scores. Splats without a feature are
     grey.
 
@@ -264,7 +264,7 @@ def layer_colours(scene: OpenedLift, layer: str) -> np.ndarray:
             raise InvalidQuery("what", expected=f"a lift with {layer}", got=got, hint=hint)
         values = as_numpy(tensor).astype(np.float32)
         valid = scene.seen & np.isfinite(values)
-        if layer == "evidence":
+        if layer == "total_weight":
             valid &= values > 0
             values = np.log(np.where(valid, values, 1.0))
         colours = heat_colours(values, valid)

@@ -36,14 +36,14 @@ def labels(scene: OpenedLift, source: Segmentation | Answer | Mapping[str, Answe
     """Return the labels of a segmentation, of answers, or of a lift's objects, of a tree with their parts.
 
     Of a segmentation, ``class_id`` is the value of a splat's word (`Segmentation.values`), and ``instance_id``
-    numbers the groups of touching splats of one word (`liftcore.scene.touching`), the one with the most evidence
-    first; groups with less than a twentieth of the evidence of their word's largest have only a class. Of an answer,
-    every selected splat has class 1, and the instances are its objects. Of several answers by name, each is a class;
-    a splat that several select belongs to the one whose threshold it exceeds most. Of a catalogue, the instances are
-    its objects and the classes their names; without names there are no classes. Of a tree, instances and classes are
-    those of its objects, and ``node_id`` is 1 + the id of the smallest node of a splat: object, part or group. 0
-    means none in all columns. ``score`` is the cosine to the word, or the answer's score. ``confidence`` is that of
-    a reweighted lift; other lifts have none.
+    numbers the groups of touching splats of one word (`liftcore.scene.touching`), the one with the largest total
+    weight first; groups with less than a twentieth of the total weight of their word's largest have only a class. Of
+    an answer, every selected splat has class 1, and the instances are its objects. Of several answers by name, each
+    is a class; a splat that several select belongs to the one whose threshold it exceeds most. Of a catalogue, the
+    instances are its objects and the classes their names; without names there are no classes. Of a tree, instances
+    and classes are those of its objects, and ``node_id`` is 1 + the id of the smallest node of a splat: object, part
+    or group. 0 means none in all columns. ``score`` is the cosine to the word, or the answer's score. ``confidence``
+    is that of a reweighted lift; other lifts have none.
 
     Raises:
         InvalidQuery: no splat has a label, or more splats are selected than are grouped to objects.
@@ -216,12 +216,12 @@ def _labels(
 
 
 def _weights(scene: OpenedLift, rows: np.ndarray) -> np.ndarray:
-    weights = scene.evidence[rows].astype(np.float64)
+    weights = scene.total_weight[rows].astype(np.float64)
     return weights if weights.any() else np.ones(len(rows))
 
 
 def _facts(scene: OpenedLift, rows: np.ndarray, scores: np.ndarray | None) -> dict[str, Any]:
-    """Summarise splats: their number, their means of scores and confidence by evidence, and their boxes."""
+    """Summarise splats: their number, their means of scores and confidence by total weight, and their boxes."""
     weights = _weights(scene, rows)
     facts: dict[str, Any] = {"splats": len(rows)}
     if scores is not None:
@@ -235,7 +235,7 @@ def _facts(scene: OpenedLift, rows: np.ndarray, scores: np.ndarray | None) -> di
 def _boxes(means: np.ndarray, weights: np.ndarray) -> dict[str, Any]:
     """Compute the axis-aligned box of splat centres, and the box along their principal axes.
 
-    Both leave out a thousandth of the evidence at each end of each axis.
+    Both leave out a thousandth of the total weight at each end of each axis.
     """
     low, high = trimmed_box(means, weights)
     middle = np.average(means, axis=0, weights=weights)

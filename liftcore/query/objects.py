@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 LEAST_EVIDENCE = 0.05  # of an object, as a share of the largest's
 LEAST_OF_FRAGMENT = 0.25  # the same of a fragment of another object, and of a group in the box of one object
 MOST_SPLATS = 1 << 20  # that are grouped: a million take seven seconds of two cores and a gigabyte
-_TAIL = 1e-3  # of an object's evidence that its box leaves out at each end of each axis
+_TAIL = 1e-3  # of an object's total weight that its box leaves out at each end of each axis
 
 
 def objects(scene: OpenedLift, answer: Answer) -> Objects:
     """Group the selected splats of an answer into objects.
 
-    An object is a group of touching splats (`touching`). A group with less than a twentieth of the evidence of the
-    largest is unassigned: single splats and small groups anywhere in the scene whose scores happen to reach the
+    An object is a group of touching splats (`touching`). A group with less than a twentieth of the total weight of
+    the largest is unassigned: single splats and small groups anywhere in the scene whose scores happen to reach the
     threshold. So are groups of fewer splats than the query's ``min_size``. If the largest group is most of an object
     of the region graph, a group that is less than a third of another one needs a quarter: features leak from an
     object to what is behind it. A query with a number of instances has at most so many objects, those of the highest
@@ -86,10 +86,10 @@ def objects(scene: OpenedLift, answer: Answer) -> Objects:
 def _without_leaks(
     scene: OpenedLift, rows: np.ndarray, groups: np.ndarray, sums: np.ndarray, order: np.ndarray
 ) -> np.ndarray:
-    """Return the groups that are objects, of groups in order of their evidence.
+    """Return the groups that are objects, of groups in order of their total weight.
 
     Args:
-        rows: [n] i64, selected splats. groups: [n] i64, the group of each. sums: [g] f64, their evidence.
+        rows: [n] i64, selected splats. groups: [n] i64, the group of each. sums: [g] f64, their total weight.
         order: [k] i64, groups, the largest first.
     """
     large = order[sums[order] >= LEAST_EVIDENCE * sums.max()]

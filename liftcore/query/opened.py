@@ -15,10 +15,11 @@ import numpy as np
 from liftcore.errors import InvalidLift, InvalidQuery, NotFound
 from liftcore.io.splats import quick_count
 from liftcore.query.scores import mean_direction, norms_of
+from liftcore.runtime.aliases import deprecated_names
 from liftcore.scene.kernel import Kernel
 from liftcore.scene.world import UNKNOWN, WorldFrame
 from liftcore.text.table import TableEncoder, own_words
-from liftcore.values.lift_file import NODE_TENSORS, OBJECT_TENSORS, read_lift
+from liftcore.values.lift_file import NODE_TENSORS, OBJECT_TENSORS, OLD_TENSORS, read_lift
 
 if TYPE_CHECKING:  # these load torch
     from torch import Tensor
@@ -38,6 +39,7 @@ MOST_OF_THING = 512  # splats of a thing, likewise
 MOST_PIXELS = 1 << 26  # of a picture: 67 million take a minute of one core and 2 GB
 
 
+@deprecated_names(**OLD_TENSORS)
 class OpenedLift:
     """A lift, with the splats and cameras of its scene: what `liftcore.query.scene.Scene` asks.
 
@@ -46,7 +48,7 @@ class OpenedLift:
 
     features: np.ndarray
     """[P, F] f16 or f32; zero rows where not seen"""
-    evidence: np.ndarray
+    total_weight: np.ndarray
     """[P] f32"""
     cluster: np.ndarray | None
     """[P] i32, -1 = in no cluster; None without aggregation"""
@@ -97,7 +99,7 @@ class OpenedLift:
             moved = self._moved["splats"]
             given: dict[str, Any] = {}
         else:
-            names = ("features", "evidence", "seen", "cluster", "cluster_features", "confidence", "embeddings")
+            names = ("features", "total_weight", "seen", "cluster", "cluster_features", "confidence", "embeddings")
             arrays = {name: as_numpy(getattr(source, name)) for name in (*names, *OBJECT_TENSORS, *NODE_TENSORS)}
             self.path, moved = Path("lift"), None
             given = {"lift": source, "metadata": self._with_places(source.metadata)}
@@ -112,7 +114,8 @@ class OpenedLift:
             self.__dict__["splats"] = splats.cpu()
 
     def _hold(self, arrays: dict[str, Any]) -> None:
-        self.features, self.evidence, self._has_feature = (arrays[n] for n in ("features", "evidence", "seen"))
+        columns = (arrays[name] for name in ("features", "total_weight", "seen"))
+        self.features, self.total_weight, self._has_feature = columns
         self.cluster, self.cluster_features = arrays.get("cluster"), arrays.get("cluster_features")
         self.confidence = arrays.get("confidence")
         self._embeddings = arrays.get("embeddings")
@@ -227,21 +230,21 @@ class OpenedLift:
 
     @cached_property
     def weights(self) -> np.ndarray | None:
-        """How much each seen splat counts in a histogram, its evidence; None when none has evidence."""
-        return self.weights_with_feature(self.evidence)
+        """How much each seen splat counts in a histogram, its total weight; None when none has total weight."""
+        return self.weights_with_feature(self.total_weight)
 
     def splat_weights(self, weigh: str) -> np.ndarray:
-        """[P] f32, how much each splat counts: by its evidence, or by that times its confidence.
+        """[P] f32, how much each splat counts: by its total weight, or by that times its confidence.
 
         Raises:
             InvalidQuery: the lift has no confidence.
         """
         if weigh == "evidence":
-            return self.evidence
+            return self.total_weight
         if self.confidence is None:
             hint, got = "lift again with the preset default, or with robust_steps", "a lift that was not reweighted"
             raise InvalidQuery("weigh", expected="a lift with confidence", got=got, hint=hint)
-        return self.evidence * self.confidence
+        return self.total_weight * self.confidence
 
     def weights_with_feature(self, weights: np.ndarray) -> np.ndarray | None:
         """Weights [P] of the seen splats; None when none is above zero, so that they count alike."""
@@ -250,14 +253,14 @@ class OpenedLift:
 
     @cached_property
     def mean(self) -> np.ndarray:
-        """[F] f32, the mean of the unit features, weighted by evidence: what all the scene's features share."""
-        return mean_direction(self.features, self.norms, self.evidence)
+        """[F] f32, the mean of the unit features, weighted by total weight: what all the scene's features share."""
+        return mean_direction(self.features, self.norms, self.total_weight)
 
     @cached_property
     def rough_mean(self) -> np.ndarray:
         """[F] f32, the mean of at most MOST_SAMPLED of them, evenly spaced: quicker, and near enough for words."""
         rows = slice(None, None, -(-len(self.features) // MOST_SAMPLED) or 1)
-        return mean_direction(self.features[rows], self.norms[rows], self.evidence[rows])
+        return mean_direction(self.features[rows], self.norms[rows], self.total_weight[rows])
 
     @cached_property
     def object_means(self) -> np.ndarray:
@@ -318,25 +321,25 @@ class OpenedLift:
     def within(self, members: np.ndarray) -> Self:
         """The same lift as if nothing but some of its splats [P] bool were seen; the tree's nodes are its things.
 
-        Means and shares of evidence are those of these splats, so that a question tells them from one another.
+        Means and shares of total weight are those of these splats, so that a question tells them from one another.
         """
         inner = copy(self)
         for name in ("seen", "all_seen", "weights", "mean", "object_means", "principal"):
             inner.__dict__.pop(name, None)
         inner._has_feature = self.seen & members
-        inner.evidence = np.where(members, self.evidence, np.float32(0.0))
+        inner.total_weight = np.where(members, self.total_weight, np.float32(0.0))
         rows = np.flatnonzero(inner._has_feature)
         rows = rows[:: -(-len(rows) // MOST_SAMPLED) or 1]
-        inner.__dict__["rough_mean"] = mean_direction(self.features[rows], self.norms[rows], self.evidence[rows])
+        inner.__dict__["rough_mean"] = mean_direction(self.features[rows], self.norms[rows], self.total_weight[rows])
         if self.node is not None and self.node_views is not None:
             inner.object, inner.object_views = self.node, self.node_views
         inner.node_features = None  # of all splats of the nodes
         return inner
 
     def mean_of(self, rows: np.ndarray) -> np.ndarray:
-        """[F] f32, the unit mean of the unit features of splats [n] by evidence; of many, of evenly chosen ones."""
+        """[F] f32, the unit mean of unit features of splats [n] by total weight; of many, of evenly spaced ones."""
         rows = rows[:: -(-len(rows) // MOST_OF_THING) or 1]
-        weights = self.evidence[rows]
+        weights = self.total_weight[rows]
         mean = mean_direction(self.features[rows], self.norms[rows], weights if weights.any() else weights + 1)
         return mean / max(float(np.linalg.norm(mean)), 1e-30)
 
@@ -345,7 +348,7 @@ class OpenedLift:
         """[P, 3] f32 in 0..1, the features as colours."""
         from liftcore.query.splat_colours import principal_colours
 
-        return principal_colours(self.features, self.evidence)
+        return principal_colours(self.features, self.total_weight)
 
     @cached_property
     def splat_file(self) -> Path:

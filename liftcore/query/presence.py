@@ -4,7 +4,7 @@ A score says where a scene is most similar to a word, and not that the object is
 similar to the word are compared with some hundreds of **reference words** of the same encoder. If the object is in
 the scene, its word is among the nearest of them; else the words of the objects that are there are nearer.
 
-    presence = share, by evidence, of the word's best splats at which at most MOST_NEARER of the references are nearer
+    presence = share, by total weight, of the word's best splats at which at most MOST_NEARER references are nearer
 
 This share is computed twice: from the cosines, and about the scene's mean, which removes what all features of the
 scene share. (Features of images and of words lie apart, and some words are nearer to all images than the right ones.)
@@ -12,7 +12,7 @@ The word is present if both shares are at least a half. It is absent if the firs
 the word is the nearest of all for less than a half. Otherwise the answer is **not sure**, and the threshold selects.
 
 - A phrase that is not among the references may have twice as many nearer words, as these are more specific.
-- The best splats are the few with LEAST_SHARE of the scene's evidence: a threshold selects no less either.
+- The best splats are the few with LEAST_SHARE of the scene's total weight: a threshold selects no less either.
 - References related to the word, with at least RELATED of the similarity of its nearest reference, are left out:
   a synonym does not compete. All words of an encoder share a cone, so they are compared about their mean.
 - ``tests.benchmarks.presence`` measures the constants.
@@ -49,7 +49,7 @@ WORD_STEP = 4  # an encoder without references encodes each 4th of the shipped w
 MOST_NEARER = 0.0033  # share of the references that may be nearer to a splat than its own word: synonyms, wrong masks
 _ITSELF = 0.9  # similarity about the mean from which a word is one of the references
 RELATED = 0.55  # of the similarity of a word's nearest reference, from which references are left out
-MOST_SPLATS = 256  # of the best ones that are compared, those with the most evidence
+MOST_SPLATS = 256  # of the best ones that are compared, those with the largest total weight
 _FIRST = 1_024  # splats among which the best ones are searched first
 _SAME_TEXT = 0.99  # least cosine of two vectors of one text that come from one encoder
 _IN_CONE = 0.5  # cosine to the shipped words' mean direction: they have .75 to .93, other spaces' vectors about 0
@@ -192,25 +192,25 @@ def any_present(words: Sequence[Presence]) -> Presence:
 
 
 def best_splats(scene: OpenedLift, scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the splats of the highest scores [P] that have LEAST_SHARE of the evidence, and their weights.
+    """Return the splats of the highest scores [P] that have LEAST_SHARE of the total weight, and their weights.
 
     Returns:
-        [m] i64, at most MOST_SPLATS, descending by score; and [m] f64, their evidence.
+        [m] i64, at most MOST_SPLATS, descending by score; and [m] f64, their total weight.
     """
-    evidence = np.where(scene.seen, scene.evidence, np.float32(0.0))
-    evidence = evidence if evidence.any() else scene.seen.astype(np.float32)
-    least, count = LEAST_SHARE * float(evidence.sum(dtype=np.float64)), min(_FIRST, len(scores))
+    total_weight = np.where(scene.seen, scene.total_weight, np.float32(0.0))
+    total_weight = total_weight if total_weight.any() else scene.seen.astype(np.float32)
+    least, count = LEAST_SHARE * float(total_weight.sum(dtype=np.float64)), min(_FIRST, len(scores))
     ranked = -scores if scene.all_seen else np.where(scene.seen, -scores, np.float32(np.inf))
     while True:
         rows = np.argpartition(ranked, count - 1)[:count] if count < len(ranked) else np.arange(count)
-        if count == len(ranked) or evidence[rows].sum(dtype=np.float64) >= least:
+        if count == len(ranked) or total_weight[rows].sum(dtype=np.float64) >= least:
             break
         count = min(4 * count, len(ranked))
     rows = rows[np.lexsort((rows, ranked[rows]))]
-    rows = rows[: int(np.searchsorted(np.cumsum(evidence[rows], dtype=np.float64), least)) + 1]
-    rows = rows[evidence[rows] > 0]
-    heaviest = np.sort(np.argsort(-evidence[rows], kind="stable")[:MOST_SPLATS])
-    return rows[heaviest], evidence[rows[heaviest]].astype(np.float64)
+    rows = rows[: int(np.searchsorted(np.cumsum(total_weight[rows], dtype=np.float64), least)) + 1]
+    rows = rows[total_weight[rows] > 0]
+    heaviest = np.sort(np.argsort(-total_weight[rows], kind="stable")[:MOST_SPLATS])
+    return rows[heaviest], total_weight[rows[heaviest]].astype(np.float64)
 
 
 def references_of(encoder: TextEncoder, text_space: str) -> References | str:

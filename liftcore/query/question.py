@@ -365,7 +365,7 @@ class Candidate(Value):
     set: str = Field(description="its notation, for sets")
     kind: NodeKind
     splats: int = Field(description="how many")
-    share: float = Field(description="of what is shown there, by weight; of words, of the thing, by evidence")
+    share: float = Field(description="of what is shown there, by weight; of words, of the thing, by total weight")
     confidence: float | None = Field(description="of the views that see it, the share that has a mask of the whole")
 
 
@@ -477,17 +477,17 @@ class FoundObject(Value):
     """Selected splats that hang together."""
 
     splats: int = Field(description="how many")
-    share: float = Field(description="of the evidence of all selected splats, or of what `weigh` says")
+    share: float = Field(description="of the total weight of all selected splats, or of what `weigh` says")
     score: float = Field(description="the mean of its splats' scores, by the same")
     centre: Point = Field(description="the middle of its box: x y z, world frame")
-    box: Box = Field(description="of its splats' centres, but for a thousandth of the evidence at each end")
+    box: Box = Field(description="of its splats' centres, but for a thousandth of the total weight at each end")
     size: Point = Field(description="the sides of its box, in `unit`")
 
 
 class Objects(Measured):
     """What an answer found, thing by thing."""
 
-    objects: tuple[FoundObject, ...] = Field(description="those with the most evidence first")
+    objects: tuple[FoundObject, ...] = Field(description="those with the largest total weight first")
     strays: int = Field(description="selected splats in none of them")
     _numbers: np.ndarray = PrivateAttr()
 
@@ -517,11 +517,11 @@ class NamedSplats(Value):
     value: int = Field(description="of its splats and pixels in labels and maps; 0 is none")
     colour: tuple[int, int, int] = Field(description="sRGB, 0 to 255, in pictures")
     splats: int = Field(description="how many it names")
-    share: float = Field(description="of the evidence of all seen splats")
-    score: float = Field(description="the mean cosine of its splats, by evidence")
+    share: float = Field(description="of the total weight of all seen splats")
+    score: float = Field(description="the mean cosine of its splats, by total weight")
     margin: float = Field(description="the mean of how much nearer they are to it than to the nearest other word")
     threshold: float = Field(description="of its cosines")
-    box: Box = Field(description="of its splats' centres, but for a thousandth of the evidence at each end")
+    box: Box = Field(description="of its splats' centres, but for a thousandth of the total weight at each end")
 
 
 class FoundWords(Value):
@@ -530,7 +530,7 @@ class FoundWords(Value):
     words: int = Field(description="how many were asked")
     splats: int = Field(description="P")
     none: int = Field(description="splats that none of the words names")
-    found: tuple[NamedSplats, ...] = Field(description="those that are there, with the most evidence first")
+    found: tuple[NamedSplats, ...] = Field(description="those that are there, with the largest total weight first")
 
 
 class BestWord(Value):
@@ -550,11 +550,11 @@ class BestWords(Value):
 class SceneObject(Value):
     """A thing that masks of many views keep together."""
 
-    id: int = Field(description="the same for the same lift; 0 has the most evidence")
+    id: int = Field(description="the same for the same lift; 0 has the largest total weight")
     name: str | None = Field(description="the nearest word of the vocabulary; null without one")
     score: float | None = Field(description="its cosine with the object's mean feature")
     splats: int = Field(description="how many")
-    share: float = Field(description="of the evidence of all splats")
+    share: float = Field(description="of the total weight of all splats")
     centre: Point = Field(description="the middle of its box: x y z, frame of the splat file")
     box: Box = Field(description="of its large groups of splats that touch, without outliers elsewhere")
     size: Point = Field(description="the sides of its box, in `unit`")
@@ -565,7 +565,7 @@ class SceneObject(Value):
 
 
 class ListedObjects(Measured):
-    """The things in a scene, or some of them, those with the most evidence first."""
+    """The things in a scene, or some of them, those with the largest total weight first."""
 
     explanation: str = Field(description="why there are so many; or why there are none")
     count: int = Field(description="of all pages")
@@ -578,7 +578,7 @@ class SceneNode(SceneObject):
     kind: NodeKind
     parent: int | None = Field(description="the node that it is a part of; null where it is of none")
     path: tuple[int, ...] = Field(description="the nodes that hold it, the largest first, and itself")
-    parts: tuple[int, ...] = Field(description="the nodes that are its parts, those with the most evidence first")
+    parts: tuple[int, ...] = Field(description="the nodes that are its parts, the largest total weight first")
     confidence: float = Field(description="of the views that see it, the share that has a mask of the whole")
 
 

@@ -68,7 +68,7 @@ def refine(
     in_file = free is not None and lift.features.nbytes > MEMORY_SHARE * free
     X = zeros(tuple(lift.features.shape), lift.features.dtype, name="features", in_file=in_file).copy_(lift.features)
     graph = SplatGraph.of(splats, threads)
-    X, facts = smooth(X, graph, lift.evidence, lift.confidence, lift.seen, strength, progress, threads)
+    X, facts = smooth(X, graph, lift.total_weight, lift.confidence, lift.seen, strength, progress, threads)
     certificate: dict[str, Any] = lift.diagnostics | {"smoothing": facts}
     certificate |= {name: None for name in OF_FEATURES if name in certificate}
     if "beta" in certificate:

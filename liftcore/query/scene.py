@@ -324,7 +324,7 @@ class Scene(OpenedLift):
         return region_mask(self, Region(view, level, region))
 
     def colours(self, what: str) -> np.ndarray:
-        """[P, 3] u8 sRGB, of splats by ``pca``, ``cluster``, ``evidence``, ``agreement`` or ``confidence``.
+        """[P, 3] u8 sRGB, of splats by ``pca``, ``cluster``, ``total_weight``, ``agreement`` or ``confidence``.
 
         Raises:
             InvalidQuery: the lift has no such thing.

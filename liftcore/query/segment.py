@@ -3,9 +3,9 @@
 A word alone is asked as a query is: its automatic threshold says which splats answer it. A splat is named by the
 nearest of the words that it answers, and by none where it answers none. Asked for what is not there, a threshold
 finds what is most like it; beside other words such a word wins hardly a splat that it answers, as these are more like
-their own. So a word is there if it is the nearest of all words for at least a quarter of its answer, by evidence, and
-if reference words do not say that it is not (`liftcore.query.presence`; the words themselves, where they are many).
-Words that are not there name nothing.
+their own. So a word is there if it is the nearest of all words for at least a quarter of its answer, by total weight,
+and if reference words do not say that it is not (`liftcore.query.presence`; the words themselves, where they are
+many). Words that are not there name nothing.
 
 The lift's tree has its say: a word that names parts, where levels say different things, names their nodes
 (`liftcore.query.selection.parts_of_words`); and what has no word in a node gets the one that names most of the node.
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from liftcore.text import TextEncoder
 
 NO_WORD = -1
-LEAST_OWN = 0.25  # of a word's answer, by evidence, that no other word is nearer to
+LEAST_OWN = 0.25  # of a word's answer, by total weight, that no other word is nearer to
 MOST_WORDS = 4_096
 AT_ONCE = 16  # words whose cosines are held at a time: [P, AT_ONCE] f32
 SHOWN = 20  # words of a drawn legend
@@ -62,7 +62,7 @@ class Segmentation:
     margin: np.ndarray
     """[P] f32, the cosine to its word less that to the nearest other; 0 where it has none"""
     found: tuple[NamedSplats, ...]
-    """those that are there, with the most evidence first"""
+    """those that are there, with the largest total weight first"""
 
     def __repr__(self) -> str:
         found = ", ".join(f"{one.word!r}: {one.splats}" for one in self.found)
@@ -135,7 +135,7 @@ def segment(
     if len(set(words)) < len(words):
         twice = next(word for place, word in enumerate(words) if word in words[:place])
         raise InvalidQuery("words", expected="every word once", got=f"{twice!r} twice")
-    weights = np.where(scene.seen, scene.evidence, 0.0).astype(np.float64)
+    weights = np.where(scene.seen, scene.total_weight, 0.0).astype(np.float64)
     weights = weights if weights.any() else scene.seen.astype(np.float64)
     thresholds, answered = np.empty(len(words)), np.empty(len(words))
     nearest = _Nearest(len(weights))

@@ -3,9 +3,9 @@
 A histogram shows where scores separate. It does not show that the splats above are the target of the query. So the
 splats above the automatic threshold are compared with other words, of two kinds:
 
-- **Reference words** (`liftcore.query.presence`): for 90 % of the selected evidence the query's word must be among
-  the nearest; else a new threshold is searched above the score from which this holds. (With 50 %, a similar and no
-  larger object beside the target would pass.)
+- **Reference words** (`liftcore.query.presence`): for 90 % of the selected total weight the query's word must be
+  among the nearest; else a new threshold is searched above the score from which this holds. (With 50 %, a similar and
+  no larger object beside the target would pass.)
 - **The other words of a pack** or of a short table are all that its author distinguishes: a splat to which one of
   them is nearer is not selected.
 
@@ -36,11 +36,11 @@ from liftcore.runtime.cores import cores
 if TYPE_CHECKING:
     from liftcore.query.opened import OpenedLift
 
-NEAR = 0.9  # share of the selected evidence at which the word must be among the nearest; .5 lets two objects pass
+NEAR = 0.9  # share of the selected total weight at which the word must be among the nearest; .5 lets two objects pass
 SAMPLED = 256  # splats sampled from each octave of the ranking: a million splats have twelve octaves
-MOSTLY_SELECTED = 2 / 3  # share of an object's evidence from which it is mostly selected
-PARTLY_SELECTED = 1 / 3  # share of an object's evidence below which its mean does not represent the selected part
-LEAST_FIRST = 0.1  # of the evidence at which the word is the nearest of all, that a clear answer selects
+MOSTLY_SELECTED = 2 / 3  # share of an object's total weight from which it is mostly selected
+PARTLY_SELECTED = 1 / 3  # share of an object's total weight below which its mean does not represent the selected part
+LEAST_FIRST = 0.1  # of the total weight at which the word is the nearest of all, that a clear answer selects
 LEVELS_AGREE = 0.9  # cosine of parts and wholes, about the mean, from which levels have one meaning; equal ones: .95
 SAME_WORD = 1 - 1e-4  # cosine from which two words of a table are one
 _BLOCK = 1 << 10  # splats that are compared with a pack's words at once: as many as fit the CPU cache
@@ -88,8 +88,8 @@ class CompetingWords:
 class RankComparison:
     """A ranking of splats by score, compared with competing words."""
 
-    lowest: float  # lowest score at or above which the word is among the nearest for NEAR of the evidence
-    first: float  # share, of the evidence at which the word is the nearest of all, at or above a threshold
+    lowest: float  # lowest score at or above which the word is among the nearest for NEAR of the total weight
+    first: float  # share, of the total weight at which the word is the nearest of all, at or above a threshold
 
 
 def compare_ranks(
@@ -288,7 +288,8 @@ def objects_within(scene: OpenedLift, selected: np.ndarray) -> np.ndarray:
         return np.zeros(0, np.bool_)
     in_object, number = scene.seen & (scene.object >= 0), len(scene.object_views)
     totals, inside = (
-        np.bincount(scene.object[rows], scene.evidence[rows], number) for rows in (in_object, in_object & selected)
+        np.bincount(scene.object[rows], scene.total_weight[rows], number)
+        for rows in (in_object, in_object & selected)
     )
     return (inside > 0) & (inside >= PARTLY_SELECTED * totals)
 

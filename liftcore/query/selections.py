@@ -349,5 +349,5 @@ def _booleans(scene: OpenedLift, splats: Any) -> np.ndarray:
 
 
 def _weights(scene: OpenedLift, rows: np.ndarray) -> np.ndarray:
-    weights = scene.evidence[rows].astype(np.float64)
+    weights = scene.total_weight[rows].astype(np.float64)
     return weights if weights.any() else np.ones(len(rows))

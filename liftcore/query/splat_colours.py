@@ -102,7 +102,7 @@ def principal_colours(features: np.ndarray, weights: np.ndarray) -> Tensor:
 
     Args:
         features: [P, F] f16 or f32; zero rows stay black.
-        weights: [P] f32 at least zero, such as the evidence.
+        weights: [P] f32 at least zero, such as the total weight.
 
     Returns:
         [P, 3] f32 in 0..1.

@@ -79,7 +79,7 @@ def find_threshold(
     method: str | float = "auto",
     weights: ArrayLike | None = None,
     least: float = -math.inf,
-    weight_name: str = "evidence",
+    weight_name: str = "total weight",
 ) -> Threshold:
     """Find a threshold on scores by one of the methods above.
 
@@ -90,7 +90,7 @@ def find_threshold(
     Args:
         scores: [n] f32, finite.
         method: one of ``METHODS``, or a number to use as it is.
-        weights: [n] f32, weight of each score, at least zero: the evidence of splats; None: equal ones, as of the
+        weights: [n] f32, weight of each score, at least zero: the total weight of splats; None: equal ones, as of the
             pixels of a view.
         weight_name: of the weights, for the explanation.
         least: ``auto`` takes no lower score, unless too few lie above it.

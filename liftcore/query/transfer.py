@@ -8,9 +8,9 @@ Gaussians (Bhattacharyya's coefficient) times their likeness in colour::
 
 A new splat that nearly equals an old one takes the values of that one alone, so that unchanged rows keep their
 values. Of exact copies among the old, which cannot be distinguished, it takes the mean. All others take the mean of
-per-splat values by w^2 over the 16 nearest old ones, and the cluster and object of the largest sum. The evidence of
-an old splat is divided among the new ones that it overlaps, so that decimated splats have that of all old ones they
-replace. A new splat that overlaps none has no feature.
+per-splat values by w^2 over the 16 nearest old ones, and the cluster and object of the largest sum. The total weight
+of an old splat is divided among the new ones that it overlaps, so that decimated splats have that of all old ones
+they replace. A new splat that overlaps none has no feature.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _VALUES = ("agreement", "confidence")
 
 @usual_modes()
 def transfer(lift: AnyLift, old: Splats, new: Splats, matrix: Any = None, progress: Progress = silent) -> AnyLift:
-    """Take a lift's features, evidence, clusters and objects to another set of splats of its scene.
+    """Take a lift's features, total weight, clusters and objects to another set of splats of its scene.
 
     Args:
         lift: of any engine; it stays as it is. old: that were lifted. new: Q others, in any order and place.
@@ -233,8 +233,8 @@ def _mix_values(lift: Lift, index: _Index, new: Splats, progress: Progress) -> t
             column[rows] = (shares * old[name][near]).sum(axis=1)
         progress("transfer", rows.stop, count, "splats")
     features[~torch.from_numpy(has_feature)] = 0
-    values["evidence"] = _divide_evidence(
-        lift.evidence.cpu().numpy(), *map(np.concatenate, zip(*partners, strict=True))
+    values["total_weight"] = _divide_weight(
+        lift.total_weight.cpu().numpy(), *map(np.concatenate, zip(*partners, strict=True))
     )
     fields: dict[str, Any] = {"features": features, "seen": torch.from_numpy(has_feature)}
     fields |= {name: torch.from_numpy(column) for name, column in values.items()}
@@ -255,8 +255,8 @@ def _strongest_label(labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return np.where(weights.any(axis=1), best, -1).astype(np.int32)
 
 
-def _divide_evidence(evidence: np.ndarray, near: np.ndarray, shares: np.ndarray) -> np.ndarray:
-    """Divide the evidence [P] of each old splat among the new ones by their shares [Q, k] in it, [Q] f32."""
-    totals = np.bincount(near.ravel(), shares.ravel().astype(np.float64), len(evidence))
-    per_share = np.divide(evidence, totals, out=np.zeros(len(evidence)), where=totals > 0)
+def _divide_weight(total_weight: np.ndarray, near: np.ndarray, shares: np.ndarray) -> np.ndarray:
+    """Divide the total weight [P] of each old splat among the new ones by their shares [Q, k] in it, [Q] f32."""
+    totals = np.bincount(near.ravel(), shares.ravel().astype(np.float64), len(total_weight))
+    per_share = np.divide(total_weight, totals, out=np.zeros(len(total_weight)), where=totals > 0)
     return (shares * per_share[near]).sum(axis=1).astype(np.float32)

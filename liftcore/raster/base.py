@@ -57,7 +57,7 @@ class Raster(Protocol):
     def region_weights(
         self, camera: Camera, observation: ViewFeatures, params: CompositingParams, weighting: Weighting
     ) -> RegionWeights:
-        """``A'^T S`` of a view and the evidence of plain weights, over the rays that the stride leaves."""
+        """``A'^T S`` of a view and the total weight of plain weights, over the rays that the stride leaves."""
         ...
 
     def iterate_views(self, requests: Iterable[ViewRequest]) -> Generator[ViewWeights]:

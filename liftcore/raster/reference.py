@@ -290,7 +290,7 @@ class ReferenceRaster:
     def region_weights(
         self, camera: Camera, observation: ViewFeatures, params: CompositingParams, weighting: Weighting
     ) -> RegionWeights:
-        """``A'^T S`` by dense products, and the evidence of plain weights."""
+        """``A'^T S`` by dense products, and the total weight of plain weights."""
         S, ray = reading_matrix(observation, camera.width, camera.height)
         A = dense_view(self.splats, camera, params).A
         strided = strided_rays(camera, params)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from pydantic import (
@@ -13,11 +14,13 @@ from pydantic import (
     ValidationError,
     ValidatorFunctionWrapHandler,
     WrapValidator,
+    computed_field,
     model_validator,
 )
 from pydantic_core import PydanticCustomError
 
-from liftcore.errors import SplatliftError
+from liftcore.errors import InvalidInput, SplatliftError
+from liftcore.runtime.aliases import add_deprecated_properties, current_names
 from liftcore.runtime.arguments import one_of
 from liftcore.runtime.one_line import one_line, value_text
 
@@ -45,12 +48,43 @@ def _no_boolean(value: Any) -> Any:
 NoBoolean = BeforeValidator(_no_boolean)  # of a number: pydantic reads true as 1
 
 
-class Shown(BaseModel):
+class AliasedModel(BaseModel):
+    """A model that is read by old names of its fields too, and written by the new (`liftcore.runtime.aliases`)."""
+
+    old_names: ClassVar[Mapping[str, str]] = {}  # new names of fields by old ones
+    error_type: ClassVar[type[SplatliftError] | None] = None  # what stands in for pydantic's errors; None: nothing
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **_: Any) -> None:
+        add_deprecated_properties(cls, {old: new for old, new in cls.old_names.items() if not hasattr(cls, old)})
+
+    @model_validator(mode="before")
+    @classmethod
+    def _by_current_names(cls, values: Any) -> Any:
+        return cls.current_names(values) if isinstance(values, dict) else values
+
+    @classmethod
+    def current_names(cls, values: dict[str, Any]) -> dict[str, Any]:
+        """Return values of fields under their new names.
+
+        Raises:
+            SplatliftError: of the model's type of errors; an old and a new name have different values.
+        """
+        return current_names(values, cls.old_names, cls.error_type or InvalidInput) if cls.old_names else values
+
+
+def old_field(new: str, annotation: Any) -> Any:
+    """Return a field that a reply has beside the one of the new name, with the same value, marked as deprecated."""
+    field = property(lambda self: getattr(self, new), doc=f"`{new}`, by its old name")
+    return computed_field(return_type=annotation, json_schema_extra={"deprecated": True})(field)
+
+
+class Shown(AliasedModel):
     """A model that Python prints in a line: the fields that were given."""
 
     def __repr__(self) -> str:
-        given = self.model_fields_set
-        return one_line(self, *(f"{name}={value_text(value)}" for name, value in self if name in given))
+        names = self.model_fields_set
+        return one_line(self, *(f"{name}={value_text(value)}" for name, value in self if name in names))
 
     def __str__(self) -> str:
         return repr(self)
@@ -60,26 +94,27 @@ class Body(Shown):
     """What a body, or a part of one, may hold. A field that is not known is refused with those that are."""
 
     model_config = ConfigDict(extra="forbid", defer_build=True)  # help lists fields, and checks none
-    error_type: ClassVar[type[SplatliftError] | None] = None  # what stands in for pydantic's errors; None: nothing
 
     @model_validator(mode="before")
     @classmethod
-    def _knows(cls, given: Any) -> Any:
-        for name in given if isinstance(given, dict) else ():
+    def _check_names(cls, values: Any) -> Any:
+        if isinstance(values, dict):
+            values = cls.current_names(values)
+        for name in values if isinstance(values, dict) else ():
             if name not in cls.model_fields:
                 # Half a surrogate pair, which JSON can name, would break pydantic's own report.
-                shown = name[:NAME_CHARACTERS].encode("utf-8", "backslashreplace").decode()
-                context = {"field": shown, "expected": one_of(cls.model_fields)}
+                text = name[:NAME_CHARACTERS].encode("utf-8", "backslashreplace").decode()
+                context = {"field": text, "expected": one_of(cls.model_fields)}
                 raise PydanticCustomError("unknown_field", "{expected}", context)
-        return given
+        return values
 
     @model_validator(mode="wrap")
     @classmethod
-    def _in_words(cls, given: Any, handler: ModelWrapValidatorHandler[Any]) -> Any:
+    def _in_words(cls, values: Any, handler: ModelWrapValidatorHandler[Any]) -> Any:
         if cls.error_type is None:
-            return handler(given)
+            return handler(values)
         try:
-            return handler(given)
+            return handler(values)
         except ValidationError as error:
             raise _error_of(cls, error, cls.error_type) from None
 

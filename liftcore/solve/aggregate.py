@@ -10,7 +10,7 @@ The paper's way, where features make the clusters (``aggregation_clusters=hdbsca
 
 Where masks make the clusters (``graph``), these are the objects that other views keep together
 (`liftcore.solve.objects`): they need no footprint to confirm them. As on grids, which have no regions to filter, a
-cluster's feature is the mean of its splats' features, weighted by evidence.
+cluster's feature is the mean of its splats' features, weighted by total weight.
 
 Splats in no cluster, and those of clusters without a kept region, keep their own features, or with
 ``aggregation_resolve`` are solved for again from the kept regions alone, if these have most of their weight.
@@ -87,7 +87,7 @@ class KeptRegions:
 
 def aggregate(
     features: Tensor,
-    evidence: np.ndarray,
+    total_weight: np.ndarray,
     splats: Splats,
     raster: Raster,
     views: LiftViews,
@@ -103,7 +103,7 @@ def aggregate(
     Args:
         features: [P, F] f16 or f32; rows of splats that take their cluster's feature are overwritten with it, and the
             same tensor is returned.
-        evidence: [P] f64, sums of plain weights.
+        total_weight: [P] f64, sums of plain weights.
         views: that were lifted.
         threads: None takes the cores that this process may use. The number changes no bit.
         things: the clusters; None: those of features.
@@ -115,20 +115,20 @@ def aggregate(
     if things is not None:
         clustering = Clustering(torch.from_numpy(things.labels), things.count, {"clustered_by": "graph"})
     else:
-        clustering = cluster_splats(features, evidence, settings, threads)
+        clustering = cluster_splats(features, total_weight, settings, threads)
         if settings.aggregation_clusters != "hdbscan":
             clustering = parted(clustering, splats, settings.aggregation_cluster_size, threads)
     masks: dict[str, np.ndarray] = {}
     if clustering.count == 0:
         merged, facts = torch.zeros(0, features.shape[1], dtype=features.dtype), {}
     elif things is not None:
-        merged, facts = evidence_means(features, evidence, clustering, threads), MASKS_MADE
+        merged, facts = weighted_means(features, total_weight, clustering, threads), MASKS_MADE
     elif any(views.features.is_regions(name) for name in names):
         kept = filter_regions(clustering, features.shape[1], raster, views, settings, progress)
         merged, masks = kept_means(kept, features.dtype), kept.masks
         facts = {"filter": "iou", "regions": kept.regions, "kept_regions": int(kept.counts.sum())}
     else:
-        merged = evidence_means(features, evidence, clustering, threads)
+        merged = weighted_means(features, total_weight, clustering, threads)
         facts = {"filter": "none: grids have no regions"}
     taken, guarded = with_feature(clustering.labels, merged), None
     if judged is not None and clustering.count:
@@ -287,27 +287,27 @@ def kept_means(kept: KeptRegions, dtype: torch.dtype) -> Tensor:
     return torch.from_numpy(means).to(dtype)
 
 
-def evidence_means(
-    features: Tensor, evidence: np.ndarray, clustering: Clustering, threads: int | None = None
+def weighted_means(
+    features: Tensor, total_weight: np.ndarray, clustering: Clustering, threads: int | None = None
 ) -> Tensor:
-    """[K, F]: the mean of the features of each cluster's splats, weighted by their evidence."""
-    sums = cluster_sums(features, evidence, clustering.labels.numpy(), clustering.count, threads)
+    """[K, F]: the mean of the features of each cluster's splats, weighted by their total weight."""
+    sums = cluster_sums(features, total_weight, clustering.labels.numpy(), clustering.count, threads)
     return cluster_means(added(sums, (features.shape[1] + 1, clustering.count)), features.dtype)
 
 
 def cluster_sums(
-    features: Tensor, evidence: np.ndarray, labels: np.ndarray, count: int, threads: int | None = None
+    features: Tensor, total_weight: np.ndarray, labels: np.ndarray, count: int, threads: int | None = None
 ) -> Iterator[PieceSums]:
-    """What a block of splats adds to its clusters, at every piece: [F + 1, K], features by evidence, and evidence.
+    """Yield what a block of splats adds to its clusters, at every piece: [F + 1, K], weighted features, total weight.
 
     Args:
-        features: [n, F] f16 or f32. evidence: [n]. labels: [n] i32 below the count, -1 for none.
+        features: [n, F] f16 or f32. total_weight: [n]. labels: [n] i32 below the count, -1 for none.
     """
 
     def add(first: int, last: int, table: np.ndarray) -> None:
         for begin in range(first, last, BLOCK):
             own = begin + np.flatnonzero(labels[begin : min(begin + BLOCK, last)] >= 0)
-            clusters, weights = labels[own], evidence[own]
+            clusters, weights = labels[own], total_weight[own]
             shares = csr_matrix((weights, (clusters, np.arange(own.size))), shape=(count, own.size))
             table[:-1] += (shares @ features[torch.from_numpy(own)].to(torch.float32).numpy()).T
             table[-1] += np.bincount(clusters, weights, minlength=count)

@@ -55,19 +55,19 @@ class Directions:
 
 
 def cluster_splats(
-    features: Tensor, evidence: np.ndarray, settings: LiftSettings, threads: int | None = None
+    features: Tensor, total_weight: np.ndarray, settings: LiftSettings, threads: int | None = None
 ) -> Clustering:
     """Cluster splats by feature.
 
     Args:
         features: [P, F] f16 or f32; zero rows belong to no cluster.
-        evidence: [P], sums of plain weights; splats are drawn for the sample with odds ``min(evidence, 1)``.
+        total_weight: [P], sums of plain weights; splats are drawn for the sample with odds ``min(total_weight, 1)``.
         settings: the ``aggregation_*`` knobs and the seed.
         threads: None takes the cores that this process may use. The number changes no bit.
     """
     count = features.shape[0]
     known = nonzero_rows(features)
-    odds = np.where(known, np.minimum(evidence, ENOUGH_EVIDENCE), 0.0)
+    odds = np.where(known, np.minimum(total_weight, ENOUGH_EVIDENCE), 0.0)
     rows = draw(odds, settings.aggregation_sample, settings.seed)
     share = rows.size / max(int((odds > 0).sum()), 1)
     smallest = max(2 * settings.aggregation_neighbours, 2, round(settings.aggregation_cluster_size * share))

@@ -51,12 +51,12 @@ class ViewMeasures:
     betas: np.ndarray  # [rows] f64; NaN where the ray meets nothing
 
 
-def certify(measures: ViewMeasures, sums: np.ndarray, evidence: Tensor, settings: LiftSettings) -> dict[str, Any]:
+def certify(measures: ViewMeasures, sums: np.ndarray, total_weight: Tensor, settings: LiftSettings) -> dict[str, Any]:
     """What the sampled rays say of a lift.
 
     Args:
         measures: of the rays of all views (`measure_samples`).
-        sums: [P] f64, of rows of W. evidence: [P] f32.
+        sums: [P] f64, of rows of W. total_weight: [P] f32.
 
     Returns:
         Plain numbers, ready for JSON; None where nothing was sampled, or where float32 has no squares.
@@ -75,7 +75,7 @@ def certify(measures: ViewMeasures, sums: np.ndarray, evidence: Tensor, settings
         "beta": beta,
         "bound": None if beta["max"] is None else 1.0 + beta["max"],
         "seen_share": float((sums > 0).mean()),
-        "evidence_over_half_share": float((evidence > 0.5).float().mean()),
+        "evidence_over_half_share": float((total_weight > 0.5).float().mean()),
     }
 
 

@@ -8,7 +8,7 @@ region n **contains** m where n has CONTAINS of what the level holds.
 A splat belongs to a **path** of nodes: to the root whose regions, with those of its parts, weigh most at it, if these
 have half of all roots' weight there; then to the part of it that weighs most, if this has half of all parts' weight
 and of what the levels that show the part have there; and so on. A part that has SAME_SPLATS of its whole's splats is
-that whole, seen twice. **Objects** are the roots, numbered by evidence, the largest first; of a root that holds
+that whole, seen twice. **Objects** are the roots, numbered by total weight, the largest first; of a root that holds
 MOST_OF_SCENE of the splats, its parts are. Other nodes are numbered after them.
 
 Memory and time are bounded: nodes are the regions of evenly chosen views, MOST_REGIONS at most, with two tables of
@@ -90,7 +90,7 @@ class NodeNumbers:
 def region_objects(
     W: RegionWeights,
     levels: np.ndarray,
-    evidence: np.ndarray,
+    total_weight: np.ndarray,
     threads: int | None = None,
     *,
     members: Memberships | None = None,
@@ -100,7 +100,7 @@ def region_objects(
     Args:
         W: of all views, by rows of codebooks, on the CPU.
         levels: [M] i8, the level of each region in its view; -1 for cells of grids, which take no part.
-        evidence: [P], sums of plain weights; objects are numbered by it.
+        total_weight: [P], sums of plain weights; objects are numbered by it.
         threads: None takes the cores that this process may use. The number changes no bit.
         members: of W, where they are known.
     """
@@ -117,7 +117,7 @@ def region_objects(
         tree = with_others(tree, others, node_shares(W, labels, number, others, threads))
         labels = node_labels(W, groups, tree, threads)
     shown = added(view_shares(W, groups, labels, number, threads), (1, number * groups.views))
-    return numbered(labels, tree, node_numbering(labels, evidence, tree), shown.reshape(number, groups.views))
+    return numbered(labels, tree, node_numbering(labels, total_weight, tree), shown.reshape(number, groups.views))
 
 
 def choose_nodes(groups: RegionGroups, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -295,11 +295,11 @@ def view_shares(
     return piece_sums(add, labels.size, (1, number * groups.views), threads)
 
 
-def node_numbering(labels: np.ndarray, evidence: np.ndarray, tree: RegionTree) -> NodeNumbers:
+def node_numbering(labels: np.ndarray, total_weight: np.ndarray, tree: RegionTree) -> NodeNumbers:
     """Which nodes are objects, and the numbers of all.
 
     Args:
-        labels: [P] i32, the smallest node of each splat. evidence: [P].
+        labels: [P] i32, the smallest node of each splat. total_weight: [P].
     """
     number, own = tree.parents.size, labels >= 0
     above = tree.lineage().T.astype(np.float64)
@@ -316,14 +316,14 @@ def node_numbering(labels: np.ndarray, evidence: np.ndarray, tree: RegionTree) -
     for node in np.flatnonzero(kept):
         whole = parents[node]
         apart = whole < 0 or (root[whole] == NO_NODE)
-        most = apart and splats[node] >= MOST_OF_SCENE * (evidence > 0).sum() and parts[node] > 1
+        most = apart and splats[node] >= MOST_OF_SCENE * (total_weight > 0).sum() and parts[node] > 1
         root[node] = NO_NODE if most else node if apart else root[whole]
     objects = np.where(kept, root, NO_NODE)
     of_object = np.append(objects[same], NO_NODE)[labels]  # -1 is the place after the last node
-    sums = np.bincount(of_object[of_object >= 0], evidence[of_object >= 0], number)
+    sums = np.bincount(of_object[of_object >= 0], total_weight[of_object >= 0], number)
     first = np.argsort(-sums, kind="stable")
     first = first[(objects == np.arange(number))[first]]
-    whole = above @ np.bincount(labels[own], evidence[own], number)
+    whole = above @ np.bincount(labels[own], total_weight[own], number)
     later = np.argsort(-whole, kind="stable")
     order = np.concatenate([first, later[(kept & (objects != np.arange(number)))[later]]])
     place = np.full(number + 1, NO_NODE, np.int32)

@@ -6,7 +6,7 @@ With e_m the direction of region m (`liftcore.solve.directions`), its weight in 
     r_jv = sum of W_jn e_n over the regions n of all other views,     c = sum W c_jm / sum W over the scene
 
 ``p_jv`` is the share of view v in the weight of splat j, and ``s_j`` gives the splat its old sum of weights back, so
-denominators, ``seen`` and evidence stay what they were. A further step takes r and p from the weights of the step
+denominators, ``seen`` and total weight stay what they were. A further step takes r and p from the weights of the step
 before, and starts from the first W again. Nothing is tuned; each part has its reason:
 
 - **The other views judge, never the region itself.** A region's vector is noisy, and the noise of a heavy region

@@ -1,6 +1,6 @@
 """Features that know their neighbours: Tikhonov's regularisation, carried from each splat to the scene.
 
-After the closed form, X0, with evidence D, confidence c and affinities a_jk (`liftcore.scene.neighbours`)::
+After the closed form, X0, with total weight D, confidence c and affinities a_jk (`liftcore.scene.neighbours`)::
 
     min over X of  sum_j w_j |x_j - x0_j|^2  +  lambda sum_jk a_jk sqrt(w_j w_k) |x_j - x_k|^2,   each pair once
     w_j = D_j max(c_j, 0.02)
@@ -15,7 +15,7 @@ and with alpha and beta known it is one pass over the graph, by blocks of channe
 Every sum has a fixed order, so that the number of threads changes no bit. The solution
 is a mean of X0's rows, so no channel of it leaves the range of X0's; nor does what is delivered.
 
-A splat without evidence has no term of its own. It takes the limit of the solution for w_j towards zero, the mean of
+A splat without weight has no term of its own. It takes the limit of the solution for w_j towards zero, the mean of
 its neighbours by ``a_jk sqrt(w_k)``, and those behind it the mean of these, ring by ring.
 """
 
@@ -42,7 +42,7 @@ from liftcore.scene.splats import Splats
 from liftcore.solve.smooth_on_card import SmoothingSystem
 
 LEAST_CONFIDENCE = 0.02  # that a splat counts by: one view alone says something, too
-LEAST_WEIGHT = 1e-30  # of the largest; a splat below it has no evidence
+LEAST_WEIGHT = 1e-30  # of the largest; a splat below it has no total weight
 BLOCK = 8 * LANES  # channels solved at a time: three [P, 64] f32
 ROWS = 1 << 13  # splats of one piece of work
 PROBES = LANES  # random sums of all channels, by which steps are found
@@ -59,10 +59,10 @@ class _System:
     """The matrix of the minimum, ``diag(w) + lambda L``, with rows in the graph's order."""
 
     graph: SplatGraph
-    weights: np.ndarray  # [P] f32, w over its largest value; zero without evidence
+    weights: np.ndarray  # [P] f32, w over its largest value; zero without weight
     couplings: np.ndarray  # [E] f32, lambda a_jk sqrt(w_j w_k)
     diagonal: np.ndarray  # [P] f32, w and the sum of a row's couplings
-    inverse: np.ndarray  # [P] f32, of the diagonal; zero without evidence
+    inverse: np.ndarray  # [P] f32, of the diagonal; zero without weight
     tolerance: float  # of the gradient, relative to that at X0
 
     @classmethod
@@ -92,7 +92,7 @@ class _System:
 def smooth(
     X: Tensor,
     graph: SplatGraph,
-    evidence: Tensor,
+    total_weight: Tensor,
     confidence: Tensor | None,
     seen: Tensor,
     smoothness: float,
@@ -106,7 +106,7 @@ def smooth(
     Args:
         X: [P, F] f16 or f32 on the CPU, changed in place.
         graph: of the P splats that were lifted.
-        evidence: [P] f32, sums of plain weights. confidence: [P] f32; None counts as one everywhere.
+        total_weight: [P] f32, sums of plain weights. confidence: [P] f32; None counts as one everywhere.
         seen: [P] bool, the splats whose row of X was solved for; the others take their neighbours' features.
         smoothness: lambda; zero leaves X as it is.
         threads: None takes the cores that this process may use. The number changes no bit.
@@ -115,13 +115,13 @@ def smooth(
     Returns:
         X, and its facts for the diagnostics: ``smoothness``, the ``steps``, the ``residual`` (the preconditioned
         gradient's length over that at X0, of the probes), ``moved`` (the root of
-        ``sum_j w_j |x_j - x0_j|^2 / sum_j w_j |x0_j|^2``), ``filled``, the splats without evidence that took a
+        ``sum_j w_j |x_j - x0_j|^2 / sum_j w_j |x0_j|^2``), ``filled``, the splats without weight that took a
         feature, and whether ``colours`` counted.
     """
-    weights = smoothing_weights(torch.where(seen, evidence, 0.0), confidence)[graph.order]
+    weights = smoothing_weights(torch.where(seen, total_weight, 0.0), confidence)[graph.order]
     rings = _rings(graph, weights) if smoothness else []
     system = _System.of(graph, weights, smoothness)
-    has_evidence, has_feature = weights > 0, weights > 0
+    has_weight, has_feature = weights > 0, weights > 0
     for rows, _ in rings:
         has_feature[rows] = True
     count, channels = X.shape
@@ -129,8 +129,8 @@ def smooth(
     card = None if device.kind == "cpu" else system.on_card(device.place)
     block = BLOCK if card is None else min(card.channels, channels)
     with ThreadPoolExecutor(threads or cores()) as pool:
-        if smoothness and has_evidence.any():
-            _, steps, residual = _conjugate_gradients(system, _probe(X, graph.order, has_evidence, pool), pool)
+        if smoothness and has_weight.any():
+            _, steps, residual = _conjugate_gradients(system, _probe(X, graph.order, has_weight, pool), pool)
             staged = torch.empty(count, block, dtype=X.dtype)  # a block in the graph's order, in X's dtype
             source, target = _in_words(X, staged)
             values, *iterates = (np.zeros((count, block), np.float32) for _ in range(3 if card is None else 1))
@@ -142,7 +142,7 @@ def smooth(
                     take_rows(rows.start, rows.stop, graph.order, source, begin // block * target.shape[1], target)
                     torch.from_numpy(values[rows, :width]).copy_(staged[rows, :width])
                     low, high = np.full(width, np.inf, np.float32), np.full(width, -np.inf, np.float32)
-                    bound_rows(rows.start, rows.stop, has_evidence, values, low, high)
+                    bound_rows(rows.start, rows.stop, has_weight, values, low, high)
                     for iterate in iterates:
                         iterate[rows] = values[rows]
                     return low, high
@@ -192,7 +192,7 @@ def smooth_channels(
 ) -> np.ndarray:
     """Smooth features [P, C] f32 with weights [P] f64 up to one, in the graph's order, as well as comparisons need.
 
-    Splats without evidence come back as zeros.
+    Splats without weight come back as zeros.
     """
     known = np.zeros((len(values), -(-values.shape[1] // LANES) * LANES), np.float32)
     np.copyto(known[:, : values.shape[1]], values, where=weights[:, None] > 0)
@@ -208,9 +208,9 @@ def warm_up_smoothing() -> None:
         smooth(X, graph, ones, None, ones > 0, 1.0, threads=1)
 
 
-def smoothing_weights(evidence: Tensor, confidence: Tensor | None) -> np.ndarray:
-    """[P] f64, w over its largest value: zero where a splat has no evidence."""
-    weights = evidence.double()
+def smoothing_weights(total_weight: Tensor, confidence: Tensor | None) -> np.ndarray:
+    """[P] f64, w over its largest value: zero where a splat has no total weight."""
+    weights = total_weight.double()
     if confidence is not None:
         weights *= confidence.double().clamp_min(LEAST_CONFIDENCE)
     values = weights.nan_to_num(0.0).numpy()
@@ -220,7 +220,7 @@ def smoothing_weights(evidence: Tensor, confidence: Tensor | None) -> np.ndarray
 
 
 def _rings(graph: SplatGraph, weights: np.ndarray) -> list[tuple[np.ndarray, Any]]:
-    """Rows without evidence, ring by ring from those that have some, with what they take of rows that have a feature.
+    """Rows without weight, ring by ring from those that have some, with what they take of rows that have a feature.
 
     Args:
         weights: [P] f64, in the graph's order.
@@ -416,10 +416,10 @@ def put_rows(first, last, order, has_feature, source, begin, target):
 
 
 @kernel
-def bound_rows(first, last, has_evidence, values, low, high):
-    """Set rows first..last without evidence to zero; widen low and high [C] f32 by the others. NaN stays NaN."""
+def bound_rows(first, last, has_weight, values, low, high):
+    """Set rows first..last without weight to zero; widen low and high [C] f32 by the others. NaN stays NaN."""
     for j in range(first, last):
-        if not has_evidence[j]:
+        if not has_weight[j]:
             values[j] = 0.0
             continue
         for c in range(low.size):

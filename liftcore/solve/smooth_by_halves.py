@@ -20,7 +20,7 @@ of the same splats, so it is the difference splat by splat that says how sure it
   which of them is the nearest is noise, and tells nothing: smoothing may change it freely.
 - **By how clearly.** At edges rays mix what they meet, in both halves alike. What smoothing puts right there would
   count against it.
-- **Each splat once.** By evidence, large things in front would decide for small ones.
+- **Each splat once.** By total weight, large things in front would decide for small ones.
 
 Lambda grows by steps of about 3, between which figures change little. Patches of the scene, SPLATS in all, stand for
 it: what a lambda does to a splat, its neighbourhood decides.
@@ -146,9 +146,9 @@ def choose_smoothness(
 
 
 def _rows_of(W: RegionWeights, rows: Tensor) -> RegionWeights:
-    """W of some splats [n] i64, a row each in their order; without evidence."""
+    """W of some splats [n] i64, a row each in their order; without weight."""
     starts, entries = W.take(rows)
-    none = W.evidence_splats[:0], W.evidence[:0]
+    none = W.total_weight_splats[:0], W.total_weight[:0]
     every = torch.arange(len(rows), dtype=torch.int32)
     return RegionWeights(every, starts, W.region[entries], W.weight[entries], *none, W.offsets)
 

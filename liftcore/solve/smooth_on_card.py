@@ -23,7 +23,7 @@ class SmoothingSystem:
     neighbours: Tensor  # [E] i64, rows
     couplings: Tensor  # [E] f64, lambda a_jk sqrt(w_j w_k)
     weights: Tensor  # [P] f64, w
-    inverse: Tensor  # [P] f64, of the diagonal; zero without evidence
+    inverse: Tensor  # [P] f64, of the diagonal; zero without weight
 
     @property
     def channels(self) -> int:

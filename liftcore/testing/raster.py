@@ -61,7 +61,7 @@ def check_region_weights(
     params: CompositingParams,
     weighting: Weighting,
 ) -> None:
-    """Hold W and the evidence of a view to the oracle, where no ray lies at a cut-off.
+    """Hold W and the total weight of a view to the oracle, where no ray lies at a cut-off.
 
     Args:
         weighting: a power of all weights.
@@ -71,10 +71,10 @@ def check_region_weights(
     plain = dense_view(splats, camera, replace(params, opacity_logit_scale=1.0))
     if plain.cut.any():
         return
-    evidence = np.zeros(splats.count)
-    evidence[weights.evidence_splats.numpy()] = weights.evidence.numpy()
+    total_weight = np.zeros(splats.count)
+    total_weight[weights.total_weight_splats.numpy()] = weights.total_weight.numpy()
     expected = plain.A[walked].sum(axis=0)  # whatever the gain and the power
-    assert np.abs(evidence - expected).max() < INSIDE * max(1.0, expected.max())
+    assert np.abs(total_weight - expected).max() < INSIDE * max(1.0, expected.max())
     view = dense_view(splats, camera, params)
     if view.cut.any():
         return

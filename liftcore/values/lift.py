@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 from pydantic import AfterValidator, BaseModel, ConfigDict, field_validator
 
 from liftcore.errors import InvalidSplats
+from liftcore.runtime.aliases import deprecated_names
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.origin import FILE_ORIGIN, Origin
 from liftcore.scene.views import composed
 from liftcore.scene.world import UNKNOWN, WorldFrame
 from liftcore.text.table import TableEncoder, own_words
-from liftcore.values.lift_file import NODE_TENSORS
+from liftcore.values.lift_file import FORMAT, NODE_TENSORS, OLD_TENSORS
 from liftcore.values.settings import LiftSettings
 
 if TYPE_CHECKING:
@@ -26,8 +27,6 @@ if TYPE_CHECKING:
     from liftcore.scene.rows import Rows
     from liftcore.scene.similarity import Numbers
     from liftcore.scene.splats import Splats
-
-FORMAT = "splatlift-lift/1"
 
 
 class InputFile(BaseModel):
@@ -83,13 +82,14 @@ class LiftMetadata(BaseModel):
         return defaults | told if isinstance(told, dict) else told
 
 
+@deprecated_names(**OLD_TENSORS)
 @dataclass(frozen=True)
 class Lift:
     """X and what supports it, one row a splat, in the splats' order."""
 
     features: Tensor
     """[P, F] f16 or f32; zero rows where not seen"""
-    evidence: Tensor
+    total_weight: Tensor
     """[P] f32, sum of plain weights w over the feature views, each ray once"""
     agreement: Tensor
     """[P] f32 in 0..1, norm of the mean of unit regions or cells; says little of being right"""
@@ -160,7 +160,7 @@ class Lift:
         from liftcore.scene.rows import chosen_rows
 
         rows = chosen_rows(keep, len(self)).to(self.features.device)
-        names = ("features", "evidence", "agreement", "seen", "confidence", "cluster", "object")
+        names = ("features", "total_weight", "agreement", "seen", "confidence", "cluster", "object")
         given = {name: getattr(self, name) for name in names}
         columns = {name: column[rows] for name, column in given.items() if column is not None}
         for labels, table in (("cluster", "cluster_features"), ("object", "object_views")):
@@ -190,7 +190,7 @@ class Lift:
     ) -> Self:
         """The lift of splats that were moved alike (`Splats.transformed`), ``p' = scale R p + translation``.
 
-        Features, evidence and objects know no frame and stay. What it remembers of places moves along; it forgets
+        Features, total weight and objects know no frame and stay. What it remembers of places moves along; it forgets
         the files of its splats and cameras, which are in the frame of before.
 
         Raises:

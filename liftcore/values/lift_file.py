@@ -1,6 +1,6 @@
 """The lift file: features on splats, with all that is needed to trust and to use them.
 
-A ``.safetensors`` file holds ``features`` [P, F], ``evidence`` [P], ``agreement`` [P] and ``seen`` [P]. After
+A ``.safetensors`` file holds ``features`` [P, F], ``total_weight`` [P], ``agreement`` [P] and ``seen`` [P]. After
 reweighting it has ``confidence`` [P] f32, which tells right splats from wrong ones, as agreement does not; after
 Post-Lifting Aggregation ``cluster`` [P] i32, -1 for splats in none, and ``cluster_features`` [K, F]; where objects
 were looked for ``object`` [P] i32, -1 for none, and ``object_views`` [N, 5] i32, and of the tree of objects, parts
@@ -13,6 +13,7 @@ large for one file is a folder of shards with the same tensors (`liftcore.io.sha
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import re
 import unicodedata
@@ -28,6 +29,7 @@ from liftcore.io.kinds import wrong_kind
 from liftcore.io.remote import landing, local_path
 from liftcore.io.safetensors_file import map_tensors
 from liftcore.io.shards import INDEX, SUFFIX, map_shards, write_shards
+from liftcore.runtime.aliases import current_names
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -37,7 +39,10 @@ if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera
     from liftcore.values.lift import InputFile, Lift, LiftMetadata
 
-TENSORS = ("features", "evidence", "agreement", "seen")
+FORMAT = "splatlift-lift/2"
+FORMATS = ("splatlift-lift/1", FORMAT)  # that are read
+TENSORS = ("features", "total_weight", "agreement", "seen")
+OLD_TENSORS = {"evidence": "total_weight"}  # of files of splatlift-lift/1: new names by old ones
 CONFIDENCE = "confidence"  # in lifts that were reweighted
 NEAR = 3  # folders of an input's path, and above a lift, among which it is looked for
 MOST_BESIDE = 16  # files of one kind beside a lift, that are read to know one of them
@@ -93,8 +98,8 @@ def open_lift(path: Path | str) -> Lift:
 
     from liftcore.values.lift import Lift
 
-    arrays, told = read_lift(path)
-    metadata = parse_metadata(told, path)
+    arrays, text = read_lift(path)
+    metadata = parse_metadata(text, path)
     return Lift(**{name: torch.from_numpy(array) for name, array in arrays.items()}, metadata=metadata)
 
 
@@ -115,11 +120,13 @@ def _read_arrays(source: Path, path: Path | str) -> tuple[dict[str, np.ndarray],
     from safetensors import SafetensorError
 
     try:
-        tensors, told = map_shards(source) if (source / INDEX).is_file() else map_tensors(source)
-        if "splatlift" not in told:
+        tensors, header = map_shards(source) if (source / INDEX).is_file() else map_tensors(source)
+        if "splatlift" not in header:
             raise InvalidLift(str(path), expected="a lift file", got="safetensors without lift metadata")
+        tensors = current_names(tensors, OLD_TENSORS, InvalidLift)
         missing = [name for name in TENSORS if name not in tensors]
         if missing:
+            _check_format(header["splatlift"], path)
             raise ValueError(f"no {missing[0]} in it")
         arrays = {name: tensors[name] for name in ALL if name in tensors}
     except FileNotFoundError as error:
@@ -129,10 +136,10 @@ def _read_arrays(source: Path, path: Path | str) -> tuple[dict[str, np.ndarray],
     except (SafetensorError, OSError, ValueError) as error:
         raise _no_lift(path, error) from None
     _check_shapes(arrays, path)
-    return arrays, told["splatlift"]
+    return arrays, header["splatlift"]
 
 
-def parse_metadata(told: str, path: Path | str) -> LiftMetadata:
+def parse_metadata(text: str, path: Path | str) -> LiftMetadata:
     """The metadata of a lift file from its JSON.
 
     Raises:
@@ -141,9 +148,23 @@ def parse_metadata(told: str, path: Path | str) -> LiftMetadata:
     from liftcore.values.lift import LiftMetadata
 
     try:
-        return LiftMetadata.model_validate_json(told)
+        _check_format(text, path)
+        return LiftMetadata.model_validate_json(text)
     except ValueError as error:  # pydantic's
         raise _no_lift(path, error) from None
+
+
+def _check_format(text: str, path: Path | str) -> None:
+    """Refuse the metadata of a lift of a later format.
+
+    Raises:
+        InvalidLift: their format is another. ValueError: they are no JSON.
+    """
+    metadata = json.loads(text)
+    name = metadata.get("format", FORMAT) if isinstance(metadata, dict) else FORMAT
+    if name not in FORMATS:
+        hint = "install the version of splatlift that wrote it, or a later one"
+        raise InvalidLift(str(path), expected=f"a lift of {' or '.join(FORMATS)}", got=repr(name)[:80], hint=hint)
 
 
 def _no_lift(path: Path | str, error: Exception) -> InvalidLift:
@@ -155,7 +176,7 @@ def _check_shapes(arrays: dict[str, np.ndarray], path: Path | str) -> None:
     features = arrays["features"]
     rows = features.shape[:1]
     fits = features.ndim == 2 and features.dtype in (np.float16, np.float32) and features.size
-    columns = (("evidence", np.float32), ("agreement", np.float32), ("seen", np.bool_))
+    columns = (("total_weight", np.float32), ("agreement", np.float32), ("seen", np.bool_))
     columns += ((CONFIDENCE, np.float32),) if CONFIDENCE in arrays else ()
     if not fits or any(arrays[name].shape != rows or arrays[name].dtype != dtype for name, dtype in columns):
         shapes = {name: list(arrays[name].shape) for name in TENSORS}

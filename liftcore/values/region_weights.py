@@ -18,22 +18,26 @@ from torch import Tensor
 
 from liftcore.errors import InvalidInput, Unavailable
 from liftcore.io.safetensors_file import map_tensors, write_tensors
+from liftcore.runtime.aliases import current_names, deprecated_names
 from liftcore.runtime.cores import cores
 from liftcore.runtime.device import out_of_memory
 from liftcore.runtime.memory import zeros
 from liftcore.runtime.one_line import one_line
 from liftcore.runtime.one_thread import one_thread
 
-FORMAT = "splatlift-weights/1"
+FORMAT = "splatlift-weights/2"
+OLD_FORMAT = "splatlift-weights/1"  # with other names of tensors
+OLD_TENSORS = {"evidence": "total_weight", "evidence_splats": "total_weight_splats"}
 MEMORY_LIMIT = 1 << 28  # bytes of W that stay in memory; what is beyond lies in mapped files
 MOST_REGIONS = 2**31 - 1  # of all views: an entry names its region in four bytes
 BLOCK_ENTRIES = 1 << 17  # that a thread works on at a time, unless a splat alone has more
 BLOCK_ROWS = 1 << 11
 
 
+@deprecated_names(**OLD_TENSORS)
 @dataclass(frozen=True)
 class RegionWeights:
-    """``W = A'^T S`` of one view or of many, CSR by splat, and the evidence ``A^T 1``.
+    """``W = A'^T S`` of one view or of many, CSR by splat, and the total weight ``A^T 1``.
 
     ``A'`` holds the weights that the settings select, to their power; for all of them at power 1 it is A. Features of
     any encoder for the same regions are ``D^-1 W E`` with D the sums of rows. W of several views has a row for every
@@ -49,9 +53,9 @@ class RegionWeights:
     """[nnz] i32 ascending in a row: view v's region m, or cell of a grid, is offsets[v] + m"""
     weight: Tensor
     """[nnz] f32, sums over rays of the selected w^p times the reading S"""
-    evidence_splats: Tensor
+    total_weight_splats: Tensor
     """[m] i32 ascending, the splats that any ray met, labelled or not"""
-    evidence: Tensor
+    total_weight: Tensor
     """[m] f32, sum of plain weights w (opacity_logit_scale 1, power 1), each ray once"""
     offsets: Tensor
     """[V + 1] i64, on the CPU: the first region of each view, and how many there are in all"""
@@ -123,10 +127,10 @@ class RegionWeights:
         return starts, entries
 
     def of_splats(self, first: int, last: int) -> Self:
-        """W and evidence of the splats ``first..last`` alone, counted from ``first`` on; a copy."""
+        """W and total weight of the splats ``first..last`` alone, counted from ``first`` on; a copy."""
         bounds = torch.tensor([first, last], dtype=torch.int32, device=self.device)
         begin, end = torch.searchsorted(self.splats, bounds).tolist()
-        met_begin, met_end = torch.searchsorted(self.evidence_splats, bounds).tolist()
+        met_begin, met_end = torch.searchsorted(self.total_weight_splats, bounds).tolist()
         starts = self.indptr[begin : end + 1]
         own = slice(int(starts[0]), int(starts[-1]))
         return replace(
@@ -135,8 +139,8 @@ class RegionWeights:
             indptr=starts - own.start,
             region=self.region[own].clone(),
             weight=self.weight[own].clone(),
-            evidence_splats=self.evidence_splats[met_begin:met_end] - first,
-            evidence=self.evidence[met_begin:met_end].clone(),
+            total_weight_splats=self.total_weight_splats[met_begin:met_end] - first,
+            total_weight=self.total_weight[met_begin:met_end].clone(),
         )
 
     def runs(self, starts: Tensor, region: Tensor) -> tuple[Tensor, Tensor]:
@@ -197,7 +201,8 @@ class RegionWeights:
             arrays, metadata = map_tensors(Path(path))
         except (OSError, ValueError, SafetensorError) as error:
             raise InvalidInput("weights", expected=f"a file of {FORMAT}", got=str(error), hint=hint) from None
-        if metadata.get("format") != FORMAT or not set(names) <= arrays.keys():
+        arrays = current_names(arrays, OLD_TENSORS)
+        if metadata.get("format") not in (FORMAT, OLD_FORMAT) or not set(names) <= arrays.keys():
             raise InvalidInput("weights", expected=f"a file of {FORMAT}", got="another safetensors file", hint=hint)
         tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
         others = {name: tensor for name, tensor in tensors.items() if name not in names}
@@ -206,17 +211,17 @@ class RegionWeights:
 
 
 def one_view(
-    splats: Tensor, indptr: Tensor, region: Tensor, weight: Tensor, evidence_splats: Tensor, evidence: Tensor,
+    splats: Tensor, indptr: Tensor, region: Tensor, weight: Tensor, total_weight_splats: Tensor, total_weight: Tensor,
     *, regions: int,
 ) -> RegionWeights:  # fmt: skip
     """W of a view of so many regions, as a raster finds it. See `RegionWeights`."""
     offsets = torch.tensor([0, regions])
-    return RegionWeights(splats, indptr, region, weight, evidence_splats, evidence, offsets)
+    return RegionWeights(splats, indptr, region, weight, total_weight_splats, total_weight, offsets)
 
 
 @one_thread()
 def stacked(parts: Sequence[RegionWeights], splats: int, threads: int | None = None) -> RegionWeights:
-    """W of all views of the parts, in their order, with a row for every splat; evidence is added up.
+    """W of all views of the parts, in their order, with a row for every splat; total weight is added up.
 
     The result lies where all parts lie if there is room, else on the CPU: in memory, or in mapped files beyond
     MEMORY_LIMIT.
@@ -244,10 +249,10 @@ def _stacked(parts: Sequence[RegionWeights], splats: int, threads: int | None) -
     places = {part.device for part in parts}
     place = places.pop() if len(places) == 1 else torch.device("cpu")
     lengths = torch.zeros(splats, dtype=torch.int64, device=place)
-    evidence = torch.zeros(splats, dtype=torch.float64, device=place)
+    total_weight = torch.zeros(splats, dtype=torch.float64, device=place)
     for part in parts:  # whose splats are different ones, so that no two threads of a device add to one
         lengths.index_add_(0, part.splats.to(place), part.indptr.diff().to(place))
-        evidence.index_add_(0, part.evidence_splats.to(place), part.evidence.to(place).double())
+        total_weight.index_add_(0, part.total_weight_splats.to(place), part.total_weight.to(place).double())
     indptr = from_zero(lengths)
     total = int(indptr[-1])
     made = []
@@ -279,12 +284,12 @@ def _stacked(parts: Sequence[RegionWeights], splats: int, threads: int | None) -
     if place.type == "cpu":
         ranges = row_blocks(lengths.numpy(), max(splats, 1), max(1 << 20, total >> 5))  # each asks every view
     run_each(fill, ranges, threads)
-    met = torch.nonzero(evidence)[:, 0]
+    met = torch.nonzero(total_weight)[:, 0]
     own = [part.offsets[1:] + base for part, base in zip(parts, bases, strict=False)]
     offsets = torch.cat([torch.zeros(1, dtype=torch.int64), *own])
     names = tuple(name for part in parts for name in part.views)
     every = torch.arange(splats, dtype=torch.int32, device=place)
-    return RegionWeights(every, indptr, region, weight, met.int(), evidence[met].float(), offsets, names)
+    return RegionWeights(every, indptr, region, weight, met.int(), total_weight[met].float(), offsets, names)
 
 
 def row_blocks(lengths: np.ndarray, rows: int, entries: int) -> list[tuple[int, int]]:

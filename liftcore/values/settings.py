@@ -164,7 +164,10 @@ class LiftSettings(Shown):
         "false. The lift's metadata have what was used, and every answer uses the same",
     )
     stride: int = Field(
-        1, ge=1, le=64, description="lift from every n-th pixel in x and in y; the evidence is scaled to all pixels"
+        1,
+        ge=1,
+        le=64,
+        description="lift from every n-th pixel in x and in y; the total weight is scaled to all pixels",
     )
     view_stride: int = Field(1, ge=1, description="lift from every n-th view by name, from the first on")
     coverage: int = Field(

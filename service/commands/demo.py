@@ -189,7 +189,7 @@ class Finding:
 
     phrase: str
     there: bool | None  # True if the scene has it; None: unknown or uncertain
-    why: str  # the evidence for `there`
+    why: str  # the total weight for `there`
     object: str | None  # name of the object that the masks show most, if names are known
     splats: int  # selected
     score: float  # the best cosine

@@ -234,7 +234,7 @@ def test_broken_lift_files_are_refused(client: TestClient, lift: dict[str, Any],
     endless[-1, -1] = np.inf
     fewer = {name: values[:-1] for name, values in tensors.items()}
     empty = {"object": np.full(lift["count"], -1, np.int32), "object_views": np.zeros((1, 5), np.int32)}
-    short = {"evidence": tensors["evidence"][1:]}
+    short = {"total_weight": tensors["total_weight"][1:]}
     for type_ in (refused(features=endless), refused(**short), refused(**fewer), refused(**empty)):
         assert type_ == "/problems/invalid-lift"
     more = '"certificate":{"x":"' + "y" * 70_000 + '",'

@@ -176,24 +176,24 @@ def conditioning(folder: Path, every: int) -> Rows:
     """
     splats, cameras = read_scene(folder)
     raster, views = CpuRaster(splats), list(cameras.values())[::every]
-    evidence = np.asarray(rays_of(raster, views, 1.0).sum(axis=0)).ravel()
-    chosen = neighbourhood(splats.means, evidence)
+    total_weight = np.asarray(rays_of(raster, views, 1.0).sum(axis=0)).ravel()
+    chosen = neighbourhood(splats.means, total_weight)
     for gain in (0.5, 0.8, 1.0, 1.2, 1.5, 2.0, 4.0, 8.0):
-        yield {"gain": gain, **conditions(rays_of(raster, views, gain), evidence, chosen)}
+        yield {"gain": gain, **conditions(rays_of(raster, views, gain), total_weight, chosen)}
 
 
-def conditions(A: csr_array, evidence: np.ndarray, chosen: np.ndarray) -> dict[str, float]:
-    """The figures of `conditioning` for A [R, P], evidence [P] and the splats ``chosen`` whose spectrum is taken."""
-    met, found = evidence > 0, {}
+def conditions(A: csr_array, total_weight: np.ndarray, chosen: np.ndarray) -> dict[str, float]:
+    """The figures of `conditioning` for A [R, P], total weight [P] and the splats ``chosen`` of the spectrum."""
+    met, found = total_weight > 0, {}
     for power, key in ((1, "w"), (2, "w2")):
         C = A if power == 1 else A.multiply(A).tocsr()
-        own, total = np.asarray(A.multiply(C).sum(axis=0)).ravel(), C.T @ (A @ np.ones(len(evidence)))
+        own, total = np.asarray(A.multiply(C).sum(axis=0)).ravel(), C.T @ (A @ np.ones(len(total_weight)))
         shares = np.divide(own, total, out=np.zeros_like(own), where=total > 0)
         G = (C[:, chosen].T @ C[:, chosen]).toarray()
         visible = np.diag(G) > 1e-24
         scale = 1 / np.sqrt(np.diag(G)[visible])
         values = np.linalg.eigvalsh(G[np.ix_(visible, visible)] * scale[:, None] * scale)
-        found[f"own_share_{key}"] = float(np.average(shares, weights=evidence))
+        found[f"own_share_{key}"] = float(np.average(shares, weights=total_weight))
         found[f"cond_{key}"] = float(values[-1] / max(values[0], 1e-16 * values[-1]))
         if power == 1:
             found["dominant"] = float((shares[met] > 0.5).mean())
@@ -213,10 +213,10 @@ def rays_of(raster: CpuRaster, views: Sequence[lc.Camera], gain: float) -> csr_a
     return csr_array(vstack(parts))
 
 
-def neighbourhood(means: Tensor, evidence: np.ndarray) -> np.ndarray:
-    """[n] i64 ascending: the splats nearest to the heaviest one, among those with evidence over a half."""
-    heavy, places = np.flatnonzero(evidence > 0.5), means.double().numpy()
-    far = np.linalg.norm(places[heavy] - places[np.argmax(evidence)], axis=1)
+def neighbourhood(means: Tensor, total_weight: np.ndarray) -> np.ndarray:
+    """[n] i64 ascending: the splats nearest to the heaviest one, among those with total weight over a half."""
+    heavy, places = np.flatnonzero(total_weight > 0.5), means.double().numpy()
+    far = np.linalg.norm(places[heavy] - places[np.argmax(total_weight)], axis=1)
     return np.sort(heavy[np.argsort(far, kind="stable")[:NEIGHBOURS]])
 
 

@@ -91,7 +91,7 @@ def exact_view(splats: lc.Splats, camera: lc.Camera, walk: lc.CompositingParams)
 def weights_of(
     splats: lc.Splats, camera: lc.Camera, walk: lc.CompositingParams, power: int = 1
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A^p [H * W, P] and the evidence [P], through region weights with one region a pixel."""
+    """A^p [H * W, P] and the total weight [P], through region weights with one region a pixel."""
     rays = camera.width * camera.height
     labels = torch.arange(rays, dtype=torch.int32).reshape(1, camera.height, camera.width)
     every_ray = lc.Regions(labels, torch.ones(rays, 1))
@@ -99,9 +99,9 @@ def weights_of(
     A = np.zeros((rays, splats.count))
     rows = np.repeat(got.splats.numpy(), np.diff(got.indptr.numpy()))
     A[got.region.numpy(), rows] = got.weight.numpy()
-    evidence = np.zeros(splats.count)
-    evidence[got.evidence_splats.numpy()] = got.evidence.numpy()
-    return A, evidence
+    total_weight = np.zeros(splats.count)
+    total_weight[got.total_weight_splats.numpy()] = got.total_weight.numpy()
+    return A, total_weight
 
 
 def traced(splats: lc.Splats, camera: lc.Camera, walk: lc.CompositingParams) -> np.ndarray:
@@ -115,10 +115,10 @@ def traced(splats: lc.Splats, camera: lc.Camera, walk: lc.CompositingParams) -> 
 
 
 def compare(splats: lc.Splats, camera: lc.Camera, walk: lc.CompositingParams | None = None) -> Comparison:
-    """A by region weights, by single rays and squared, the row sums and the evidence, against the oracle."""
+    """A by region weights, by single rays and squared, the row sums and the total weight, against the oracle."""
     walk = walk or lc.CompositingParams()
     exact = exact_view(splats, camera, walk)
-    weights, evidence = weights_of(splats, camera, walk)
+    weights, total_weight = weights_of(splats, camera, walk)
     single, squares = traced(splats, camera, walk), weights_of(splats, camera, walk, power=2)[0]
     sums = CpuRaster(splats, threads=2).row_sums(camera, walk).numpy().ravel()
     errors = np.abs(np.concatenate([weights - exact.A, single - exact.A, squares - exact.A**2], axis=1)).max(axis=1)
@@ -129,8 +129,8 @@ def compare(splats: lc.Splats, camera: lc.Camera, walk: lc.CompositingParams | N
     )
     if not plain.cut.any():
         total = plain.A.sum(axis=0)
-        worst = max(worst, float((np.abs(evidence - total) / np.maximum(total, 1)).max()))
-    finite = all(bool(np.isfinite(part).all()) for part in (weights, single, squares, sums, evidence))
+        worst = max(worst, float((np.abs(total_weight - total) / np.maximum(total, 1)).max()))
+    finite = all(bool(np.isfinite(part).all()) for part in (weights, single, squares, sums, total_weight))
     flips = int((errors[exact.cut] > FLIP).sum())
     return Comparison(exact.A, weights, worst, len(errors), int(exact.cut.sum()), flips, finite)
 
@@ -241,7 +241,7 @@ def lifted(
         faint = (totals > 0) & (totals < FAINT)
         errors = np.abs(made.features.double().numpy() - X) / (longest or 1.0)
         seen = made.seen.numpy()
-        sound = all(bool(part.isfinite().all()) for part in (made.features, made.evidence, made.agreement))
+        sound = all(bool(part.isfinite().all()) for part in (made.features, made.total_weight, made.agreement))
         sound &= np.array_equal(seen[~faint], totals[~faint] > 0) and not made.features[~made.seen].any()
         sound &= survives(run(named, own, **{**(settings or {}), **EVERYTHING})[0], next(iter(named.values())))
         gives = f"{int(seen.sum())} of {own.count} seen, {str(made.features.dtype).removeprefix('torch.')}"

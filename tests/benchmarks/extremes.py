@@ -3,11 +3,11 @@
     python -m tests.benchmarks.extremes [--json]
 
 Each row is a test too (``tests/stability/test_table.py``). The error of weights is the largest difference from the
-float64 reference over all weights, their squares, the row sums and the evidence, on all rays of the view and over the
-kernels that are named; rays that float32 decided otherwise at a cut-off are counted apart. The error of a distorted
-photo is how far from a pixel, in pixels, its ray meets the photo again. The error of features is the largest
-difference from the dense closed form in float64, over the largest value of the codebook. What float32 gives is shown
-for the first kernel named. "Told" are the words of ``splatlift inspect`` and of the lift's own warnings.
+float64 reference over all weights, their squares, the row sums and the total weight, on all rays of the view and over
+the kernels that are named; rays that float32 decided otherwise at a cut-off are counted apart. The error of a
+distorted photo is how far from a pixel, in pixels, its ray meets the photo again. The error of features is the
+largest difference from the dense closed form in float64, over the largest value of the codebook. What float32 gives
+is shown for the first kernel named. "Told" are the words of ``splatlift inspect`` and of the lift's own warnings.
 """
 
 import math
@@ -426,7 +426,7 @@ MAPS: tuple[Extreme, ...] = (
     lifted("a label of 32,768, the first beyond int16", _one_pixel(LARGEST_I16 + 1, LARGEST_I16 + 2),
         kernels=GAUSSIAN, told="are read by no label"),
     lifted("a view without any label", _labelled(np.full((3, 4), -1), 2),
-        lambda made: not bool(made.seen.any()) and bool((made.evidence > 0).any()), bound=0.0,
+        lambda made: not bool(made.seen.any()) and bool((made.total_weight > 0).any()), bound=0.0,
         told="no labelled ray reached any splat"),
     lifted("a view that sees nothing beside one that does", {AWAY: checkerboard(), "v0": checkerboard()},
         lambda made: bool(made.seen.any()), told="1 of 2 views meet no splat: away"),
@@ -444,7 +444,7 @@ MAPS: tuple[Extreme, ...] = (
         lifted(f"squared weights and a gain of {gain:g}", checkerboard(), settings={"power": 2, "lift_gain": gain})
         for gain in (0.01, 8.0, 16.0)
     ),
-    lifted("weights of 1e-20, squared (DBS)", checkerboard(), lambda made: float(made.evidence[0]) < 1e-15,
+    lifted("weights of 1e-20, squared (DBS)", checkerboard(), lambda made: float(made.total_weight[0]) < 1e-15,
         splats=splats_at([(0.0, 0.0, 0.0)], 0.0, logits=-46.0, kernel=Kernel.BETA), settings={"power": 2},
         told="where float32 loses digits", kernels=BETA),
 )

@@ -89,17 +89,17 @@ def views_of(device: Device, shared: Path) -> Iterator[dict[str, Any]]:
 
 
 def beside_processor(files: Sequence[Path], device: Device) -> dict[str, Any]:
-    """The same lift on both, over splats with evidence over a half. A ray at a cut-off may fall either way."""
+    """The same lift on both, over splats with total weight over a half. A ray at a cut-off may fall either way."""
     settings = (lc.LiftSettings.of(certificate_rays=0, device=kind) for kind in ("cpu", device.kind))
     one, other = (lift_files(files[0], files[1], files[2:], each).to(CPU.place) for each in settings)
-    counted = one.evidence > 0.5
+    counted = one.total_weight > 0.5
     first, second = one.features[counted].float(), other.features[counted].float()
-    evidence = one.evidence[counted]
+    total_weight = one.total_weight[counted]
     return {
         "splats": int(counted.sum()),
         "least cosine": f"{float(cosine_similarity(first, second, dim=1).min()):.6f}",
         "largest difference / largest value": float((first - second).abs().max() / first.abs().max()),
-        "evidence, relative": float(((evidence - other.evidence[counted]).abs() / evidence).max()),
+        "total weight, relative": float(((total_weight - other.total_weight[counted]).abs() / total_weight).max()),
         "seen by one": int((one.seen != other.seen).sum()),
     }
 

@@ -10,8 +10,8 @@ together, exactly two objects are found, one in each. Table and curtain, which h
 
 ``--without-words`` judges the objects that lifts of masks hold instead, with 52, 26 and 13 views, beside HDBSCAN's
 clusters of the same lift's features: of the twelve things ``found`` by an object with an IoU of splats over .75, over
-splats with evidence over 0.5; the ``mean`` and ``worst`` of their best IoUs; ``all`` objects there are, of 14 that
-there should be with table and curtain; and what they cost, ``seconds`` of the lift's ``of``.
+splats with total weight over 0.5; the ``mean`` and ``worst`` of their best IoUs; ``all`` objects there are, of 14
+that there should be with table and curtain; and what they cost, ``seconds`` of the lift's ``of``.
 """
 
 import time
@@ -88,7 +88,7 @@ def rows_without_words(folder: Path, packs: Iterable[str], strides: Iterable[int
         made = truth.lift(read_pack(folder, pack, stride), preset="default")
         assert made.object is not None
         start = time.perf_counter()
-        clusters = cluster_splats(made.features, made.evidence.numpy(), made.settings).labels
+        clusters = cluster_splats(made.features, made.total_weight.numpy(), made.settings).labels
         spent = {"objects": made.metadata.timings["objects"], "HDBSCAN": time.perf_counter() - start}
         for by, labels in (("objects", made.object), ("HDBSCAN", clusters)):
             own = labels.numpy()[truth.counted.numpy()]

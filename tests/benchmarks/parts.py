@@ -5,9 +5,9 @@
     python -m tests.benchmarks.parts DIR --words [--every N ...] [--json]
     python -m tests.benchmarks.parts --look DIR VIEW X,Y OUT.png ...
 
-``nodes`` and ``largest`` are of the tree; ``thing`` and ``part`` the mean IoU, over splats with evidence over 0.5, of
-the best node of each true thing and part (table and curtain, which hold the things, left out), ``worst part`` the
-least. ``clicks`` are one a true part and held-out view that shows 100 pixels of it, at its innermost pixel:
+``nodes`` and ``largest`` are of the tree; ``thing`` and ``part`` the mean IoU, over splats with total weight over
+0.5, of the best node of each true thing and part (table and curtain, which hold the things, left out), ``worst part``
+the least. ``clicks`` are one a true part and held-out view that shows 100 pixels of it, at its innermost pixel:
 ``best`` is the mean mask IoU of the best candidate with the part, ``best thing`` with the thing, ``alone`` that of
 the plain answer of the same click with the part. ``agreement`` is that of levels, ``seconds`` the processor time of
 the objects stage, tree and all, of the lift's ``of`` without compilation. ``--seconds`` measures these alone, on any
@@ -15,9 +15,9 @@ scene with such a pack.
 
 ``--words`` compares three ways to score splats for a word: by ``sum``, the lift's features; by ``level``, those of
 the lift of one level alone whose best splats are nearest to the word, beside the nearest other word; by ``node``, the
-best node of each splat's path. Figures are the mean IoU of words over splats with evidence over 0.5, each at its best
-threshold. Beside the folder's things it asks those and the parts of the tests' still life under hard masks, whose
-words here share nothing, so that its levels say different things.
+best node of each splat's path. Figures are the mean IoU of words over splats with total weight over 0.5, each at its
+best threshold. Beside the folder's things it asks those and the parts of the tests' still life under hard masks,
+whose words here share nothing, so that its levels say different things.
 
 ``--look`` draws a view of a scene with the candidates of a click side by side, for eyes.
 """

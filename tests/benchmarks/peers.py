@@ -6,7 +6,7 @@ All lift ``X = (A^T B) / (A^T n)`` of a synthetic room with label maps of 4 leve
 the codebook rows that a ray's levels read, n counts them. Each starts from splats, cameras, label maps and codebooks;
 the others make an image of all channels a view first, and have our projection and tile lists, so that what differs
 is the accumulation alone. Seconds are the median of the rounds, taken in turns; a peer whose lift takes longer than
-LONG is not asked for more. Cosine: of a splat's feature with ours, the mean by evidence.
+LONG is not asked for more. Cosine: of a splat's feature with ours, the mean by total weight.
 
 - ours: region weights ``A^T S`` once a view, then the closed form for all channels.
 - dense numba: for each weight of a pixel, ``w b`` of all channels onto the splat's own, compiled.
@@ -298,7 +298,7 @@ def side_by_side(
                 start = time.perf_counter()
                 answers[name] = lift(work)
                 seconds[name].append(time.perf_counter() - start)
-    features, evidence = answers["splatlift"]
+    features, total_weight = answers["splatlift"]
     usual = statistics.median(seconds["splatlift"])
     for name, (theirs, _) in answers.items():
         median = statistics.median(seconds[name])
@@ -306,7 +306,7 @@ def side_by_side(
         yield {
             "splats": size.splats, "image": "x".join(map(str, size.size)), "views": size.views,
             "channels": size.channels, "peer": name, "seconds": median, "fastest": min(seconds[name]),
-            "times ours": median / usual, "cosine": float((cosines * evidence).sum() / evidence.sum()),
+            "times ours": median / usual, "cosine": float((cosines * total_weight).sum() / total_weight.sum()),
         }  # fmt: skip
 
 

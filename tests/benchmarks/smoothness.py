@@ -101,7 +101,7 @@ class StepInputs:
     W: RegionWeights
     levels: np.ndarray  # [M] i8
     codebook: Codebook
-    evidence: Tensor  # [P] f32
+    total_weight: Tensor  # [P] f32
     confidence: Tensor | None  # [P] f32
     seen: Tensor  # [P] bool
     scores: Tensor  # [P, K] f32, of X with the classes
@@ -121,9 +121,9 @@ class StepInputs:
             return SmoothnessChoice(0.0, {})
 
         def hold(X: Tensor, *arguments: Any, **_: Any) -> tuple[Tensor, dict[str, Any]]:
-            evidence, confidence, seen = arguments[1:4]
+            total_weight, confidence, seen = arguments[1:4]
             scores = torch.cat([rows.float() @ truth.classes.T for rows in X.split(1 << 14)])
-            parts.update(evidence=evidence, confidence=confidence, seen=seen, scores=scores)
+            parts.update(total_weight=total_weight, confidence=confidence, seen=seen, scores=scores)
             return X, {"smoothness": 0.0}
 
         with mock.patch.multiple(in_memory, weaken_edges=weaken, choose_smoothness=choose, smooth=hold):
@@ -141,7 +141,7 @@ class StepInputs:
     def judge(self, steps: Mapping[str, tuple[SplatGraph, float]]) -> dict[str, str]:
         """Figures after each step, a graph with a lambda."""
         tables = [
-            smooth(self.scores.clone(), graph, self.evidence, self.confidence, self.seen, strength)[0]
+            smooth(self.scores.clone(), graph, self.total_weight, self.confidence, self.seen, strength)[0]
             for graph, strength in steps.values()
         ]
         figures = self.truth.judge_each(tables, self.params)

@@ -43,7 +43,7 @@ def main() -> None:
             "views": len(one.metadata.views),
             "processor s": seconds[speed],
             "times less": seconds["exact"] / seconds[speed],
-            **cosine_figures(one.features, exact.features, exact.evidence),
+            **cosine_figures(one.features, exact.features, exact.total_weight),
             "expected of the views": one.metadata.certificate["plan"]["view_cosine"],
         }
         for speed, one in made.items()

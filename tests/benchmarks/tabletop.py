@@ -3,8 +3,8 @@
     python -m tests.benchmarks.tabletop DIR [--json]
 
 Each row is one lift. Splat accuracy is the share of splats whose most similar class vector is their own class, over
-the splats whose evidence from the 52 views of ``features.safetensors`` exceeds 0.5, whatever the lift. mIoU is of the
-argmax over the class scores, rendered in the held-out views with the opacity gain of the lift.
+the splats whose total weight from the 52 views of ``features.safetensors`` exceeds 0.5, whatever the lift. mIoU is of
+the argmax over the class scores, rendered in the held-out views with the opacity gain of the lift.
 """
 
 import json
@@ -113,11 +113,11 @@ def tabletop(folder: Path) -> Truth:
 
 
 def counted(splats: lc.Splats, cameras: lc.Cameras, views: Mapping[str, ViewFeatures]) -> Tensor:
-    """[P] bool: the splats with evidence over EVIDENCE_OVER in these views."""
+    """[P] bool: the splats with total weight over EVIDENCE_OVER in these views."""
     weights = lc.region_weights(splats, cameras, views, preset="row-sum")
-    evidence = torch.zeros(splats.count)
-    evidence[weights.evidence_splats.long()] = weights.evidence
-    return evidence > EVIDENCE_OVER
+    total_weight = torch.zeros(splats.count)
+    total_weight[weights.total_weight_splats.long()] = weights.total_weight
+    return total_weight > EVIDENCE_OVER
 
 
 @dataclass(frozen=True)

@@ -123,7 +123,7 @@ def test_fourteen_words_are_found_among_many(truth: Truth, usual: lc.LiftResult,
     absent = np.random.default_rng(0).choice(others, 100, replace=False).tolist()
     found = segment(scene, words + absent, encoder.encode(words + absent))
     assert {named.word for named in found.found} == set(words)
-    counted = scene.seen & (scene.evidence > 0.5)
+    counted = scene.seen & (scene.total_weight > 0.5)
     assert (found.labels == real)[counted].mean() > 0.9
     alone = segment(scene, words[:7], encoder.encode(words[:7])).labels
     assert (alone[counted & (real >= 7)] < 0).mean() > 0.5
@@ -131,7 +131,7 @@ def test_fourteen_words_are_found_among_many(truth: Truth, usual: lc.LiftResult,
 
 def test_a_thing_stays_found_when_something_else_is_not_wanted(truth: Truth, usual: lc.LiftResult) -> None:
     scene, real = truth.opened(usual), truth.objects.numpy()
-    best = [int(np.argmax(np.where(real == thing, scene.evidence, -1.0))) for thing in range(CURTAIN + 1)]
+    best = [int(np.argmax(np.where(real == thing, scene.total_weight, -1.0))) for thing in range(CURTAIN + 1)]
 
     def iou(thing: int, *unlike: int) -> float:
         """Of the splats found with those of the thing, asked by the splat of each class that was seen best."""

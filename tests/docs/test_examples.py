@@ -132,7 +132,7 @@ def test_pack_of_ones_own_program_makes_a_lift_that_python_reads(
     vertices = PlyData.read("scene.ply")["vertex"]
     positions = np.stack([vertices[axis] for axis in "xyz"], axis=1)
     assert np.array_equal(positions, read_splats(scene_folder / "scene.ply").means.numpy())
-    mask = lift["seen"] & (lift["evidence"] > 0.5)
+    mask = lift["seen"] & (lift["total_weight"] > 0.5)
     clusters = np.digitize(positions[mask, 0], [-0.6, 0.6])  # 0 apple, 1 book, 2 lamp
     assert len(set(clusters)) == 3 and np.array_equal(lift["features"][mask].argmax(axis=1), clusters)
 

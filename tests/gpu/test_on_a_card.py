@@ -62,7 +62,7 @@ def test_a_lift_on_a_card_is_the_processors(paths: list[Path], grids: bool, how:
     ours, theirs = (lifted(paths, views, device=device, **how) for device in ("cpu", "cuda"))
     assert theirs.features.is_cuda or "engine" in how, "results stay where the work was; an engine's lie in files"
     theirs = theirs.cpu()
-    for name in ("features", "evidence", "agreement"):
+    for name in ("features", "total_weight", "agreement"):
         one, other = getattr(ours, name).float(), getattr(theirs, name).float()
         assert torch.allclose(one, other, rtol=2e-3, atol=2e-3), name
     assert torch.equal(ours.seen, theirs.seen)

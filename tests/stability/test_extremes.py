@@ -22,7 +22,7 @@ DISC, BETA = Kernel.GAUSSIAN_2D, Kernel.BETA
 
 
 def assert_equals_the_oracle(splats: Splats, camera: Camera, walk: CompositingParams | None = None) -> np.ndarray:
-    """Every weight of every ray, by both ways to A, squared too, the evidence and the row sums; the oracle's A."""
+    """Every weight of every ray, by both ways to A, squared too, total weight and the row sums; the oracle's A."""
     got = compare(splats, camera, walk)
     assert got.finite
     assert got.error < WEIGHTS
@@ -33,9 +33,9 @@ def assert_equals_the_oracle(splats: Splats, camera: Camera, walk: CompositingPa
 def test_scales_beyond_all_bounds_stay_finite(kernel):
     for log_scale in (-80.0, 80.0):
         splats = splats_at(ROW, log_scales=log_scale, kernel=kernel)
-        A, evidence = weights_of(splats, camera_at_origin(), CompositingParams())
+        A, total_weight = weights_of(splats, camera_at_origin(), CompositingParams())
         assert np.isfinite(A).all()
-        assert evidence.max() > 0
+        assert total_weight.max() > 0
 
 
 def test_sums_over_a_million_rays_are_those_of_float64():
@@ -50,7 +50,7 @@ def test_sums_over_a_million_rays_are_those_of_float64():
     raster, region = CpuRaster(splats), Regions(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1))
     plain, squared = (raster.region_weights(camera, region, CompositingParams(), Weighting(n)) for n in (1, 2))
     adjoint = raster.adjoint(camera, torch.ones(side, side, 1), CompositingParams())
-    assert [float(plain.weight[0]), float(plain.evidence[0]), float(adjoint[0, 0])] == pytest.approx(3 * [total])
+    assert [float(plain.weight[0]), float(plain.total_weight[0]), float(adjoint[0, 0])] == pytest.approx(3 * [total])
     assert float(squared.weight[0]) == pytest.approx(squares)
 
 

@@ -103,7 +103,7 @@ def test_lift_of_values_has_the_bits_of_the_lift_of_files(scene, given):
     }
     expected = lift_files(splats, cameras, [pack], lc.LiftSettings.of(preset="row-sum"))
     found = lc.lift(cloud, poses, forms[given](), preset="row-sum")
-    for name in ("features", "evidence", "agreement", "seen"):
+    for name in ("features", "total_weight", "agreement", "seen"):
         assert torch.equal(getattr(found, name), getattr(expected, name))
     assert found.views == expected.views == ("v0", "v1", "v2")
     assert found.diagnostics["residual"] == pytest.approx(expected.diagnostics["residual"], rel=0.5)
@@ -432,7 +432,7 @@ def test_torch_modes_change_no_bit_and_hold_in_the_callers_iterator(scene, mode)
         answer = made.query(vectors, splats=splats)
         W, image = lc.region_weights(splats, cameras, views), lc.render(splats, cameras["v0"], values)
         tuples = lc.lift(splats, cameras, views, preset="row-sum").features
-        return made.features, made.evidence, answer.scores, W.weight, image, tuples
+        return made.features, made.total_weight, answer.scores, W.weight, image, tuples
 
     def iterator(seen):
         for name, view in views.items():

@@ -48,7 +48,7 @@ def weights_of(raster: CpuRaster, weighting: Weighting) -> list[tuple[torch.Tens
     )
     found = [raster.region_weights(CAMERA, observation, walk, weighting) for observation, walk in looks]
     return [
-        (w.splats, w.indptr, w.region, w.evidence_splats, w.weight, w.evidence) for w in found
+        (w.splats, w.indptr, w.region, w.total_weight_splats, w.weight, w.total_weight) for w in found
     ]  # what is the same, then what is summed in another order
 
 

@@ -128,9 +128,9 @@ class WeightBlock(NamedTuple):
     starts: np.ndarray  # [n + 1] i64
     region: np.ndarray  # [nnz] i32, counted from the piece's first
     weight: np.ndarray  # [nnz] f32
-    evidence_splats: np.ndarray  # [m] i32 ascending
-    evidence_starts: np.ndarray  # [m + 1] i64
-    evidence: np.ndarray  # [e] f32, of each view that meets the splat
+    total_weight_splats: np.ndarray  # [m] i32 ascending
+    total_weight_starts: np.ndarray  # [m + 1] i64
+    total_weight: np.ndarray  # [e] f32, of each view that meets the splat
 
 
 # ---- weighing
@@ -251,7 +251,7 @@ def _renumbered(view: ViewWeights, ids: Tensor) -> ViewWeights:
     """Replace the numbers of a view's splats by those of the scene."""
     weights = view.weights
     numbers = ids.to(weights.device)
-    scene_numbers = {name: numbers[getattr(weights, name).long()] for name in ("splats", "evidence_splats")}
+    scene_numbers = {name: numbers[getattr(weights, name).long()] for name in ("splats", "total_weight_splats")}
     return replace(view, weights=replace(weights, **scene_numbers))
 
 
@@ -263,7 +263,7 @@ def _write_view(path: Path, weights: RegionWeights, request: WeightRequest, rows
     tensors = {f"rays/{name}": getattr(rows, name) for name in ("indptr", "splats", "weights")}
     tensors |= {f"read/{name}": torch.from_numpy(getattr(readout, name)) for name in ("rays", "columns", "shares")}
     tensors |= {"codebook": request.codebook.rows, "levels": torch.from_numpy(request.levels)}
-    tensors["counts"] = torch.tensor([weights.region.shape[0], weights.evidence.shape[0]])
+    tensors["counts"] = torch.tensor([weights.region.shape[0], weights.total_weight.shape[0]])
     write_tensors(path, tensors | ({} if tuples is None else {"tuples": tuples}), {})
 
 
@@ -285,23 +285,28 @@ def _write_weights(job: Job, piece: int) -> None:
     parts = [RegionWeights.load(_entries_file(job, number)) for number in job.views_of(piece)]
     bases = np.cumsum([0, *(int(part.offsets[-1]) for part in parts[:-1])]).astype(np.int32)
     splats = _union([part.splats for part in parts], job.splats)
-    hit_splats = _union([part.evidence_splats for part in parts], job.splats)
+    hit_splats = _union([part.total_weight_splats for part in parts], job.splats)
 
     def entries() -> Iterator[SomeRows]:
         for part, base in zip(parts, bases, strict=True):
             values = part.region.numpy() + base, part.weight.numpy()
             yield SomeRows(np.searchsorted(splats, part.splats.numpy()), part.indptr.numpy(), values)
 
-    def evidence() -> Iterator[SomeRows]:
+    def total_weight() -> Iterator[SomeRows]:
         for part in parts:
-            rows = np.searchsorted(hit_splats, part.evidence_splats.numpy())
-            yield SomeRows(rows, np.arange(rows.size + 1), [part.evidence.numpy()])
+            rows = np.searchsorted(hit_splats, part.total_weight_splats.numpy())
+            yield SomeRows(rows, np.arange(rows.size + 1), [part.total_weight.numpy()])
 
     starts, (region, weight) = gather_rows(entries, splats.size, [torch.int32, torch.float32])
-    evidence_starts, (sums,) = gather_rows(evidence, hit_splats.size, [torch.float32])
-    tensors = {"splats": splats, "starts": starts, "evidence_splats": hit_splats, "evidence_starts": evidence_starts}
+    total_weight_starts, (sums,) = gather_rows(total_weight, hit_splats.size, [torch.float32])
+    tensors = {
+        "splats": splats,
+        "starts": starts,
+        "total_weight_splats": hit_splats,
+        "total_weight_starts": total_weight_starts,
+    }
     tensors = {name: torch.from_numpy(array) for name, array in tensors.items()}
-    write_tensors(job.weights_file(piece), tensors | {"region": region, "weight": weight, "evidence": sums}, {})
+    write_tensors(job.weights_file(piece), tensors | {"region": region, "weight": weight, "total_weight": sums}, {})
 
 
 def _union(parts: list[Tensor], count: int) -> np.ndarray:

@@ -282,9 +282,9 @@ class InBlocks(LiftSteps[Job]):
                 tree, other_masks, (part for file in _pieces(W, "labels-0") for part in unpacked(file))
             )
         self._label(W, 1, tree)
-        labels, evidence = _column(W, "labels-1", "labels"), _column(W, "rows", "evidence")
+        labels, total_weight = _column(W, "labels-1", "labels"), _column(W, "rows", "total_weight")
         weights = _sums(W, "labels-1", (1, number * groups.views))
-        numbers = node_numbering(labels, evidence, tree)
+        numbers = node_numbering(labels, total_weight, tree)
         steps.write_piece(W.folder / steps.OBJECTS, {"object": numbers.object})
         return numbered(labels, tree, numbers, weights.reshape(number, groups.views))
 
@@ -328,10 +328,10 @@ class InBlocks(LiftSteps[Job]):
     def solve(self, W: Job, clusters: RegionObjects | None) -> tuple[Tensor, SplatSupport]:
         job = _with_clusters(W, clusters)
         self.run("solve", steps.solve, job, job.splat_pieces)
-        sums, evidence = _column(job, "rows", "sums"), _column(job, "rows", "evidence")
+        sums, total_weight = _column(job, "rows", "sums"), _column(job, "rows", "total_weight")
         agreement, robust = _column(job, "columns", "agreement"), job.settings.robust_steps
         confidence = torch.from_numpy(_column(job, "columns", "confidence")) if robust else None
-        support = SplatSupport(sums, torch.from_numpy(evidence), torch.from_numpy(agreement), confidence)
+        support = SplatSupport(sums, torch.from_numpy(total_weight), torch.from_numpy(agreement), confidence)
         return _mapped(job, job.solved_file), support
 
     def refine(self, W: Job, X: Tensor, visible: np.ndarray) -> NoReturn:

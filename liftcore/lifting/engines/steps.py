@@ -6,7 +6,7 @@ them up and writes the totals as files too. So the result is bitwise identical t
 
     step      piece of   writes
     relate    views      the regions that their splats belong to, as tuples (`liftcore.solve.consensus`)
-    gather    splats     W of all views, a row a splat, its sums and evidence; the tuples of all views
+    gather    splats     W of all views, a row a splat, its sums and total weight; the tuples of all views
     contain   views      the regions that contain theirs (`liftcore.solve.objects`)
     label     splats     the object of each splat, and its weight in other regions and in views
     share     views      the consensus of other views about their entries (`liftcore.solve.consensus`)
@@ -161,7 +161,7 @@ def _view_block(job: Job, piece: int) -> ViewBlock:
 
 
 def _weights(starts: np.ndarray, region: Tensor, weight: Tensor, offsets: np.ndarray) -> RegionWeights:
-    """Make W, a row for each of ``starts``, without evidence."""
+    """Make W, a row for each of ``starts``, without weight."""
     rows, begins = torch.arange(starts.size - 1, dtype=torch.int32), torch.from_numpy(starts)
     return RegionWeights(rows, begins, region, weight, rows[:0], weight[:0], torch.from_numpy(offsets))
 
@@ -256,19 +256,19 @@ def _weight_rows(job: Job, ends: tuple[int, int]) -> Iterator[SomeRows]:
         yield SomeRows(part.rows, part.starts, [part.values[0] + base, part.values[1]])
 
 
-def _evidence(job: Job, ends: tuple[int, int]) -> Tensor:
-    """Sum the evidence of a block [n] f32 over views, in their order."""
+def _total_weight(job: Job, ends: tuple[int, int]) -> Tensor:
+    """Sum the total weight of a block [n] f32 over views, in their order."""
     sums = np.zeros(ends[1] - ends[0])
     for piece in range(job.view_pieces):
         block = read_weights(job, piece)
-        part = _part(block.evidence_splats, block.evidence_starts, (block.evidence,), ends)
+        part = _part(block.total_weight_splats, block.total_weight_starts, (block.total_weight,), ends)
         np.add.at(sums, np.repeat(part.rows, np.diff(part.starts)), part.values[0].astype(np.float64))
     return torch.from_numpy(sums).float()
 
 
 @piece_of("rows")
 def gather(job: Job, piece: int, threads: int | None) -> Piece:
-    """Write W of a block of splats in all views, its sums, evidence and tuples."""
+    """Write W of a block of splats in all views, its sums, total weight and tuples."""
     ends = first, last = _bounds(job, piece)
     starts, values = gather_rows(lambda: _weight_rows(job, ends), last - first, (torch.int32, torch.float32))
     W = _weights(starts, values[0], values[1], offsets_of(job))
@@ -281,7 +281,7 @@ def gather(job: Job, piece: int, threads: int | None) -> Piece:
     arrays = {"indptr": W.indptr, "region": W.region, "weight": W.weight, "sums": sums}
     needs_totals = job.settings.robust_steps or job.settings.objects  # these read the weight of each region
     totals = list(region_totals(W, threads)) if needs_totals else []
-    return arrays | {"evidence": _evidence(job, ends), "bounds": bounds}, totals
+    return arrays | {"total_weight": _total_weight(job, ends), "bounds": bounds}, totals
 
 
 def _gather_tuples(job: Job, piece: int, ends: tuple[int, int], totals: Tensor) -> None:
@@ -446,7 +446,7 @@ def solve(job: Job, piece: int, threads: int | None) -> None:
     parts = list[PieceSums]()
     if job.clusters:
         labels = labels_of(job, piece)
-        parts = list(cluster_sums(X, block.arrays["evidence"], labels, job.clusters, threads))
+        parts = list(cluster_sums(X, block.arrays["total_weight"], labels, job.clusters, threads))
         if settings.aggregation_guard and scores is not None:
             write_piece(job.piece_file("guard", piece), {"weight": W.weight, "consistency": scores[1]})
     write_piece(columns_file, columns, parts)

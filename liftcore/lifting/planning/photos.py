@@ -1,17 +1,17 @@
 """The order in which to encode photos, before there are features, and the coverage of the first ones.
 
-The feature that a photo will give a splat is unknown, but its weight is not: ``e_jv``, the evidence of view v in
+The feature that a photo will give a splat is unknown, but its weight is not: ``e_jv``, the total weight of view v in
 splat j, is the sum of the splat's weights on the view's rays, with occlusion. It is computed for sampled splats at
 coarse pixels.
 
-**Visible.** A view sees a splat if its evidence is at least VISIBLE_SHARE of the largest of any view. This rule needs
-no unit. It ignores light that leaks through a surface, and accepts the same view from three times the distance.
+**Visible.** A view sees a splat if its total weight is at least VISIBLE_SHARE of the largest of any view. This rule
+needs no unit. It ignores light that leaks through a surface, and accepts the same view from three times the distance.
 
-**Order.** Each next photo adds the most to ``sum_j e_j (1 - 2^-n_j)``, with e_j the evidence of all views and n_j the
-number of chosen photos that see splat j. A first photo of a splat counts a half, a second a quarter, and so on. So
-unseen splats come first, then splats of a single photo, whose errors no other photo corrects. A further photo always
-counts a little, so that the order has no arbitrary end. As it never counts more than the one before, the first N
-photos are worth at least 1 - 1/e of the best N (Nemhauser, Wolsey and Fisher 1978).
+**Order.** Each next photo adds the most to ``sum_j e_j (1 - 2^-n_j)``, with e_j the total weight of all views and n_j
+the number of chosen photos that see splat j. A first photo of a splat counts a half, a second a quarter, and so on.
+So unseen splats come first, then splats of a single photo, whose errors no other photo corrects. A further photo
+always counts a little, so that the order has no arbitrary end. As it never counts more than the one before, the first
+N photos are worth at least 1 - 1/e of the best N (Nemhauser, Wolsey and Fisher 1978).
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from liftcore.values.settings import LiftSettings
 from liftcore.values.views import Regions
 
 SIDE = 240  # pixels of an image's longer side, about: shares of weight are within .01 of those of all pixels
-VISIBLE_SHARE = 0.1  # of the evidence of the view that sees a splat best
+VISIBLE_SHARE = 0.1  # of the total weight of the view that sees a splat best
 LEAST_NEW = 0.001  # of the weight: a photo that adds less adds nothing
 FIRST_COUNT = 4  # photos of the first row; each next row has twice as many
 SHOWN_PHOTOS = 12  # names in a line for people
@@ -126,9 +126,9 @@ def plan_photos(
     rows = spread(splats.count, min(SAMPLE, splats.count))
     raster = open_raster(splats, CPU, threads)
     with one_thread(), shown_progress(progress) as reporter:
-        evidence, row_sum = evidence_of_views(raster, views, rows, settings, reporter)
+        total_weight, row_sum = total_weight_of_views(raster, views, rows, settings, reporter)
         seconds = _seconds(raster, views[len(views) // 2], settings)
-    weight, visible = evidence.sum(axis=0, dtype=np.float64), sees(evidence)
+    weight, visible = total_weight.sum(axis=0, dtype=np.float64), sees(total_weight)
     order = list(photo_order(visible, weight))
     seen_share = float(visible.any(axis=0).mean())
     empty_warnings = [unseen(seen_share)] if seen_share < LEAST_IN_VIEW else []
@@ -145,10 +145,10 @@ def plan_photos(
     )
 
 
-def evidence_of_views(
+def total_weight_of_views(
     raster: Raster, views: Sequence[Camera], rows: np.ndarray, settings: LiftSettings, progress: Progress = silent
 ) -> tuple[np.ndarray, float]:
-    """Compute the evidence [V, n] f32 of the views in the splats ``rows`` [n] i64, and a ray's mean sum of weights.
+    """Compute total weights [V, n] f32 of the views in the splats ``rows`` [n] i64, and a ray's mean sum of weights.
 
     At coarse pixels, each of which stands for all pixels up to the next.
     """
@@ -157,23 +157,26 @@ def evidence_of_views(
         ViewRequest(camera, ONE_REGION, params, settings.weighting, NO_PIXELS)
         for camera, params in zip(views, view_params, strict=True)
     )
-    evidence, view_evidence = np.zeros((len(views), len(rows)), np.float32), np.zeros(raster.splats.count, np.float32)
+    total_weight, view_weight = (
+        np.zeros((len(views), len(rows)), np.float32),
+        np.zeros(raster.splats.count, np.float32),
+    )
     rays, total = 0, 0.0
     for number, answer in enumerate(raster.iterate_views(requests)):
         camera, stride = views[number], view_params[number].stride
-        view_evidence[:] = 0.0
-        view_evidence[answer.weights.evidence_splats.numpy()] = answer.weights.evidence.numpy()
-        evidence[number] = view_evidence[rows] * stride**2
+        view_weight[:] = 0.0
+        view_weight[answer.weights.total_weight_splats.numpy()] = answer.weights.total_weight.numpy()
+        total_weight[number] = view_weight[rows] * stride**2
         left, top = view_params[number].offset
         rays += len(range(left, camera.width, stride)) * len(range(top, camera.height, stride))
-        total += float(view_evidence.sum(dtype=np.float64))
+        total += float(view_weight.sum(dtype=np.float64))
         progress("photos", number + 1, len(views), "photos")
-    return evidence, total / max(rays, 1)
+    return total_weight, total / max(rays, 1)
 
 
-def sees(evidence: np.ndarray) -> np.ndarray:
-    """Return [V, n] bool: True where the view sees the splat, by its evidence [V, n]."""
-    return (evidence > 0) & (evidence >= VISIBLE_SHARE * evidence.max(axis=0, initial=0.0))
+def sees(total_weight: np.ndarray) -> np.ndarray:
+    """Return [V, n] bool: True where the view sees the splat, by its total weight [V, n]."""
+    return (total_weight > 0) & (total_weight >= VISIBLE_SHARE * total_weight.max(axis=0, initial=0.0))
 
 
 def photo_order(visible: np.ndarray, weight: np.ndarray) -> Iterator[int]:

@@ -25,11 +25,11 @@ A splat in none of these views has s = 0 and c = 0, so that the mean cosine incl
 
 Before a lift, s and B are estimated by footprints: areas in place of weights. The variance v and occlusion are
 estimated from NOISE_VIEWS evenly spaced views of the full scene at coarse pixels. Three means over the sampled
-splats, weighted by evidence, are needed: S of the squared length of a single view's feature, M of the squared length
-of the combined feature of these views, and b, the B of these views. As ``S = m + e`` and ``M = m + e b`` for features
-of squared length m and errors of variance e, ``e = (S - M) / (1 - b)`` and ``v = e / (S - e)``. b is the chance that
-two observations of a splat are from one view. It rises as views are left out: for K of V views it is ``B / (B + (1 -
-B) (K - 1) / (V - 1))``. Solved for B, this corrects the B by areas for occlusion. Vectors are compared in
+splats, weighted by total weight, are needed: S of the squared length of a single view's feature, M of the squared
+length of the combined feature of these views, and b, the B of these views. As ``S = m + e`` and ``M = m + e b`` for
+features of squared length m and errors of variance e, ``e = (S - M) / (1 - b)`` and ``v = e / (S - e)``. b is the
+chance that two observations of a splat are from one view. It rises as views are left out: for K of V views it is ``B
+/ (B + (1 - B) (K - 1) / (V - 1))``. Solved for B, this corrects the B by areas for occlusion. Vectors are compared in
 NOISE_CHANNELS random projections.
 """
 
@@ -217,7 +217,7 @@ class ViewNoiseEstimate:
 
     areas: np.ndarray  # [V, n] f32, of the sampled splats in all views
     errors: np.ndarray  # [n] f64, d: the share of errors in the squared lengths of the features of all views
-    weights: np.ndarray  # [n] f64, the evidence of all views, in any unit
+    weights: np.ndarray  # [n] f64, the total weight of all views, in any unit
 
     def cosines(self, order: Sequence[int]) -> Iterator[float]:
         """Yield the expected mean cosine to all views of the first view of the order, of the first two, and so on."""
@@ -257,17 +257,19 @@ def estimate_view_noise(
         geometry = weigh_views(raster, raster.splats.count, sample_views, coarse_settings, silent, by_rows=False)
         means = [view.means(view.rows.float() @ axes) for view in geometry.codebook.views]
         disagreement = ViewDisagreement(geometry.weights, torch.cat(means), torch.from_numpy(rows))
-    evidence = _evidence(geometry.evidence().numpy()[rows], visible.areas, visible.areas[sample])
-    if not evidence.any():  # no ray hits a splat: there is no estimate
-        return ViewNoiseEstimate(visible.areas, np.ones(len(evidence)), np.ones(len(evidence)))
-    variance, same_view_share = disagreement.disagreement(evidence)
+    total_weight = _total_weight(geometry.total_weight().numpy()[rows], visible.areas, visible.areas[sample])
+    if not total_weight.any():  # no ray hits a splat: there is no estimate
+        return ViewNoiseEstimate(visible.areas, np.ones(len(total_weight)), np.ones(len(total_weight)))
+    variance, same_view_share = disagreement.disagreement(total_weight)
     share = same_view_share / (
         same_view_share + (1.0 - same_view_share) * (total - 1) / (count - 1)
     )  # B, in the mean
     by_area = _ratio(
         (visible.areas.astype(np.float64) ** 2).sum(axis=0), visible.areas.sum(axis=0, dtype=np.float64) ** 2
     )
-    return ViewNoiseEstimate(visible.areas, _errors(variance, by_area * share / _mean(by_area, evidence)), evidence)
+    return ViewNoiseEstimate(
+        visible.areas, _errors(variance, by_area * share / _mean(by_area, total_weight)), total_weight
+    )
 
 
 class ViewDisagreement:
@@ -305,27 +307,27 @@ class ViewDisagreement:
         single, combined, same_view_share = (_mean(values[hit], weights[hit]) for values in means)
         return single, combined, same_view_share
 
-    def disagreement(self, evidence: np.ndarray) -> tuple[float, float]:
+    def disagreement(self, total_weight: np.ndarray) -> tuple[float, float]:
         """Return v, infinite if the views have nothing in common, and b, over the splats that a labelled ray hits."""
-        if not (evidence[self.weights > 0] > 0).any():
+        if not (total_weight[self.weights > 0] > 0).any():
             return np.inf, 1.0
-        single, combined, same_view_share = self.means(evidence)
+        single, combined, same_view_share = self.means(total_weight)
         if same_view_share >= 1.0:
             return np.inf, 1.0
         error = max(0.0, single - combined) / (1.0 - same_view_share)
         return (error / (single - error) if error < single else np.inf), same_view_share
 
 
-def _evidence(sample_evidence: np.ndarray, areas: np.ndarray, sample_areas: np.ndarray) -> np.ndarray:
-    """Estimate the evidence of all views [n] f64 from that of the sample, in proportion to a splat's areas.
+def _total_weight(sample_weight: np.ndarray, areas: np.ndarray, sample_areas: np.ndarray) -> np.ndarray:
+    """Estimate the total weight of all views [n] f64 from that of the sample, in proportion to a splat's areas.
 
     Splats that the sample does not see get the mean proportion.
     """
     area_sums = sample_areas.sum(axis=0, dtype=np.float64)
     per_area = np.divide(
-        sample_evidence,
+        sample_weight,
         area_sums,
-        out=np.full(len(sample_evidence), sample_evidence.sum() / max(area_sums.sum(), 1.0)),
+        out=np.full(len(sample_weight), sample_weight.sum() / max(area_sums.sum(), 1.0)),
         where=area_sums > 0,
     )
     return per_area * areas.sum(axis=0, dtype=np.float64)

@@ -104,7 +104,7 @@ class CpuRaster:
     def region_weights(
         self, camera: Camera, observation: ViewFeatures, params: CompositingParams, weighting: Weighting
     ) -> RegionWeights:
-        """``A'^T S`` of a view and the evidence of plain weights. See the protocol."""
+        """``A'^T S`` of a view and the total weight of plain weights. See the protocol."""
         choice = choice_of(weighting)
         bands = self._bands(camera, params)
         reading = reading_of(observation, camera.width, camera.height, params)

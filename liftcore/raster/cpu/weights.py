@@ -7,9 +7,9 @@ side of the tile reads it, two for a segment however many cells it meets, with t
 columns' shares come once a splat is done: a line's lanes times those of a column add up to what the splat gave that
 cell.
 
-**Weighing**: every tile writes entries (row of a projected splat, slot, weight, evidence) into its share's buffer:
-what a splat gave to the pixels of one slot, and on its first entry of the tile the sum of its plain weights over all
-rays. The pixel loop knows neither labels nor channels.
+**Weighing**: every tile writes entries (row of a projected splat, slot, weight, total weight) into its share's
+buffer: what a splat gave to the pixels of one slot, and on its first entry of the tile the sum of its plain weights
+over all rays. The pixel loop knows neither labels nor channels.
 
 **Merging**: a counting sort gathers the entries by splat; only then are slots expanded to the codebook rows of all
 levels and summed, in float64. Ranges of splats are merged independently, and what a range gives depends on nothing
@@ -376,11 +376,11 @@ def weigh_tiles(
     Args:
         squared: whether a weight counts by its square; a gate sees to that itself.
         gate: Choice of the weights that count; None for all of them.
-        plain: True when the evidence needs rays of its own, of plain logits; else None.
+        plain: True when the total weight needs rays of its own, of plain logits; else None.
 
     Returns:
-        places [n] i32 (rows of projected splats), slots [n] i32 (-1 none), weights [n] f32, evidence [n] f32, near to
-        far tile by tile; and slot_rows [s, levels] i32, the codebook rows of a slot (-1 none).
+        places [n] i32 (rows of projected splats), slots [n] i32 (-1 none), weights [n] f32, total weight [n] f32,
+        near to far tile by tile; and slot_rows [s, levels] i32, the codebook rows of a slot (-1 none).
     """
     rays, taps, sums = new_rays(frame), new_taps(reading.levels), np.zeros(MAX_SLOTS * LANES, np.float32)
     *entries, slot_rows = _weigh(first, last, frame, reading, rays, taps, sums, squared, gate, new_marks(gate), plain)
@@ -396,11 +396,11 @@ def _weigh(first, last, frame, reading, rays, taps, sums, squared, gate, marks, 
     alone, slot_sets, spans, shares = taps.alone, taps.slot_sets, taps.spans, taps.shares
     is_grid = reading.is_grid
     spot = NO_SPOT
-    # A slot that all pixels read holds just the evidence.
+    # A slot that all pixels read holds just the total weight.
     reuse = plain is None and gate is None and not squared
     size = max(1 << 15, 2 * levels)
     places, slots = np.empty(size, np.int32), np.empty(size, np.int32)
-    weights, evidence = np.empty(size, np.float32), np.empty(size, np.float32)
+    weights, total_weight = np.empty(size, np.float32), np.empty(size, np.float32)
     slot_rows = np.empty(size, np.int32)
     count = slot_count = 0
     for tile in range(first, last):
@@ -426,7 +426,7 @@ def _weigh(first, last, frame, reading, rays, taps, sums, squared, gate, marks, 
             if needed > places.shape[0]:
                 needed = max(2 * places.shape[0], needed)
                 places, slots = _longer(places, needed), _longer(slots, needed)
-                weights, evidence = _longer(weights, needed), _longer(evidence, needed)
+                weights, total_weight = _longer(weights, needed), _longer(total_weight, needed)
             for step in range(near, min(near + CHECK_EVERY, starts[tile + 1])):
                 splat = next_splat(frame, tile, step, x0, y0)
                 if gate is not None and gate.kind == CENTRAL:
@@ -499,9 +499,9 @@ def _weigh(first, last, frame, reading, rays, taps, sums, squared, gate, marks, 
                     count += 1
                 for entry in range(begun, count):
                     places[entry] = items[step]
-                    evidence[entry] = total if entry == begun else 0.0
+                    total_weight[entry] = total if entry == begun else 0.0
         slot_count += used
-    return places[:count], slots[:count], weights[:count], evidence[:count], slot_rows[: slot_count * levels]
+    return places[:count], slots[:count], weights[:count], total_weight[:count], slot_rows[: slot_count * levels]
 
 
 @kernel
@@ -529,7 +529,7 @@ def merged(
         ids: [P] i32, the splat of each row. run: runs a function for each of a list of tuples of arguments.
 
     Returns:
-        splats, indptr, columns, weights, evidence_splats, evidence of ``RegionWeights``, as arrays.
+        splats, indptr, columns, weights, total_weight_splats, total_weight of ``RegionWeights``, as arrays.
     """
     slot_rows = np.concatenate([share[4] for share in entries])
     bases = np.cumsum([0, *(share[4].shape[0] for share in entries)])
@@ -556,8 +556,8 @@ def merged(
     marks = np.searchsorted(ends, np.linspace(0, ends[-1], ranges + 1)[1:-1], side="right")
     parts = run(merge, list(pairwise([0, *marks.tolist(), len(ids)])))
     entries.clear()
-    splats, lengths, columns, weights, met, evidence = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return splats, np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64), columns, weights, met, evidence
+    splats, lengths, columns, weights, met, total_weight = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return splats, np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64), columns, weights, met, total_weight
 
 
 @kernel
@@ -571,11 +571,11 @@ def count_entries(places, counts):
 def gather_entries(first, last, entries, slot_base, cursors, gathered):
     """Scatter the entries of rows ``first..last`` to their places (cursors move on).
 
-    ``entries = (places, slots, weights, evidence)`` of one tile share, its slots counted from ``slot_base``.
+    ``entries = (places, slots, weights, total_weight)`` of one tile share, its slots counted from ``slot_base``.
     ``gathered = (words, numbers, totals)``: one table [n, 2] of slot and weight, so that an entry is written at one
-    place in memory, seen as i32 and as f32; and the evidence of each row, [last - first] f64, which grows.
+    place in memory, seen as i32 and as f32; and the total weight of each row, [last - first] f64, which grows.
     """
-    places, slots, weights, evidence = entries
+    places, slots, weights, total_weight = entries
     words, numbers, totals = gathered
     flat, end = words.reshape(-1), places.shape[0] - 1
     for i in range(places.shape[0]):
@@ -590,7 +590,7 @@ def gather_entries(first, last, entries, slot_base, cursors, gathered):
             cursors[place - first] = at + 1
             words[at, 0] = slots[i] + slot_base if slots[i] >= 0 else -1
             numbers[at, 1] = weights[i]
-            totals[place - first] += evidence[i]
+            totals[place - first] += total_weight[i]
 
 
 @kernel
@@ -603,7 +603,7 @@ def merge_range(starts, gathered, slot_rows, codebook_rows, ids):
 
     Returns:
         splats [r] i32, lengths [r] i64, columns [nnz] i32, weights [nnz] f32, and the splats [m] i32 and sums [m] f32
-        of the evidence.
+        of the total weight.
     """
     words, numbers, totals = gathered
     levels = slot_rows.shape[1]
@@ -612,7 +612,7 @@ def merge_range(starts, gathered, slot_rows, codebook_rows, ids):
     # The columns that a row has: a set is in order as it is, where rows of fine cells had to be sorted.
     touched = np.zeros(codebook_rows // _WORD + 1, np.uint64)
     splats, lengths = np.empty(size, np.int32), np.empty(size, np.int64)
-    met, evidence = np.empty(size, np.int32), np.empty(size, np.float32)
+    met, total_weight = np.empty(size, np.int32), np.empty(size, np.float32)
     most = words.shape[0] * levels  # known before: arrays that may be replaced in a loop are counted at each use
     columns, weights = np.empty(most, np.int32), np.empty(most, np.float32)
     found = count = met_count = 0
@@ -630,7 +630,7 @@ def merge_range(starts, gathered, slot_rows, codebook_rows, ids):
                     low, high = min(low, word), max(high, word)
                     sums[column] += numbers[i, 1]
         if total > 0:
-            met[met_count], evidence[met_count] = ids[row], total
+            met[met_count], total_weight[met_count] = ids[row], total
             met_count += 1
         for word in range(low, high + 1):
             left, touched[word] = touched[word], 0
@@ -642,21 +642,28 @@ def merge_range(starts, gathered, slot_rows, codebook_rows, ids):
         if count > begun:
             splats[found], lengths[found] = ids[row], count - begun
             found += 1
-    return splats[:found], lengths[:found], columns[:count], weights[:count], met[:met_count], evidence[:met_count]
+    return (
+        splats[:found],
+        lengths[:found],
+        columns[:count],
+        weights[:count],
+        met[:met_count],
+        total_weight[:met_count],
+    )
 
 
 def entries_of(found: RegionWeights, ids: np.ndarray, codebook_rows: int, levels: int) -> tuple[np.ndarray, ...]:
     """What other bands have found as a share of entries, as ``weigh_tiles`` gives them: a slot for each column."""
     used = np.flatnonzero(ids >= 0)
     records = used[np.searchsorted(ids[used], found.splats.numpy())]
-    met = used[np.searchsorted(ids[used], found.evidence_splats.numpy())]
-    entries, evidence = found.region.numpy(), found.evidence.numpy()
+    met = used[np.searchsorted(ids[used], found.total_weight_splats.numpy())]
+    entries, total_weight = found.region.numpy(), found.total_weight.numpy()
     slot_rows = np.full((codebook_rows, levels), -1, np.int32)
     slot_rows[:, 0] = np.arange(codebook_rows)
     return (
         np.concatenate([np.repeat(records, np.diff(found.indptr.numpy())), met]).astype(np.int32),
         np.concatenate([entries, np.full(len(met), NO_SLOT, np.int32)]),
         np.concatenate([found.weight.numpy(), np.zeros(len(met), np.float32)]),
-        np.concatenate([np.zeros(len(entries), np.float32), evidence]),
+        np.concatenate([np.zeros(len(entries), np.float32), total_weight]),
         slot_rows,
     )

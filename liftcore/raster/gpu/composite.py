@@ -5,9 +5,9 @@ near to far, each pixel a lane: ``w = alpha T``, ``T -= w``, as on the CPU and f
 The weights of the chunk are left in the program's own scratch, from where a product takes them as a matrix. Scratch
 fits the card's nearest caches, and threads wait for one another only twice a chunk.
 
-Scratch has PARTS parts of [CHUNK, 256] f32: alphas, weights and, where evidence has rays of its own or more weights
-than count, the same of it. What is read is never written over before a barrier, however threads share the pixels.
-A tile's 256 pixels are counted row by row.
+Scratch has PARTS parts of [CHUNK, 256] f32: alphas, weights and, where total weight has rays of its own or more
+weights than count, the same of it. What is read is never written over before a barrier, however threads share the
+pixels. A tile's 256 pixels are counted row by row.
 
 A falloff is taken at a row, a column's start in float64, and a lane, the whole pixels from there on. What changes
 from row to row is taken in float64 and rounded once; along a row a pixel costs float32 only, for most cards have few
@@ -27,7 +27,7 @@ KINDS = {Kernel.GAUSSIAN_3D: GAUSSIANS, Kernel.BETA: BETAS, Kernel.GAUSSIAN_2D: 
 FLOORS = {Kernel.GAUSSIAN_3D: ALPHA_FLOOR, Kernel.BETA: 0.0, Kernel.GAUSSIAN_2D: ALPHA_FLOOR}
 CHUNK = 16  # splats at a time; no smaller, for the matrix products
 PART = CHUNK * TILE * TILE  # floats of a part of scratch
-PARTS = 2  # of scratch, twice as many with those of the evidence
+PARTS = 2  # of scratch, twice as many with those of the total weight
 
 # What kernels read of all this.
 _CHUNK, _TILE, _PIXELS = tl.constexpr(CHUNK), tl.constexpr(TILE), tl.constexpr(TILE * TILE)
@@ -174,7 +174,7 @@ def weights_of(scratch, count, pixel):
 def blend_chosen(
     scratch, light, stop, count, least, room, light_in_front, SELECTION: tl.constexpr, PLAIN: tl.constexpr
 ):
-    """``blend_chunk`` that leaves only weights that count, and with PLAIN all of them as the evidence's.
+    """``blend_chunk`` that leaves only weights that count, and with PLAIN all of them as the total weight's.
 
     Args:
         least: [256] f32, of top-k: the k-th largest weight of a ray; room: [256] i32, how many that equal it count.

@@ -115,7 +115,7 @@ class GpuRaster:
     def region_weights(
         self, camera: Camera, observation: ViewFeatures, params: CompositingParams, weighting: Weighting
     ) -> RegionWeights:
-        """``A'^T S`` of a view and the evidence of plain weights. See the protocol."""
+        """``A'^T S`` of a view and the total weight of plain weights. See the protocol."""
         return self._brought(self._weighed(self._read(observation, camera, params), camera, params, weighting))
 
     @_within_memory

@@ -223,7 +223,7 @@ def _sums(values: Tensor, order: Tensor | None, counts: Tensor) -> Tensor:
 
 @jit
 def _weigh(
-    places, inks, starts, items, scratch, taps, shares, slot_starts, table, table_starts, evidence, least, room,
+    places, inks, starts, items, scratch, taps, shares, slot_starts, table, table_starts, total_weight, least, room,
     band_tile, own_tile, slots_tile, columns, width, height, light_in_front, smallest, cap, stop, floor,
     KIND: tl.constexpr, TAPS: tl.constexpr, SELECTION: tl.constexpr, POWER: tl.constexpr, GAIN: tl.constexpr,
 ):  # fmt: skip
@@ -264,7 +264,7 @@ def _weigh(
         for from_pixel in range(0, _PIXELS, _BLOCK):
             pixel = from_pixel + tl.arange(0, _BLOCK)
             seen += tl.sum(weights_of(others if GATED or GAIN else mine, count, pixel), 1)
-        tl.store(evidence + number, seen, mask=number < last)
+        tl.store(total_weight + number, seen, mask=number < last)
         for block in range(0, used, _COLUMNS):
             product = tl.zeros([_CHUNK, _COLUMNS], tl.float32)
             for from_pixel in range(0, _PIXELS, _BLOCK):
@@ -324,17 +324,17 @@ def _gather(
 def region_weights(
     frame: Frame, reading: DeviceReading, choice: Choice, with_plain: bool, splats: int
 ) -> RegionWeights:
-    """``A'^T S`` of a view and the evidence of plain weights, on the device.
+    """``A'^T S`` of a view and the total weight of plain weights, on the device.
 
     Args:
         with_plain: whether plain weights are others, as the opacities have a scale on their logits.
     """
     rows = reading.codebook_rows
     weights: list[Sums] = []
-    evidence: list[Sums] = []
+    total_weight: list[Sums] = []
     for band in frame.bands:
-        _weigh_band(frame, frame.lists_of(band), reading, choice, with_plain, splats, weights, evidence)
-    found, met = sums_over_units(weights), sums_over_units(evidence)
+        _weigh_band(frame, frame.lists_of(band), reading, choice, with_plain, splats, weights, total_weight)
+    found, met = sums_over_units(weights), sums_over_units(total_weight)
     own, counts = torch.unique_consecutive(found.keys // rows, return_counts=True)
     indptr = torch.zeros(own.shape[0] + 1, dtype=torch.int64, device=frame.device)
     torch.cumsum(counts, 0, out=indptr[1:])
@@ -346,9 +346,9 @@ def region_weights(
 
 def _weigh_band(
     frame: Frame, lists: Lists, reading: DeviceReading, choice: Choice, with_plain: bool, splats: int,
-    weights: list[Sums], evidence: list[Sums],
+    weights: list[Sums], total_weight: list[Sums],
 ) -> None:  # fmt: skip
-    """Add a band's sums to those of the weights and of the evidence."""
+    """Add a band's sums to those of the weights and of the total weight."""
     rows = reading.codebook_rows
     given = torch.zeros(lists.items.shape[0], 1, device=frame.device, dtype=torch.float32)
     for first, last in frame.tile_runs(lists):
@@ -361,7 +361,7 @@ def _weigh_band(
             places = table.nonzero()[:, 0]
             for part in _whole_units(frame, job, starts, places, frame.sums_at_once):
                 weights.append(_sums_of(frame, job, table, starts, part, splats * rows, rows))
-    evidence.append(_of_items(frame, lists, (0, lists.tiles), given))
+    total_weight.append(_of_items(frame, lists, (0, lists.tiles), given))
 
 
 class _Run(NamedTuple):
@@ -377,9 +377,9 @@ class _Run(NamedTuple):
 
 
 def _weigh_run(
-    frame: Frame, job: _Run, taps: int, choice: Choice, with_plain: bool, evidence: Tensor
+    frame: Frame, job: _Run, taps: int, choice: Choice, with_plain: bool, total_weight: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The table of a run and where each tile's part of it begins [tiles + 1] i64; the evidence of its items too."""
+    """The table of a run and where each tile's part of it begins [tiles + 1] i64; total weights of its items too."""
     lists, slots, programs = job.lists, job.slots, job.tiles[1] - job.tiles[0]
     starts = torch.zeros(programs + 1, dtype=torch.int64, device=frame.device)
     torch.cumsum(job.sizes, 0, out=starts[1:])
@@ -388,7 +388,7 @@ def _weigh_run(
     least, room = job.marks or (slots.shares, slots.taps)  # unread where there are no marks
     launch(
         _weigh, programs, *lists.splats, lists.starts, lists.items, frame.scratch(programs, parts), slots.taps,
-        slots.shares, slots.starts, table, starts, evidence, least, room, lists.first_tile, job.tiles[0],
+        slots.shares, slots.starts, table, starts, total_weight, least, room, lists.first_tile, job.tiles[0],
         job.slots_tile, *frame.size, float(choice.transmittance), float(choice.floor), *frame.cuts, KIND=frame.kind,
         TAPS=taps, SELECTION=choice.kind, POWER=choice.power, GAIN=with_plain,
     )  # fmt: skip

@@ -25,10 +25,13 @@ def cameras_of(count: int) -> Cameras:
 
 def test_order_and_shares_are_those_of_the_dense_definition():
     splats, cameras = random_splats(3, 60, spread=1.5), cameras_of(9)
-    evidence = np.stack(
+    total_weight = np.stack(
         [dense_view(splats, camera, CompositingParams()).A.sum(axis=0) for camera in cameras.values()]
     )
-    weight, seen = evidence.sum(axis=0), evidence >= np.maximum(VISIBLE_SHARE * evidence.max(axis=0), 1e-12)
+    weight, seen = (
+        total_weight.sum(axis=0),
+        total_weight >= np.maximum(VISIBLE_SHARE * total_weight.max(axis=0), 1e-12),
+    )
     order, looks, shares = [], np.zeros(splats.count), []
     while len(order) < 9:
         gains = seen @ (weight / 2 ** (looks + 1))

@@ -54,7 +54,7 @@ def test_a_pilot_foresees_how_near_fewer_views_come(tmp_path, error):
     whole = lift_files(splats, cameras, [pack], LiftSettings.of(preset="tikhonov"))
     fewer = lift_files(splats, cameras, [pack], LiftSettings.of(preset="tikhonov", view_cosine=0.98))
     expected = fewer.metadata.certificate["plan"]["view_cosine"]
-    found = cosine_figures(fewer.features, whole.features, whole.evidence)["cosine"]
+    found = cosine_figures(fewer.features, whole.features, whole.total_weight)["cosine"]
     assert expected >= 0.98
     assert found == pytest.approx(expected, abs=0.02)
     assert whole.metadata.certificate["plan"]["view_cosine"] is None
@@ -81,7 +81,7 @@ def test_cosines_are_those_of_the_variance_and_of_the_splats_that_views_show():
     among = variance / (1 + variance / views)
     for count, cosine in enumerate(pilot.cosines(range(views)), start=1):
         assert 1 / cosine**2 - 1 == pytest.approx(among * (1 / count - 1 / views), abs=1e-9)
-    shown = pilot_of([[1.0, 0.0], [0.0, 1.0]], [0.0, 0.0], [3.0, 1.0])  # evidence weighs splats
+    shown = pilot_of([[1.0, 0.0], [0.0, 1.0]], [0.0, 0.0], [3.0, 1.0])  # total weight weighs splats
     assert list(shown.cosines([0, 1])) == pytest.approx([0.75, 1.0])
     assert list(shown.cosines([1, 0])) == pytest.approx([0.25, 1.0])
     assert pilot_of([[1.0]] * 100, [1.0], [1.0]).views_for(0.9, range(100)) == (81, pytest.approx(0.9))  # all error
@@ -129,7 +129,7 @@ def test_in_a_room_where_views_share_few_splats_a_pilot_is_right_too(tmp_path):
     for wanted in (0.9, 0.97):
         fewer = lift_files(*paths[:2], [paths[2]], LiftSettings.of(view_cosine=wanted))
         plan = fewer.metadata.certificate["plan"]
-        found = cosine_figures(fewer.features, whole.features, whole.evidence)["cosine"]
+        found = cosine_figures(fewer.features, whole.features, whole.total_weight)["cosine"]
         assert found is not None
         assert plan["views_left_out"] > 0
         assert 0.4 < (1 - found) / (1 - plan["view_cosine"]) < 1.2

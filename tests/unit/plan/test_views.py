@@ -47,7 +47,7 @@ def test_whatever_a_view_blends_is_in_its_field(kernel):
     for k, camera in enumerate(cameras):
         met = raster.region_weights(
             camera, random_regions(k), CompositingParams(), Weighting()
-        ).evidence_splats.numpy()
+        ).total_weight_splats.numpy()
         assert met.size
         assert seen.in_view[k][met].all()
     assert not seen.in_view.all()
@@ -117,7 +117,7 @@ def test_a_lift_with_coverage_is_the_lift_of_the_chosen_views(tmp_path):
     assert len(made.metadata.views) == plan["views"] == 3 - plan["views_left_out"] < 3
     whole = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(preset="row-sum"))
     assert not torch.equal(made.features, whole.features)
-    assert bool((made.evidence <= whole.evidence + 1e-4).all())
+    assert bool((made.total_weight <= whole.total_weight + 1e-4).all())
 
 
 def test_plan_and_lift_say_which_level_is_taken_alone_of_how_many():

@@ -52,9 +52,9 @@ class Axes:
 
 
 def of(scene: Scene, rows: np.ndarray, **fields: torch.Tensor) -> Scene:
-    """A lift of other features [P, F], all seen, of evidence one."""
+    """A lift of other features [P, F], all seen, of total weight one."""
     ones = torch.ones(len(rows))
-    given = {"evidence": ones, "agreement": ones, "seen": ones > 0} | fields
+    given = {"total_weight": ones, "agreement": ones, "seen": ones > 0} | fields
     return Scene(replace(scene.lift, features=torch.from_numpy(rows.astype(np.float32)), **given))
 
 
@@ -96,7 +96,9 @@ def test_splats_without_evidence_or_confidence_do_not_decide_the_threshold(exact
     stray = np.zeros((COUNT, CHANNELS))
     stray[:, 0], stray[:, 1] = 1.0, np.linspace(0.0, 3.0, COUNT)  # scores all over the range
     weights = torch.cat([torch.ones(COUNT), torch.full((COUNT,), 1e-4)])
-    crowd = of(exact, np.concatenate([exact.features, stray]), **{weigh: weights})
+    crowd = of(
+        exact, np.concatenate([exact.features, stray]), **{{"evidence": "total_weight"}.get(weigh, weigh): weights}
+    )
     answer = ask(crowd, Query.of(("x",), weigh=weigh), Axes())
     plainly = ask(crowd, Query.of(("x",)), Axes())
     assert np.array_equal(answer.scores, plainly.scores)
@@ -152,7 +154,7 @@ def test_what_cannot_be_asked_is_refused(scene: Scene) -> None:
             lambda: question(scene, Query.of(("x",), weigh="confidence"), Axes()),
             "a lift with confidence.*preset default",
         ),
-        (lambda: Query.of(("x",), weigh="light"), "weigh: expected one of evidence, confidence"),
+        (lambda: Query.of(("x",), weigh="light"), "weigh: expected one of total weight, confidence"),
         (lambda: Query.of(()), "query: expected a text or an example"),
         (lambda: Query.of(("a",) * 65), "at most 64"),
         (lambda: Query.of(("a",), keep="some"), "keep: expected"),
@@ -396,7 +398,7 @@ def test_a_lift_with_other_rows_than_its_splats_answers_nothing(
 ) -> None:
     path = lift_tiny(tmp_path)
     lift, splats = load_lift(path), tmp_path / f"other{suffix}"
-    rows = ("features", "evidence", "agreement", "seen", "confidence", "cluster", "object", "node")
+    rows = ("features", "total_weight", "agreement", "seen", "confidence", "cluster", "object", "node")
     cropped = {name: getattr(lift, name)[:-1] for name in rows if getattr(lift, name) is not None}
     save_lift(replace(lift, **cropped), tmp_path / "cropped.lift")
     ask(Scene(path), Query.of((SplatTerm(0),)))

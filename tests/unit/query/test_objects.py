@@ -42,16 +42,16 @@ def test_clusters_that_are_apart_are_objects_with_their_boxes(weigh: str, scene:
     answer = answer_with(answer, weigh=weigh)
     found = objects(Scene(replace(scene.lift, confidence=confidence), scene.splats), answer)
     assert len(found.found) == 2 and found.strays == 0
-    evidence = scene.evidence * (confidence.numpy() if weigh == "confidence" else 1)
+    total_weight = scene.total_weight * (confidence.numpy() if weigh == "confidence" else 1)
     for number, thing in enumerate(found.found):
         rows = np.flatnonzero(found.numbers == number)
         cluster = rows[0] // SPLATS_A_CLUSTER
         assert rows.tolist() == list(range(cluster * SPLATS_A_CLUSTER, (cluster + 1) * SPLATS_A_CLUSTER))
         assert thing.splats == SPLATS_A_CLUSTER
-        assert thing.share == pytest.approx(evidence[rows].sum() / evidence[answer.selected].sum())
-        assert thing.score == pytest.approx(np.average(answer.scores[rows], weights=evidence[rows]))
+        assert thing.share == pytest.approx(total_weight[rows].sum() / total_weight[answer.selected].sum())
+        assert thing.score == pytest.approx(np.average(answer.scores[rows], weights=total_weight[rows]))
         low, high = means(scene, cluster).min(axis=0), means(scene, cluster).max(axis=0)
-        # So few splats have a thousandth of the evidence each, or more: the box holds all of them, or nearly.
+        # So few splats have a thousandth of the total weight each, or more: the box holds all of them, or nearly.
         assert (np.array(thing.box[0]) >= low).all() and (np.array(thing.box[1]) <= high).all()
         assert np.array(thing.box) == pytest.approx(np.stack([low, high]), abs=0.3)
         assert thing.centre == pytest.approx(np.mean(thing.box, axis=0))
@@ -165,11 +165,11 @@ def test_more_splats_than_are_grouped_are_refused(scene: Scene, monkeypatch) -> 
 def test_a_twentieth_of_the_evidence_of_the_largest_makes_an_object(scene: Scene) -> None:
     rows = len(scene.features)
     for share, count in ((0.049, 1), (0.051, 2), (1.0, 2)):
-        evidence = torch.ones(rows)
-        evidence[2 * SPLATS_A_CLUSTER :] = share
-        weighed = Scene(replace(scene.lift, evidence=evidence))
+        total_weight = torch.ones(rows)
+        total_weight[2 * SPLATS_A_CLUSTER :] = share
+        weighed = Scene(replace(scene.lift, total_weight=total_weight))
         assert len(objects(weighed, of(scene, 0, 2)).found) == count
-    bare = Scene(replace(scene.lift, evidence=torch.zeros(rows)))  # without any, splats count alike
+    bare = Scene(replace(scene.lift, total_weight=torch.zeros(rows)))  # without any, splats count alike
     found = objects(bare, of(scene, 0, rows=(2 * SPLATS_A_CLUSTER, 2 * SPLATS_A_CLUSTER + 1)))
     assert found.found[0].splats == SPLATS_A_CLUSTER
     assert sum(thing.share for thing in found.found) <= 1.0

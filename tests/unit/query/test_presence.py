@@ -48,7 +48,7 @@ def clip(scene: Scene, table: TableEncoder) -> Scene:
         0.28 * words + 0.9 * gap / np.linalg.norm(gap) + 0.25 * noise / np.linalg.norm(noise, axis=1, keepdims=True)
     )
     ones = torch.ones(COUNT)
-    given = {"evidence": ones, "agreement": ones, "seen": ones > 0}
+    given = {"total_weight": ones, "agreement": ones, "seen": ones > 0}
     lifted = replace(scene.lift, features=torch.from_numpy(rows.astype(np.float32)), **given)
     return Scene(lifted, scene.splats, scene.cameras)
 
@@ -108,10 +108,10 @@ def test_small_evidence_does_not_make_a_thing(clip: Scene, table: TableEncoder) 
     stray = torch.cat([clip.lift.features, torch.from_numpy(table.encode(["sofa"]))])
     ones = torch.ones(COUNT + 1)
     given = {"features": stray, "agreement": ones, "seen": ones > 0}
-    evidence = torch.cat([torch.ones(COUNT), torch.tensor([1e-4])])
+    total_weight = torch.cat([torch.ones(COUNT), torch.tensor([1e-4])])
     for weight, present in ((1e-4, False), (1.0, True)):
-        evidence[-1] = weight
-        lifted = Scene(replace(clip.lift, evidence=evidence.clone(), **given))
+        total_weight[-1] = weight
+        lifted = Scene(replace(clip.lift, total_weight=total_weight.clone(), **given))
         assert ask(lifted, "sofa", table).present is present
 
 

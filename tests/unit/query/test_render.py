@@ -231,7 +231,7 @@ def test_groups_get_colours_that_can_be_told_apart_at_every_run() -> None:
     means = torch.stack([first[:-1][group[:-1] == k].mean(dim=0) for k in range(3)])
     assert torch.pdist(means).min() > 0.4
     assert principal_colours(np.random.rand(10, 2), np.ones(10)).shape == (10, 3)  # of fewer than three channels
-    assert not principal_colours(np.random.rand(10, 4), np.zeros(10)).any()  # and without evidence
+    assert not principal_colours(np.random.rand(10, 4), np.zeros(10)).any()  # and without weight
     colours = cluster_colours(24).astype(int)
     apart = np.abs(colours[:, None] - colours[None]).max(axis=2)[~np.eye(25, dtype=bool)]
     assert apart.min() >= 16 and tuple(colours[-1]) == NO_CLUSTER_COLOUR
@@ -244,7 +244,9 @@ def scene_of(given: Scene, splats: Splats, camera: Camera) -> Scene:
     """A lift of nothing, over those splats and that camera."""
     ones = torch.ones(splats.count)
     metadata = given.metadata.model_copy(update={"landmarks": ()})
-    made = replace(given.lift, features=torch.ones(splats.count, 1), evidence=ones, seen=ones > 0, metadata=metadata)
+    made = replace(
+        given.lift, features=torch.ones(splats.count, 1), total_weight=ones, seen=ones > 0, metadata=metadata
+    )
     return Scene(made, splats, Cameras((camera,)))
 
 

@@ -37,7 +37,7 @@ def clear(scene: Scene) -> Scene:
     """Each cluster is an axis with noise on all others."""
     rows = EYE[CLUSTER] + np.random.default_rng(0).normal(0, 0.05, (COUNT, CHANNELS)).astype(np.float32)
     ones = torch.ones(COUNT)
-    lift = replace(scene.lift, features=torch.from_numpy(rows), evidence=ones, seen=ones > 0)
+    lift = replace(scene.lift, features=torch.from_numpy(rows), total_weight=ones, seen=ones > 0)
     lifted = Scene(lift, scene.splats, scene.cameras)
     lifted.splat_file = scene.splat_file
     return lifted

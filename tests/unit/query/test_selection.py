@@ -17,7 +17,7 @@ from liftcore.query.threshold import METHODS, find_threshold
 from liftcore.text import LVIS_TABLE
 from liftcore.text.table import TableEncoder
 
-CAT, COW, CURTAIN = 21, 2320, 659  # splats: .7 % of the evidence, 77.3 % and 22 %
+CAT, COW, CURTAIN = 21, 2320, 659  # splats: .7 % of the total weight, 77.3 % and 22 %
 THINGS = np.repeat([0, 1, 2], [CAT, COW, CURTAIN])
 
 
@@ -27,9 +27,9 @@ def table() -> TableEncoder:
 
 
 def lifted(scene: Scene, features: np.ndarray, **fields: Any) -> Scene:
-    """A lift of other features [P, F], of evidence one."""
+    """A lift of other features [P, F], of total weight one."""
     ones = torch.ones(len(features))
-    given = {"evidence": ones, "agreement": ones, "seen": ones > 0, "object": None, "object_views": None}
+    given = {"total_weight": ones, "agreement": ones, "seen": ones > 0, "object": None, "object_views": None}
     return Scene(replace(scene.lift, features=torch.from_numpy(features.astype(np.float32)), **given | fields))
 
 

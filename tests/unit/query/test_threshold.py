@@ -136,7 +136,7 @@ def test_the_share_above_is_told_as_one_of_the_evidence_or_of_the_pixels(method:
     scores = hills((0.2, 0.01, 9000), (0.3, 0.01, 1000))
     weights = torch.where(scores > 0.25, 1.0, 9.0)  # a tenth of the scores is an eighty-second of the weight
     assert f"; 10.0% of the pixels at or above {find_threshold(scores, method).value:.4g}." in told(scores, method)
-    assert "; 1.2% of the evidence at or above 0.2" in told(scores, method, weights)
+    assert "; 1.2% of the total weight at or above 0.2" in told(scores, method, weights)
 
 
 def told(scores: torch.Tensor, method: str, weights: torch.Tensor | None = None) -> str:

@@ -40,7 +40,7 @@ def test_rows_that_are_kept_come_back_as_they_were(lifted: tuple[LiftResult, Spl
     result, splats = lifted
     order = np.random.default_rng(1).permutation(splats.count)[:45]
     found = result.transferred(splats, splats[order])
-    for name in ("features", "evidence", "agreement", "seen"):
+    for name in ("features", "total_weight", "agreement", "seen"):
         assert torch.equal(getattr(found, name), getattr(result, name)[order]), name
     expected = result[order]
     assert expected.object is not None and found.object is not None and torch.equal(found.object, expected.object)
@@ -64,7 +64,7 @@ def test_exact_copies_share_what_the_lift_says_of_them(lifted: tuple[LiftResult,
             torch.testing.assert_close(found.features[place].float(), mean, atol=1e-3, rtol=0)
         others = np.flatnonzero(~np.isin(order, rows))
         assert torch.equal(found.features[others], features[order][others])
-        assert float(found.evidence.sum()) == pytest.approx(float(result.evidence.sum()), rel=1e-5)
+        assert float(found.total_weight.sum()) == pytest.approx(float(result.total_weight.sum()), rel=1e-5)
         assert found.diagnostics["transfer"]["rows"] == len(twice)
 
 

@@ -88,7 +88,7 @@ def test_a_moved_scene_has_the_same_features_pictures_and_plan(kernel: Kernel) -
     assert torch.equal(far.seen, here.seen)
     apart = (far.features - here.features).norm(dim=1) / here.features.norm(dim=1).clamp_min(1e-9)
     assert float(apart[here.seen].quantile(0.95)) < 1e-3  # rays at the edge of a splat may fall on its other side
-    assert torch.allclose(far.evidence, here.evidence, rtol=1e-2, atol=1e-2)
+    assert torch.allclose(far.total_weight, here.total_weight, rtol=1e-2, atol=1e-2)
     first, second = Scene(here, splats, Cameras(cameras)), Scene(far, there, Cameras(there_cameras))
     for name in ("v0", "v3"):
         for one, other in zip(expected_depth(first, name), expected_depth(second, name), strict=True):
@@ -124,7 +124,7 @@ def test_an_offset_that_float64_holds_leaves_every_bit(kernel: Kernel) -> None:
         lc.lift(replace(splats, means=there.means), Cameras(cameras), views),
         lc.lift(there, Cameras([moved_camera(camera, np.array(there.origin)) for camera in cameras]), views),
     ]
-    for name in ("features", "evidence", "agreement", "seen"):
+    for name in ("features", "total_weight", "agreement", "seen"):
         assert torch.equal(getattr(lifts[0], name), getattr(lifts[1], name)), name
 
 

@@ -22,8 +22,8 @@ from liftcore.runtime.progress import silent
 from liftcore.scene.cameras import Cameras
 from liftcore.solve.aggregate import (
     LEAST_KEPT,
-    evidence_means,
     filter_regions,
+    weighted_means,
 )
 from liftcore.solve.clusters import Clustering
 from liftcore.values.lift_file import CLUSTER_TENSORS, save_lift
@@ -80,11 +80,11 @@ def test_kept_regions_are_those_of_the_paper_pixel_by_pixel(tmp_path_factory, se
 
 def test_clusters_of_grids_take_the_mean_of_their_splats_weighted_by_evidence():
     rng = np.random.default_rng(0)
-    labels, evidence = rng.integers(-1, K - 1, 500), rng.uniform(0, 3, 500)
+    labels, total_weight = rng.integers(-1, K - 1, 500), rng.uniform(0, 3, 500)
     features = torch.tensor(rng.normal(size=(500, 4)), dtype=torch.float32)
-    means = evidence_means(features, evidence, clustering_of(labels)).numpy()
+    means = weighted_means(features, total_weight, clustering_of(labels)).numpy()
     for k in range(K - 1):
-        weights = evidence * (labels == k)
+        weights = total_weight * (labels == k)
         assert np.abs(means[k] - weights @ features.double().numpy() / weights.sum()).max() < 1e-6
     assert not means[K - 1].any()
 

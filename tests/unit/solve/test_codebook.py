@@ -55,7 +55,7 @@ def test_tuples_give_what_rows_give_with_fewer_entries(seed, levels, power, size
     np.testing.assert_allclose(tuples.agreement, rows.agreement, atol=1e-5)
     (by_row, _), (by_tuple, _) = weighed(maps, True), weighed(maps, False)
     assert by_tuple.region.numel() < by_row.region.numel()
-    assert torch.equal(by_tuple.evidence, by_row.evidence)
+    assert torch.equal(by_tuple.total_weight, by_row.total_weight)
 
 
 def test_means_of_float16_rows_are_rounded_as_the_features_are():

@@ -201,7 +201,7 @@ def test_all_that_was_seen_is_refined_however_faintly(tmp_path, monkeypatch):
     monkeypatch.setattr("liftcore.lifting.in_memory.refine", lambda *told: given.append(told[2]) or refine(*told))
     made = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(preset="row-sum", cg_steps=1))
     assert np.array_equal(given[0], made.seen.numpy())
-    assert (made.evidence[made.seen] < 0.5).any()  # or it would say nothing of faint ones
+    assert (made.total_weight[made.seen] < 0.5).any()  # or it would say nothing of faint ones
 
 
 def test_a_lift_takes_no_step_unless_asked(tmp_path):

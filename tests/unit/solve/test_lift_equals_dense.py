@@ -70,11 +70,11 @@ CASES = {
 
 @dataclass
 class Dense:
-    """A lift by its definition, in float64; strided evidence speaks for all pixels."""
+    """A lift by its definition, in float64; strided total weight speaks for all pixels."""
 
     X: np.ndarray  # [P, F]
     D: np.ndarray  # [P]
-    evidence: np.ndarray  # [P]
+    total_weight: np.ndarray  # [P]
     undecided: np.ndarray  # [P] bool: some ray of the splat float32 may decide otherwise
     rays: int
 
@@ -92,7 +92,7 @@ def dense_lift(seed: int, grids: bool, case: Case, splats: Splats, cameras: Came
         numerator += weights.T @ (S[own] @ observation.codebook.double().numpy())
         made.D += weights.sum(axis=0)
         plain = dense_view(splats, camera, replace(walk, opacity_logit_scale=1.0))
-        made.evidence += settings.stride**2 * plain.A[walked].sum(axis=0)
+        made.total_weight += settings.stride**2 * plain.A[walked].sum(axis=0)
         made.undecided |= (view.A[close | view.cut | plain.cut] > 0).any(axis=0)
         made.rays += int(walked.sum())
     made.X = np.divide(numerator, made.D[:, None], out=np.zeros((50, 6)), where=made.D[:, None] > 0)
@@ -114,7 +114,7 @@ def test_a_lift_equals_the_dense_definition(tmp_path, case, grids, seed):
     error = np.linalg.norm(got.features.double().numpy() - exact.X, axis=1)
     assert (error <= 1e-3 * np.linalg.norm(exact.X, axis=1) + 1e-7)[decided & (exact.D > 1e-6)].all()
     assert (decided & seen).sum() > 10
-    assert np.abs(got.evidence.numpy() - exact.evidence)[decided].max() < 1e-3
+    assert np.abs(got.total_weight.numpy() - exact.total_weight)[decided].max() < 1e-3
     assert got.metadata.certificate["rays"] == exact.rays
 
 

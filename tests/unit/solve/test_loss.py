@@ -61,7 +61,7 @@ def test_a_huber_lift_is_nearest_by_hubers_loss(tmp_path, grids):
     how = {"cameras": cameras, "views": views, "preset": "row-sum"}
     lifted, squares = (lc.lift(splats, **how, dtype="float32", loss=name) for name in ("huber", "l2"))
     np.testing.assert_allclose(lifted.features.numpy(), X, atol=1e-5)
-    assert torch.equal(lifted.evidence, squares.evidence)
+    assert torch.equal(lifted.total_weight, squares.total_weight)
     for splat in np.flatnonzero(lifted.seen.numpy())[::5]:
         own = W[splat] / W[splat].sum()
         least = minimize(loss, squares.features[splat].double().numpy(), (own, E, delta), tol=1e-12).fun

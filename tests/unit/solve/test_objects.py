@@ -85,8 +85,10 @@ def test_objects_are_those_of_the_definition(seed: int) -> None:
 def test_merged_and_split_masks_do_not_change_the_things() -> None:
     right = [0, 1, 2, 3]
     merged, split = [0, 0, 1, 2], [0, 1, 2, 2]
-    found = region_objects(*of_things([right, merged, right, split, right, right]), evidence=np.arange(SPLATS) + 1.0)
-    np.testing.assert_array_equal(found.labels, np.repeat([3, 2, 1, 0], SPLATS // 4))  # most evidence first
+    found = region_objects(
+        *of_things([right, merged, right, split, right, right]), total_weight=np.arange(SPLATS) + 1.0
+    )
+    np.testing.assert_array_equal(found.labels, np.repeat([3, 2, 1, 0], SPLATS // 4))  # largest total weight first
     assert len(found.views) == 4 and set(found.views[0][found.views[0] >= 0]) <= set(range(6))
 
 

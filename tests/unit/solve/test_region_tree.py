@@ -102,7 +102,7 @@ def test_what_holds_the_whole_scene_is_a_group_and_its_parts_are_the_objects() -
     W, levels, codebook = three_levels(1, wrong=0.0, rooms=True)
     found = region_objects(W, levels, np.arange(SPLATS) + 1.0)
     assert found.count == 4 and set(found.tree.parents[:4]) == {4} and found.tree.parents[4] < 0
-    np.testing.assert_array_equal(found.labels, 3 - THING)  # the most evidence first
+    np.testing.assert_array_equal(found.labels, 3 - THING)  # the largest total weight first
     totals = np.bincount(W.region.numpy(), W.weight.numpy(), levels.size)
     facts = object_facts(found, NodeVectors.of(codebook, totals, found))
     assert (

@@ -43,16 +43,16 @@ class Scene:
         self.splats: Splats = replace(splats, sh=0.1 * splats.sh)
         self.seen: Tensor = torch.from_numpy(rng.random(count) >= unseen)
         self.X: Tensor = torch.from_numpy(rng.normal(size=(count, channels)).astype(np.float32)) * self.seen[:, None]
-        self.evidence: Tensor = torch.from_numpy(10 ** rng.uniform(-4, 3, count)).float()
+        self.total_weight: Tensor = torch.from_numpy(10 ** rng.uniform(-4, 3, count)).float()
         self.confidence: Tensor = torch.from_numpy(rng.random(count)).float()
 
     def smooth(self, smoothness: float, **how: Any) -> Tensor:
-        given = SplatGraph.of(self.splats), self.evidence, self.confidence, self.seen, smoothness
+        given = SplatGraph.of(self.splats), self.total_weight, self.confidence, self.seen, smoothness
         return smooth(self.X.clone(), *given, **how)[0]
 
     def minimum(self, smoothness: float) -> tuple[np.ndarray, np.ndarray]:
         """The features [P, F] of the splats that were seen by a dense solver, and their weights [P], both f64."""
-        weights = self.evidence.double() * self.confidence.double().clamp_min(0.02) * self.seen
+        weights = self.total_weight.double() * self.confidence.double().clamp_min(0.02) * self.seen
         weights, affinities = weights.numpy(), dense(SplatGraph.of(self.splats))
         couplings = smoothness * affinities * np.sqrt(np.outer(weights, weights))
         K = np.diag(weights + couplings.sum(axis=1)) - couplings
@@ -114,7 +114,7 @@ def test_no_channel_leaves_the_range_of_the_features(dtype: torch.dtype, longest
     scene = Scene(1, 300)
     X = (scene.X / scene.X.abs().max() * longest).to(dtype)
     low, high = X[scene.seen].aminmax(dim=0)
-    smoothed, facts = smooth(X.clone(), SplatGraph.of(scene.splats), scene.evidence, None, scene.seen, 1e6)
+    smoothed, facts = smooth(X.clone(), SplatGraph.of(scene.splats), scene.total_weight, None, scene.seen, 1e6)
     assert smoothed.dtype == dtype
     assert ((smoothed >= low.clamp_max(0)) & (smoothed <= high.clamp_min(0))).all()
     assert ("warning" in facts) == (facts["steps"] >= STEPS)
@@ -126,7 +126,7 @@ def test_splats_that_no_neighbour_reaches_stay_as_they_are() -> None:
     far[40:] += 1e4
     splats, seen = replace(scene.splats, means=far), torch.arange(60) < 40
     X = (scene.X.abs() + 1) * seen[:, None]
-    smoothed, facts = smooth(X.clone(), SplatGraph.of(splats), scene.evidence, None, seen, 1.0)
+    smoothed, facts = smooth(X.clone(), SplatGraph.of(splats), scene.total_weight, None, seen, 1.0)
     assert facts["filled"] == 0
     assert not smoothed[40:].any()
     assert (smoothed[:40] >= 1).all()
@@ -136,11 +136,13 @@ def test_features_that_are_one_stay_as_they_are() -> None:
     scene = Scene(2, 200, unseen=0.0)
     X = torch.ones(200, 3)
     smoothed, facts = smooth(
-        X.clone(), SplatGraph.of(scene.splats), scene.evidence, scene.confidence, scene.seen, 4.0
+        X.clone(), SplatGraph.of(scene.splats), scene.total_weight, scene.confidence, scene.seen, 4.0
     )
     assert torch.equal(smoothed, X)
     assert facts["moved"] == facts["steps"] == facts["filled"] == 0
-    nothing, facts = smooth(0 * X, SplatGraph.of(scene.splats), scene.evidence, scene.confidence, ~scene.seen, 4.0)
+    nothing, facts = smooth(
+        0 * X, SplatGraph.of(scene.splats), scene.total_weight, scene.confidence, ~scene.seen, 4.0
+    )
     assert not nothing.any()
     assert facts["moved"] is None
     assert "not at all" in smoothing_line(facts)
@@ -163,10 +165,10 @@ def chosen(
     graph = SplatGraph.of(replace(random_splats(3, count), means=means, sh=colours))
     rows = truth + noise * rng.normal(size=(views, *truth.shape))
     regions = (torch.arange(views)[None] * count + torch.arange(count)[:, None]).reshape(-1).int()
-    starts, evidence = torch.arange(count + 1) * views, torch.full((count,), float(views))
+    starts, total_weight = torch.arange(count + 1) * views, torch.full((count,), float(views))
     every = torch.arange(count, dtype=torch.int32)
     offsets = torch.arange(views + 1) * count
-    W = RegionWeights(every, starts, regions, torch.ones(views * count), every, evidence, offsets)
+    W = RegionWeights(every, starts, regions, torch.ones(views * count), every, total_weight, offsets)
     codebook = Codebook(tuple(ViewCodebook(torch.from_numpy(own).float()) for own in rows))
     return choose_smoothness(W, codebook, graph, None, **how)
 
@@ -219,7 +221,7 @@ def test_refined_lift_is_the_lift_with_that_smoothness(grids: tuple[Path, Path, 
     refined = plain.refined(lc.read_splats(grids[0]), smoothness=1.5)
     assert torch.equal(plain.features, before)
     assert not torch.equal(smoothed.features, before)
-    for name in ("features", "evidence", "agreement", "confidence", "seen"):
+    for name in ("features", "total_weight", "agreement", "confidence", "seen"):
         assert torch.equal(getattr(refined, name), getattr(smoothed, name)), name
     assert refined.settings == smoothed.settings
     assert refined.diagnostics["smoothing"] | {"parted": 0} == smoothed.diagnostics["smoothing"]

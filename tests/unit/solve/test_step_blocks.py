@@ -194,8 +194,8 @@ def test_objects_by_blocks_are_those_of_the_whole_scene(
 ) -> None:
     monkeypatch.setattr(objects, "MOST_REGIONS", VIEWS * REGIONS // 2)  # so that some views give no nodes
     monkeypatch.setattr(objects, "FEWEST_VIEWS", 3)
-    evidence = np.random.default_rng(4).random(SPLATS)
-    whole = objects.region_objects(W, LEVELS, evidence, 2)
+    total_weight = np.random.default_rng(4).random(SPLATS)
+    whole = objects.region_objects(W, LEVELS, total_weight, 2)
     groups = RegionGroups.of(W.offsets.numpy(), LEVELS)
     parts, totals = view_blocks(views, groups, 2), W.row_sums().numpy()
     tuples = all_tuples(parts)
@@ -228,7 +228,7 @@ def test_objects_by_blocks_are_those_of_the_whole_scene(
     ]
     shown = added(over_files(sums), (1, number * VIEWS)).reshape(number, VIEWS)
     every = np.concatenate(labels)
-    got = objects.numbered(every, tree, objects.node_numbering(every, evidence, tree), shown)
+    got = objects.numbered(every, tree, objects.node_numbering(every, total_weight, tree), shown)
     assert (got.labels >= 0).any() and len(got.views) > 1
     for name in ("labels", "node", "node_views"):
         np.testing.assert_array_equal(getattr(got, name), getattr(whole, name))
@@ -266,14 +266,14 @@ def test_clusters_of_blocks_have_the_features_of_the_whole_scene(
 ) -> None:
     rng = np.random.default_rng(5)
     features = torch.from_numpy(rng.normal(size=(SPLATS, 9)).astype(np.float16))
-    labels, evidence = rng.integers(-1, 4, SPLATS).astype(np.int32), rng.random(SPLATS).astype(np.float32)
+    labels, total_weight = rng.integers(-1, 4, SPLATS).astype(np.int32), rng.random(SPLATS).astype(np.float32)
     directions, own = RegionDirections.of_weights(W, codebook), torch.full((SPLATS,), 0.2)
-    whole = cluster_means(added(cluster_sums(features, evidence, labels, 4, 2), (10, 4)), torch.float32)
-    sums = [part for a, b in blocks for part in cluster_sums(features[a:b], evidence[a:b], labels[a:b], 4, 1)]
+    whole = cluster_means(added(cluster_sums(features, total_weight, labels, 4, 2), (10, 4)), torch.float32)
+    sums = [part for a, b in blocks for part in cluster_sums(features[a:b], total_weight[a:b], labels[a:b], 4, 1)]
     merged = cluster_means(added(over_files(sums), (10, 4)), torch.float32)
     assert torch.equal(merged, whole)
-    weights = features.double().numpy() * evidence[:, None]
-    expected = [weights[labels == k].sum(axis=0) / evidence[labels == k].sum(dtype=np.float64) for k in range(4)]
+    weights = features.double().numpy() * total_weight[:, None]
+    expected = [weights[labels == k].sum(axis=0) / total_weight[labels == k].sum(dtype=np.float64) for k in range(4)]
     np.testing.assert_allclose(merged.numpy(), expected, rtol=1e-5, atol=1e-7)
     taken = with_feature(torch.from_numpy(labels), merged)
     guarded = guard(taken, torch.from_numpy(labels), merged, W, directions, own, 2)

@@ -35,9 +35,9 @@ def test_stacked_views_are_their_matrices_side_by_side():
     assert W.offsets.tolist() == [0, 4, 9, 15, 22, 30]
     rows = np.split(W.region.numpy(), W.indptr.numpy()[1:-1])
     assert all((np.diff(row) > 0).all() for row in rows)
-    evidence = np.bincount(np.concatenate([view.splats.numpy() for view in own]), minlength=SPLATS)
-    assert np.array_equal(np.flatnonzero(evidence), W.evidence_splats.numpy())
-    assert np.array_equal(evidence[evidence > 0], W.evidence.numpy())
+    total_weight = np.bincount(np.concatenate([view.splats.numpy() for view in own]), minlength=SPLATS)
+    assert np.array_equal(np.flatnonzero(total_weight), W.total_weight_splats.numpy())
+    assert np.array_equal(total_weight[total_weight > 0], W.total_weight.numpy())
     np.testing.assert_allclose(W.row_sums().numpy(), dense(W, SPLATS).sum(axis=1), rtol=1e-12)
 
 

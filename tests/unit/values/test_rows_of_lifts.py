@@ -34,7 +34,7 @@ def test_rows_of_a_lift_are_its_columns_and_answer_as_those_of_the_whole(scene, 
     splats, _, result = scene
     keep = splats.means[:, 0] > -0.2
     some, whole = result[keep], result
-    for name in ("features", "evidence", "agreement", "seen", "confidence"):
+    for name in ("features", "total_weight", "agreement", "seen", "confidence"):
         assert torch.equal(getattr(some, name), getattr(whole, name)[keep]), name
     assert len(some) == len(splats[keep]) == int(keep.sum())
     answer = some.query(np.eye(1, 6), splats=splats[keep], threshold=0.5)

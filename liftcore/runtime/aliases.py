@@ -1,0 +1,91 @@
+"""Old public names: read as the new ones, in Python with a `DeprecationWarning`, and never written to a file.
+
+A row of the table of public names in CONTRIBUTING.md is one entry ``old: new`` of a mapping here called aliases. An
+old and a new name with different values are an error, as either could be the one that was meant.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from functools import wraps
+from typing import Any, TypeVar
+
+from liftcore.errors import InvalidInput, SplatliftError
+
+T = TypeVar("T")
+C = TypeVar("C", bound=type)
+VALUE_CHARACTERS = 60  # characters of a value in an error
+
+
+def current_names(
+    values: Mapping[str, T], aliases: Mapping[str, str], error_type: type[SplatliftError] = InvalidInput
+) -> dict[str, T]:
+    """Return values under their new names, each in its place.
+
+    Args:
+        values: by old and new names. aliases: new names by old ones.
+
+    Raises:
+        SplatliftError: of ``error_type``; an old and a new name have different values.
+    """
+    for old, new in aliases.items():
+        if old in values and new in values and not _equal(values[old], values[new]):
+            got = " and ".join(f"{name}={values[name]!r}"[:VALUE_CHARACTERS] for name in (new, old))
+            expected = f"one value: {old} is the old name of {new}"
+            raise error_type(new, expected=expected, got=got, hint=f"leave {old} out")
+    return {aliases.get(name, name): value for name, value in values.items()}
+
+
+def with_old_names(values: Mapping[str, Any], aliases: Mapping[str, str]) -> dict[str, Any]:
+    """Return values with each old name behind its new one, as replies have both."""
+    olds: dict[str, list[str]] = {}
+    for old, new in aliases.items():
+        olds.setdefault(new, []).append(old)
+    return {key: value for name, value in values.items() for key in (name, *olds.get(name, ()))}
+
+
+def deprecated_names(**aliases: str) -> Callable[[C], C]:
+    """Let a class have attributes and keyword arguments by their old names, each with a `DeprecationWarning`.
+
+    Args:
+        aliases: new names by old ones.
+    """
+
+    def decorate(cls: C) -> C:
+        add_deprecated_properties(cls, aliases)
+        initialise = cls.__init__
+
+        @wraps(initialise)
+        def initialise_by_names(self: Any, *args: Any, **keywords: Any) -> None:
+            for old in aliases.keys() & keywords.keys():
+                _warn(cls, old, aliases[old])
+            initialise(self, *args, **current_names(keywords, aliases))
+
+        cls.__init__ = initialise_by_names
+        return cls
+
+    return decorate
+
+
+def add_deprecated_properties(cls: type, aliases: Mapping[str, str]) -> None:
+    """Let instances of a class be read by old names, each with a `DeprecationWarning`."""
+    for old, new in aliases.items():
+
+        def read_new(self: Any, old: str = old, new: str = new) -> Any:
+            _warn(type(self), old, new)
+            return getattr(self, new)
+
+        setattr(cls, old, property(read_new, doc=f"Deprecated: `{new}`."))
+
+
+def _warn(cls: type, old: str, new: str) -> None:
+    warnings.warn(f"{cls.__name__}.{old} is now {new}", DeprecationWarning, stacklevel=3)
+
+
+def _equal(a: Any, b: Any) -> bool:
+    """Return True if values are equal; arrays and tensors by shape and every element."""
+    if getattr(a, "shape", None) != getattr(b, "shape", None):
+        return False
+    equal = a == b
+    return bool(equal.all() if hasattr(equal, "all") else equal)

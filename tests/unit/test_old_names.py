@@ -1,0 +1,95 @@
+"""Old public names: read in files, settings and calls with the new ones' values, and refused beside other values."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+
+import liftcore as lc
+from liftcore.values.lift_file import FORMATS, OLD_TENSORS
+from liftcore.values.region_weights import OLD_TENSORS as OLD_WEIGHTS
+from tests.scenes import observed, write_scene
+from tests.unit.solve.sparse_views import random_view
+
+
+@pytest.fixture(scope="module")
+def lift(tmp_path_factory: pytest.TempPathFactory) -> lc.LiftResult:
+    """A lift of a small scene."""
+    splats, cameras, _ = write_scene(tmp_path_factory.mktemp("scene"), 3)
+    views = {f"v{k}": observed(3, k) for k in range(3)}
+    return lc.lift(lc.read_splats(splats), lc.read_cameras(cameras), views)
+
+
+def old_names(values: dict[str, Any], aliases: dict[str, str]) -> dict[str, Any]:
+    """Return values with old names in place of new ones."""
+    olds = {new: old for old, new in aliases.items()}
+    return {olds.get(name, name): value for name, value in values.items()}
+
+
+def read_file(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """Return the tensors and the metadata of a lift file."""
+    with safe_open(path, "pt") as file:
+        return load_file(path), json.loads(file.metadata()["splatlift"])
+
+
+def write_file(path: Path, tensors: dict[str, torch.Tensor], metadata: dict[str, Any]) -> Path:
+    save_file(tensors, path, {"splatlift": json.dumps(metadata)})
+    return path
+
+
+def test_lift_file_of_the_first_format_opens_with_the_same_values(lift: lc.LiftResult, tmp_path: Path) -> None:
+    lift.save(tmp_path / "new.safetensors")
+    tensors, metadata = read_file(tmp_path / "new.safetensors")
+    assert metadata["format"] == FORMATS[-1] and not OLD_TENSORS.keys() & tensors.keys()
+    metadata |= {"format": FORMATS[0]}
+    old = lc.load_lift(write_file(tmp_path / "old.safetensors", old_names(tensors, OLD_TENSORS), metadata))
+    for name in OLD_TENSORS.values():
+        assert torch.equal(getattr(old, name), getattr(lift, name))
+    assert old.diagnostics == lift.diagnostics and old.settings == lift.settings
+
+
+@pytest.mark.parametrize("old", OLD_TENSORS)
+def test_lift_file_with_both_names_and_other_values_is_refused(lift: lc.LiftResult, tmp_path: Path, old: str) -> None:
+    lift.save(tmp_path / "lift.safetensors")
+    tensors, metadata = read_file(tmp_path / "lift.safetensors")
+    new = OLD_TENSORS[old]
+    lc.load_lift(write_file(tmp_path / "same.safetensors", tensors | {old: tensors[new].clone()}, metadata))
+    other = ~tensors[new] if tensors[new].dtype == torch.bool else tensors[new] + 1
+    with pytest.raises(lc.InvalidLift, match=f"{old} is the old name of {new}"):
+        lc.load_lift(write_file(tmp_path / "other.safetensors", tensors | {old: other}, metadata))
+
+
+def test_lift_file_of_a_later_format_is_refused_by_its_format(lift: lc.LiftResult, tmp_path: Path) -> None:
+    lift.save(tmp_path / "lift.safetensors")
+    tensors, metadata = read_file(tmp_path / "lift.safetensors")
+    metadata["format"] = "splatlift-lift/999"
+    for columns in (tensors, {"features": tensors["features"]}):
+        with pytest.raises(lc.InvalidLift, match="splatlift-lift/999"):
+            lc.load_lift(write_file(tmp_path / "later.safetensors", columns, metadata))
+
+
+@pytest.mark.parametrize("old", OLD_TENSORS)
+def test_old_attributes_and_keywords_of_a_lift_are_deprecated(lift: lc.LiftResult, old: str) -> None:
+    new = OLD_TENSORS[old]
+    with pytest.deprecated_call(match=f"{old} is now {new}"):
+        assert getattr(lift, old) is getattr(lift, new)
+    columns = {name: getattr(lift, name) for name in ("features", "total_weight", "agreement", "seen", "metadata")}
+    with pytest.deprecated_call(match=f"{old} is now {new}"):
+        result = lc.LiftResult(**old_names(columns, {old: new}))
+    assert getattr(result, new) is getattr(lift, new)
+
+
+def test_weights_file_of_the_first_format_opens(tmp_path: Path) -> None:
+    weights = replace(random_view(0, 4, 30), views=("v0",))
+    weights.save(tmp_path / "new.safetensors")
+    tensors = old_names(load_file(tmp_path / "new.safetensors"), OLD_WEIGHTS)
+    metadata = {"format": "splatlift-weights/1", "views": json.dumps(weights.views)}
+    save_file(tensors, tmp_path / "old.safetensors", metadata)
+    back = lc.RegionWeights.load(tmp_path / "old.safetensors")
+    assert back.views == weights.views
+    assert all(torch.equal(tensor, back.tensors()[name]) for name, tensor in weights.tensors().items())
