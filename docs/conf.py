@@ -88,10 +88,17 @@ def table_of_question() -> str:
 
 
 def table_of_names() -> str:
-    """Return the names of each public module beside `liftcore`."""
-    names = {f"liftcore.{module}": import_module(f"liftcore.{module}").__all__ for module in PUBLIC_MODULES}
-    rows = ((f"`{module}`", ", ".join(f"`{name}`" for name in sorted(public))) for module, public in names.items())
-    return table(("module", "names"), *rows)
+    """Return each public module with the first line of its docstring and its names."""
+    modules = [import_module(name) for name in ("liftcore", *(f"liftcore.{module}" for module in PUBLIC_MODULES))]
+    rows = (
+        (
+            f"`{module.__name__}`",
+            (module.__doc__ or "").splitlines()[0].removeprefix("Public: ").rstrip(":.").replace("``", "`"),
+            ", ".join(f"`{name}`" for name in sorted(module.__all__)),
+        )
+        for module in modules
+    )
+    return table(("module", "for", "names"), *rows)
 
 
 def table_of_routes() -> str:
