@@ -14,7 +14,7 @@ from liftcore.features.prompts import Folders, Unannotated, prompt_views
 from liftcore.io.files import whole_file
 from liftcore.io.outputs import check_output, writing
 from liftcore.io.photos import orientation_warnings
-from liftcore.io.remote import landing, local_path
+from liftcore.io.remote import local_path, open_output
 from liftcore.io.safetensors_file import with_metadata
 from liftcore.runtime.arguments import check_choice, check_text, one_of
 from liftcore.runtime.progress import Progress, shown_progress
@@ -110,7 +110,7 @@ def pack_folder(
         metadata = {"source": kind} | {name: text for name, text in texts.items() if names[name] is not None}
         if kind == "langsplat" and len(views[next(iter(views))].labels) == len(LANGSPLAT_LEVELS):
             metadata["levels"] = json.dumps(LANGSPLAT_LEVELS)
-        with writing(out), landing(out) as file:
+        with writing(out), open_output(out) as file:
             write_pack(file, views, metadata, reporter, table)
     keeps_names = kind in ("langsplat", "prompts") or is_encoded  # names of their files have no image suffix
     return {
@@ -204,5 +204,5 @@ def retag_pack(pack: Path | str, out: Path | str, names: Mapping[str, str]) -> N
     pack = local_path(pack, "pack")
     check_output(out, [pack], "pack")
     read_features(pack)  # so that an invalid pack is an error before a file is created
-    with writing(out), landing(out) as file, whole_file(file) as handle:
+    with writing(out), open_output(out) as file, whole_file(file) as handle:
         handle.writelines(with_metadata(pack, names))

@@ -352,7 +352,7 @@ class _Asset:
     # -- parts of the file
 
     def _attribute(self, attributes: dict[str, Any], name: str, width: int, count: int) -> np.ndarray:
-        """[P, width] of an attribute; normalized whole numbers as f32."""
+        """Read an attribute [P, width]; normalized integers as f32."""
         accessor = self._at(self._list(self.json, "accessors"), attributes.get(name), f"accessor of {name}")
         component, kind, normalized = (accessor.get(key) for key in ("componentType", "type", "normalized"))
         code = COMPONENTS.get(component) if type(component) is int else None
@@ -377,7 +377,7 @@ class _Asset:
         return values
 
     def _view(self, place: Any) -> np.ndarray:
-        """[n] u8, the bytes of a buffer view."""
+        """Return the bytes [n] u8 of a buffer view."""
         view = self._at(self._list(self.json, "bufferViews"), place, "buffer view")
         first, size, buffer = view.get("byteOffset", 0), view.get("byteLength"), view.get("buffer")
         content = self._buffer(buffer)

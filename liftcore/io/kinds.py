@@ -1,8 +1,8 @@
 """The kind of any file or folder, and what to do with one that no reader takes. Loads no torch.
 
-`identify` looks at the beginning of a file, at the names in a zip or a folder, and at a name's suffix last: files are
-renamed, and their names are lost on the way to a server. What it reads is bounded. Readers, the command line, the
-check of uploads and `inspect` all ask it; the page has its table of suffixes (`page_table`).
+`identify` reads the beginning of a file, or the names in a zip or a folder, and a name's suffix last: files are
+renamed, and their names are lost on the way to a server. It reads a bounded number of bytes. Readers, the command
+line, the check of uploads and `inspect` all use it; the page has its table of suffixes (`page_table`).
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ PARTS = {"labels", "codebook", "grid"}  # of a feature pack's views
 CAMERA_FILES = re.compile(
     r"(^|/)((cameras|images|frames|rigs)\.(bin|txt)|(dataparser_)?transforms[^/]*\.json|cameras\.json)$"
 )
-MAX_JSON_BYTES = 64 << 20  # that are parsed to tell what a document is
-MAX_LINE_BYTES = 1 << 20  # of a line that is parsed likewise
-HEAD_BYTES = 4096  # of what is told by its first bytes
+MAX_JSON_BYTES = 64 << 20  # of a document that is parsed
+MAX_LINE_BYTES = 1 << 20  # of a line that is parsed
+HEAD_BYTES = 4096  # of files recognised by their beginning
 DEPTH = 5  # folders down
 MAX_FOLDERS = 2_000
-MAX_NAMES = 50_000  # of files in a folder that are looked at
+MAX_NAMES = 50_000  # of files in a folder
 MOST_HEADERS = 32  # of PLYs in a folder or zip that are read, the likeliest first
 TEXT_SHOWN = 60  # characters
 
@@ -65,7 +65,7 @@ OPEN_COPY = "open it where it lies, so that it is downloaded, and copy that"
 
 
 class SplatFormat(StrEnum):
-    """A format that is read, as people call it."""
+    """A format of splats that is read, by its usual name."""
 
     PLY = "PLY"  # of every dialect
     COMPRESSED_PLY = "compressed PLY"
@@ -98,15 +98,15 @@ class FileKind:
     """The kind of a file or folder, in the words of an error."""
 
     kind: str | None  # splats, cameras, photos (a zip or folder), features, masks, table or lift; None: none of these
-    name: str  # as it stands behind "got"
+    name: str  # as errors have it behind "got"
     hint: str = ""  # what to do with it
     format: SplatFormat | None = None  # of splats
     splats: tuple[str, ...] = ()  # splat files in a folder or zip, the one (or the folder of all ranks) to give first
-    recognised: bool = True  # False: nothing is known of it but its first bytes
+    recognised: bool = True  # False: only its first bytes are known
 
     @property
-    def sent(self) -> tuple[str, ...]:
-        """Those of ``splats`` that HTTP takes, where no pickle is opened."""
+    def accepted_over_http(self) -> tuple[str, ...]:
+        """Those of ``splats`` that HTTP accepts, where no pickle is opened."""
         return tuple(name for name in self.splats if name.lower().endswith(SPLATS_SENT))
 
     @property
@@ -252,36 +252,36 @@ Fault = TypeVar("Fault", bound=InvalidInput)
 
 
 def kind_of(path: Path) -> str | None:
-    """The kind of a file or folder; None where it is none of those of `FileKind`, or does not open."""
+    """Return the kind of a file or folder; None where it is none of those of `FileKind`, or does not open."""
     return identify(path).kind
 
 
 def wrong_kind(
-    path: Path | str, wanted: str, fault: type[Fault], *, argument: str = "", expected: str = ""
+    path: Path | str, kind: str, fault: type[Fault], *, argument: str = "", expected: str = ""
 ) -> Fault | None:
-    """The error for a file or folder in the place of one of another kind; None where it may be of the wanted kind.
+    """Return the error for a file or folder of another kind than expected; None if it may be of that kind.
 
     Args:
-        path: the file or folder. wanted: of `FileKind.kind`. fault: the error's type. argument: its name there, the
-        path if empty. expected: what belongs there, ``wanted`` if empty.
+        path: the file or folder. kind: of `FileKind.kind`. fault: the error's type. argument: its name there, the
+        path if empty. expected: of the error, ``kind`` if empty.
     """
-    found = identify(path)
-    if found.kind == wanted or not found.recognised:
+    identified = identify(path)
+    if identified.kind == kind or not identified.recognised:
         return None
-    hint = found.hint
-    if found.kind is not None or (wanted == "splats" and found.splats):
-        hint = _replacement_hint(Path(path), found, wanted) or hint
-    return fault(argument or str(path), expected=expected or wanted, got=found.name, hint=hint)
+    hint = identified.hint
+    if identified.kind is not None or (kind == "splats" and identified.splats):
+        hint = _replacement_hint(Path(path), identified, kind) or hint
+    return fault(argument or str(path), expected=expected or kind, got=identified.name, hint=hint)
 
 
-def _replacement_hint(path: Path, found: FileKind, wanted: str) -> str:
-    """The hint of what to give in the place of a file or folder of ours."""
-    if wanted == "splats" and found.splats:
-        one = found.splats[0]
+def _replacement_hint(path: Path, identified: FileKind, kind: str) -> str:
+    """Return advice what to give in place of a file or folder of a known kind."""
+    if kind == "splats" and identified.splats:
+        first = identified.splats[0]
         if path.is_dir():
-            return f"give {path / one}"
-        return f"unzip it and give {one}"
-    if found.format is SplatFormat.CHECKPOINT and wanted in ("features", "masks", "table"):
+            return f"give {path / first}"
+        return f"unzip it and give {first}"
+    if identified.format is SplatFormat.CHECKPOINT and kind in ("features", "masks", "table"):
         return "save its arrays as .npy files ('splatlift pack npy' makes packs of those), or as safetensors"
     hints = {
         ("features", "photos"): "'splatlift encode IMAGES -o PACK' makes a feature pack of photos",
@@ -296,11 +296,11 @@ def _replacement_hint(path: Path, found: FileKind, wanted: str) -> str:
         ("lift", "features"): "'splatlift lift SPLATS CAMERAS FEATURES -o LIFT' makes a lift of them",
         ("lift", "splats"): "'splatlift lift SPLATS CAMERAS FEATURES -o LIFT' makes a lift of them",
     }
-    return hints.get((wanted, found.kind or ""), "")
+    return hints.get((kind, identified.kind or ""), "")
 
 
 def identify(path: Path | str) -> FileKind:
-    """Find what a file or folder is, without an error: what does not open says so in its name.
+    """Identify a file or folder, without an error: one that does not open has a name that says so.
 
     Raises:
         InvalidInput: it is no path.
@@ -325,7 +325,7 @@ def identify(path: Path | str) -> FileKind:
 
 
 def splat_format(path: Path) -> SplatFormat | None:
-    """The format of splats that are read, by content; None of anything else."""
+    """Return the format of splats that are read, by content; None of anything else."""
     return identify(path).format
 
 
@@ -339,8 +339,8 @@ def _file(path: Path) -> FileKind:
 
 
 def _first_match(rules: Iterable[FileKind | None]) -> FileKind:
-    """The first that fits; the last of such rules always does."""
-    return next(found for found in rules if found is not None)
+    """Return the first kind that fits; the last rule always does."""
+    return next(kind for kind in rules if kind is not None)
 
 
 def _file_rules(path: Path, head: bytes, size: int) -> Iterator[FileKind | None]:
@@ -354,13 +354,15 @@ def _file_rules(path: Path, head: bytes, size: int) -> Iterator[FileKind | None]
     damaged = FileKind(None, "a zip that is cut short or damaged", "copy or download it again")
     yield damaged if head[:4] == b"PK\3\4" else None
     yield _safetensors(path) if suffix == ".safetensors" or _is_safetensors(head, size) else None
-    known = _by_magic(head) or (_by_text(path, head, size) if _is_text(head) else None)
-    is_splat = suffix == ".splat" or (known is None and suffix not in _BY_SUFFIX and looks_like_splat(head, size))
+    by_content = _by_magic(head) or (_by_text(path, head, size) if _is_text(head) else None)
+    is_splat = suffix == ".splat" or (
+        by_content is None and suffix not in _BY_SUFFIX and looks_like_splat(head, size)
+    )
     yield _splats_as(SplatFormat.SPLAT) if is_splat else None
     meta = path.parent / META
-    is_part = known is _PICTURE and meta.is_file() and _is_sog(meta)
+    is_part = by_content is _PICTURE and meta.is_file() and _is_sog(meta)
     yield replace(_PICTURE, name="a picture of a SOG", hint=f"give {meta}") if is_part else None
-    yield known
+    yield by_content
     yield _BY_SUFFIX[".ksplat"] if _is_ksplat(head, size) else None
     yield _BY_SUFFIX.get(suffix)
     zeros = FileKind(None, "a file of zeros", "a copy or download did not finish: fetch it again")
@@ -368,18 +370,18 @@ def _file_rules(path: Path, head: bytes, size: int) -> Iterator[FileKind | None]
     yield FileKind(None, f"a file that begins with {head[:8]!r}", recognised=False)
 
 
-def _splats_as(found: SplatFormat) -> FileKind:
+def _splats_as(splat_format: SplatFormat) -> FileKind:
     pickled = "a checkpoint or another Python pickle, which may run code when it is opened"
-    return FileKind("splats", pickled if found is SplatFormat.CHECKPOINT else "splats", format=found)
+    return FileKind("splats", pickled if splat_format is SplatFormat.CHECKPOINT else "splats", format=splat_format)
 
 
 def _ply(head: bytes) -> FileKind:
     lines = head.partition(b"end_header")[0].decode("latin1").splitlines()
-    if found := cloud_without_splats(lines):
-        return FileKind(None, *found)
+    if cloud := cloud_without_splats(lines):
+        return FileKind(None, *cloud)
     first = next((line.split()[1:2] for line in lines if line.startswith("element ")), [])
-    ours = SplatFormat.COMPRESSED_PLY if first == ["chunk"] else SplatFormat.PLY
-    return FileKind("splats", "splats", format=ours)
+    splat_format = SplatFormat.COMPRESSED_PLY if first == ["chunk"] else SplatFormat.PLY
+    return FileKind("splats", "splats", format=splat_format)
 
 
 def _is_safetensors(head: bytes, size: int) -> bool:
@@ -399,13 +401,13 @@ def _safetensors(path: Path) -> FileKind:
     kind = next((kind for kind, fits in signs.items() if fits), None)
     if kind is not None:
         return FileKind(kind, kind)
-    some = ", ".join(repr(key[:40]) for key in sorted(keys)[:3]) or "no tensor"
+    tensors = ", ".join(repr(key[:40]) for key in sorted(keys)[:3]) or "no tensor"
     hint = "weights of an encoder go to --weights or the encoder's name; 'splatlift pack' makes feature packs"
-    return FileKind(None, f"a safetensors file of {some}", hint)
+    return FileKind(None, f"a safetensors file of {tensors}", hint)
 
 
 def keys_of(path: Path) -> tuple[set[str], dict[str, str]]:
-    """The names of a safetensors file's tensors, and its metadata.
+    """Return the names of a safetensors file's tensors, and its metadata.
 
     Raises:
         InvalidInput: it does not open.
@@ -421,12 +423,12 @@ def keys_of(path: Path) -> tuple[set[str], dict[str, str]]:
 
 
 def _by_magic(head: bytes) -> FileKind | None:
-    found = next((kind for place, magic, kind in _MAGIC if head.startswith(magic, place)), None)
-    if found is None and head[:1] == b"\x80" and head[1:2] in b"\x02\x03\x04\x05":
-        found = FileKind(None, "a Python pickle, which may run code when it is opened", EXPORT_PLY)
-    if found is _GLTF and b"KHR_gaussian_splatting" in head:
+    identified = next((kind for place, magic, kind in _MAGIC if head.startswith(magic, place)), None)
+    if identified is None and head[:1] == b"\x80" and head[1:2] in b"\x02\x03\x04\x05":
+        identified = FileKind(None, "a Python pickle, which may run code when it is opened", EXPORT_PLY)
+    if identified is _GLTF and b"KHR_gaussian_splatting" in head:
         return _splats_as(SplatFormat.GLTF)
-    return _splats_as(SplatFormat.USD) if found is _USD else found
+    return _splats_as(SplatFormat.USD) if identified is _USD else identified
 
 
 def _is_ksplat(head: bytes, size: int) -> bool:
@@ -443,7 +445,7 @@ def _cameras_of(program: str) -> FileKind:
 
 
 def _by_text(path: Path, head: bytes, size: int) -> FileKind | None:
-    """The kind of a text: JSON, a page, a mesh, COLMAP's text, or a server's error."""
+    """Return the kind of a text: JSON, a page, a mesh, COLMAP's text, or a server's error."""
     start = head[:HEAD_BYTES].lstrip(b"\xef\xbb\xbf \t\r\n")
     lower, suffix = start.lower(), path.suffix.lower()
     if start[:1] in (b"{", b"["):
@@ -488,7 +490,7 @@ def _json(path: Path, size: int) -> FileKind:
 
 
 def _json_lines(path: Path) -> FileKind | None:
-    """The kind of a text of which each line is JSON; None where the first two are not."""
+    """Return the kind of a text of which each line is JSON; None where the first two are not."""
     with suppress(ValueError, RecursionError, OSError), open_regular(path) as handle:
         first, _ = (json.loads(handle.readline(MAX_LINE_BYTES)) for _ in range(2))
         if isinstance(first, dict) and first.keys() >= {"format", "made_by"}:  # `liftcore.io.labels`
@@ -498,7 +500,7 @@ def _json_lines(path: Path) -> FileKind | None:
 
 
 def _document(document: Any, path: Path) -> FileKind:
-    """The kind of a JSON document, by its keys."""
+    """Return the kind of a JSON document, by its keys."""
     if isinstance(document, list):
         return _first_match(_list_rules(document))
     if isinstance(document, dict):
@@ -524,7 +526,7 @@ def _object_rules(document: dict[str, Any], path: Path) -> Iterator[FileKind | N
     first = frames[0] if isinstance(frames, list) and frames and isinstance(frames[0], dict) else {}
     yield _cameras_of("sdfstudio") if {"rgb_path", "camtoworld"} <= first.keys() else None
     yield FileKind("cameras", "cameras") if "frames" in keys else None
-    program = next((name for name, own in _CAMERA_KEYS.items() if own <= keys), None)
+    program = next((name for name, required in _CAMERA_KEYS.items() if required <= keys), None)
     yield _cameras_of(program) if program else None
     frame = FileKind(None, f"the frame of a nerfstudio run ({FRAME_FILE})", "give the cameras that it belongs to")
     yield frame if keys >= {"transform", "scale"} else None
@@ -541,8 +543,8 @@ def _object_rules(document: dict[str, Any], path: Path) -> Iterator[FileKind | N
     yield _BY_SUFFIX.get(path.suffix.lower())
     is_answer = len(keys) <= 6 and keys & {"error", "errors", "detail", "message", "Message"}
     yield FileKind(None, f"an answer of a server ({str(document)[:TEXT_SHOWN]!r})", DOWNLOAD) if is_answer else None
-    some = ", ".join(map(str, list(keys)[:5]))[:TEXT_SHOWN]
-    yield FileKind(None, f"a JSON object with {some or 'nothing'}", recognised=False)
+    listing = ", ".join(map(str, list(keys)[:5]))[:TEXT_SHOWN]
+    yield FileKind(None, f"a JSON object with {listing or 'nothing'}", recognised=False)
 
 
 def _is_sog(path: Path) -> bool:
@@ -569,7 +571,7 @@ def _first_bytes(archive: zipfile.ZipFile, name: str) -> bytes:
 
 
 def _user_files(names: Iterable[str]) -> list[str]:
-    """The files but those that systems put there."""
+    """Return the files without those of the operating system."""
     files = [name for name in names if not name.endswith("/")]
     return [name for name in files if not is_system_file(PurePosixPath(name.replace("\\", "/")))]
 
@@ -591,12 +593,12 @@ def _of_names_in_zip(names: list[str], head_of: Callable[[str], bytes]) -> Itera
     yield _zip_with(splats) if splats else None
     yield FileKind("photos", "photos") if suffixes & IMAGE_SUFFIXES else None
     yield _zip_with(packs) if (packs := [name for name in names if name.endswith(".safetensors")]) else None
-    known = next((kind for last in lasts if (kind := _BY_SUFFIX.get(PurePosixPath(last).suffix.lower()))), None)
-    yield replace(_zip_with(names), hint=known.hint if known else "unzip it and give the file itself")
+    by_suffix = next((kind for last in lasts if (kind := _BY_SUFFIX.get(PurePosixPath(last).suffix.lower()))), None)
+    yield replace(_zip_with(names), hint=by_suffix.hint if by_suffix else "unzip it and give the file itself")
 
 
 def _zip_with(names: Sequence[str]) -> FileKind:
-    """A zip with files of interest, the first of which is the one to give."""
+    """Return a zip with files of interest, the first of which is the one to give."""
     several = f" and {len(names) - 1} more" if len(names) > 1 else ""
     splats = tuple(name for name in names if name.lower().endswith((*SPLATS_SENT, *PICKLED)))
     return FileKind(None, f"a zip with {names[0]}{several} in it", f"unzip it and give {names[0]}", splats=splats)
@@ -640,11 +642,11 @@ def _folder_rules(path: Path) -> Iterator[FileKind | None]:
     yield _splats_as(SplatFormat.STREAMED_SOG) if (path / LOD_META).is_file() else None
     names = _names_below(path)
     splats = _splat_files(names, lambda name: _has_splats(path / name))
-    named = _folder_name(names, splats)
+    folder_name = _folder_name(names, splats)
     if splats and len(rank_files(path / splats[0])) > 1:  # their folder is the whole scene
         splats = (str(PurePosixPath(splats[0]).parent), *splats)
-    yield FileKind("cameras", named or "a folder of cameras", splats=splats) if _has_cameras(path) else None
-    yield FileKind(None, named or "a folder", f"give {path / splats[0]}", splats=splats) if splats else None
+    yield FileKind("cameras", folder_name or "a folder of cameras", splats=splats) if _has_cameras(path) else None
+    yield FileKind(None, folder_name or "a folder", f"give {path / splats[0]}", splats=splats) if splats else None
     suffixes = {PurePosixPath(name).suffix.lower() for name in names}
     is_langsplat = all(any(name.endswith(end) for name in names) for end in ("_f.npy", "_s.npy"))
     hint = f"'splatlift pack langsplat {path} -o PACK.safetensors' makes a feature pack of it"
@@ -659,7 +661,7 @@ def _folder_rules(path: Path) -> Iterator[FileKind | None]:
 
 
 def _has_cameras(path: Path) -> bool:
-    from liftcore.io.cameras import camera_source  # which asks here what a wrong file is
+    from liftcore.io.cameras import camera_source  # which imports `wrong_kind`
 
     with suppress(InvalidInput):
         return bool(camera_source(path).files)
@@ -673,23 +675,23 @@ def _has_splats(path: Path) -> bool:
 
 
 def _folder_name(names: Sequence[str], splats: Sequence[str]) -> str:
-    """The trainer of a folder, as far as that shows, and how many files of splats are in it."""
-    trainer = next((who for sign, who in _TRAINERS.items() if any(sign in name for name in names)), None)
+    """Return the trainer of a folder, as far as that shows, and how many files of splats are in it."""
+    trainer = next((program for sign, program in _TRAINERS.items() if any(sign in name for name in names)), None)
     if trainer is None and any(re.search(r"(^|/)export_[0-9]+\.ply$", name) for name in names):
         trainer = "Brush"
-    named = f"a folder of {trainer}" if trainer else "a folder" if len(splats) > 1 else ""
-    return f"{named} with {len(splats)} files of splats in it" if len(splats) > 1 else named
+    label = f"a folder of {trainer}" if trainer else "a folder" if len(splats) > 1 else ""
+    return f"{label} with {len(splats)} files of splats in it" if len(splats) > 1 else label
 
 
 def _names_below(folder: Path) -> list[str]:
-    """The files below a folder, relative to it, without hidden ones; links are not followed."""
+    """Return the files below a folder, relative to it, without hidden ones; links are not followed."""
     names: list[str] = []
     for parent, inner, files in islice(os.walk(folder), MAX_FOLDERS):
-        here = Path(parent).relative_to(folder)
-        names += [(here / name).as_posix() for name in sorted(files) if not is_system_file(Path(name))]
+        relative = Path(parent).relative_to(folder)
+        names += [(relative / name).as_posix() for name in sorted(files) if not is_system_file(Path(name))]
         if len(names) > MAX_NAMES:
             break
-        inner[:] = [name for name in sorted(inner) if len(here.parts) < DEPTH and not is_system_file(Path(name))]
+        inner[:] = [name for name in sorted(inner) if len(relative.parts) < DEPTH and not is_system_file(Path(name))]
     return names
 
 
@@ -697,7 +699,7 @@ def _names_below(folder: Path) -> list[str]:
 
 
 def page_table() -> dict[str, Any]:
-    """The suffixes by which the page sends files, and those that it does not send, in the words above."""
+    """Return the suffixes of files that the page sends, and those that it refuses, with the hints above."""
     return {
         "kinds": {
             **dict.fromkeys(SPLATS_SENT, "splats"), ".json": "cameras", ".safetensors": "features", ".zip": "cameras",

@@ -1,6 +1,6 @@
 """Splat scenes in PLY files of every dialect: read, written back to the byte, and copied with one thing changed.
 
-Headers are read under limits, and what they say must fit the file's size, before anything trusts their numbers.
+Headers are read under limits, and checked against the file's size, before their numbers are used.
 
 One table of columns serves reading and writing, for every dialect: Inria, gsplat (no normals), SAGA and LaGa
 (``mask``), 2DGS (two scales) and DBS (``sh0_*``, ``shN_*``, ``sb_params_*``, ``beta``). Colour coefficients and lobes
@@ -34,10 +34,10 @@ MAX_HEADER_LINES = 4096
 BLOCK_ROWS = 16_384  # rows converted at a time: a few MB, so that memory stays near the file's size
 MAX_SH_DEGREE = 4
 LOBE_CHANNELS = 6  # of a spherical beta lobe: r g b theta phi beta
-COLOUR = ("sh", "sb_params")  # fields that a lift has no use for, and most of a file
+COLOUR = ("sh", "sb_params")  # fields that a lift does not need, and most of a file
 FILTER = "filter_3D"  # of Mip-Splatting, the column of its smoothing filter
 MIP_SPLATTING = f"the column {FILTER!r} of Mip-Splatting"  # which also trains with compensated opacities
-UNREAD = {  # columns that change what is rendered and are not read: what the splats are, and a pattern of names
+UNREAD = {  # columns that change renderings and are not read: the effect of ignoring them, and a pattern of names
     "move, and are lifted as they stand": r"(motion|trbf|omega|velocity|rot_r|rotation_r|scale_t|scaling_t)(_.*)?|"
     r"t|t_.*|time",
     "have a footprint of their own, and are lifted with the kernel's": r"(shape|gamma|nu|nu_degree|beta|kernel)"
@@ -65,10 +65,10 @@ REWRITE = (
     "p.byte_order = '<'; p.write('OUT.ply')"
 )
 _END = re.compile(rb"(?:^|\n)end_header[ \t]*(\r?\n)")
-_REMARKS = ("comment", "obj_info")  # lines that are kept, and not understood
+_REMARKS = ("comment", "obj_info")  # lines that are kept, and not parsed
 PADDING = b"\0 \t\r\n"  # bytes that some programs end a file with
-MAX_PADDING_BYTES = 4096  # that are looked at
-FLOAT_BYTES = 4  # of a column that a header may have forgotten
+MAX_PADDING_BYTES = 4096  # that are read
+FLOAT_BYTES = 4  # of a column that a header may lack
 _ELEMENT = re.compile(r"\s*element\s+(\S+)\s+([0-9]{1,18})\s*")
 _GSPLAT = {"x", "y", "z", "f_dc_0", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_3"}
 _SIGNATURES = {
@@ -116,32 +116,32 @@ def read_ply(path: Path, kernel: Kernel | str = "auto", *, colour: bool = True) 
             raise InvalidSplats(argument, expected="float or double", got=SPELLING[code], hint=hint)
     if header.count == 0:
         raise InvalidSplats(str(path), expected="at least one splat", got="an empty scene")
-    others = [name for name in header.names if name not in slots]
+    extra_names = [name for name in header.names if name not in slots]
     if not colour:
         slots = {name: slot for name, slot in slots.items() if slot.field not in COLOUR}
-        others = [name for name in others if name == FILTER]
-    fields, extras = _read_columns(path, header, slots, others)
+        extra_names = [name for name in extra_names if name == FILTER]
+    fields, extras = _read_columns(path, header, slots, extra_names)
     layout, lines = (header.names, header.lines) if colour else ((), ())
     if FILTER in extras:
         lines, layout = (), tuple(name for name in layout if name != FILTER)
-        fields |= _filtered(fields["log_scales"], fields["opacity_logits"], extras.pop(FILTER))
+        fields |= _apply_filter(fields["log_scales"], fields["opacity_logits"], extras.pop(FILTER))
     if colour and "sh" not in fields and (channels := channel_names(header.names)):
         levels = np.stack([extras[name] for name in channels], axis=1)
         terms = constant_terms(levels / full_level(levels)).astype(np.float32)
         fields["sh"] = np.ascontiguousarray(terms[:, None])
     tensors = {name: torch.from_numpy(values) for name, values in extras.items()}
-    own = {"layout": layout, "header": lines, "render_mode": mode, "warnings": warnings}
-    return Splats(**fields, kernel=kernel, extras=tensors, **own)
+    origin_fields = {"layout": layout, "header": lines, "render_mode": mode, "warnings": warnings}
+    return Splats(**fields, kernel=kernel, extras=tensors, **origin_fields)
 
 
 def read_places(path: Path) -> np.ndarray:
-    """[P, 3] f32 (f64 of doubles), the means alone of what `read_ply` takes, in the file's frame; without torch."""
+    """Read the means [P, 3] f32 (f64 of doubles) alone, in the file's frame, without torch."""
     header = read_header(path)
     return _read_columns(path, header, {axis: Slot("means", (k,)) for k, axis in enumerate("xyz")}, ())[0]["means"]
 
 
 def ply_blocks(splats: Splats) -> Iterator[bytes]:
-    """The bytes of a PLY of splats, in blocks: the layout they were read with, or else their kernel's usual one.
+    """Yield the bytes of a PLY of splats in blocks, with the layout they were read with, or their kernel's usual one.
 
     Raises:
         InvalidSplats: the layout names a column that the splats do not have.
@@ -149,7 +149,7 @@ def ply_blocks(splats: Splats) -> Iterator[bytes]:
     layout = splats.layout or _default_layout(splats)
     columns = _columns_of(splats, layout)
     source = None
-    if splats.header:  # still describes the columns unless somebody changed the layout
+    if splats.header:  # describes the columns unless the layout was changed
         header = parse_header(header_bytes(splats.header), "header")
         source = header if header.names == splats.layout else None
     codes = {name: source.dtype[name].str[1:] if source else "f4" for name in layout}
@@ -171,8 +171,8 @@ def ply_blocks(splats: Splats) -> Iterator[bytes]:
         yield rows.tobytes()
 
 
-def some_rows(path: Path, kept: np.ndarray) -> Iterator[bytes]:
-    """A PLY with some of its rows, of its own bytes, a block of rows at a time.
+def some_rows(path: Path, mask: np.ndarray) -> Iterator[bytes]:
+    """Yield a PLY with some of its rows, byte for byte, a block of rows at a time.
 
     Args:
         path: the file.
@@ -184,14 +184,14 @@ def some_rows(path: Path, kept: np.ndarray) -> Iterator[bytes]:
     Raises:
         InvalidSplats: the file is malformed, or has another number of splats.
     """
-    header = _header_of(path, len(kept))
-    yield header_bytes(header.lines_for(int(np.count_nonzero(kept))))
+    header = _header_of(path, len(mask))
+    yield header_bytes(header.lines_for(int(np.count_nonzero(mask))))
     for first, rows in _blocks(path, header):
-        yield rows[kept[first : first + len(rows)]].tobytes()
+        yield rows[mask[first : first + len(rows)]].tobytes()
 
 
 def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
-    """A PLY whose splats have one colour each, the same from everywhere; all else is of its own bytes.
+    """Yield a PLY whose splats have one colour each, independent of the view; all else is unchanged byte for byte.
 
     Higher harmonics become zero. The lobes of DBS become dark and not zero: a lobe of zeros shines. Of files without
     harmonics, red, green and blue are changed, in their type and unit.
@@ -233,7 +233,7 @@ def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
 
 
 def with_columns(path: Path, columns: Mapping[str, np.ndarray]) -> Iterator[bytes]:
-    """A PLY with more properties behind those that it has, which keep their bytes; of one name, the new one stays.
+    """Yield a PLY with further properties behind its own, which stay byte for byte; of one name, the new one stays.
 
     Args:
         path: the file. columns: name -> [P] i32 or f32.
@@ -245,21 +245,23 @@ def with_columns(path: Path, columns: Mapping[str, np.ndarray]) -> Iterator[byte
         InvalidSplats: the file is malformed, or has another number of splats.
     """
     header = _header_of(path, len(next(iter(columns.values()))))
-    kept = [name for name in header.names if name not in columns]
+    unchanged_names = [name for name in header.names if name not in columns]
     codes = {name: values.dtype.str[1:] for name, values in columns.items()}
-    dtype = np.dtype([(name, header.dtype[name]) for name in kept] + [(name, f"<{codes[name]}") for name in codes])
+    dtype = np.dtype(
+        [(name, header.dtype[name]) for name in unchanged_names] + [(name, f"<{codes[name]}") for name in codes]
+    )
     properties = [line for line in header.lines if line.split()[:1] == ["property"]]
     replaced = {line for line in properties if line.split()[-1] in columns}
     *lines, end = (line for line in header.lines if line not in replaced)
     ending = "\r" if end.endswith("\r") else ""
     yield header_bytes([*lines, *(f"property {SPELLING[code]} {name}{ending}" for name, code in codes.items()), end])
     for first, rows in _blocks(path, header):
-        made = np.empty(len(rows), dtype)
-        for name in kept:
-            made[name] = rows[name]
+        block = np.empty(len(rows), dtype)
+        for name in unchanged_names:
+            block[name] = rows[name]
         for name, values in columns.items():
-            made[name] = values[first : first + len(rows)]
-        yield made.tobytes()
+            block[name] = values[first : first + len(rows)]
+        yield block.tobytes()
 
 
 def _header_of(path: Path, count: int) -> PlyHeader:
@@ -270,7 +272,7 @@ def _header_of(path: Path, count: int) -> PlyHeader:
 
 
 def _blocks(path: Path, header: PlyHeader) -> Iterator[tuple[int, np.ndarray]]:
-    """The number of the first row, and rows with a field a column. Read, not mapped: what was copied is let go."""
+    """Yield the first row's index, and a block of rows with a field a column; read, not mapped, to bound memory."""
     with path.open("rb", buffering=0) as source:
         source.seek(header.data_offset)
         for first in range(0, header.count, BLOCK_ROWS):
@@ -278,9 +280,9 @@ def _blocks(path: Path, header: PlyHeader) -> Iterator[tuple[int, np.ndarray]]:
 
 
 def _read_columns(
-    path: Path, header: PlyHeader, slots: Mapping[str, Slot], others: Sequence[str]
+    path: Path, header: PlyHeader, slots: Mapping[str, Slot], extra_names: Sequence[str]
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """The model's fields as f32, means of doubles as f64, and the other columns in their own type."""
+    """Return the model's fields as f32, means of doubles as f64, and the other columns in their own type."""
     shapes: dict[str, tuple[int, ...]] = {}
     for slot in slots.values():
         corner = shapes.get(slot.field, (0,) * len(slot.index))
@@ -291,7 +293,7 @@ def _read_columns(
         field: np.empty((header.count, *shape), np.float64 if field in doubled else np.float32)
         for field, shape in shapes.items()
     }
-    extras = {name: np.empty(header.count, header.dtype[name]) for name in others}
+    extras = {name: np.empty(header.count, header.dtype[name]) for name in extra_names}
     targets = {name: fields[slot.field][(slice(None), *slot.index)] for name, slot in slots.items()} | extras
     table = np.memmap(path, header.dtype, "r", header.data_offset, (header.count,))
     with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite and is refused as such
@@ -302,7 +304,9 @@ def _read_columns(
     return fields, extras
 
 
-def _filtered(log_scales: np.ndarray, opacity_logits: np.ndarray, deviations: np.ndarray) -> dict[str, np.ndarray]:
+def _apply_filter(
+    log_scales: np.ndarray, opacity_logits: np.ndarray, deviations: np.ndarray
+) -> dict[str, np.ndarray]:
     """Log scales [P, 3] and opacity logits [P] with the 3D smoothing filter of Mip-Splatting in them.
 
     Such a scene (and GOF's) is trained with every Gaussian convolved with one of the standard deviation f [P], its
@@ -318,8 +322,8 @@ def _filtered(log_scales: np.ndarray, opacity_logits: np.ndarray, deviations: np
     with np.errstate(divide="ignore", invalid="ignore"):  # a deviation of zero changes nothing; so do logs of it
         widened = np.logaddexp(2 * scales, 2 * np.log(deviations.astype(np.float64))[:, None]) / 2
         # log of sigmoid(theta) and of what it loses, then the logit of their product
-        lost = np.where(np.isinf(scales), -np.inf, scales - widened).sum(axis=1)
-        lowered = -np.logaddexp(0.0, -theta) + np.where(deviations > 0, lost, 0.0)
+        log_ratio = np.where(np.isinf(scales), -np.inf, scales - widened).sum(axis=1)
+        lowered = -np.logaddexp(0.0, -theta) + np.where(deviations > 0, log_ratio, 0.0)
         logits = lowered - np.log(-np.expm1(lowered))
     return {"log_scales": widened.astype(np.float32), "opacity_logits": logits.astype(np.float32)}
 
@@ -327,8 +331,8 @@ def _filtered(log_scales: np.ndarray, opacity_logits: np.ndarray, deviations: np
 def _default_layout(splats: Splats) -> tuple[str, ...]:
     sh_rows = 0 if splats.sh is None else splats.sh.shape[1]
     lobes = 0 if splats.sb_params is None else splats.sb_params.shape[1]
-    usual = usual_layout(splats.kernel, sh_rows, lobes)
-    return (*usual, *(name for name in splats.extras if name not in usual))
+    layout = usual_layout(splats.kernel, sh_rows, lobes)
+    return (*layout, *(name for name in splats.extras if name not in layout))
 
 
 def _columns_of(splats: Splats, layout: Sequence[str]) -> dict[str, np.ndarray]:
@@ -352,30 +356,30 @@ def _columns_of(splats: Splats, layout: Sequence[str]) -> dict[str, np.ndarray]:
     return columns
 
 
-# ---- columns: which of them is which number of the model
+# ---- columns and the numbers of the model
 
 
 @dataclass(frozen=True)
 class Slot:
-    """Where a column lives: a field of ``Splats`` and the index behind the splat's."""
+    """Place of a column: a field of ``Splats`` and the index behind the splat's."""
 
     field: str
     index: tuple[int, ...]
 
 
 def unread_warnings(names: Sequence[str], slots: Mapping[str, Slot]) -> list[str]:
-    """A warning of each kind of columns that would change what is rendered, if they were read."""
-    others = [name for name in names if name not in slots and name != FILTER]
+    """Return a warning of each kind of columns that would change what is rendered, if they were read."""
+    extra_names = [name for name in names if name not in slots and name != FILTER]
     warnings = []
-    for what, pattern in UNREAD.items():
-        unread = [name for name in others if re.fullmatch(pattern, name, re.I)]
-        some = ", ".join(unread[:3]) + (", ..." if len(unread) > 3 else "")
-        warnings += [f"the properties {some} are not read: these splats {what}"] if unread else []
+    for effect, pattern in UNREAD.items():
+        unread = [name for name in extra_names if re.fullmatch(pattern, name, re.I)]
+        listing = ", ".join(unread[:3]) + (", ..." if len(unread) > 3 else "")
+        warnings += [f"the properties {listing} are not read: these splats {effect}"] if unread else []
     return warnings
 
 
 def recognise_kernel(names: Collection[str], mode: RenderMode | None = None) -> Kernel:
-    """The kernel that the columns speak of; where they leave it open, the one that the file says."""
+    """Return the kernel of the columns; where they leave it open, that of the render mode."""
     if "beta" in names or "sb_params_0" in names or "sh0_0" in names:
         return Kernel.BETA
     if "scale_1" in names and "scale_2" not in names:
@@ -384,12 +388,12 @@ def recognise_kernel(names: Collection[str], mode: RenderMode | None = None) -> 
 
 
 def channel_names(names: Collection[str]) -> tuple[str, ...]:
-    """The columns of red, green and blue, as nerfstudio's ``--ply-color-mode rgb`` writes; none where one lacks."""
+    """Return the columns of red, green and blue, as nerfstudio's ``--ply-color-mode rgb`` has them; none without."""
     return next((channels for channels in CHANNELS if set(channels) <= set(names)), ())
 
 
 def full_level(levels: np.ndarray) -> float:
-    """The number that stands for 1 among levels [P, 3] of red, green and blue: the largest of an integer type.
+    """Return the level that stands for 1 in levels [P, 3] of red, green and blue: the largest of an integer type.
 
     Floats are 0..1 in most files and 0..255 in some, where most of them are above 1.
     """
@@ -400,19 +404,19 @@ def full_level(levels: np.ndarray) -> float:
 
 
 def nearest_dialect(names: Collection[str]) -> str:
-    """The dialect that shares most of these columns."""
-    found = set(names)
-    return max(_SIGNATURES, key=lambda dialect: len(_SIGNATURES[dialect] & found) / len(_SIGNATURES[dialect]))
+    """Return the dialect that shares most of these columns."""
+    columns = set(names)
+    return max(_SIGNATURES, key=lambda dialect: len(_SIGNATURES[dialect] & columns) / len(_SIGNATURES[dialect]))
 
 
 def usual_layout(kernel: Kernel, sh_rows: int, lobes: int) -> tuple[str, ...]:
-    """The column order of the kernel's own trainer, for ``sh_rows`` coefficients a channel and S lobes."""
-    first, *others = _columns(kernel, sh_rows, lobes, beta_names=kernel is Kernel.BETA)
-    return (first, *others[:2], *NORMALS, *others[2:])
+    """Return the column order of the kernel's own trainer, for ``sh_rows`` coefficients a channel and S lobes."""
+    first, *remaining = _columns(kernel, sh_rows, lobes, beta_names=kernel is Kernel.BETA)
+    return (first, *remaining[:2], *NORMALS, *remaining[2:])
 
 
 def model_slots(names: Sequence[str], kernel: Kernel, source: str) -> dict[str, Slot]:
-    """The columns that the model knows; the others are extras.
+    """Return the columns that are fields of the model; the others are extras.
 
     Raises:
         InvalidSplats: a column of the kernel is missing, there is an odd number of them, or the model is another.
@@ -423,28 +427,28 @@ def model_slots(names: Sequence[str], kernel: Kernel, source: str) -> dict[str, 
             raise InvalidSplats(source, expected="splats", got=got, hint="export the splats themselves")
     for name in _columns(kernel, 0, 0, beta_names=False):
         if name not in names:
-            some = ", ".join([*names[:8], "..."] if len(names) > 8 else names)
+            listing = ", ".join([*names[:8], "..."] if len(names) > 8 else names)
             expected, got = (
                 f"the property {name!r} of a {kernel} splat",
-                f"{len(names)} properties without it ({some})",
+                f"{len(names)} properties without it ({listing})",
             )
             raise InvalidSplats(source, expected=expected, got=got, hint=_nearest(names))
     beta_names = "sh0_0" in names
     first, rest = ("sh0", "shN") if beta_names else ("f_dc", "f_rest")
-    base, higher = _numbered(names, first, source), _numbered(names, rest, source)
+    base, higher = _count_numbered(names, first, source), _count_numbered(names, rest, source)
     complete = [3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGREE + 1)]
     if (base, higher) != (0, 0) and (base != 3 or higher not in complete):
         counts = ", ".join(map(str, complete))
         expected = f"3 properties {first}_* and {counts} properties {rest}_* (degree 0..{MAX_SH_DEGREE})"
         raise InvalidSplats(source, expected=expected, got=f"{base} and {higher}", hint=_nearest(names))
-    lobes = _numbered(names, "sb_params", source) if kernel is Kernel.BETA else 0
+    lobes = _count_numbered(names, "sb_params", source) if kernel is Kernel.BETA else 0
     if lobes % LOBE_CHANNELS:
         raise InvalidSplats(source, expected=f"a multiple of {LOBE_CHANNELS} properties sb_params_*", got=str(lobes))
     return _columns(kernel, (base + higher) // 3, lobes // LOBE_CHANNELS, beta_names=beta_names)
 
 
 def _columns(kernel: Kernel, sh_rows: int, lobes: int, *, beta_names: bool) -> dict[str, Slot]:
-    """The columns of a model, in the usual order, without normals."""
+    """Return the columns of a model, in the usual order, without normals."""
     first, rest = ("sh0", "shN") if beta_names else ("f_dc", "f_rest")
     higher = max(0, sh_rows - 1)
     slots = {axis: Slot("means", (i,)) for i, axis in enumerate("xyz")}
@@ -458,13 +462,13 @@ def _columns(kernel: Kernel, sh_rows: int, lobes: int, *, beta_names: bool) -> d
     return slots | {f"rot_{i}": Slot("quats", (i,)) for i in range(4)}
 
 
-def _numbered(names: Sequence[str], stem: str, source: str) -> int:
-    """How many columns ``stem_0, stem_1, ...`` there are; they must have no gap."""
+def _count_numbered(names: Sequence[str], stem: str, source: str) -> int:
+    """Count the columns ``stem_0, stem_1, ...``, which must have no gap."""
     pattern = re.compile(re.escape(stem) + r"_(0|[1-9][0-9]{0,5})")
     indices = sorted(int(match[1]) for match in map(pattern.fullmatch, names) if match)
-    for wanted, found in enumerate(indices):
-        if found != wanted:
-            expected, got = f"the property '{stem}_{wanted}'", f"'{stem}_{found}' without it"
+    for expected_index, index in enumerate(indices):
+        if index != expected_index:
+            expected, got = f"the property '{stem}_{expected_index}'", f"'{stem}_{index}' without it"
             raise InvalidSplats(source, expected=expected, got=got, hint=_nearest(names))
     return len(indices)
 
@@ -493,11 +497,11 @@ class PlyHeader:
         return self.dtype.names or ()
 
     def lines_for(self, count: int) -> list[str]:
-        """The lines of a file with ``count`` rows of these columns; all but that number stays as it is."""
+        """Return the lines of a file with ``count`` rows of these columns; all but that number stays as it is."""
         end = "\r" if self.lines[0].endswith("\r") else ""
-        changed = f"element vertex {count}{end}"
+        vertex_line = f"element vertex {count}{end}"
         is_same = count == self.count
-        return [changed if line.split()[:1] == ["element"] and not is_same else line for line in self.lines]
+        return [vertex_line if line.split()[:1] == ["element"] and not is_same else line for line in self.lines]
 
 
 def read_header(path: Path) -> PlyHeader:
@@ -512,27 +516,27 @@ def read_header(path: Path) -> PlyHeader:
     head, size = read_head(path)
     header = parse_header(head, str(path))
     length, stride = size - header.data_offset, header.dtype.itemsize
-    described = header.count * stride + (header.after or 0)
-    tail = 0 if header.after is None else max(0, length - described)
+    data_bytes = header.count * stride + (header.after or 0)
+    tail = 0 if header.after is None else max(0, length - data_bytes)
     padding = padding_bytes(path, size, tail)
-    forgotten = tail > padding and header.count > 1 and tail % (FLOAT_BYTES * header.count) == 0
-    if length < described or forgotten:
+    has_longer_rows = tail > padding and header.count > 1 and tail % (FLOAT_BYTES * header.count) == 0
+    if length < data_bytes or has_longer_rows:
         hint = "the file is truncated: copy or export it again"
-        if forgotten:
+        if has_longer_rows:
             hint = "the rows are longer than their properties in the header: export the file again"
-        others = f" and {header.after} bytes of other elements" if header.after else ""
-        expected = f"{header.count} rows of {stride} bytes{others} = {described} bytes after the header"
+        element_bytes = f" and {header.after} bytes of other elements" if header.after else ""
+        expected = f"{header.count} rows of {stride} bytes{element_bytes} = {data_bytes} bytes after the header"
         raise InvalidSplats(str(path), expected=expected, got=f"{length} bytes", hint=hint)
     return replace(header, tail=tail - padding)
 
 
 def tail_warnings(tail: int) -> tuple[str, ...]:
-    """A warning of bytes behind all that a header describes, if there are any."""
-    return (f"{tail} bytes at the file's end are of nothing that its header describes: not read",) if tail else ()
+    """Warn of bytes behind all that a header describes, if there are any."""
+    return (f"{tail} bytes at the file's end are not described by its header: not read",) if tail else ()
 
 
 def padding_bytes(path: Path, size: int, tail: int) -> int:
-    """How many of the last ``tail`` bytes of a file of ``size`` bytes say nothing: all, if all are zeros or blank."""
+    """Count the bytes of padding among the last ``tail`` of ``size`` bytes: all, if all are zeros or blank."""
     if not 0 < tail <= MAX_PADDING_BYTES:
         return 0
     with path.open("rb") as handle:
@@ -541,7 +545,7 @@ def padding_bytes(path: Path, size: int, tail: int) -> int:
 
 
 def read_head(path: Path) -> tuple[bytes, int]:
-    """As many bytes of a file as a header may take, and the file's size.
+    """Read as many bytes of a file as a header may take, and return them with the file's size.
 
     Raises:
         InvalidSplats: it does not open.
@@ -561,20 +565,20 @@ def parse_header(head: bytes, source: str) -> PlyHeader:
         InvalidSplats: the bytes are not the header of a splat PLY.
     """
     lines, elements, offset = parse_elements(head, source)
-    first, *others = elements
+    first, *remaining = elements
     if first.name != "vertex":
-        raise _refused(source, "'vertex' as the first element", repr(first.name[:60]))
+        raise _header_error(source, "'vertex' as the first element", repr(first.name[:60]))
     if first.list_column is not None:
-        raise _refused(source, "scalar properties ('property float x')", f"a list {first.list_column[:60]!r}")
-    has_lists = any(element.count and element.list_column is not None for element in others)
-    after = None if has_lists else sum(element.count * element.dtype.itemsize for element in others)
-    own = [i for i, line in enumerate(lines) if line.split()[:1] == ["element"]][1:2] or [len(lines) - 1]
-    return PlyHeader((*lines[: own[0]], lines[-1]), first.count, first.dtype, offset, after)
+        raise _header_error(source, "scalar properties ('property float x')", f"a list {first.list_column[:60]!r}")
+    has_lists = any(element.count and element.list_column is not None for element in remaining)
+    after = None if has_lists else sum(element.count * element.dtype.itemsize for element in remaining)
+    ends = [i for i, line in enumerate(lines) if line.split()[:1] == ["element"]][1:2] or [len(lines) - 1]
+    return PlyHeader((*lines[: ends[0]], lines[-1]), first.count, first.dtype, offset, after)
 
 
 @dataclass(frozen=True)
 class Element:
-    """What a header says of an element."""
+    """An element of a header."""
 
     name: str
     count: int  # rows
@@ -583,12 +587,16 @@ class Element:
 
 
 def parse_elements(head: bytes, source: str) -> tuple[tuple[str, ...], list[Element], int]:
-    """The lines of a binary little-endian header, its elements, at least one, and its length in bytes.
+    """Return the lines of a binary little-endian header, its elements, at least one, and its length in bytes.
 
     Raises:
         InvalidSplats: the bytes are not such a header.
     """
-    from plyfile import PlyData, PlyListProperty, PlyParseError  # here: processes that read no PLY start sooner
+    from plyfile import (
+        PlyData,
+        PlyListProperty,
+        PlyParseError,
+    )  # imported here: processes that read no PLY start faster
 
     lines, offset = _header_lines(head, source)
     counts: list[int] = []
@@ -597,38 +605,38 @@ def parse_elements(head: bytes, source: str) -> tuple[tuple[str, ...], list[Elem
         words, element = line.split(), _ELEMENT.fullmatch(line)
         if words[:1] == ["element"] and element is None:
             expected = "the name of an element and a count of zero or more"
-            raise _refused(source, expected, repr(" ".join(words)[:60]))
+            raise _header_error(source, expected, repr(" ".join(words)[:60]))
         counts += [int(element[2])] if element else []
         if words and not line.startswith(_REMARKS):
             empty.append(f"element {element[1]} 0" if element else " ".join(words))
     try:
         ply = PlyData.read(io.BytesIO(header_bytes(empty)))
     except (PlyParseError, ValueError) as error:
-        raise _refused(source, "a header of PLY 1.0", f"one that does not parse ({str(error)[:120]})") from None
+        raise _header_error(source, "a header of PLY 1.0", f"one that does not parse ({str(error)[:120]})") from None
     if ply.text or ply.byte_order != "<":
         kind = "ascii" if ply.text else "binary_big_endian"
-        raise _refused(source, "'format binary_little_endian 1.0'", f"'format {kind} 1.0'", REWRITE)
+        raise _header_error(source, "'format binary_little_endian 1.0'", f"'format {kind} 1.0'", REWRITE)
     elements = []
     for element, count in zip(ply.elements, counts, strict=True):
         lists = [column.name for column in element.properties if isinstance(column, PlyListProperty)]
         scalars = [(column.name, "<" + column.val_dtype) for column in element.properties if column.name not in lists]
         elements.append(Element(element.name, count, np.dtype(scalars), lists[0] if lists else None))
     if not elements or not (elements[0].dtype.names or elements[0].list_column):
-        raise _refused(source, "an element 'vertex' with properties", "a header without one")
+        raise _header_error(source, "an element 'vertex' with properties", "a header without one")
     return lines, elements, offset
 
 
-def _refused(source: str, expected: str, got: str, hint: str = EXPORT) -> InvalidSplats:
+def _header_error(source: str, expected: str, got: str, hint: str = EXPORT) -> InvalidSplats:
     return InvalidSplats(f"{source} header", expected=expected, got=got, hint=hint)
 
 
 def header_bytes(lines: Sequence[str]) -> bytes:
-    """The lines of a header as they stand in a file; comments may hold any bytes, a character each."""
+    """Encode the lines of a header; comments may hold any bytes, a character each."""
     return "".join(f"{line}\n" for line in lines).encode("latin-1")
 
 
 def _header_lines(head: bytes, source: str) -> tuple[tuple[str, ...], int]:
-    """The lines of a header without their line feeds, and its length in bytes."""
+    """Return the lines of a header without their line feeds, and its length in bytes."""
     if head[:4] not in (b"ply\n", b"ply\r"):
         raise InvalidSplats(source, expected="a PLY file (first line 'ply')", got=repr(head[:8]), hint=EXPORT)
     end = _END.search(head)
@@ -638,7 +646,7 @@ def _header_lines(head: bytes, source: str) -> tuple[tuple[str, ...], int]:
     lines = tuple(head[: end.end() - 1].decode("latin-1").split("\n"))
     if not all(line.isascii() or line.startswith(_REMARKS) for line in lines):
         expected, got = "ASCII characters in all lines but comments", "other characters in it"
-        raise _refused(source, expected, got)
+        raise _header_error(source, expected, got)
     if len(lines) > MAX_HEADER_LINES:
         limit, hint = f"at most {MAX_HEADER_LINES} header lines", "leave out properties that are no splat's"
         raise InvalidSplats(source, expected=limit, got=str(len(lines)), hint=hint)
@@ -647,13 +655,13 @@ def _header_lines(head: bytes, source: str) -> tuple[tuple[str, ...], int]:
 
 
 def _refuse_clouds(lines: tuple[str, ...], source: str) -> None:
-    if found := cloud_without_splats(lines):
+    if cloud := cloud_without_splats(lines):
         expected = "splats (properties such as 'opacity', 'scale_0', 'rot_0')"
-        raise InvalidSplats(source, expected=expected, got=f"{found[0]} without any of them", hint=found[1])
+        raise InvalidSplats(source, expected=expected, got=f"{cloud[0]} without any of them", hint=cloud[1])
 
 
 def cloud_without_splats(lines: Sequence[str]) -> tuple[str, str] | None:
-    """The name of a point cloud or mesh by the lines of its header, and what to do with it; None of splats.
+    """Return the name of a point cloud or mesh by the lines of its header, and what to do with it; None of splats.
 
     What is wrong with such a file is not how it is written.
     """

@@ -1,6 +1,6 @@
-"""Safetensors files: looked at before a reader parses them, mapped, and written whole, with no copy in memory.
+"""Safetensors files: checked before a reader parses them, mapped, and written atomically, without a copy in memory.
 
-Torch is imported only where tensors are written, so that processes without it can look at files.
+Torch is imported only where tensors are written, so that processes without it can read files.
 """
 
 import ctypes
@@ -51,7 +51,7 @@ _START = 9  # bytes: the header's length, and the brace that it begins with
 
 
 def check_header(path: Path, name: str, fault: type[InvalidInput], *, expected: str, hint: str = "") -> None:
-    """Refuse what is no safetensors file, headers of absurd length, and those that say a name twice.
+    """Refuse files that are no safetensors, headers of absurd length, and those with a name twice.
 
     Args:
         path: the file.
@@ -85,13 +85,13 @@ def check_header(path: Path, name: str, fault: type[InvalidInput], *, expected: 
 
 
 def _check_names(path: Path, name: str, fault: type[InvalidInput], length: int) -> None:
-    """Refuse headers that say a name twice, of which each reader believes another; safetensors refuses bad JSON."""
+    """Refuse headers with a name twice, which readers resolve differently; safetensors refuses bad JSON."""
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        named = dict(pairs)
-        if len(named) < len(pairs):
+        members = dict(pairs)
+        if len(members) < len(pairs):
             raise fault(name, expected="a header that says each name once", got="one twice")
-        return named
+        return members
 
     with path.open("rb") as handle, suppress(ValueError, RecursionError):
         handle.seek(8)
@@ -99,7 +99,7 @@ def _check_names(path: Path, name: str, fault: type[InvalidInput], length: int) 
 
 
 def write_tensors(path: Path, tensors: "Mapping[str, Tensor]", metadata: Mapping[str, str]) -> None:
-    """Write tensors of any strides and place."""
+    """Write tensors of any strides and device."""
     specs = [(name, tensor.dtype, tuple(tensor.shape)) for name, tensor in tensors.items()]
     header, offsets = safetensors_header(specs, metadata)
     with whole_file(path) as handle:
@@ -110,7 +110,7 @@ def write_tensors(path: Path, tensors: "Mapping[str, Tensor]", metadata: Mapping
 
 
 def safetensors_header(specs: "Iterable[Spec]", metadata: Mapping[str, str]) -> tuple[bytes, dict[str, int]]:
-    """The bytes before the first tensor, and where each tensor begins behind them."""
+    """Return the bytes before the first tensor, and the offset of each tensor behind them."""
     header: dict[str, object] = {"__metadata__": dict(metadata)}
     offsets: dict[str, int] = {}
     end = 0
@@ -123,14 +123,14 @@ def safetensors_header(specs: "Iterable[Spec]", metadata: Mapping[str, str]) -> 
 
 
 def header_bytes(header: Mapping[str, object]) -> bytes:
-    """What a file begins with: the header as JSON after its length, padded so that tensors lie aligned."""
+    """Encode a header as JSON after its length, padded so that tensors are aligned."""
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
     return len(text).to_bytes(8, "little") + text
 
 
 def with_metadata(path: Path | str, changes: Mapping[str, str]) -> Iterator[bytes]:
-    """The bytes of a safetensors file with other metadata, in blocks; all else of it stays to the byte."""
+    """Yield the bytes of a safetensors file with changed metadata, in blocks; all else stays byte for byte."""
     with Path(path).open("rb") as handle:
         header = json.loads(handle.read(int.from_bytes(handle.read(8), "little")))
         header["__metadata__"] = (header.get("__metadata__") or {}) | dict(changes)
@@ -140,7 +140,7 @@ def with_metadata(path: Path | str, changes: Mapping[str, str]) -> Iterator[byte
 
 
 def tensor_bytes(tensor: "Tensor") -> memoryview:
-    """A tensor's bytes in row order, without a copy where it lies so already; from a card, if it lies there."""
+    """Return a tensor's bytes in row order, without a copy if it is contiguous in host memory."""
     import torch
 
     if not tensor.numel():  # an empty one of numpy's may have strides of zero, of which torch makes no bytes
@@ -150,7 +150,7 @@ def tensor_bytes(tensor: "Tensor") -> memoryview:
 
 
 def map_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """The tensors of a safetensors file, and its metadata.
+    """Return the tensors of a safetensors file, and its metadata.
 
     The mapping is private: what a caller writes into an array stays in memory.
 
@@ -160,17 +160,17 @@ def map_tensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """
     from safetensors import safe_open
 
-    with safe_open(str(path), framework="np") as handle:  # which judges the header
+    with safe_open(str(path), framework="np") as handle:  # which validates the header
         metadata = handle.metadata() or {}
     with path.open("rb") as file:
         start = 8 + int.from_bytes(file.read(8), "little")
         header = json.loads(file.read(start - 8))
         mapped = map_file(file)
-    return {name: _array(mapped, start, told) for name, told in header.items() if name != "__metadata__"}, metadata
+    return {name: _array(mapped, start, entry) for name, entry in header.items() if name != "__metadata__"}, metadata
 
 
 def map_file(file: IO[bytes]) -> mmap.mmap:
-    """Map a whole file privately. It is not kept open, as Python's own maps keep theirs: there may be thousands."""
+    """Map a whole file privately, without keeping it open as Python's own maps do: there may be thousands."""
     if sys.platform == "win32":
         return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
     size = os.fstat(file.fileno()).st_size
@@ -201,11 +201,11 @@ def map_over(place: mmap.mmap, offset: int, file: IO[bytes], begin: int, size: i
         raise OSError(code, os.strerror(code), file.name)
 
 
-def _array(mapped: mmap.mmap, start: int, told: dict) -> np.ndarray:
-    if told["dtype"] not in DTYPES:
-        raise ValueError(f"tensors of the type {told['dtype']}")
-    dtype, count = np.dtype(DTYPES[told["dtype"]]), math.prod(told["shape"])
+def _array(mapped: mmap.mmap, start: int, entry: dict) -> np.ndarray:
+    if entry["dtype"] not in DTYPES:
+        raise ValueError(f"tensors of the type {entry['dtype']}")
+    dtype, count = np.dtype(DTYPES[entry["dtype"]]), math.prod(entry["shape"])
     if count == 0:
-        return np.empty(told["shape"], dtype)
-    array = np.frombuffer(mapped, dtype, count, start + told["data_offsets"][0]).reshape(told["shape"])
+        return np.empty(entry["shape"], dtype)
+    array = np.frombuffer(mapped, dtype, count, start + entry["data_offsets"][0]).reshape(entry["shape"])
     return np.require(array, requirements="A")  # a copy where the file was not aligned

@@ -1,4 +1,4 @@
-"""A lift in shards: a folder with X cut by rows, and an index, for lifts that no single file should hold.
+"""A lift in shards: a folder with X split by rows, and an index, for lifts too large for a single file.
 
 The layout is that of sharded safetensors: ``lift.safetensors.index.json`` names the file of every tensor. X lies in
 ``features-00000.safetensors`` and so on, ROWS splats each, and the columns of the splats in ``columns.safetensors``.
@@ -49,12 +49,12 @@ class Shard(NamedTuple):
 
 
 def features_file(number: int) -> str:
-    """The name of a shard's file."""
+    """Return the name of a shard's file."""
     return f"features-{number:05}.safetensors"
 
 
 def shards_of(splats: int, rows: int = ROWS) -> list[tuple[int, int]]:
-    """(first, last + 1) splat of every shard."""
+    """Return (first, last + 1) splat of every shard."""
     return [(first, min(first + rows, splats)) for first in range(0, splats, rows)]
 
 
@@ -76,11 +76,11 @@ def write_index(folder: Path, columns: Mapping[str, Tensor], shards: int, metada
     """
     write_tensors(folder / COLUMNS, columns, {})
     files = [features_file(number) for number in range(shards)]
-    named = {file.partition(".")[0]: file for file in files} | dict.fromkeys(columns, COLUMNS)
-    total = sum((folder / file).stat().st_size for file in {*named.values()})
+    weight_map = {file.partition(".")[0]: file for file in files} | dict.fromkeys(columns, COLUMNS)
+    total = sum((folder / file).stat().st_size for file in {*weight_map.values()})
     with whole_file(folder / INDEX) as handle:
-        told = {"metadata": {"total_size": total, "splatlift": metadata}, "weight_map": named}
-        handle.write(json.dumps(told).encode())
+        index = {"metadata": {"total_size": total, "splatlift": metadata}, "weight_map": weight_map}
+        handle.write(json.dumps(index).encode())
 
 
 def write_shards(folder: Path, tensors: Mapping[str, Tensor], metadata: str) -> None:
@@ -96,7 +96,7 @@ def write_shards(folder: Path, tensors: Mapping[str, Tensor], metadata: str) -> 
 
 
 def map_shards(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """The tensors of a sharded lift, and its metadata, as `map_tensors` has those of one file.
+    """Return the tensors of a sharded lift, and its metadata, as `map_tensors` has those of one file.
 
     Raises:
         SafetensorError, OSError, ValueError: a file is missing, is none, or does not fit the others.
@@ -106,9 +106,9 @@ def map_shards(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     if len(content) > MAX_INDEX_BYTES:
         raise ValueError(f"an index of more than {MAX_INDEX_BYTES} bytes")
     try:
-        told = json.loads(content)
-        metadata, named = dict(told["metadata"]), dict(told["weight_map"])
-        files = sorted({str(file) for file in named.values()} - {COLUMNS})
+        index = json.loads(content)
+        metadata, weight_map = dict(index["metadata"]), dict(index["weight_map"])
+        files = sorted({str(file) for file in weight_map.values()} - {COLUMNS})
     except (TypeError, KeyError, ValueError, RecursionError):
         raise ValueError("an index without metadata and weight_map") from None
     strangers = [file for file in files if Path(file).name != file]
@@ -119,7 +119,7 @@ def map_shards(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
 
 
 def shard_at(path: Path) -> Shard:
-    """What a shard's header says of it.
+    """Read the header of a shard.
 
     Raises:
         OSError, ValueError: there is no whole shard.
@@ -130,8 +130,8 @@ def shard_at(path: Path) -> Shard:
             raise ValueError(f"{path.name} is no shard: its rows begin at byte {begin}")
         size = os.fstat(handle.fileno()).st_size
         try:
-            told = json.loads(handle.read(begin - 8))[path.name.partition(".")[0]]
-            dtype, shape = np.dtype(DTYPES[told["dtype"]]), tuple(told["shape"])
+            entry = json.loads(handle.read(begin - 8))[path.name.partition(".")[0]]
+            dtype, shape = np.dtype(DTYPES[entry["dtype"]]), tuple(entry["shape"])
         except (TypeError, KeyError, ValueError, RecursionError):
             raise ValueError(f"{path.name} is no shard: its header does not describe its rows") from None
     if not all(type(side) is int and side > 0 for side in shape):
@@ -142,7 +142,7 @@ def shard_at(path: Path) -> Shard:
 
 
 def map_rows(shards: Sequence[Shard]) -> np.ndarray:
-    """One array [P, F] over the rows of all shards, mapped; what is written into it stays in memory.
+    """Return one array [P, F] over the rows of all shards, mapped; what is written into it stays in memory.
 
     Raises:
         OSError: they cannot be mapped. ValueError: shards differ, or one but the last ends within a page.

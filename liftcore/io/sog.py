@@ -35,7 +35,7 @@ HINT = "export it again with SuperSplat or splat-transform, or as PLY"
 
 
 def read_sog(path: Path, *, colour: bool = True) -> Fields:
-    """The fields of a ``.sog`` file, of a folder of what such a file holds, or of the ``meta.json`` in one.
+    """Read the fields of a ``.sog`` file, of an unpacked folder, or of the ``meta.json`` in one.
 
     Raises:
         InvalidSplats: the file is malformed, of another version, or has more splats than its size can be of.
@@ -54,37 +54,37 @@ def read_sog(path: Path, *, colour: bool = True) -> Fields:
 
 
 def decode_sog(
-    read: Callable[[str, int], bytes | None], path: Path, size: int, *, meta: str = META, colour: bool = True
+    read_member: Callable[[str, int], bytes | None], path: Path, size: int, *, meta: str = META, colour: bool = True
 ) -> Fields:
-    """The fields of a SOG whose files are read one by one.
+    """Decode the fields of a SOG whose files are read one by one.
 
     Args:
-        read: name, most bytes -> the first bytes of that file; None where there is none. path: what errors name.
+        read_member: name, limit in bytes -> first bytes of that file; None if it does not exist. path: for errors.
         size: bytes of all files as they are stored. meta: the name of its description.
 
     Raises:
         InvalidSplats: it is malformed, of another version, or has more splats than its size can be of.
     """
-    return _Pictures(read, meta, path, size).fields(colour=colour)
+    return _Pictures(read_member, meta, path, size).fields(colour=colour)
 
 
 def is_sog_document(document: Any) -> bool:
-    """Whether a JSON document is the ``meta.json`` of a SOG of any version."""
+    """Return True if a JSON document is the ``meta.json`` of a SOG of any version."""
     parts = ("means", "scales", "quats")
     return isinstance(document, dict) and all(isinstance(document.get(part), dict) for part in parts)
 
 
 def sog_folder(names: Iterable[str]) -> str | None:
-    """The folder, with a slash if any, in which a zip of these names holds a SOG; None if in none."""
-    known = set(names)
-    if META in known:
+    """Return the folder, with a slash if any, in which a zip of these names holds a SOG; None if in none."""
+    members = set(names)
+    if META in members:
         return ""
-    folders = (name.removesuffix(META) for name in known if name.endswith(f"/{META}") and "__MACOSX/" not in name)
-    return min((folder for folder in folders if f"{folder}means_l.webp" in known), default=None)
+    folders = (name.removesuffix(META) for name in members if name.endswith(f"/{META}") and "__MACOSX/" not in name)
+    return min((folder for folder in folders if f"{folder}means_l.webp" in members), default=None)
 
 
 def sog_files(path: Path) -> list[Path]:
-    """The files that an unbundled SOG is read from, sorted: its ``meta.json`` and the pictures that this names."""
+    """Return the files of an unbundled SOG, sorted: its ``meta.json`` and the pictures that this names."""
     meta = _meta_of(path)
     try:
         with open_regular(meta) as handle:
@@ -108,7 +108,7 @@ def _is_beside(name: Any) -> bool:
 
 
 def is_bundled(path: Path) -> bool:
-    """Whether a SOG is one file, a zip: else it is a folder, or the ``meta.json`` in one."""
+    """Return True if a SOG is one file, a zip, and not a folder or the ``meta.json`` in one."""
     if path.is_dir():
         return False
     with open_regular(path) as handle:
@@ -120,51 +120,51 @@ def _meta_of(path: Path) -> Path:
 
 
 def _in_folder(folder: Path) -> Callable[[str, int], bytes | None]:
-    def read(name: str, most: int) -> bytes | None:
+    def read(name: str, limit: int) -> bytes | None:
         if not (folder / name).is_file():
             return None
         with open_regular(folder / name) as file:
-            return file.read(most)
+            return file.read(limit)
 
     return read
 
 
-def read_in_archive(archive: zipfile.ZipFile, prefix: str, name: str, most: int) -> bytes | None:
-    """The first bytes of a member of an archive, below a folder with a slash; None where there is none."""
+def read_in_archive(archive: zipfile.ZipFile, prefix: str, name: str, limit: int) -> bytes | None:
+    """Return the first bytes of a member of an archive, below a folder with a slash; None where there is none."""
     try:
         with archive.open(prefix + name) as member:
-            return member.read(most)
+            return member.read(limit)
     except KeyError:
         return None
 
 
 class _Pictures:
-    """What is in an open file, or a folder.
+    """Decoder of an open file, or a folder.
 
     Args:
-        read: name, most bytes -> the first bytes of that member; None where there is none. meta: the name of its
-        description. path: what errors name. size: bytes of all members as they are stored.
+        read_member: name, limit in bytes -> the first bytes of that member; None if it does not exist. meta: the name
+        of its description. path: for errors. size: bytes of all members as they are stored.
     """
 
-    def __init__(self, read: Callable[[str, int], bytes | None], meta: str, path: Path, size: int) -> None:
-        self.read, self.path, self.size = read, path, size
+    def __init__(self, read_member: Callable[[str, int], bytes | None], meta: str, path: Path, size: int) -> None:
+        self.read_member, self.path, self.size = read_member, path, size
         try:
             self.meta: Any = json.loads(self._member(meta, MAX_META_BYTES))
         except (ValueError, RecursionError) as error:
-            raise self._refused(f"{META} as JSON", str(error)[:120]) from None
+            raise self._error(f"{META} as JSON", str(error)[:120]) from None
         version = self.meta.get("version") if isinstance(self.meta, dict) else None
         if version != 2:
-            raise self._refused("version 2", repr(version)[:60])
+            raise self._error("version 2", repr(version)[:60])
         count = self.meta.get("count")
         bands = self.meta["shN"].get("bands") if isinstance(self.meta.get("shN"), dict) else 0
         higher = SH_ROWS[bands] if bands in (1, 2, 3) else 0
         row_bytes = FIELD_BYTES + TERM_BYTES * (1 + higher)
         if type(count) is not int or not 0 < count * row_bytes <= MOST_GROWTH * self.size:
-            raise self._refused("a count of splats that the file's size can be of", repr(count)[:60])
+            raise self._error("a count of splats that the file's size can be of", repr(count)[:60])
         self.count: int = count  # P
 
     def fields(self, *, colour: bool) -> Fields:
-        """The splats' fields."""
+        """Return the splats' fields."""
         low, high = (self._numbers("means", key, 3) for key in ("mins", "maxs"))
         lower, upper = (self._pixels("means", i) for i in (0, 1))
         quats, scales, colours = (self._pixels(part, 0) for part in ("quats", "scales", "sh0"))
@@ -176,11 +176,11 @@ class _Pictures:
             folded = low + np.where(high > low, high - low, 1.0) * (levels / 65_535)
             largest = quats[rows, 3].astype(np.int64) - 252
             parts = (quats[rows, :3] / 127.5 - 1) * np.sqrt(0.5)
-            turned = smallest_three(parts, largest.clip(0))
-            turned[largest < 0] = (1, 0, 0, 0)
+            rotations = smallest_three(parts, largest.clip(0))
+            rotations[largest < 0] = (1, 0, 0, 0)
             fields = {
                 "means": np.sign(folded) * np.expm1(np.abs(folded)),
-                "quats": turned,
+                "quats": rotations,
                 "log_scales": scale_book[scales[rows, :3]],
                 "opacity_logits": logits(colours[rows, 3] / 255.0),
             }
@@ -196,48 +196,48 @@ class _Pictures:
         return fields | {"render_mode": mode, "warnings": warnings}
 
     def _harmonics(self) -> tuple[np.ndarray, np.ndarray]:
-        """The palette [n, K - 1, 3], and each splat's row in it [P]."""
+        """Return the palette [n, K - 1, 3], and each splat's row in it [P]."""
         bands, count = (self._part("shN").get(key) for key in ("bands", "count"))
         if bands not in (1, 2, 3) or type(count) is not int or not 0 < count <= MAX_PALETTE:
-            raise self._refused(f"1 to 3 bands and a palette of at most {MAX_PALETTE}", f"{bands} and {count}"[:60])
+            raise self._error(f"1 to 3 bands and a palette of at most {MAX_PALETTE}", f"{bands} and {count}"[:60])
         book, higher = self._numbers("shN", "codebook", 256), SH_ROWS[bands]
         picture = self._picture("shN", 0, -(-count // PALETTE_COLUMNS) * PALETTE_COLUMNS * higher)
         if picture.shape[1] != PALETTE_COLUMNS * higher:
-            raise self._refused(f"a palette {PALETTE_COLUMNS * higher} pixels wide", f"{picture.shape[1]}")
+            raise self._error(f"a palette {PALETTE_COLUMNS * higher} pixels wide", f"{picture.shape[1]}")
         palette = book[picture[..., :3]].reshape(-1, higher, 3)[:count]
         bits = self._pixels("shN", 1).astype(np.int64)
         labels = bits[:, 0] | bits[:, 1] << 8
         if labels.max() >= count:
-            raise self._refused(f"labels below {count}", f"the label {labels.max()}")
+            raise self._error(f"labels below {count}", f"the label {labels.max()}")
         return palette, labels
 
     def _part(self, name: str) -> dict[str, Any]:
         part = self.meta.get(name)
         if not isinstance(part, dict):
-            raise self._refused(f"{name!r} in {META}", "none")
+            raise self._error(f"{name!r} in {META}", "none")
         return part
 
     def _numbers(self, part: str, key: str, count: int) -> np.ndarray:
         values = self._part(part).get(key)
         try:
-            found = np.array(values, np.float64)
+            numbers = np.array(values, np.float64)
         except (TypeError, ValueError, OverflowError):
-            found = np.empty(0)
-        if found.shape != (count,) or not np.abs(found).max() <= MAX_TERM:
-            raise self._refused(f"{count} finite numbers as {key!r} of {part!r}", repr(values)[:60])
-        return found
+            numbers = np.empty(0)
+        if numbers.shape != (count,) or not np.abs(numbers).max() <= MAX_TERM:
+            raise self._error(f"{count} finite numbers as {key!r} of {part!r}", repr(values)[:60])
+        return numbers
 
     def _pixels(self, part: str, index: int) -> np.ndarray:
-        """[P, 4] u8, a pixel a splat."""
+        """Read a pixel of each splat, [P, 4] u8."""
         return self._picture(part, index, self.count).reshape(-1, 4)[: self.count]
 
     def _picture(self, part: str, index: int, least: int) -> np.ndarray:
-        """[h, w, 4] u8, of at least so many pixels and not many more."""
+        """Read a picture [h, w, 4] u8 of at least ``least`` pixels and not many more."""
         from PIL import Image, UnidentifiedImageError
 
         names = self._part(part).get("files")
         if not isinstance(names, list) or len(names) <= index or not isinstance(names[index], str):
-            raise self._refused(f"{index + 1} files of {part!r} in {META}", repr(names)[:60])
+            raise self._error(f"{index + 1} files of {part!r} in {META}", repr(names)[:60])
         content = self._member(names[index], self.size)
         try:
             with warnings.catch_warnings():
@@ -245,18 +245,18 @@ class _Pictures:
                 with Image.open(io.BytesIO(content), formats=["WEBP"]) as picture:
                     pixels = picture.width * picture.height
                     if not least <= pixels <= 2 * least + (1 << 16):
-                        raise self._refused(f"{least} pixels in {names[index]!r}", f"{pixels}")
+                        raise self._error(f"{least} pixels in {names[index]!r}", f"{pixels}")
                     return np.asarray(picture.convert("RGBA"))
         except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
-            raise self._refused(f"a WebP picture as {names[index]!r}", str(error)[:120]) from None
+            raise self._error(f"a WebP picture as {names[index]!r}", str(error)[:120]) from None
 
-    def _member(self, name: str, most: int) -> bytes:
-        content = self.read(name, most + 1) if PurePosixPath(name).name == name else None  # beside meta.json alone
+    def _member(self, name: str, limit: int) -> bytes:
+        content = self.read_member(name, limit + 1) if PurePosixPath(name).name == name else None
         if content is None:
-            raise self._refused(f"{name!r} beside {META}", "none")
-        if len(content) > most:
-            raise self._refused(f"at most {most} bytes of {name!r}", "more")
+            raise self._error(f"{name!r} beside {META}", "none")
+        if len(content) > limit:
+            raise self._error(f"at most {limit} bytes of {name!r}", "more")
         return content
 
-    def _refused(self, expected: str, got: str) -> InvalidSplats:
+    def _error(self, expected: str, got: str) -> InvalidSplats:
         return InvalidSplats(str(self.path), expected=expected, got=got, hint=HINT)

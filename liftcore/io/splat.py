@@ -20,14 +20,14 @@ if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
 
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colours", "u1", 4), ("quats", "u1", 4)])
-LOOKED_AT = 1024  # rows by which a file is told to be one
-FARTHEST = 1e9  # scene units, of what is no accident
+CHECKED_ROWS = 1024  # first rows, by which a file is recognised
+FARTHEST = 1e9  # scene units; a larger mean is no splat's
 QUAT_LENGTHS = (0.9, 1.1)  # of a unit quaternion in bytes
 
 
 def looks_like_splat(head: bytes, size: int) -> bool:
-    """Whether the first rows of a file of whole rows are splats that somebody could have trained."""
-    rows = np.frombuffer(head[: len(head) // ROW.itemsize * ROW.itemsize], ROW)[:LOOKED_AT]
+    """Return True if the file has whole rows, and the first ones are plausible splats."""
+    rows = np.frombuffer(head[: len(head) // ROW.itemsize * ROW.itemsize], ROW)[:CHECKED_ROWS]
     if not len(rows) or size % ROW.itemsize:
         return False
     with np.errstate(invalid="ignore"):
@@ -37,7 +37,7 @@ def looks_like_splat(head: bytes, size: int) -> bool:
 
 
 def read_splat(path: Path, *, colour: bool = True) -> Fields:
-    """The fields of a ``.splat`` file.
+    """Read the fields of a ``.splat`` file.
 
     Raises:
         InvalidSplats: it has no rows, or ends within one.
@@ -49,11 +49,11 @@ def read_splat(path: Path, *, colour: bool = True) -> Fields:
     table = np.memmap(path, ROW, "r")
 
     def decode(rows: slice) -> Fields:
-        read = table[rows]
+        block = table[rows]
         with np.errstate(divide="ignore"):  # a scale of zero is flat; a negative one is refused as no number
-            scales = np.log(read["scales"].astype(np.float64))
-        rgba = read["colours"] / 255.0
-        fields = {"means": read["means"], "log_scales": scales, "quats": read["quats"] / 128.0 - 1}
+            scales = np.log(block["scales"].astype(np.float64))
+        rgba = block["colours"] / 255.0
+        fields = {"means": block["means"], "log_scales": scales, "quats": block["quats"] / 128.0 - 1}
         fields["opacity_logits"] = logits(rgba[:, 3])
         return fields | ({"sh": constant_terms(rgba[:, None, :3])} if colour else {})
 
@@ -61,11 +61,11 @@ def read_splat(path: Path, *, colour: bool = True) -> Fields:
 
 
 def splat_blocks(splats: Splats) -> Iterator[bytes]:
-    """The bytes of a ``.splat`` file of any splats (`gaussian_rows`), in blocks; colours are the constant ones."""
-    for some in gaussian_rows(splats):
-        rows = np.zeros(len(some.means), ROW)
-        rows["means"], rows["scales"] = some.means, some.scales
-        rows["colours"][:, :3] = np.round(255 * some.colours.clip(0, 1))
-        rows["colours"][:, 3] = np.round(255 * some.opacities)
-        rows["quats"] = np.round(128 + 128 * some.quats).clip(0, 255)
+    """Yield the bytes of a ``.splat`` file of any splats (`gaussian_rows`), in blocks, with constant colours."""
+    for block in gaussian_rows(splats):
+        rows = np.zeros(len(block.means), ROW)
+        rows["means"], rows["scales"] = block.means, block.scales
+        rows["colours"][:, :3] = np.round(255 * block.colours.clip(0, 1))
+        rows["colours"][:, 3] = np.round(255 * block.opacities)
+        rows["quats"] = np.round(128 + 128 * block.quats).clip(0, 255)
         yield rows.tobytes()

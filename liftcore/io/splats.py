@@ -1,7 +1,7 @@
-"""Splat files: which format one is of, told by its content, and reading and copying it.
+"""Splat files: recognise the format by content, read, write and copy.
 
-All have a row a splat, and ours are the file's rows in their order. What is of none of these formats is refused with
-what it is and what to do.
+All formats have a row of each splat, and ours are the file's rows in their order. The error of a file of another kind
+names its kind and what to do.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from liftcore.io.kinds import CONVERT, SplatFormat, identify, wrong_kind
 from liftcore.io.labels import COLUMN, IDS, Labels, id_column, read_document
 from liftcore.io.quantised import Fields
 from liftcore.io.ranks import rank_files
-from liftcore.io.remote import landing, local_path
+from liftcore.io.remote import local_path, open_output
 from liftcore.io.sog import is_bundled, read_sog, sog_files
 from liftcore.io.splat import ROW, read_splat, splat_blocks
 from liftcore.io.spz import read_spz, read_spz_document, spz_blocks
@@ -74,46 +74,48 @@ WITH_COLUMNS = (".ply", ".glb", ".spz", ".usdc", ".usdz")  # formats that hold f
 def read_splats(path: Path | str, kernel: Kernel | str = "auto", *, colour: bool = True) -> Splats:
     """Read trained splats from a file of any `SplatFormat`, recognised by content.
 
-    With the kernel ``auto`` the columns of a PLY tell it, or what the file says of its training
-    (`liftcore.scene.render_mode`); what says nothing is of 3D Gaussians. A file of no such format is read by the
+    With the kernel ``auto`` it is recognised from the columns of a PLY, or from the file's render mode
+    (`liftcore.scene.render_mode`); without either it is 3D Gaussians. A file of no such format is read by the
     plugin of its suffix, if there is one (`liftcore.runtime.plugins`). Without ``colour``
-    neither colours nor what else a lift has no use for are read or allocated, and what comes cannot be written back.
+    neither colours nor other fields that a lift does not need are read, and the splats cannot be written back.
     More of PLYs is in `liftcore.io.ply.read_ply`. Checkpoints are opened for tensors alone: no code of theirs runs.
 
     Args:
-        path: a file, a folder of a SOG or of a checkpoint's ranks, or where one lies elsewhere (`io.remote`).
+        path: a file, a folder of a SOG or of a checkpoint's ranks, or a URL (`io.remote`).
         kernel: auto, 3dgs, 2dgs or dbs. colour: whether colours and further columns are read.
 
     Raises:
-        InvalidInput: it lies elsewhere (`io.remote`), and does not come.
+        InvalidInput: it is a URL (`io.remote`) that cannot be read.
         InvalidSplats: the file is malformed or of no such format, lacks a property of the kernel, or holds no splat
             of finite numbers.
     """
     path = local_path(path)
-    found = format_of(path)
+    splat_format = format_of(path)
     with _naming(path):
-        if found is SplatFormat.PLY:
+        if splat_format is SplatFormat.PLY:
             return ply.read_ply(path, kernel, colour=colour)
-        if isinstance(found, Plugin):
-            return found.call(path, needs=("means", "quats", "log_scales", "opacity_logits", "kernel", "count"))
+        if isinstance(splat_format, Plugin):
+            return splat_format.call(
+                path, needs=("means", "quats", "log_scales", "opacity_logits", "kernel", "count")
+            )
         if kernel != "auto":
             require_kernel(path, kernel_named(kernel), str(path))
         from liftcore.scene.splats import Splats
 
-        fields = _READERS[found](path, colour=colour)
-        chosen = kernel_of_mode(fields.get("render_mode")) if kernel == "auto" else kernel_named(kernel)
-        if chosen is Kernel.GAUSSIAN_2D:
+        fields = _READERS[splat_format](path, colour=colour)
+        used_kernel = kernel_of_mode(fields.get("render_mode")) if kernel == "auto" else kernel_named(kernel)
+        if used_kernel is Kernel.GAUSSIAN_2D:
             fields["log_scales"] = np.ascontiguousarray(fields["log_scales"][:, :2])
-        return Splats(**fields, kernel=chosen)
+        return Splats(**fields, kernel=used_kernel)
 
 
 def write_splats(path: Path | str, splats: Splats, columns: Mapping[str, Any] | None = None) -> None:
-    """Write splats whole or not at all, as a PLY, or as the suffix says: .splat, .spz, .glb, .usdc or .usdz.
+    """Write splats atomically, as a PLY or in the format of the suffix: .splat, .spz, .glb, .usdc or .usdz.
 
     A PLY keeps the layout and the further columns that the splats were read with.
 
     Args:
-        path: a file; it may lie elsewhere (`io.remote`). A name without a suffix is a PLY.
+        path: a file or a URL (`io.remote`). A name without a suffix is a PLY.
         columns: of all but a ``.splat``, further numbers a splat: name -> [P] booleans or numbers of numpy or torch,
             such as ``{"object": result.object, "score": answer.scores}``; one that the splats have is replaced.
 
@@ -133,16 +135,18 @@ def write_splats(path: Path | str, splats: Splats, columns: Mapping[str, Any] | 
         expected = f"a path that ends in {' or '.join(WITH_COLUMNS)}, which hold columns"
         raise InvalidSplats("columns", expected=expected, got=repr(suffix))
     if columns:
-        own = {str(name): _column(name, values, splats.count) for name, values in columns.items()}
-        layout = (*splats.layout, *(name for name in own if name not in splats.layout)) if splats.layout else ()
-        splats = replace(splats, extras={**splats.extras, **own}, layout=layout)
-    with landing(path) as place, whole_file(place) as handle:
+        new_columns = {str(name): _column(name, values, splats.count) for name, values in columns.items()}
+        layout = (
+            (*splats.layout, *(name for name in new_columns if name not in splats.layout)) if splats.layout else ()
+        )
+        splats = replace(splats, extras={**splats.extras, **new_columns}, layout=layout)
+    with open_output(path) as place, whole_file(place) as handle:
         for block in write(splats, None):
             handle.write(block)
 
 
 def _column(name: Any, values: Any, count: int) -> Tensor:
-    """Return a column [P] of a type that PLY has.
+    """Convert values to a column [P] of a type that PLY has.
 
     Raises:
         InvalidSplats: the name or the values are none of a column.
@@ -156,27 +160,27 @@ def _column(name: Any, values: Any, count: int) -> Tensor:
         expected = "a name of letters, digits and underscores that no property of splats has"
         raise InvalidSplats(argument, expected=expected, got=repr(name)[:80])
     try:
-        found = shared_tensor(values).cpu()
+        column = shared_tensor(values).cpu()
     except (TypeError, ValueError, RuntimeError):
         raise InvalidSplats(argument, expected=f"numbers [{count}]", got=repr(values)[:80]) from None
-    found = found[:, 0] if found.ndim == 2 and found.shape[1] == 1 else found
-    if found.shape != (count,) or found.is_complex():
-        hint = "give each of several columns a name" if found.ndim == 2 else ""
-        raise InvalidSplats(argument, expected=f"numbers [{count}]", got=f"shape {list(found.shape)}", hint=hint)
-    if found.dtype == torch.bool:
-        return found.to(torch.uint8)
-    if found.dtype in (torch.float16, torch.bfloat16):
-        return found.float()
-    if found.dtype in (torch.int64, torch.uint64):
-        low, high = int(found.min()), int(found.max())
+    column = column[:, 0] if column.ndim == 2 and column.shape[1] == 1 else column
+    if column.shape != (count,) or column.is_complex():
+        hint = "give each of several columns a name" if column.ndim == 2 else ""
+        raise InvalidSplats(argument, expected=f"numbers [{count}]", got=f"shape {list(column.shape)}", hint=hint)
+    if column.dtype == torch.bool:
+        return column.to(torch.uint8)
+    if column.dtype in (torch.float16, torch.bfloat16):
+        return column.float()
+    if column.dtype in (torch.int64, torch.uint64):
+        low, high = int(column.min()), int(column.max())
         if low < -(2**31) or high >= 2**31:
             raise InvalidSplats(argument, expected="whole numbers of 32 bits, as PLY has them", got=f"{low}..{high}")
-        return found.to(torch.int32)
-    return found
+        return column.to(torch.int32)
+    return column
 
 
 def blocks_as(splats: Splats, suffix: str) -> Iterator[bytes]:
-    """Splats as the bytes of a format that is written, in blocks, with what they were read with where it holds that.
+    """Encode splats in the format of a suffix, in blocks, with their layout and header where the format has these.
 
     Raises:
         InvalidSplats: the format is not written.
@@ -185,10 +189,10 @@ def blocks_as(splats: Splats, suffix: str) -> Iterator[bytes]:
 
 
 def _writer_of(suffix: str, argument: str) -> Callable[[Splats, Document | None], Iterator[bytes]]:
-    """What writes files that end so.
+    """Return the writer of files with this suffix.
 
     Raises:
-        InvalidSplats: nothing does.
+        InvalidSplats: there is none.
     """
     if suffix not in _WRITERS:
         hint = "write a .ply, and convert it: npx @playcanvas/splat-transform IN.ply OUT"
@@ -198,18 +202,22 @@ def _writer_of(suffix: str, argument: str) -> Callable[[Splats, Document | None]
 
 
 def read_places(path: Path, kernel: Kernel | str = "auto") -> np.ndarray:
-    """[P, 3] f32 or f64, the means alone of what `read_splats` reads, as `Splats.positions` has them.
+    """Read the means [P, 3] f32 or f64 alone, as `Splats.positions` of `read_splats`.
 
-    Only checkpoints and scenes in map coordinates need torch for that, which takes a second to import. Places that
-    are no number become the first that is.
+    Only checkpoints and scenes in map coordinates need torch, which takes a second to import. Means that
+    are not finite become the first finite one.
 
     Raises:
         InvalidSplats: the file is of no format of splats.
     """
-    found = format_of(path)
-    if isinstance(found, Plugin):
+    splat_format = format_of(path)
+    if isinstance(splat_format, Plugin):
         return read_splats(path, kernel, colour=False).positions()
-    places = ply.read_places(path) if found is SplatFormat.PLY else _READERS[found](path, colour=False)["means"]
+    places = (
+        ply.read_places(path)
+        if splat_format is SplatFormat.PLY
+        else _READERS[splat_format](path, colour=False)["means"]
+    )
     if lies_apart(places):
         return read_splats(path, kernel, colour=False).positions()
     with np.errstate(over="ignore"):
@@ -224,19 +232,19 @@ def format_of(path: Path) -> SplatFormat | Plugin:
     """Return the format of a file, by its content; else the plugin that reads files of its suffix.
 
     Raises:
-        InvalidSplats: it is of none; the error says what it is, if that can be told.
+        InvalidSplats: it is of none; the error names its kind if it is recognised.
         Unavailable: two plugins read it.
     """
-    found = identify(path)
-    if found.format is not None:
-        return found.format
+    identified = identify(path)
+    if identified.format is not None:
+        return identified.format
     suffix = path.suffix.lower().removeprefix(".")
     if suffix and path.exists() and (plugin := find_plugin(PLUGINS, suffix, OWN_SUFFIXES)):
         return plugin
     if error := wrong_kind(path, "splats", InvalidSplats, expected=EXPECTED):
         raise error
-    hint = found.hint or (f"{ply.EXPORT}; or {CONVERT}" if path.is_file() else "")
-    raise InvalidSplats(str(path), expected=EXPECTED, got=found.name, hint=hint)
+    hint = identified.hint or (f"{ply.EXPORT}; or {CONVERT}" if path.is_file() else "")
+    raise InvalidSplats(str(path), expected=EXPECTED, got=identified.name, hint=hint)
 
 
 def quick_count(path: Path) -> int | None:
@@ -249,7 +257,7 @@ def quick_count(path: Path) -> int | None:
                 return path.stat().st_size // ROW.itemsize
             case SplatFormat.COMPRESSED_PLY:
                 elements = ply.parse_elements(ply.read_head(path)[0], str(path))[1]
-                return next((one.count for one in elements if one.name == "vertex"), None)
+                return next((element.count for element in elements if element.name == "vertex"), None)
             case _:
                 pass
     return None
@@ -278,35 +286,37 @@ def require_kernel(path: Path, kernel: Kernel, source: str) -> None:
     Raises:
         InvalidSplats: it does; ``source`` is named.
     """
-    found = format_of(path)
-    if found is SplatFormat.PLY:
+    splat_format = format_of(path)
+    if splat_format is SplatFormat.PLY:
         ply.model_slots(ply.read_header(path).names, kernel, source)
     elif kernel is Kernel.BETA:
-        raise InvalidSplats(source, expected="the property 'beta' of a dbs splat", got=f"{found}, which has none")
+        raise InvalidSplats(
+            source, expected="the property 'beta' of a dbs splat", got=f"{splat_format}, which has none"
+        )
 
 
-def some_rows(path: Path, kept: np.ndarray, suffix: str = ".ply", world: WorldFrame | None = None) -> Iterator[bytes]:
-    """Some rows of a file, in its order, as the bytes of a PLY or of another format that is written, in blocks.
+def some_rows(path: Path, mask: np.ndarray, suffix: str = ".ply", world: WorldFrame | None = None) -> Iterator[bytes]:
+    """Yield some rows of a file, in its order, as the bytes of a PLY or of another written format, in blocks.
 
-    A PLY gives its own bytes to one (`liftcore.io.ply.some_rows`); of another format comes a PLY of 3DGS.
+    Rows of a PLY stay byte for byte (`liftcore.io.ply.some_rows`); another format becomes a PLY of 3DGS.
 
     Args:
-        path: the file. kept: [P] bool, the rows to keep. suffix: of what is written.
-        world: of its splats; None: as the file says it.
+        path: the file. mask: [P] bool, the rows to keep. suffix: of the output.
+        world: of its splats; None: the file's.
 
     Raises:
         InvalidSplats: the file is malformed, or has another number of splats.
     """
     write = _writer_of(suffix, "suffix")
     if suffix == ".ply" and format_of(path) is SplatFormat.PLY:
-        return ply.some_rows(path, kept)
-    splats = _of_count(path, len(kept))
-    own = {} if world is None else {"world": world}
-    return write(replace(splats[kept], extras={}, layout=(), header=(), **own), None)
+        return ply.some_rows(path, mask)
+    splats = _of_count(path, len(mask))
+    frame = {} if world is None else {"world": world}
+    return write(replace(splats[mask], extras={}, layout=(), header=(), **frame), None)
 
 
 def with_columns(path: Path, columns: Mapping[str, np.ndarray]) -> Iterator[bytes]:
-    """Return a file with more properties a splat, as the bytes of a PLY in blocks; those that it has are replaced.
+    """Yield a file with further columns, as the bytes of a PLY in blocks; columns of the same name are replaced.
 
     Args:
         path: the file. columns: name -> [P] i32 or f32.
@@ -318,16 +328,16 @@ def with_columns(path: Path, columns: Mapping[str, np.ndarray]) -> Iterator[byte
 
 
 def labelled(
-    path: Path, labels: Labels, suffix: str = ".ply", kept: np.ndarray | None = None, *, prims: bool = False
+    path: Path, labels: Labels, suffix: str = ".ply", mask: np.ndarray | None = None, *, prims: bool = False
 ) -> Iterator[bytes]:
-    """Return a file with labels a splat, as the bytes of a PLY or of another format that holds columns, in blocks.
+    """Yield a file with labels, as the bytes of a PLY or of another format that has columns, in blocks.
 
-    A PLY of a PLY has all else of its own bytes; one of another format is of its kernel.
+    From a PLY to a PLY all else stays byte for byte; from another format the PLY has the layout of its kernel.
 
     Args:
         path: the file. labels: of its splats; columns that it has are replaced. suffix: of what is written.
             The document's ``world`` is that of the splats.
-        kept: [P] bool, the rows to keep; None: all. prims: of USD, whether each object is a prim (`usd_blocks`).
+        mask: [P] bool, the rows to keep; None: all. prims: of USD, True: each object is a prim (`usd_blocks`).
 
     Raises:
         InvalidSplats: the file is malformed or has another number of splats, or the format holds no columns.
@@ -339,22 +349,22 @@ def labelled(
         write = partial(usd_blocks, suffix=suffix, prims=True)
     if suffix not in WITH_COLUMNS:
         raise InvalidSplats("suffix", expected=" or ".join(WITH_COLUMNS) + ", which hold labels", got=repr(suffix))
-    if suffix == ".ply" and kept is None and format_of(path) is SplatFormat.PLY:
+    if suffix == ".ply" and mask is None and format_of(path) is SplatFormat.PLY:
         return ply.with_columns(path, labels.columns)
     import torch
 
     splats = _of_count(path, len(next(iter(labels.columns.values()))))
-    if kept is not None:
-        splats, labels = splats[kept], labels.subset(kept)
-    own = {name: torch.from_numpy(values) for name, values in labels.columns.items()}
-    layout = (*splats.layout, *(name for name in own if name not in splats.layout)) if splats.layout else ()
+    if mask is not None:
+        splats, labels = splats[mask], labels.subset(mask)
+    columns = {name: torch.from_numpy(values) for name, values in labels.columns.items()}
+    layout = (*splats.layout, *(name for name in columns if name not in splats.layout)) if splats.layout else ()
     world = world_of(labels.document["world"]) if "world" in labels.document else splats.world
-    splats = replace(splats, extras={**splats.extras, **own}, layout=layout, world=world)
+    splats = replace(splats, extras={**splats.extras, **columns}, layout=layout, world=world)
     return write(splats, labels.document)
 
 
 def read_labels(path: Path | str) -> Labels:
-    """The labels that a splat file keeps: columns of ``instance_id`` and ``class_id``, and what their numbers mean.
+    """Read the labels in a splat file: columns of ``instance_id`` and ``class_id``, and their document.
 
     A PLY has its document beside it (``NAME.ply.json``), if anywhere.
 
@@ -386,9 +396,9 @@ def _document_of(path: Path) -> dict[str, Any]:
 
 
 def recoloured(path: Path, colours: np.ndarray) -> Iterator[bytes]:
-    """Return a file with one colour a splat, the same from everywhere, as the bytes of a PLY in blocks.
+    """Yield a file with one view-independent colour of each splat, as the bytes of a PLY in blocks.
 
-    All else of a PLY is of its own bytes (`liftcore.io.ply.recoloured`); another format becomes a PLY of 3DGS.
+    All else of a PLY stays byte for byte (`liftcore.io.ply.recoloured`); another format becomes a PLY of 3DGS.
 
     Args:
         path: the file. colours: [P, 3] u8 sRGB.

@@ -26,7 +26,7 @@ import numpy as np
 from liftcore.errors import InvalidInput, InvalidLift
 from liftcore.io.files import open_regular, visible_files
 from liftcore.io.kinds import wrong_kind
-from liftcore.io.remote import landing, local_path
+from liftcore.io.remote import local_path, open_output
 from liftcore.io.safetensors_file import map_tensors
 from liftcore.io.shards import INDEX, SUFFIX, map_shards, write_shards
 from liftcore.runtime.aliases import current_names
@@ -76,7 +76,7 @@ def save_lift(lift: Lift, path: Path | str) -> None:
 
     metadata = lift.metadata.model_dump_json()
     tensors = tensors_of(lift)
-    with landing(path) as place:
+    with open_output(path) as place:
         if place.suffix == SUFFIX:
             write_shards(place, tensors, metadata)
         else:

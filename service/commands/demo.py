@@ -462,10 +462,10 @@ def find_scene(folder: Path, phrases: Sequence[str], scratch: Path, pack: Path |
 def _splats(folder: Path) -> Path:
     """Return the splats of a folder, or of the last iteration that a 3DGS trainer wrote."""
     kind = identify(folder)
-    if not kind.sent:
+    if not kind.accepted_over_http:
         got = f"{kind.splats[0]} alone" if kind.splats else "none"
         raise InvalidInput(f"splats of {folder.name}", expected="splats that the service takes", got=got)
-    return folder / kind.sent[0]
+    return folder / kind.accepted_over_http[0]
 
 
 def _cameras(folder: Path, scratch: Path) -> Path:
