@@ -1,4 +1,4 @@
-"""`splatlift bench`: how long a view takes to lift, and how much memory that needs."""
+"""`splatlift bench`: the time of a lift per view, and its memory."""
 
 import statistics
 import time
@@ -30,12 +30,12 @@ from liftcore.values.settings import LiftSettings, Preset
 from liftcore.values.views import Regions, ViewFeatures
 
 PASSES = 3  # over all views, of which the median counts
-PACKS = ("regions.safetensors", "features.safetensors")  # of a scene folder, the first that is there
+PACKS = ("regions.safetensors", "features.safetensors")  # of a scene folder, the first that exists
 
 
 @dataclass(frozen=True)
 class Workload:
-    """What is lifted: a scene, and views with label maps over random unit codebooks."""
+    """The input of a benchmark: a scene, and views with label maps over random unit codebooks."""
 
     name: str
     splats: Splats
@@ -60,7 +60,7 @@ def run_bench(
         scene: a folder with point_cloud.ply, cameras and region maps; None: a synthetic room.
         splats: of the room. size: of its images, WIDTHxHEIGHT in pixels.
         channels: of features. levels: of labels. views: at most.
-        threads: None takes the cores that this process may use. preset: None: all. device: auto, cpu or cuda.
+        threads: None uses the cores that this process may use. preset: None: all. device: auto, cpu or cuda.
 
     Returns:
         Plain numbers, ready for JSON: hardware, versions, seconds a view by stage (medians), the stages
@@ -70,17 +70,17 @@ def run_bench(
         InvalidInput: a size or a folder that makes no workload. InvalidSettings: a count that is none, or an unknown
             preset or device.
     """
-    place = choose_device(LiftSettings.of(device=device).device)
+    bench_device = choose_device(LiftSettings.of(device=device).device)
     presets = [LiftSettings.of(preset=preset).preset] if preset else list(Preset)
     for name, count in {"splats": splats, "channels": channels, "levels": levels, "views": views}.items():
         check_count(name, count)
     check_count("threads", threads, "all cores")
     if scene:
-        work = _scene(local_path(scene, "scene"), channels, levels, views)
+        work = _scene_workload(local_path(scene, "scene"), channels, levels, views)
     else:
-        work = _room(splats, size, channels, levels, views)
+        work = _room_workload(splats, size, channels, levels, views)
     start = time.perf_counter()
-    warm_up_lift(work.splats.kernel, place, LiftSettings.of(preset=Preset.ROW_SUM))
+    warm_up_lift(work.splats.kernel, bench_device, LiftSettings.of(preset=Preset.ROW_SUM))
     compile_seconds = time.perf_counter() - start
     camera, observed = work.views[0]
     return {
@@ -92,25 +92,25 @@ def run_bench(
         "channels": observed.codebook.shape[1],
         "levels": levels,
         "compile_or_load_s": compile_seconds,
-        "presets": {str(one): time_lift(work, one, place, threads) for one in presets},
+        "presets": {str(preset_name): time_lift(work, preset_name, bench_device, threads) for preset_name in presets},
         "peak_memory_bytes": peak_memory(),
         "machine_speed": machine_speed(threads),
-        "hardware": hardware() | ({} if place.kind == "cpu" else {"device": place.facts()}),
+        "hardware": hardware() | ({} if bench_device.kind == "cpu" else {"device": bench_device.facts()}),
     }
 
 
 def time_lift(work: Workload, preset: Preset, device: Device, threads: int | None = None) -> dict[str, Any]:
-    """Seconds a view of geometry and solution: medians over PASSES of all views, each as a lift walks them.
+    """Time geometry and solution in seconds per view: medians over PASSES of all views, in the order of a lift.
 
     ``geometry_s_per_view_min`` is that of the shortest pass.
     """
     settings, count = LiftSettings.of(preset=preset).for_splats(work.splats), work.splats.count
-    looking, raster = (settings.lift_params, settings.weighting), open_raster(work.splats, device, threads)
-    weigh_regions(raster, work.views[:1], looking, count, threads)  # for the caches alone
+    parameters, raster = (settings.lift_params, settings.weighting), open_raster(work.splats, device, threads)
+    weigh_regions(raster, work.views[:1], parameters, count, threads)  # fills the caches
     geometry, solution, entries = [], [], 0
     for _ in range(PASSES):
         start = time.perf_counter()
-        W, codebook = weigh_regions(raster, work.views, looking, count, threads)
+        W, codebook = weigh_regions(raster, work.views, parameters, count, threads)
         middle = time.perf_counter()
         solve(W, codebook, torch.float16, means=work.splats.means, threads=threads, device=device)
         geometry.append((middle - start) / len(work.views))
@@ -127,11 +127,11 @@ def time_lift(work: Workload, preset: Preset, device: Device, threads: int | Non
 
 
 def stage_shares(work: Workload, preset: Preset, device: Device, threads: int | None = None) -> dict[str, float]:
-    """Seconds of each stage of a whole lift over those of its geometry, and of ``all``; compiling is apart."""
+    """Time a full lift: seconds of each stage, and of ``all``, over those of geometry; compilation is excluded."""
     cameras = {camera.name: camera for camera, _ in work.views}
     views = {camera.name: observed for camera, observed in work.views}
-    made = lift(work.splats, cameras, views, preset, device=device.kind, threads=threads, progress=False)
-    stages = {name: seconds for name, seconds in made.metadata.timings.items() if name != "compile"}
+    result = lift(work.splats, cameras, views, preset, device=device.kind, threads=threads, progress=False)
+    stages = {name: seconds for name, seconds in result.metadata.timings.items() if name != "compile"}
     return {name: seconds / stages["geometry"] for name, seconds in (stages | {"all": sum(stages.values())}).items()}
 
 
@@ -139,30 +139,30 @@ def stage_shares(work: Workload, preset: Preset, device: Device, threads: int | 
 def weigh_regions(
     raster: Raster,
     views: Sequence[tuple[Camera, ViewFeatures]],
-    looking: tuple[CompositingParams, Weighting],
+    parameters: tuple[CompositingParams, Weighting],
     count: int,
     threads: int | None = None,
 ) -> tuple[RegionWeights, Codebook]:
-    """W of all views and what its regions stand for, as a lift makes them for the closed form.
+    """Compute W of all views and the codebook of its regions, as a lift does for the closed form.
 
     Args:
         count: P.
     """
     codebooks: list[ViewCodebook] = []
-    nowhere = torch.empty(0, 2, dtype=torch.int32)
+    no_pixels = torch.empty(0, 2, dtype=torch.int32)
 
     def requests() -> Iterator[ViewRequest]:
         for camera, observation in views:
-            regions, own = as_regions(observation, by_rows=False)
-            codebooks.append(own)
-            yield ViewRequest(camera, regions, *looking, nowhere)
+            regions, codebook = as_regions(observation, by_rows=False)
+            codebooks.append(codebook)
+            yield ViewRequest(camera, regions, *parameters, no_pixels)
 
-    found = enumerate(raster.iterate_views(requests()))
-    parts = [codebooks[number].counted(view.weights) for number, view in found]
+    answers = enumerate(raster.iterate_views(requests()))
+    parts = [codebooks[number].counted(view.weights) for number, view in answers]
     return stacked(parts, count, threads), Codebook(tuple(codebooks))
 
 
-def _room(splats: int, size: str, channels: int, levels: int, views: int) -> Workload:
+def _room_workload(splats: int, size: str, channels: int, levels: int, views: int) -> Workload:
     width, times, height = str(size).lower().partition("x")
     if not (times and width.isdecimal() and height.isdecimal() and int(width) and int(height)):
         raise InvalidInput("size", expected="WIDTHxHEIGHT in pixels", got=repr(size)[:80])
@@ -171,7 +171,7 @@ def _room(splats: int, size: str, channels: int, levels: int, views: int) -> Wor
     return Workload("synthetic room", room_splats(splats), observed)
 
 
-def _scene(folder: Path, channels: int, levels: int, count: int) -> Workload:
+def _scene_workload(folder: Path, channels: int, levels: int, count: int) -> Workload:
     from liftcore.io.cameras import read_cameras
     from liftcore.io.splats import read_splats
     from liftcore.values.pack import pair, read_features

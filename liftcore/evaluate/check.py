@@ -1,12 +1,13 @@
-"""Do splats, cameras, photos and features belong together? What is wrong is told before the work.
+"""A check, before a lift, that splats, cameras, photos and features belong together.
 
-Nothing here knows how good a scene is. Each measure has its own control: a render is held against other views' photos
-too, the edges of masks against the same masks mirrored, and features as `lifting.planning.contradictions` has it.
+No measure needs to know the quality of a scene, as each has its own control: a render is compared with other views'
+photos too, the edges of masks with those of the mirrored masks, and features as `lifting.planning.contradictions`
+does.
 
-Photos of another shape than their cameras are told by their headers alone, and compared no further. Where renders are
-not like their photos, the causes that photos can show are tried: photos that are turned or mirrored, photos that are
-shifted (a principal point that is off), photos of another exposure, positions in another scale. One is named where it
-makes renders like their photos; where none does, nothing is blamed.
+Photos of another shape than their cameras are found by their headers, and compared no further. If renders do not
+match their photos, causes that photos can show are tried: turned or mirrored photos, shifted photos (a wrong
+principal point), photos of another exposure, positions in another scale. A cause is reported if it makes renders
+match their photos; else no cause is.
 """
 
 from __future__ import annotations
@@ -57,15 +58,15 @@ from liftcore.values.pack import Views, pair, read_features
 from liftcore.values.settings import LiftSettings
 from liftcore.values.views import FeatureGrid, Regions
 
-VIEWS = 12  # that are looked at, evenly spread
-CONTROLS = 3  # other photos that a render is held against
+VIEWS = 12  # that are checked, evenly spread
+CONTROLS = 3  # photos of other views that a render is compared with
 LEAST_GAIN = 3.0  # dB, of a render over other views' photos to its own
 LEAST_SHIFT = 2.0  # pixels, beyond what a pinhole's rounding and a lens leave
-SCALED_VIEWS = 4  # that are rendered anew for each scale
+SCALED_VIEWS = 4  # that are rendered again for each scale
 LEAST_EDGES = 1.1  # of the photo's edges under masks, over those under mirrored ones
 
 
-HOW_TURNED = {  # by EXIF's orientation
+TURN_NAMES = {  # by EXIF's orientation
     2: "mirrored left to right", 3: "turned by 180 degrees", 4: "mirrored upside down", 5: "transposed",
     6: "turned by 90 degrees clockwise", 7: "transposed across", 8: "turned by 90 degrees counterclockwise",
 }  # fmt: skip
@@ -73,7 +74,7 @@ HOW_TURNED = {  # by EXIF's orientation
 
 @dataclass(frozen=True)
 class ViewCheck:
-    """A view beside its photo."""
+    """The comparison of a render with its photo."""
 
     view: str
     row_sum: float  # the mean of A 1
@@ -83,14 +84,14 @@ class ViewCheck:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """What was looked at, and what is wrong."""
+    """The result of a check."""
 
     views: tuple[ViewCheck, ...]
     in_view: float  # share of the splats that some camera can see
     features: Mapping[str, float]  # medians over views of what applies
-    wrong: tuple[str, ...]  # a sentence each: what was found, and what to do
-    notes: tuple[str, ...]  # what may be so on purpose
-    worst: bytes | None  # PNG of the view that is least like its photo: the photo, and the render beside it
+    wrong: tuple[str, ...]  # a sentence each: a contradiction, and what to do
+    notes: tuple[str, ...]  # remarks on what may be intended
+    worst: bytes | None  # PNG of the view with the lowest PSNR: the photo, and the render beside it
 
 
 def check_scene(
@@ -101,17 +102,17 @@ def check_scene(
     progress: Progress | bool | None = False,
     settings: LiftSettings | None = None,
 ) -> CheckReport:
-    """Render some views and hold them against what is known of them.
+    """Render some views, and compare them with their photos; check features against cameras and photos.
 
     Args:
-        splats, cameras: or where they lie, as `read_splats` and `read_cameras` take them.
+        splats, cameras: or their paths, as `read_splats` and `read_cameras` take them.
         photos: view -> image; or images and folders of them. features: of the views; or the paths of feature packs.
-        progress: as `liftcore.lift` has it; told about a stage "check", in views.
-        settings: of the lift that is to come; its ``antialiased`` counts. None: the default ones.
+        progress: as in `liftcore.lift`; reports a stage "check", in views.
+        settings: of the later lift, for its ``antialiased``. None: the defaults.
 
     Raises:
         InvalidInput: an image that cannot be read. InvalidFeatures: features that cannot be read.
-        InvalidSplats, InvalidCameras: as readers of splats and cameras have it.
+        InvalidSplats, InvalidCameras: as in readers of splats and cameras.
     """
     settings = LiftSettings.or_default(settings)
     features = features if features is None or isinstance(features, Views) else read_features(*as_list(features))
@@ -141,16 +142,18 @@ def _check(
     notes += [f"cameras: {text}" for text in cameras.warnings]
     if trained.antialiased:
         notes.append(f"splats: rendered antialiased: {rendering_reason(splats.render_mode, True)}")
-    files, whole = _paired_photos(photos, cameras, features is not None, wrong, notes)
-    sizes = {name: _photo_of(cameras[name], whole[name]) for name in files}
+    files, panoramas = _paired_photos(photos, cameras, features is not None, wrong, notes)
+    sizes = {name: _photo_of(cameras[name], panoramas[name]) for name in files}
     headers = {name: read_header(file) for name, file in files.items()}
     notes += [f"photos: {line}" for line in orientation_warnings(readings_of(headers, sizes), "their cameras")]
-    odd, told = _other_shapes(headers, sizes)
-    wrong += told
-    alike = {name: file for name, file in files.items() if name not in odd}
-    names = evenly_spaced(list(alike) or list(cameras), VIEWS)
-    shown = [name for name in names if name in alike]
-    pictures = {name: _photo(files[name], sizes[name], cameras[name].photo_size, whole[name]) for name in shown}
+    misshapen, found_wrong = _other_shapes(headers, sizes)
+    wrong += found_wrong
+    comparable = {name: file for name, file in files.items() if name not in misshapen}
+    names = evenly_spaced(list(comparable) or list(cameras), VIEWS)
+    with_photo = [name for name in names if name in comparable]
+    pictures = {
+        name: _photo(files[name], sizes[name], cameras[name].photo_size, panoramas[name]) for name in with_photo
+    }
     raster, views, renders = open_raster(splats, CPU), [], {}
     unfilled: dict[str, np.ndarray] = {}
     for number, name in enumerate(names):
@@ -166,7 +169,7 @@ def _check(
     wrong += _unlike_photos(views, pictures, renders, headers, _Scaled(raster, splats, cameras, trained, background))
     figures: dict[str, float] = {}
     if features is not None:
-        figures, told = _check_features(features, cameras, files, whole)
+        figures, found_wrong = _check_features(features, cameras, files, panoramas)
         paired_features = pair(features, cameras)[0]
         notes += [
             f"features: {text}"
@@ -176,11 +179,11 @@ def _check(
         agreement = agreement_of_views(raster, lifted, settings).agreement
         if agreement is not None:
             figures["agreement_of_views"] = agreement
-            if not (told or wrong):  # other cameras are told already, and broken maps agree nowhere
-                told += disagreement(raster, lifted, settings, agreement)
-        wrong += told
-    compared = [view for view in views if view.psnr is not None]
-    worst = min(compared, key=lambda view: view.psnr or 0.0).view if compared else None
+            if not (found_wrong or wrong):  # wrong cameras are reported already, and broken maps agree nowhere
+                found_wrong += disagreement(raster, lifted, settings, agreement)
+        wrong += found_wrong
+    with_psnr = [view for view in views if view.psnr is not None]
+    worst = min(with_psnr, key=lambda view: view.psnr or 0.0).view if with_psnr else None
     side_by_side = _png(np.concatenate([pictures[worst], renders[worst]], axis=1)) if worst else None
     return CheckReport(tuple(views), in_view, figures, tuple(wrong), tuple(notes), side_by_side)
 
@@ -188,40 +191,45 @@ def _check(
 def _paired_photos(
     photos: Mapping[str, Path], cameras: Cameras, featured: bool, wrong: list[str], notes: list[str]
 ) -> tuple[dict[str, Path], dict[str, Camera | None]]:
-    """Camera -> its photo, and the camera itself where it is a face of a panorama that the photo is; None elsewhere.
+    """Pair cameras with photos: camera -> photo, and camera -> itself if its photo is a panorama, else None.
 
     Args:
-        featured: whether there are features. wrong, notes: take what photos and cameras say of each other.
+        featured: True if there are features. wrong, notes: lists that messages about the pairs are added to.
     """
     paired = cameras_of_views(photos, with_panoramas(cameras))
-    taken = {name: photos[view] for view, name in paired.items()}
+    photo_of = {name: photos[view] for view, name in paired.items()}
     faces = {name: camera.face.photo for name, camera in cameras.items() if camera.face is not None}
-    files = {name: taken[photo] for name, photo in faces.items() if photo in taken and name not in taken}
+    files = {name: photo_of[photo] for name, photo in faces.items() if photo in photo_of and name not in photo_of}
     panoramas = frozenset(files)  # of which a file is the panorama, and not the camera's own photo
-    files |= {name: file for name, file in taken.items() if name in cameras}
+    files |= {name: file for name, file in photo_of.items() if name in cameras}
     if not photos:
-        what = "so the features alone tell" if featured else "so nothing tells"
-        notes.append(f"photos: none were given, {what} whether these cameras are those of the splats")
+        consequence = "so the features alone tell" if featured else "so nothing tells"
+        notes.append(f"photos: none were given, {consequence} whether these cameras are those of the splats")
     elif not files:
-        named = f"{first_names(photos)}, but the cameras {first_names(cameras)}"
-        wrong.append(f"photos: none is named as a camera: the photos are {named}")
+        names = f"{first_names(photos)}, but the cameras {first_names(cameras)}"
+        wrong.append(f"photos: none is named as a camera: the photos are {names}")
     else:
-        bare, lost = [name for name in cameras if name not in files], [name for name in photos if name not in paired]
-        notes += [f"photos: {len(bare)} cameras have none: {first_names(bare)}"] if bare else []
-        notes += [f"photos: {len(lost)} have no camera: {first_names(lost)}"] if lost else []
+        without_photo, unpaired = (
+            [name for name in cameras if name not in files],
+            [name for name in photos if name not in paired],
+        )
+        notes += (
+            [f"photos: {len(without_photo)} cameras have none: {first_names(without_photo)}"] if without_photo else []
+        )
+        notes += [f"photos: {len(unpaired)} have no camera: {first_names(unpaired)}"] if unpaired else []
     return files, {name: cameras[name] if name in panoramas else None for name in files}
 
 
 def evenly_spaced(names: Sequence[str], count: int) -> list[str]:
-    """As many of the names, evenly spread."""
-    places = np.linspace(0, len(names) - 1, min(count, len(names))).round()
-    return [names[int(place)] for place in places]
+    """Select ``count`` names, evenly spread."""
+    indices = np.linspace(0, len(names) - 1, min(count, len(names))).round()
+    return [names[int(index)] for index in indices]
 
 
 def _render(
     raster: Raster, splats: Splats, camera: Camera, params: CompositingParams
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A view over black [H, W, 3] f32 in the pixels of its photo, and what splats leave of each ray [H, W, 1] f32."""
+    """Render a view over black [H, W, 3] f32 in the pixels of its photo, and the transmittance [H, W, 1] f32."""
     values = torch.cat([view_colours(splats, camera), torch.ones(splats.count, 1, dtype=torch.float32)], dim=1)
     image = in_photo(camera, lambda of: raster.render(of, values, params)).numpy()
     return image[..., :3], 1.0 - image[..., 3:]
@@ -230,7 +238,7 @@ def _render(
 def _background(
     renders: Mapping[str, np.ndarray], unfilled: Mapping[str, np.ndarray], pictures: Mapping[str, np.ndarray]
 ) -> float:
-    """White (1) where it makes renders more like their photos, as captures without a background have; else 0."""
+    """Choose white (1) if renders match their photos better on it, as photos without a background do; else 0."""
     gains = [
         _psnr((renders[name] + unfilled[name]).clip(0, 1), photo) - _psnr(renders[name].clip(0, 1), photo)
         for name, photo in pictures.items()
@@ -240,7 +248,7 @@ def _background(
 
 
 def _photo_of(camera: Camera, panorama: Camera | None) -> tuple[int, int]:
-    """Width and height of the photo that a camera is of; of a ``panorama`` that camera, a face, of the whole one."""
+    """Return width and height of a camera's photo; for a face of a ``panorama``, those of the full panorama."""
     face = None if panorama is None else panorama.face
     return camera.photo_size if face is None else (face.width, face.height)
 
@@ -248,37 +256,38 @@ def _photo_of(camera: Camera, panorama: Camera | None) -> tuple[int, int]:
 def _other_shapes(
     headers: Mapping[str, PhotoHeader], sizes: Mapping[str, tuple[int, int]]
 ) -> tuple[set[str], list[str]]:
-    """The views whose photos no scale makes as large as their cameras say, and a sentence for each kind of them."""
-    across, others = [], []
+    """Find views whose photos have another aspect ratio than their cameras; return a message for each kind too."""
+    sideways, other_shape = [], []
     for name, header in headers.items():
         size = header.oriented if header.turns_for(sizes[name]) else header.stored
         if not is_stretched(size, sizes[name]):
             continue
-        (across if not is_stretched((size[1], size[0]), sizes[name]) else others).append(name)
+        (sideways if not is_stretched((size[1], size[0]), sizes[name]) else other_shape).append(name)
     advice = {
-        "lie on their side ({}): take the photos as they were when their cameras were made": across,
-        "are of another shape than their cameras ({}): crops or other photos": others,
+        "lie on their side ({}): take the photos as they were when their cameras were made": sideways,
+        "are of another shape than their cameras ({}): crops or other photos": other_shape,
     }
     shapes = {
-        name: "{}x{} for a camera of {}x{}".format(*headers[name].stored, *sizes[name]) for name in across + others
+        name: "{}x{} for a camera of {}x{}".format(*headers[name].stored, *sizes[name])
+        for name in sideways + other_shape
     }
-    return {*across, *others}, [
-        f"photos: {len(found)} of {len(headers)} {text.format(f'{found[0]} is {shapes[found[0]]}')}"
-        for text, found in advice.items()
-        if found
+    return {*sideways, *other_shape}, [
+        f"photos: {len(names)} of {len(headers)} {text.format(f'{names[0]} is {shapes[names[0]]}')}"
+        for text, names in advice.items()
+        if names
     ]
 
 
 def _photo(path: Path, like: tuple[int, int], size: tuple[int, int], panorama: Camera | None) -> np.ndarray:
-    """[H, W, 3] f32 in 0..1, a photo in a size (width, height); of a ``panorama`` what that camera, a face, sees.
+    """Read a photo [H, W, 3] f32 in 0..1 at a size (width, height); of a ``panorama`` the image of that face.
 
     Args:
-        like: width and height of what tells the photo's orientation.
+        like: width and height that decide the photo's orientation.
     """
     image = read_image(path, like)[0]
     if panorama is not None and panorama.face is not None:
-        whole = image.resize((panorama.face.width, panorama.face.height), Image.Resampling.BOX)
-        image = Image.fromarray(photo_as_pinhole_sees(np.asarray(whole), panorama))
+        full_image = image.resize((panorama.face.width, panorama.face.height), Image.Resampling.BOX)
+        image = Image.fromarray(photo_as_pinhole_sees(np.asarray(full_image), panorama))
     return np.asarray(image.resize(size, Image.Resampling.BOX), np.float32) / 255
 
 
@@ -289,8 +298,8 @@ def _against(name: str, row_sum: float, render: np.ndarray | None, pictures: Map
     return ViewCheck(name, row_sum, _psnr(render, pictures[name]), float(np.mean(controls)) if controls else None)
 
 
-def _psnr(one: np.ndarray, other: np.ndarray) -> float:
-    return float(-10 * np.log10(max(np.square(one - other, dtype=np.float64).mean(), 1e-10)))
+def _psnr(left: np.ndarray, right: np.ndarray) -> float:
+    return float(-10 * np.log10(max(np.square(left - right, dtype=np.float64).mean(), 1e-10)))
 
 
 def _wrong_cameras(views: Sequence[ViewCheck], in_view: float) -> list[str]:
@@ -313,11 +322,11 @@ class _Scaled:
     background: float  # 0, black, or 1, white
 
     def render(self, view: str, factor: float) -> np.ndarray:
-        """[H, W, 3] f32 in 0..1, of a view."""
+        """Render a view [H, W, 3] f32 in 0..1."""
         camera, scale = self.cameras[view], np.ones((4, 4))
         scale[:3, 3] = factor
-        moved = camera.replace(viewmat=camera.viewmat * scale)
-        render, unfilled = _render(self.raster, self.splats, moved, self.params)
+        scaled_camera = camera.replace(viewmat=camera.viewmat * scale)
+        render, unfilled = _render(self.raster, self.splats, scaled_camera, self.params)
         return (render + self.background * unfilled).clip(0.0, 1.0)
 
 
@@ -328,21 +337,21 @@ def _unlike_photos(
     headers: Mapping[str, PhotoHeader],
     scaled: _Scaled,
 ) -> list[str]:
-    """That renders are not like their photos, if so, and the cause that makes them alike, if one does."""
-    compared = {
+    """Report renders that do not match their photos, with the cause if one is found; empty if they match."""
+    psnrs = {
         view.view: (view.psnr, view.other_psnr)
         for view in views
         if view.psnr is not None and view.other_psnr is not None
     }
-    if not compared:
+    if not psnrs:
         return []
-    if _median([own - other for own, other in compared.values()]) >= LEAST_GAIN:
-        return _some_turned(compared, pictures, renders)
-    own = {name: psnr for name, (psnr, _) in compared.items()}
-    gain = _median([psnr - other for psnr, other in compared.values()])
-    told = f"photos: renders are hardly more like their own photos ({_median(list(own.values())):.1f} dB)"
-    told = f"{told} than like other views' ({gain:+.1f} dB)"
-    floor = {name: max(compared[name]) for name in own}
+    if _median([own_psnr - other for own_psnr, other in psnrs.values()]) >= LEAST_GAIN:
+        return _some_turned(psnrs, pictures, renders)
+    own_psnr = {name: psnr for name, (psnr, _) in psnrs.items()}
+    gain = _median([psnr - other for psnr, other in psnrs.values()])
+    finding = f"photos: renders are hardly more like their own photos ({_median(list(own_psnr.values())):.1f} dB)"
+    finding = f"{finding} than like other views' ({gain:+.1f} dB)"
+    floor = {name: max(psnrs[name]) for name in own_psnr}
     cause = (
         _turned_photos(floor, pictures, renders, headers)
         or _shifted_photos(floor, pictures, renders)
@@ -350,30 +359,30 @@ def _unlike_photos(
         or _scaled_positions(floor, pictures, scaled)
     )
     unknown = "splats, cameras and photos are not of one scene in one frame, or photos and cameras not of each other"
-    return [f"{told}; {cause or unknown}"]
+    return [f"{finding}; {cause or unknown}"]
 
 
 def _some_turned(
-    compared: Mapping[str, tuple[float, float]], pictures: Mapping[str, np.ndarray], renders: Mapping[str, np.ndarray]
+    psnrs: Mapping[str, tuple[float, float]], pictures: Mapping[str, np.ndarray], renders: Mapping[str, np.ndarray]
 ) -> list[str]:
-    """A sentence for each turn that makes single photos like their renders, among others that are like them."""
-    turned: dict[int, list[str]] = {}
-    for name, (own, other) in compared.items():
-        if own - other >= LEAST_GAIN:
+    """Report single photos that match their renders only when turned, a message a turn."""
+    names_by_turn: dict[int, list[str]] = {}
+    for name, (own_psnr, other) in psnrs.items():
+        if own_psnr - other >= LEAST_GAIN:
             continue
         ways = {tag: np.asarray(_turn(pictures[name], way)) for tag, way in TURNS.items()}
         gains = {
-            tag: _psnr(renders[name], picture) - max(own, other)
+            tag: _psnr(renders[name], picture) - max(own_psnr, other)
             for tag, picture in ways.items()
             if picture.shape == renders[name].shape
         }
         best = max(gains, key=lambda tag: gains[tag])
         if gains[best] >= LEAST_GAIN:
-            turned.setdefault(best, []).append(name)
+            names_by_turn.setdefault(best, []).append(name)
     return [
-        f"photos: {len(names)} of the {len(compared)} compared ({first_names(names)}) are {HOW_TURNED[tag]}: "
+        f"photos: {len(names)} of the {len(psnrs)} compared ({first_names(names)}) are {TURN_NAMES[tag]}: "
         "take the photos that cameras were made of"
-        for tag, names in sorted(turned.items())
+        for tag, names in sorted(names_by_turn.items())
     ]
 
 
@@ -383,27 +392,27 @@ def _turned_photos(
     renders: Mapping[str, np.ndarray],
     headers: Mapping[str, PhotoHeader],
 ) -> str:
-    """The turn of the photos that makes renders like them; empty where none does."""
+    """Report the turn of all photos that makes renders match; empty if none does."""
     best, turn = 0.0, 0
     for tag, way in TURNS.items():
-        turned = {name: np.asarray(_turn(pictures[name], way)) for name in floor}
-        found = [
-            _psnr(renders[name], turned[name]) - floor[name]
+        turned_pictures = {name: np.asarray(_turn(pictures[name], way)) for name in floor}
+        gains = [
+            _psnr(renders[name], turned_pictures[name]) - floor[name]
             for name in floor
-            if turned[name].shape == renders[name].shape
+            if turned_pictures[name].shape == renders[name].shape
         ]
-        if found and _median(found) > best:
-            best, turn = _median(found), tag
+        if gains and _median(gains) > best:
+            best, turn = _median(gains), tag
     if best < LEAST_GAIN:
         return ""
-    how = f"with the photos {HOW_TURNED[turn]} they are {best:.1f} dB more so"
+    finding = f"with the photos {TURN_NAMES[turn]} they are {best:.1f} dB more so"
     if _median([float(headers[name].orientation == turn) for name in floor]) > 0:
-        return f"{how}: cameras are of the photos as their EXIF turns them; save them turned, without the tag"
-    return f"{how}: photos and cameras are turned to each other; take the photos that cameras were made of"
+        return f"{finding}: cameras are of the photos as their EXIF turns them; save them turned, without the tag"
+    return f"{finding}: photos and cameras are turned to each other; take the photos that cameras were made of"
 
 
 def _turn(picture: np.ndarray, way: Image.Transpose) -> np.ndarray:
-    """A picture [H, W, 3] turned as Pillow has it."""
+    """Turn a picture [H, W, 3] as Pillow does."""
     flips = {
         Image.Transpose.FLIP_LEFT_RIGHT: lambda image: image[:, ::-1],
         Image.Transpose.FLIP_TOP_BOTTOM: lambda image: image[::-1],
@@ -419,7 +428,7 @@ def _turn(picture: np.ndarray, way: Image.Transpose) -> np.ndarray:
 def _shifted_photos(
     floor: Mapping[str, float], pictures: Mapping[str, np.ndarray], renders: Mapping[str, np.ndarray]
 ) -> str:
-    """The shift of the photos by which renders are like them; empty where none is."""
+    """Report the shift of the photos that makes renders match; empty if none does."""
     shifts = np.array([_shift(pictures[name], renders[name]) for name in floor])
     down, across = np.median(shifts, axis=0)
     if max(abs(down), abs(across)) < LEAST_SHIFT:
@@ -437,38 +446,39 @@ def _shifted_photos(
 
 
 def _shift(photo: np.ndarray, render: np.ndarray) -> tuple[int, int]:
-    """The shift (down, across) in pixels of a photo that lies best on a render, by phase correlation."""
-    one, other = (np.fft.rfft2(image.mean(axis=2) - image.mean()) for image in (render, photo))
-    cross = one * other.conj()
+    """Estimate the shift (down, across) in pixels of a photo onto a render, by phase correlation."""
+    render_spectrum, photo_spectrum = (np.fft.rfft2(image.mean(axis=2) - image.mean()) for image in (render, photo))
+    cross = render_spectrum * photo_spectrum.conj()
     peaks = np.fft.irfft2(cross / np.maximum(np.abs(cross), 1e-12), s=render.shape[:2])
-    place = np.unravel_index(int(peaks.argmax()), peaks.shape)
+    peak = np.unravel_index(int(peaks.argmax()), peaks.shape)
     down, across = (
-        int(at) - side if at > side // 2 else int(at) for at, side in zip(place, peaks.shape, strict=True)
+        int(offset) - side if offset > side // 2 else int(offset)
+        for offset, side in zip(peak, peaks.shape, strict=True)
     )
     return down, across
 
 
 def _overlap(photo: np.ndarray, render: np.ndarray, down: int, across: int) -> tuple[np.ndarray, np.ndarray]:
-    """What a photo that is shifted and a render both show."""
+    """Crop a shifted photo and a render to their overlap."""
     height, width = render.shape[:2]
-    here = np.s_[max(0, down) : height + min(0, down), max(0, across) : width + min(0, across)]
-    there = np.s_[max(0, -down) : height - max(0, down), max(0, -across) : width - max(0, across)]
-    return photo[there], render[here]
+    render_part = np.s_[max(0, down) : height + min(0, down), max(0, across) : width + min(0, across)]
+    photo_part = np.s_[max(0, -down) : height - max(0, down), max(0, -across) : width - max(0, across)]
+    return photo[photo_part], render[render_part]
 
 
 def _exposed_photos(
     floor: Mapping[str, float], pictures: Mapping[str, np.ndarray], renders: Mapping[str, np.ndarray]
 ) -> str:
-    """The change of the renders' colours by which they are like their photos; empty where none is.
+    """Report the change of the renders' colours that makes them match their photos; empty if none does.
 
-    Any colours become like any photo's to some degree, so other views' photos are the control here too.
+    Fitted colours bring any render nearer to any photo, so that other views' photos are the control here too.
     """
     gains, factors = [], []
     for name, least in floor.items():
-        changed, factor = _in_colours_of(renders[name], pictures[name])
-        others = _controls(name, pictures)
-        control = [_psnr(_in_colours_of(renders[name], photo)[0], photo) for photo in others]
-        gains.append(_psnr(changed, pictures[name]) - max(least, *control))
+        recoloured, factor = _in_colours_of(renders[name], pictures[name])
+        control_photos = _controls(name, pictures)
+        control = [_psnr(_in_colours_of(renders[name], photo)[0], photo) for photo in control_photos]
+        gains.append(_psnr(recoloured, pictures[name]) - max(least, *control))
         factors.append(factor)
     if _median(gains) < LEAST_GAIN:
         return ""
@@ -479,20 +489,20 @@ def _exposed_photos(
 
 
 def _in_colours_of(render: np.ndarray, photo: np.ndarray) -> tuple[np.ndarray, float]:
-    """A render [H, W, 3] f32 with the factor and the offset of each channel that fit a photo, and the mean factor."""
+    """Fit a factor and an offset a channel of a render [H, W, 3] f32 to a photo; return it with the mean factor."""
     centred = render - render.mean(axis=(0, 1))
     factors = (centred * photo).mean(axis=(0, 1)) / np.maximum(np.square(centred).mean(axis=(0, 1)), 1e-12)
     return photo.mean(axis=(0, 1)) + factors * centred, float(factors.mean())
 
 
 def _controls(name: str, pictures: Mapping[str, np.ndarray]) -> list[np.ndarray]:
-    """Photos of other views that a render is held against, of the shape of its own."""
-    alike = [view for view in pictures if view != name and pictures[view].shape == pictures[name].shape]
-    return [pictures[view] for view in evenly_spaced(alike, CONTROLS)]
+    """Select photos of other views, of the same shape, that a render is compared with."""
+    same_shape = [view for view in pictures if view != name and pictures[view].shape == pictures[name].shape]
+    return [pictures[view] for view in evenly_spaced(same_shape, CONTROLS)]
 
 
 def _scaled_positions(floor: Mapping[str, float], pictures: Mapping[str, np.ndarray], scaled: _Scaled) -> str:
-    """The scale of the cameras' positions by which renders are like the photos; empty where none is."""
+    """Report the scale of the cameras' positions that makes renders match; empty if none does."""
     names, best, scale = evenly_spaced(list(floor), SCALED_VIEWS), 0.0, 1.0
     for factor in (*NEAR_SCALES, *FAR_SCALES):
         gains = []
@@ -514,9 +524,9 @@ def _median(values: Sequence[float]) -> float:
 
 
 def _check_features(
-    features: Views, cameras: Cameras, files: Mapping[str, Path], whole: Mapping[str, Camera | None]
+    features: Views, cameras: Cameras, files: Mapping[str, Path], panoramas: Mapping[str, Camera | None]
 ) -> tuple[dict[str, float], list[str]]:
-    """Medians over some views, and what is wrong by them."""
+    """Measure features: medians over some views, and messages of what is wrong."""
     views = pair(features, cameras)[0]
     grids: list[np.ndarray] = []
     rows: list[tuple[float, float]] = []
@@ -527,27 +537,31 @@ def _check_features(
         elif isinstance(observed, Regions) and name in files:
             labels = observed.labels[-1].numpy()
             size = (labels.shape[1], labels.shape[0])
-            photo = _photo(files[name], size, size, whole[name]).mean(axis=2)
+            photo = _photo(files[name], size, size, panoramas[name]).mean(axis=2)
             mirrored = max(_edges(labels[:, ::-1], photo), _edges(labels[::-1], photo))
             rows.append((_edges(labels, photo), mirrored))
     figures, wrong = {}, unlike_maps(grids)
     if grids:
-        found = smoothness(grids)
-        figures |= {"neighbouring_cells": found.neighbours, "any_two_cells": found.all_pairs, **found.readings}
+        figures_of_maps = smoothness(grids)
+        figures |= {
+            "neighbouring_cells": figures_of_maps.neighbours,
+            "any_two_cells": figures_of_maps.all_pairs,
+            **figures_of_maps.readings,
+        }
     if rows:
-        own, mirrored = np.median(np.array(rows), axis=0).tolist()
-        figures |= {"edges": own, "edges_of_mirrored": mirrored}
-        if own < LEAST_EDGES * mirrored:
-            told = f"edges of photos are {own:.2f} of the mean under the masks' borders"
+        edges, mirrored = np.median(np.array(rows), axis=0).tolist()
+        figures |= {"edges": edges, "edges_of_mirrored": mirrored}
+        if edges < LEAST_EDGES * mirrored:
+            finding = f"edges of photos are {edges:.2f} of the mean under the masks' borders"
             control = f"{mirrored:.2f} under mirrored ones"
             wrong.append(
-                f"features: {told}, {control}: masks must be of these photos, upright, whole, not transposed"
+                f"features: {finding}, {control}: masks must be of these photos, upright, whole, not transposed"
             )
     return figures, wrong
 
 
 def _edges(labels: np.ndarray, photo: np.ndarray) -> float:
-    """How strong a photo's edges [h, w] are where the labels [h, w] change, over their mean."""
+    """Measure a photo's edges [h, w] where the labels [h, w] change, over the mean of all its edges."""
     down, across = np.abs(np.diff(photo, axis=0))[:, :-1], np.abs(np.diff(photo, axis=1))[:-1]
     strength = np.maximum(down, across)
     border = (labels[1:, :-1] != labels[:-1, :-1]) | (labels[:-1, 1:] != labels[:-1, :-1])

@@ -1,6 +1,6 @@
-"""Masks to judge lifts by: in a ``.safetensors`` file, ``VIEW/mask`` [h, w] of numbers of classes, -1 for none.
+"""Masks that lifts are evaluated by: a ``.safetensors`` file with ``VIEW/mask`` [h, w] of class numbers, -1 for none.
 
-In u8 none is 255. What else is in the file is left alone. Masks need not have the image's size.
+In u8 none is 255. Other tensors in the file are ignored. Masks need not have the image's size.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ EXPECTED = "labels, as VIEW/mask [h, w] (.safetensors)"
 
 
 def read_masks(path: Path, classes: int) -> dict[str, Tensor]:
-    """View -> [h, w] i64 of numbers below ``classes``, NO_CLASS for none.
+    """Read masks: view -> [h, w] i64 of numbers below ``classes``, NO_CLASS for none.
 
     Raises:
         InvalidMasks: no such file, not a safetensors file, or a mask that is no image of class numbers.
@@ -35,7 +35,7 @@ def read_masks(path: Path, classes: int) -> dict[str, Tensor]:
 
 
 def describe_masks(path: Path) -> dict[str, Any]:
-    """Read every mask: counts, sizes and warnings. ``classes`` is how many the largest number asks for.
+    """Read every mask: counts, sizes and warnings. ``classes`` is one more than the largest number.
 
     Raises:
         InvalidMasks: as `read_masks`; or there is none.
@@ -61,34 +61,36 @@ def describe_masks(path: Path) -> dict[str, Any]:
 
 
 def _masks(path: Path, classes: int | None) -> Iterator[tuple[str, Tensor, int]]:
-    """Views in their order, with their mask [h, w] i64 and its highest number."""
+    """Iterate over views in order, with their mask [h, w] i64 and its highest number."""
     from safetensors import SafetensorError, safe_open
 
     check_header(path, str(path), InvalidMasks, expected=EXPECTED)
     try:
         with safe_open(str(path), framework="pt") as handle:
             for name in sorted(name for name in tuple(handle.keys()) if name.endswith("/mask")):
-                where, part = f"{path} {name[:80]!r}", handle.get_slice(name)
-                _check_kind(where, part.get_dtype(), part.get_shape())
+                location, part = f"{path} {name[:80]!r}", handle.get_slice(name)
+                _check_kind(location, part.get_dtype(), part.get_shape())
                 mask = handle.get_tensor(name).long()
                 if part.get_dtype() == "U8":  # as in the labels of feature packs: it has no -1
                     mask[mask == U8_NO_LABEL] = NO_CLASS
-                yield composed(name.removesuffix("/mask")), mask, _highest(where, mask, classes)
+                yield composed(name.removesuffix("/mask")), mask, _highest(location, mask, classes)
     except (SafetensorError, OSError) as error:
         got = f"a file that does not open as one ({str(error)[:120]})"
         raise InvalidMasks(str(path), expected=EXPECTED, got=got) from None
 
 
-def _check_kind(where: str, dtype: str, shape: list[int]) -> None:
+def _check_kind(location: str, dtype: str, shape: list[int]) -> None:
     if len(shape) != 2 or not all(shape) or dtype not in MASK_TYPES:
-        raise InvalidMasks(where, expected="labels as integers [h, w], no side empty", got=f"{dtype} {shape}"[:120])
+        raise InvalidMasks(
+            location, expected="labels as integers [h, w], no side empty", got=f"{dtype} {shape}"[:120]
+        )
 
 
-def _highest(where: str, mask: Tensor, classes: int | None) -> int:
-    """The highest number in a mask, once all are seen to name a class or none."""
+def _highest(location: str, mask: Tensor, classes: int | None) -> int:
+    """Return the highest number in a mask, after a check that all are classes or none."""
     low, high = (int(value) for value in torch.aminmax(mask))
     if low < NO_CLASS or (classes is not None and high >= classes):
         top = "0.." if classes is None else f"0..{classes - 1}"
         got = f"the number {low if low < NO_CLASS else high}"
-        raise InvalidMasks(where, expected=f"labels of {NO_CLASS} or classes {top}", got=got)
+        raise InvalidMasks(location, expected=f"labels of {NO_CLASS} or classes {top}", got=got)
     return high

@@ -1,4 +1,4 @@
-"""The machine that a figure was taken on; the most memory that this process took."""
+"""The machine of a measurement, and the peak memory of this process."""
 
 import platform
 import sys
@@ -18,10 +18,10 @@ COPIED, SIDE, TRIES = 1 << 25, 1 << 10, 5  # float32 that are copied, of a matri
 
 
 def hardware() -> dict[str, Any]:
-    """The machine and the versions that a figure was taken on.
+    """Describe the machine and the versions of a measurement.
 
-    The processor has LLVM's name too, for which code is compiled: a virtual one's own name may be no more than its
-    maker's, of generations a factor of two apart.
+    The CPU is named by LLVM's target too: a virtual machine may name the maker alone, whose generations differ by a
+    factor of two in speed.
     """
     import numba
     from llvmlite.binding import get_host_cpu_name
@@ -37,10 +37,10 @@ def hardware() -> dict[str, Any]:
 
 
 def machine_speed(threads: int | None = None) -> dict[str, float]:
-    """Bytes a second that so many threads read and write together, and float32 operations a second: the best of some.
+    """Measure bytes read and written a second by all threads, and float32 operations a second: the best of TRIES.
 
     Args:
-        threads: None takes the cores that this process may use.
+        threads: None uses the cores that this process may use.
     """
     count = threads or cores()
     ends = [(at * COPIED // count, (at + 1) * COPIED // count) for at in range(count)]
@@ -49,13 +49,13 @@ def machine_speed(threads: int | None = None) -> dict[str, float]:
     def copy(first: int, last: int) -> None:
         np.copyto(target[first:last], source[first:last])
 
-    one, other = torch.rand(2, SIDE, SIDE, dtype=torch.float32)
+    left, right = torch.rand(2, SIDE, SIDE, dtype=torch.float32)
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
         with ThreadPoolExecutor(count) as pool:
             copying = min(_seconds(lambda: list(pool.map(copy, *zip(*ends, strict=True)))) for _ in range(TRIES))
-        multiplying = min(_seconds(lambda: one @ other) for _ in range(TRIES))
+        multiplying = min(_seconds(lambda: left @ right) for _ in range(TRIES))
     finally:
         torch.set_num_threads(before)
     return {"memory_bytes_per_s": 2 * source.nbytes / copying, "float32_flops": 2 * SIDE**3 / multiplying}
@@ -68,14 +68,14 @@ def _seconds(work: Callable[[], object]) -> float:
 
 
 def machine_line(facts: Mapping[str, Any]) -> str:
-    """What `hardware` told, in a line."""
+    """Format the facts of `hardware` as one line."""
     return ", ".join(f"{name} {value}" for name, value in facts.items())
 
 
 def peak_memory() -> int | None:
-    """Bytes of this process at its largest; None on Windows.
+    """Return the peak memory of this process in bytes; None on Windows.
 
-    Not ``ru_maxrss`` where Linux says better: that one survives exec, so a child starts from its parent's size.
+    On Linux from /proc: ``ru_maxrss`` survives exec, so that a child starts with its parent's size.
     """
     status = Path("/proc/self/status")
     if status.is_file():

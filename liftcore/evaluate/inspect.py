@@ -1,4 +1,4 @@
-"""What is in any file of ours, and what looks wrong with it."""
+"""Descriptions of files: counts, ranges, and warnings of what looks wrong."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ ANY_KIND = "splats, cameras, features, masks, a text table or a lift"
 QUANTILES = {"min": 0.0, "q01": 0.01, "median": 0.5, "q99": 0.99, "max": 1.0}
 FAR = 1e5  # scene units; float32 resolves only a hundredth there
 TINY = 1e-7  # scene units
-LARGEST = 1e300  # shown in place of what overflows, which JSON cannot hold
+LARGEST = 1e300  # replaces infinity, which JSON cannot hold
 OFF_CENTRE = 0.1  # of the image's side
 OTHER_FRAME = (
     f"the COLMAP model was read, and beside it lies nerfstudio's {TRANSFORMS}, which is in another frame: if "
     f"nerfstudio trained the splats, put its run's {FRAME_FILE} beside them"
 )
-SHOWN = 3  # names in a warning
-FLAT = 100  # times thinner than wide: what converters make of discs
+MAX_NAMES = 3  # names in a warning
+FLAT = 100  # times thinner than wide, as converters store discs
 NARROW = 4  # times longer than wide, or wider: photos are not
 UNIT_TOLERANCE = 0.01  # a float16 unit vector of 512 channels is within it
 
@@ -58,40 +58,40 @@ def inspect_file(path: Path | str, kind: str = "", *, trusted: bool = True) -> d
     """Describe a file of splats, cameras, features, masks, a lift or a table of text embeddings.
 
     Args:
-        path: of the file or folder; it may lie elsewhere (`io.remote`).
-        kind: what it is described as, one of DESCRIPTIONS, or ``photos`` of a zip; empty: what it looks like.
-        trusted: False refuses splats in formats that may hold code, and what plugins read.
+        path: of the file or folder; it may be remote (`io.remote`).
+        kind: one of DESCRIPTIONS, or ``photos`` of a zip; empty: it is identified.
+        trusted: False rejects splats in formats that may hold code, and formats of plugins.
 
     Returns:
         ``kind``, ``bytes``, counts and ranges of the kind, and ``warnings``: what looks wrong.
 
     Raises:
-        InvalidInput: the file is missing, malformed or none of these, or there is no such kind.
+        InvalidInput: the file is missing, malformed or of no kind, or the kind is unknown.
     """
     path = local_path(path)
     if kind:
         check_choice("kind", kind, DESCRIPTIONS)
     if not path.exists():
         raise InvalidInput(str(path), expected="a file or a folder", got="nothing of that name")
-    found = identify(path)
-    kind = kind or ("" if found.kind == "photos" else found.kind or "")
+    identified = identify(path)
+    kind = kind or ("" if identified.kind == "photos" else identified.kind or "")
     describe, files_of = DESCRIPTIONS.get(kind, (None, None))
     if describe is None or files_of is None:
-        if not found.recognised and (path.is_dir() or path.suffix.lower() == ".json"):
+        if not identified.recognised and (path.is_dir() or path.suffix.lower() == ".json"):
             describe_camera_file(path)  # raises with what cameras lack
-        if found.kind == "photos":
+        if identified.kind == "photos":
             hint = "'splatlift encode' and 'splatlift pack masks' make features of photos"
             raise InvalidInput(str(path), expected=ANY_KIND, got="photos", hint=hint)
-        raise InvalidInput(str(path), expected=ANY_KIND, got=found.name, hint=found.hint)
+        raise InvalidInput(str(path), expected=ANY_KIND, got=identified.name, hint=identified.hint)
     if kind == "splats" and not trusted:
-        _refuse_code(path)
-    description = describe(path)  # first: a reader says better which of its files is not there
+        _reject_code(path)
+    description = describe(path)  # first, as a reader's error names the missing file
     size = sum(file.stat().st_size for file in files_of(path))
     return {"kind": kind, "bytes": size, **description}
 
 
 def describe_lift_file(path: Path) -> dict[str, Any]:
-    """`describe_lift` of a file or a folder of shards.
+    """Describe a lift: a file or a folder of shards.
 
     Raises:
         InvalidLift: it is malformed.
@@ -105,30 +105,30 @@ def _files_of_lift(path: Path) -> list[Path]:
     return sorted(path.iterdir()) if path.is_dir() else [path]
 
 
-def _refuse_code(path: Path) -> None:
-    found = format_of(path)
-    if found is SplatFormat.CHECKPOINT:
+def _reject_code(path: Path) -> None:
+    file_format = format_of(path)
+    if file_format is SplatFormat.CHECKPOINT:
         got = "a checkpoint of a trainer, which is a Python pickle"
         raise InvalidSplats("splats", expected="a format that holds no code", got=got, hint=EXPORT_PLY)
-    if found is SplatFormat.USD:
+    if file_format is SplatFormat.USD:
         got, hint = "a USD scene, which may lead to other files", "send the splats as .glb, .ply, .spz or .sog"
         raise InvalidSplats("splats", expected="a format that holds all in itself", got=got, hint=hint)
-    if isinstance(found, Plugin):
-        raise InvalidSplats("splats", expected="a format of splatlift's own", got=found.value, hint=EXPORT_PLY)
+    if isinstance(file_format, Plugin):
+        raise InvalidSplats("splats", expected="a format of splatlift's own", got=file_format.value, hint=EXPORT_PLY)
 
 
 def describe_splat_file(path: Path) -> dict[str, Any]:
-    """`describe_splats` of a file; the dialect of what is no PLY is its format.
+    """Describe a file of splats; the dialect of formats other than PLY is the format's name.
 
     Raises:
         InvalidSplats: the file is malformed.
     """
-    found, splats = format_of(path), read_splats(path)
-    return describe_splats(splats) | ({} if found is SplatFormat.PLY else {"dialect": found.value})
+    file_format, splats = format_of(path), read_splats(path)
+    return describe_splats(splats) | ({} if file_format is SplatFormat.PLY else {"dialect": file_format.value})
 
 
 def describe_splats(splats: Splats) -> dict[str, Any]:
-    """Counts, ranges (after activation) and warnings of splats."""
+    """Return counts, ranges (after activation) and warnings of splats."""
     low, high = splats.means.amin(dim=0), splats.means.amax(dim=0)
     opacities = torch.sigmoid(splats.opacity_logits)
     scales = torch.exp(splats.log_scales.double()).clamp(max=LARGEST)
@@ -149,21 +149,23 @@ def describe_splats(splats: Splats) -> dict[str, Any]:
 
 
 def describe_camera_file(path: Path) -> dict[str, Any]:
-    """The same of a camera file or folder, with a warning of what in it was not read.
+    """Describe a camera file or folder, with warnings of parts that were not read.
 
     Raises:
         InvalidCameras: the file is malformed.
     """
-    found, others = describe_cameras(read_cameras(path)), other_models(path)
-    if others:
-        found["warnings"].append(f"{len(others)} more COLMAP models were not read: {', '.join(others[:SHOWN])}")
-    if found["frame"] is None:
-        found["warnings"] += [OTHER_FRAME] if has_nerfstudio_beside(path) else []
-    return found
+    description, other_paths = describe_cameras(read_cameras(path)), other_models(path)
+    if other_paths:
+        description["warnings"].append(
+            f"{len(other_paths)} more COLMAP models were not read: {', '.join(other_paths[:MAX_NAMES])}"
+        )
+    if description["frame"] is None:
+        description["warnings"] += [OTHER_FRAME] if has_nerfstudio_beside(path) else []
+    return description
 
 
 def describe_cameras(cameras: Cameras) -> dict[str, Any]:
-    """Counts, ranges and warnings of cameras."""
+    """Return counts, ranges and warnings of cameras."""
     centres = np.stack([camera.centre for camera in cameras.values()])
     sizes = sorted({"{}x{}".format(*camera.photo_size) for camera in cameras.values()})
     focals = [focal for camera in cameras.values() for focal in (camera.fx, camera.fy)]
@@ -182,8 +184,8 @@ def describe_cameras(cameras: Cameras) -> dict[str, Any]:
 def _quantiles(values: Tensor) -> dict[str, float]:
     # torch.quantile refuses large inputs; numpy's partition does not.
     flat = values.double().flatten().cpu().numpy()
-    found = np.quantile(flat, list(QUANTILES.values()), method="nearest")
-    return dict(zip(QUANTILES, found.tolist(), strict=True))
+    values_at = np.quantile(flat, list(QUANTILES.values()), method="nearest")
+    return dict(zip(QUANTILES, values_at.tolist(), strict=True))
 
 
 def _splat_warnings(splats: Splats, scales: Tensor, opacities: Tensor) -> list[str]:
@@ -193,7 +195,7 @@ def _splat_warnings(splats: Splats, scales: Tensor, opacities: Tensor) -> list[s
     tiny = int((scales.amax(dim=1) < TINY).sum())
     far = int((splats.means.abs().amax(dim=1) > FAR).sum())
     faint = int((opacities < ALPHA_FLOOR).sum()) if splats.kernel is not Kernel.BETA else 0
-    counted = {
+    counts = {
         "have a zero quaternion, which counts as no rotation": zero_quats,
         "are larger than the scene": large,
         f"are smaller than {TINY:g} scene units on every axis": tiny,
@@ -201,7 +203,7 @@ def _splat_warnings(splats: Splats, scales: Tensor, opacities: Tensor) -> list[s
         "have an opacity below 1/255 and are never seen": faint,
     }
     warnings = [*splats.warnings]
-    warnings += [f"{count} of {splats.count} splats {what}" for what, count in counted.items() if count]
+    warnings += [f"{count} of {splats.count} splats {finding}" for finding, count in counts.items() if count]
     if splats.sh is None:
         warnings.append("no colour: renders in RGB are not possible")
     if splats.kernel is Kernel.GAUSSIAN_3D and bool((scales[:, 2] * FLAT < scales[:, :2].amin(dim=1)).all()):
@@ -227,7 +229,7 @@ def _camera_warnings(cameras: Cameras, centres: np.ndarray) -> list[str]:
 
 @dataclass(frozen=True)
 class _ViewFacts:
-    """What is counted of a view."""
+    """Counts and ranges of a view's features."""
 
     is_regions: bool
     size: str
@@ -242,33 +244,33 @@ class _ViewFacts:
 
 def describe_packs(packs: Views) -> dict[str, Any]:
     """Read every view: counts, ranges and warnings of feature packs."""
-    found = [_view_facts(view) for view in packs.values()]
-    regions = [view for view in found if view.is_regions]
-    norms = [view.norms for view in found if view.norms is not None] or [(0.0, 0.0)]
+    facts = [_view_facts(view) for view in packs.values()]
+    regions = [view for view in facts if view.is_regions]
+    norms = [view.norms for view in facts if view.norms is not None] or [(0.0, 0.0)]
     low, high = min(least for least, _ in norms), max(largest for _, largest in norms)
     return {
         "views": len(packs),
         "names": list(packs),
         "region_maps": len(regions),
-        "grids": len(found) - len(regions),
+        "grids": len(facts) - len(regions),
         "channels": packs.channels,
         "encoder": packs.encoder,
         "text_space": packs.text_space,
         "normalised": packs.normalised,
-        "sizes": sorted({view.size for view in found}),
+        "sizes": sorted({view.size for view in facts}),
         "level_names": list(packs.level_names),
-        "codebook_rows": sum(view.rows for view in found),
+        "codebook_rows": sum(view.rows for view in facts),
         "norms": {"min": low, "max": high},
         "unlabelled": sum(view.unlabelled for view in regions) / len(regions) if regions else 0.0,
-        "warnings": [*_pack_warnings(packs, found, low, high), *unlike_maps(some_grids(packs, packs.views))],
+        "warnings": [*_pack_warnings(packs, facts, low, high), *unlike_maps(some_grids(packs, packs.views))],
     }
 
 
 def _view_facts(view: ViewFeatures) -> _ViewFacts:
     norms = torch.linalg.vector_norm(view.codebook, dim=1, dtype=torch.float64)
-    long = norms[norms > 0]
-    ends = (float(long.min()), float(long.max())) if len(long) else None
-    rows, zero = len(norms), len(norms) - len(long)
+    nonzero = norms[norms > 0]
+    ends = (float(nonzero.min()), float(nonzero.max())) if len(nonzero) else None
+    rows, zero = len(norms), len(norms) - len(nonzero)
     if not isinstance(view, Regions):
         height, width, _ = view.grid.shape
         return _ViewFacts(False, f"{width}x{height} cells", (width, height), rows, zero, 0, 0.0, ends)
@@ -276,15 +278,15 @@ def _view_facts(view: ViewFeatures) -> _ViewFacts:
     unused = int((torch.bincount(view.labels.flatten() - NO_LABEL, minlength=rows + 1)[1:] == 0).sum())
     unlabelled = float((view.labels == NO_LABEL).float().mean())
     size = f"{levels} levels of {width}x{height}"
-    alone = bool((view.labels == view.labels[0, 0, 0]).all()) and unlabelled == 0.0
-    return _ViewFacts(True, size, (width, height), rows, zero, unused, unlabelled, ends, alone)
+    is_single = bool((view.labels == view.labels[0, 0, 0]).all()) and unlabelled == 0.0
+    return _ViewFacts(True, size, (width, height), rows, zero, unused, unlabelled, ends, is_single)
 
 
-def _pack_warnings(packs: Views, found: list[_ViewFacts], low: float, high: float) -> list[str]:
-    rows = sum(view.rows for view in found)
-    zero = sum(view.zero for view in found)
-    unused = sum(view.unused for view in found)
-    empty = sum(view.unlabelled == 1.0 for view in found)
+def _pack_warnings(packs: Views, facts: list[_ViewFacts], low: float, high: float) -> list[str]:
+    rows = sum(view.rows for view in facts)
+    zero = sum(view.zero for view in facts)
+    unused = sum(view.unused for view in facts)
+    empty = sum(view.unlabelled == 1.0 for view in facts)
     unit = abs(low - 1) < UNIT_TOLERANCE and abs(high - 1) < UNIT_TOLERANCE
     warnings = []
     if packs.normalised and not unit:
@@ -297,13 +299,13 @@ def _pack_warnings(packs: Views, found: list[_ViewFacts], low: float, high: floa
         warnings.append(f"{unused} of {rows} codebook rows are read by no label")
     if empty:
         warnings.append(f"{empty} views have no label at all")
-    if len(alone := [view for view in found if view.single_region]) > len(found) / 2:
+    if len(single := [view for view in facts if view.single_region]) > len(facts) / 2:
         warnings.append(
-            f"{len(alone)} views have one region alone, over all of their pixels: masks tell nothing apart"
+            f"{len(single)} views have one region alone, over all of their pixels: these masks separate nothing"
         )
     if not packs.encoder:
         warnings.append("the pack does not name its encoder")
-    narrow = next((view for view in found if max(view.sides) > NARROW * min(view.sides)), None)
+    narrow = next((view for view in facts if max(view.sides) > NARROW * min(view.sides)), None)
     if narrow is not None:
         shape = f"maps of {narrow.size}, which few images are like"
         warnings.append(f"{shape}: where channels come first, pack them with --layout chw")
@@ -311,7 +313,7 @@ def _pack_warnings(packs: Views, found: list[_ViewFacts], low: float, high: floa
 
 
 def describe_lift(lift: Lift) -> dict[str, Any]:
-    """Counts, ranges, how it was made, and warnings of a lift."""
+    """Return counts, ranges, provenance and warnings of a lift."""
     metadata = lift.metadata
     count, channels = lift.features.shape
     return {
@@ -356,25 +358,25 @@ def _lift_warnings(lift: Lift, metadata: LiftMetadata) -> list[str]:
 
 
 def describe_table(path: Path) -> dict[str, Any]:
-    """Counts, ranges and warnings of a table of text embeddings that opens, be it fit for use or not.
+    """Return counts, ranges and warnings of a table of text embeddings, valid or not.
 
     Raises:
-        InvalidTable: there is more in the file, so that it may be of another kind too.
+        InvalidTable: the file has other tensors, so that it may be of another kind.
     """
     from safetensors import safe_open
 
     with safe_open(str(path), framework="pt") as handle:
-        more = sorted({*handle.keys()} - {"embeddings"})
-        if more:
-            raise InvalidTable(str(path), expected="embeddings alone", got=f"{more[0][:80]!r} beside them")
+        other_tensors = sorted({*handle.keys()} - {"embeddings"})
+        if other_tensors:
+            raise InvalidTable(str(path), expected="embeddings alone", got=f"{other_tensors[0][:80]!r} beside them")
         embeddings, metadata = handle.get_tensor("embeddings"), handle.metadata() or {}
     norms = torch.linalg.vector_norm(embeddings.float().reshape(len(embeddings), -1), dim=1)
     words = _words(metadata)
     warnings = [] if len(words) == len(embeddings) else [f"{len(words)} words for {len(embeddings)} rows"]
     if int((norms == 0).sum()):
         warnings.append(f"{int((norms == 0).sum())} rows are zero")
-    if twice := len(words) - len(set(map(normalize_text, words))):
-        warnings.append(f"{twice} of {len(words)} words come again, and only their first row is read")
+    if repeats := len(words) - len(set(map(normalize_text, words))):
+        warnings.append(f"{repeats} of {len(words)} words come again, and only their first row is read")
     return {
         "rows": len(embeddings),
         "channels": embeddings.shape[-1],

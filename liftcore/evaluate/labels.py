@@ -24,9 +24,9 @@ Box = tuple[int, int, int, int]  # x1 y1 x2 y2, pixels, both ends inside
 
 @dataclass(frozen=True)
 class LabelledObject:
-    """What is really there: all that one category covers in a frame."""
+    """The ground truth of a category in a frame."""
 
-    category: str  # the text that is asked
+    category: str  # the text of the query
     mask: np.ndarray  # [H, W] bool, at the camera's size
     boxes: tuple[Box, ...]  # one a polygon
 
@@ -45,7 +45,7 @@ class LabelledScene(Protocol):
         ...
 
     def objects(self, view: str, width: int, height: int) -> list[LabelledObject]:
-        """The objects of a frame at the size of its camera [pixels]; a category stands once, and may be empty.
+        """Read the objects of a frame at the size of its camera [pixels]; a category is there once, and may be empty.
 
         Raises:
             InvalidInput: the labels are malformed.
@@ -69,9 +69,9 @@ class LerfScene:
         return tuple(self.files)
 
     def objects(self, view: str, width: int, height: int) -> list[LabelledObject]:
-        """The categories of a frame, each the union of its polygons, rescaled to the camera's size.
+        """Read the categories of a frame, each the union of its polygons, rescaled to the camera's size.
 
-        Polygons cover their outlines too, as the field's scripts draw them.
+        Polygons include their outlines, as in the field's scripts.
 
         Raises:
             InvalidInput: the file is no ISAT JSON.
@@ -88,27 +88,27 @@ class LerfScene:
                 parts = _polygons(entry.get("segmentation"), scale, path)
                 polygons.setdefault(category, []).extend(part for part in parts if part)
         return [
-            LabelledObject(category, _filled(parts, width, height), tuple(_box(part) for part in parts))
+            LabelledObject(category, _draw_polygons(parts, width, height), tuple(_box(part) for part in parts))
             for category, parts in polygons.items()
         ]
 
 
 def lerf_scenes(data: Path) -> dict[str, LerfScene]:
-    """Scene name -> its labels, of the dataset's folder, its ``label`` folder, or one scene's folder of labels.
+    """Find scenes and their labels in the dataset's folder, its ``label`` folder, or one scene's folder of labels.
 
     Raises:
         InvalidInput: there are none.
     """
     root = data / "label" if (data / "label").is_dir() else data
     folders = sorted(path for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
-    found = {}
+    scenes = {}
     for folder in [*folders, root]:
         files = {composed(path.stem): path for path in visible_files(folder, "*.json")}
         if files:
-            found[folder.name] = LerfScene(folder.name, files)
-    if not found:
+            scenes[folder.name] = LerfScene(folder.name, files)
+    if not scenes:
         raise InvalidInput("data", expected="LeRF-OVS with label/SCENE/frame_*.json", got=f"none in {data}")
-    return found
+    return scenes
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -136,12 +136,12 @@ def _list(value: object, path: Path) -> list[Any]:
 
 
 def _polygons(segmentation: object, scale: tuple[float, float], path: Path) -> list[Polygon]:
-    """The parts of a polygon with points, in pixels of the camera."""
+    """Read the parts of a polygon, in pixels of the camera."""
     parts = read_polygons(segmentation, str(path))
     return [[(math.floor(x * scale[0]), math.floor(y * scale[1])) for x, y in part.tolist()] for part in parts]
 
 
-def _filled(polygons: list[Polygon], width: int, height: int) -> np.ndarray:
+def _draw_polygons(polygons: list[Polygon], width: int, height: int) -> np.ndarray:
     canvas = Image.new("1", (width, height))
     for polygon in polygons:
         if len(polygon) > 1:
@@ -175,42 +175,42 @@ class ThreeDOvsScene:
         return tuple(self.folders)
 
     def objects(self, view: str, width: int, height: int) -> list[LabelledObject]:
-        """Every class at the camera's size; one without a mask is nowhere in the view.
+        """Read every class at the camera's size; one without a mask is not in the view.
 
         Raises:
             InvalidInput: a mask is no image, or the view has masks of none of the classes.
         """
         folder = self.folders[view]
-        found = {composed(path.stem): path for path in visible_files(folder) if path.suffix.lower() in _SUFFIXES}
-        if not any(name in found for name in self.classes):
-            got = ", ".join(sorted(found)[:3]) or "no images"
+        files = {composed(path.stem): path for path in visible_files(folder) if path.suffix.lower() in _SUFFIXES}
+        if not any(name in files for name in self.classes):
+            got = ", ".join(sorted(files)[:3]) or "no images"
             raise InvalidInput(str(folder), expected=f"masks named like the classes of {_CLASSES}", got=got)
         masks = {
-            name: _mask(found[name], width, height) if name in found else np.zeros((height, width), bool)
+            name: _mask(files[name], width, height) if name in files else np.zeros((height, width), bool)
             for name in self.classes
         }
         return [LabelledObject(name, mask, _boxes(mask)) for name, mask in masks.items()]
 
 
 def three_d_ovs_scenes(data: Path) -> dict[str, ThreeDOvsScene]:
-    """Scene name -> its labels, of the dataset's folder or of one scene's.
+    """Find scenes and their labels in the dataset's folder or in one scene's.
 
     Raises:
         InvalidInput: there are none, or a list of classes is empty or is no text.
     """
     roots = [data, *sorted(path for path in data.iterdir() if path.is_dir())] if data.is_dir() else []
-    found = {}
+    scenes = {}
     for root in roots:
         labels = root / "segmentations"
         if (labels / _CLASSES).is_file():
             folders = [path for path in sorted(labels.iterdir()) if path.is_dir()]
             views = {composed(path.name): path for path in folders if not is_system_file(Path(path.name))}
             name = root.resolve().name
-            found[name] = ThreeDOvsScene(name, _classes(labels / _CLASSES), views)
-    if not found:
+            scenes[name] = ThreeDOvsScene(name, _classes(labels / _CLASSES), views)
+    if not scenes:
         expected = f"3D-OVS with SCENE/segmentations/{_CLASSES}"
         raise InvalidInput("data", expected=expected, got=f"none in {data}")
-    return found
+    return scenes
 
 
 def _classes(path: Path) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Lifts against the labels of LeRF-OVS and 3D-OVS, in the protocols of the field, beside what was published."""
+"""Evaluation of lifts by the labels of LeRF-OVS and 3D-OVS, beside those of papers."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from liftcore.text import TextEncoder
 _DATASETS = {"lerf-ovs": lerf_scenes, "3d-ovs": three_d_ovs_scenes}
 _LIFT_SUFFIX = ".safetensors"
 _IOUS = {"object_micro": "mIoU, objects", "frame_macro": "mIoU, frames", "class_pooled": "IoU, classes"}
-_SHOWN = {  # the means of a protocol that a table shows, and their names there
+_COLUMNS = {  # the means of a protocol that a table shows, and their names there
     "P1": _IOUS | {"localised": "mAcc, in a box"},
     "P2": _IOUS | {"accuracy_25": "mAcc@0.25", "accuracy_50": "mAcc@0.5"},
     "P3": _IOUS | {"localised": "mAcc, in the mask"},
@@ -33,7 +33,7 @@ _SHOWN = {  # the means of a protocol that a table shows, and their names there
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What was measured of lifts, a scene and a protocol at a time."""
+    """The results of lifts by scene and protocol."""
 
     dataset: str
     lifts: Mapping[str, Path]  # by scene
@@ -43,7 +43,7 @@ class Evaluation:
     warnings: tuple[str, ...]
 
     def document(self) -> dict[str, Any]:
-        """All figures, ready for JSON."""
+        """Return all figures, ready for JSON."""
         return {
             "dataset": self.dataset,
             "settings": {
@@ -74,7 +74,7 @@ class Evaluation:
         }
 
     def lines(self) -> Iterable[str]:
-        """Percentages: what was measured, a protocol and a metric a row; then what was published."""
+        """Yield a table of percentages, a protocol and a metric a row: measured, then published."""
         yield from _table(self.results, self.published)
         yield from (f"warning: {text}" for text in self.warnings)
 
@@ -91,21 +91,21 @@ def evaluate_lifts(
     held_out: Path | str | None = None,
     progress: Progress | bool | None = None,
 ) -> Evaluation:
-    """Judge every lift whose scene is labelled.
+    """Evaluate every lift whose scene is labelled.
 
     Args:
         dataset: whose labels. lifts: SCENE=LIFT, SCENE.lift.safetensors, or folders of those. data: the dataset, or
             its labels.
-        encoder: of the categories, or its specification; None: of each lift's text space.
+        encoder: of the categories, or its specification; None: that of each lift's text space.
         protocols: P1, P2, P3 and own, or some. threshold: of all but P1, a method or a number. negatives: texts to
             compete with.
-        held_out: a file of the only frames to judge, a name a line; None: all that are labelled.
-        progress: as `liftcore.lift` has it.
+        held_out: a file of the only frames to evaluate, a name a line; None: all labelled ones.
+        progress: as in `liftcore.lift`.
 
     Raises:
-        InvalidInput: a lift belongs to no labelled scene, or two to one; there is no such dataset or protocol; or as
-            `evaluate_scene` has it.
-        InvalidQuery, InvalidLift, Unavailable: as `evaluate_scene` and `Scene.encoder` have it.
+        InvalidInput: a lift belongs to no labelled scene, or two to one; the dataset or protocol is unknown; or as in
+            `evaluate_scene`.
+        InvalidQuery, InvalidLift, Unavailable: as in `evaluate_scene` and `Scene.encoder`.
     """
     check_choice("dataset", dataset, _DATASETS)
     labels = _DATASETS[dataset](local_path(data, "data"))
@@ -129,7 +129,7 @@ def evaluate_lifts(
 
 
 def find_lifts(lifts: Iterable[Path | str], scenes: Collection[str]) -> dict[str, Path]:
-    """Scene -> its lift, of ``SCENE=LIFT``, of files named after their scenes, and of folders of those.
+    """Find the lift of each scene, from ``SCENE=LIFT``, files named after their scenes, and folders of those.
 
     Raises:
         InvalidInput: a lift belongs to no labelled scene, or two belong to one.
@@ -164,7 +164,7 @@ def _named_lifts(path: Path, scenes: Collection[str]) -> list[tuple[str, Path]]:
 
 
 def _names(path: Path) -> frozenset[str]:
-    """View names, one a line, with or without an image's extension."""
+    """Read view names, one a line, with or without an image's extension."""
 
     try:
         lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
@@ -177,7 +177,7 @@ def _names(path: Path) -> frozenset[str]:
 
 
 def _table(results: Sequence[SceneResult], rows: Sequence[Published]) -> Iterable[str]:
-    """Percentages: what was measured, a protocol and a metric a row; then what was published."""
+    """Yield a table of percentages, a protocol and a metric a row: measured, then published."""
 
     scenes = tuple(dict.fromkeys(result.scene for result in results))
     head = ("", "protocol", "metric", "frames", *scenes, "mean", "method", "source")
@@ -185,7 +185,7 @@ def _table(results: Sequence[SceneResult], rows: Sequence[Published]) -> Iterabl
     for protocol, groups in mean_over_scenes(results).items():
         by_scene = {result.scene: result.means() for result in results if result.protocol == protocol}
         for group, overall in groups.items():
-            for key, label in _SHOWN[protocol].items():
+            for key, label in _COLUMNS[protocol].items():
                 if getattr(overall, key) is None:
                     continue
                 cells = [_percent(getattr(by_scene[name][group], key)) if name in by_scene else "" for name in scenes]
@@ -195,7 +195,7 @@ def _table(results: Sequence[SceneResult], rows: Sequence[Published]) -> Iterabl
     for row in rows:
         cells = [f"{row.scenes[name]:.1f}" if name in row.scenes else "" for name in scenes]
         mean = f"{row.mean:.1f}" if row.scenes.keys() <= set(scenes) else ""  # over the paper's scenes
-        protocol = row.protocol if row.protocol in _SHOWN else "unknown"
+        protocol = row.protocol if row.protocol in _COLUMNS else "unknown"
         source = f"{row.source}, {row.note}" if row.note else row.source
         lines.append(("published", protocol, row.metric, "", *cells, mean, row.method, source))
     widths = [max(len(line[k]) for line in lines) for k in range(len(head))]

@@ -1,4 +1,4 @@
-"""How the field measures open-vocabulary segmentation: three protocols whose numbers cannot be compared, and our own.
+"""Protocols of open-vocabulary segmentation: three of the field, whose numbers cannot be compared, and our own.
 
 - P1 (LangSplat): features are rendered, a relevancy map is made in 2D and cut at 0.4. Localised when its peak lies in
   a box of the object.
@@ -43,7 +43,7 @@ CHANNELS = 32  # rendered at a time
 
 
 class EvaluationProtocol(StrEnum):
-    """Which way a number was measured."""
+    """The protocol of a measurement."""
 
     P1 = "P1"
     P2 = "P2"
@@ -53,18 +53,18 @@ class EvaluationProtocol(StrEnum):
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a protocol finds for a text in a view."""
+    """A protocol's prediction for a text in a view."""
 
     mask: np.ndarray  # [H, W] bool
     peak: tuple[int, int] | None  # x y of the highest value; None where the protocol has no such pixel
 
 
 class Segmenter(ABC):
-    """One protocol at work on one lift, for fixed texts.
+    """One protocol on one lift, for fixed texts.
 
     Args:
         threshold: a method or a number; P1 has its own.
-        negatives: of each question; of P1 in place of LangSplat's four.
+        negatives: of each query; of P1 in place of LangSplat's four.
     """
 
     def __init__(
@@ -80,10 +80,10 @@ class Segmenter(ABC):
 
     @abstractmethod
     def predict_view(self, view: str) -> dict[str, Prediction]:
-        """What each text finds in a view."""
+        """Predict the mask of each text in a view."""
 
     def answers(self) -> dict[str, Answer]:
-        """Each text asked of the splats."""
+        """Query the splats for each text."""
         return {
             text: ask(self.scene, Query.of(text, self.negatives, threshold=self.threshold), self.encoder)
             for text in self.texts
@@ -91,7 +91,7 @@ class Segmenter(ABC):
 
 
 class RenderedFeatures(Segmenter):
-    """P1: features are rendered, and words are asked of the picture.
+    """P1: features are rendered, and the image is queried.
 
     A pixel's feature is ``sum_j A_ij x_j``, made a unit vector; its relevancy for a text is the least softmax
     against the negatives, sharpened tenfold.
@@ -106,17 +106,17 @@ class RenderedFeatures(Segmenter):
         return torch.cat(blocks)
 
     def predict_view(self, view: str) -> dict[str, Prediction]:
-        """What each text finds in a view."""
+        """Predict the mask of each text in a view."""
         cosines = self.cosines(view)
         shape, count, flat = cosines.shape[:2], len(self.texts), cosines.flatten(0, 1).numpy()
-        found = {}
+        predictions = {}
         for k, text in enumerate(self.texts):
             against = np.concatenate([flat[:, k : k + 1], flat[:, count:]], axis=1)
-            found[text] = segment(relevancy(against, 1).reshape(shape))
-        return found
+            predictions[text] = segment(relevancy(against, 1).reshape(shape))
+        return predictions
 
     def cosines(self, view: str) -> Tensor:
-        """[H, W, n + N] f32, of the rendered features to the texts and the negatives; 0 where nothing is seen."""
+        """Render the cosines [H, W, n + N] f32 of features to the texts and the negatives; 0 where nothing is hit."""
         return self.scene.image(view, self._cosines)
 
     def _cosines(self, camera: Camera) -> Tensor:
@@ -130,7 +130,7 @@ class RenderedFeatures(Segmenter):
 
 
 def segment(relevance: np.ndarray) -> Prediction:
-    """LangSplat's mask and peak of a relevancy map [H, W] f32.
+    """Segment a relevancy map [H, W] f32 as LangSplat does, and find its peak.
 
     The map is averaged over 30 x 30 pixels; half of that and half of the map itself is stretched to -1..1 and cut
     at 0.4; each pixel then takes the majority of the 7 x 7 around it. The peak is the averaged map's.
@@ -144,14 +144,14 @@ def segment(relevance: np.ndarray) -> Prediction:
 
 
 def _majority(mask: np.ndarray) -> np.ndarray:
-    """[H, W] bool, whether more than half of the square's pixels that lie in the image are set."""
+    """Return [H, W] bool: True if more than half of the square's pixels in the image are set."""
     share = uniform_filter(mask.astype(np.float64), MAJORITY, mode="constant")
     inside = uniform_filter(np.ones(mask.shape), MAJORITY, mode="constant")
     return share > 0.5 * inside + 1e-9
 
 
 class SelectedSplats(Segmenter):
-    """P2: splats are selected in 3D, and their silhouette is seen alone: what stood before them hides nothing."""
+    """P2: splats are selected in 3D, and rendered without the others, so that nothing occludes them."""
 
     @cached_property
     def _selected(self) -> dict[str, np.ndarray]:
@@ -159,14 +159,16 @@ class SelectedSplats(Segmenter):
         return {text: answer.selected for text, answer in self.answers().items()}
 
     def predict_view(self, view: str) -> dict[str, Prediction]:
-        """What each text finds in a view."""
-        splats, found = self.scene.splats, {}
+        """Predict the mask of each text in a view."""
+        splats, predictions = self.scene.splats, {}
         for text, selected in self._selected.items():
-            logits = torch.where(torch.from_numpy(selected), splats.opacity_logits, -1e4)  # an opacity of nothing
-            alone = open_raster(replace(splats, opacity_logits=logits), CPU)
-            sums = self.scene.image(view, lambda camera, alone=alone: alone.row_sums(camera, self.scene.compositing))
-            found[text] = Prediction((sums > SOLID).numpy(), None)
-        return found
+            logits = torch.where(torch.from_numpy(selected), splats.opacity_logits, -1e4)  # an opacity of zero
+            raster = open_raster(replace(splats, opacity_logits=logits), CPU)
+            sums = self.scene.image(
+                view, lambda camera, raster=raster: raster.row_sums(camera, self.scene.compositing)
+            )
+            predictions[text] = Prediction((sums > SOLID).numpy(), None)
+        return predictions
 
 
 class RenderedScores(Segmenter):
@@ -181,20 +183,20 @@ class RenderedScores(Segmenter):
         return torch.from_numpy(np.stack(columns, axis=1))
 
     def predict_view(self, view: str) -> dict[str, Prediction]:
-        """What each text finds in a view."""
-        scene, found = self.scene, {}
+        """Predict the mask of each text in a view."""
+        scene, predictions = self.scene, {}
         image = scene.image(view, lambda camera: scene.raster.render(camera, self._values, scene.compositing))
-        met = image[..., -1] >= MINIMUM_ROW_SUM
+        hit = image[..., -1] >= MINIMUM_ROW_SUM
         for k, text in enumerate(self.texts):
             attention = image[..., k].contiguous()
-            threshold = find_threshold(attention[met], self.threshold)
+            threshold = find_threshold(attention[hit], self.threshold)
             row, column = np.unravel_index(int(attention.argmax()), attention.shape)
-            found[text] = Prediction((met & (attention >= threshold.value)).numpy(), (int(column), int(row)))
-        return found
+            predictions[text] = Prediction((hit & (attention >= threshold.value)).numpy(), (int(column), int(row)))
+        return predictions
 
 
 class OwnMasks(Segmenter):
-    """Our own way: the masks that ``splatlift query --mask`` makes, of the objects that were found."""
+    """Our own protocol: the masks of ``splatlift query --mask``, of the answer's objects."""
 
     @cached_property
     def _answers(self) -> dict[str, Answer]:
@@ -203,11 +205,11 @@ class OwnMasks(Segmenter):
 
     @cached_property
     def _objects(self) -> dict[str, Objects]:
-        """What each text found, filled as views ask for it."""
+        """The objects of each text, computed on first use."""
         return {}
 
     def predict_view(self, view: str) -> dict[str, Prediction]:
-        """What each text finds in a view."""
+        """Predict the mask of each text in a view."""
         return {text: self._predict_view(text, view) for text in self._answers}
 
     def _predict_view(self, text: str, view: str) -> Prediction:

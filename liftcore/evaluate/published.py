@@ -1,9 +1,9 @@
-"""Numbers that papers print, to stand beside measured ones and never to be averaged with them.
+"""Numbers that papers print, for comparison with measured ones; the two are never averaged.
 
-*Splat Feature Solver* measures as LaGa does (P3). Rows that it marks with a dagger are copied from the methods' own
-papers, whose protocols differ and are not stated in the table; a double dagger marks what its authors measured with
-the methods' official code. Its ablation table swaps the columns Teatime and Ramen of its last row: the rows here are
-those of the main table, which the appendix confirms.
+*Splat Feature Solver* uses the protocol of LaGa (P3). Rows that it marks with a dagger are copied from the methods'
+own papers, whose protocols differ and are not stated in the table; a double dagger marks what its authors measured
+with the methods' official code. Its ablation table swaps the columns Teatime and Ramen of its last row: the rows here
+are those of the main table, which the appendix confirms.
 """
 
 from collections.abc import Collection, Mapping
@@ -67,7 +67,7 @@ _VALA_ROWS: tuple[tuple[str, str, float, float], ...] = (
     ("VALA", "P2", 58.02, 82.85),
 )
 _VALA_SCENES = {"figurines": 60.38, "teatime": 70.61, "ramen": 45.41, "waldo_kitchen": 55.71}  # its mIoU by P2
-_LIGHT = "LightSplat (CVPR 2026)"
+_LIGHTSPLAT = "LightSplat (CVPR 2026)"
 
 
 @dataclass(frozen=True)
@@ -76,21 +76,21 @@ class Published:
 
     dataset: str
     method: str
-    protocol: str  # P1, P2, P3, or why it is not known
+    protocol: str  # P1, P2, P3, or the reason why it is unknown
     metric: str  # mIoU or mAcc
     scenes: Mapping[str, float]  # in %; empty where the paper gives the mean alone
     mean: float  # in %, as printed, which is not always the mean of the scenes
     source: str
-    note: str  # what the paper's mark says; "" = its own row
+    note: str  # the meaning of the paper's mark; "" = its own row
 
 
 def published(dataset: str, scenes: Collection[str] | None = None) -> list[Published]:
-    """The rows that were printed for a dataset, or of some scenes of it: means alone only where all are there."""
+    """Return the published rows of a dataset, or of some of its scenes; rows of means alone need all scenes."""
     rows = _lerf_ovs() if dataset == LERF_OVS else _three_d_ovs()
     if scenes is None:
         return rows
-    whole = set(_LERF_SCENES if dataset == LERF_OVS else _3D_SCENES) <= set(scenes)
-    return [row for row in rows if row.scenes.keys() & set(scenes) or (whole and not row.scenes)]
+    is_complete = set(_LERF_SCENES if dataset == LERF_OVS else _3D_SCENES) <= set(scenes)
+    return [row for row in rows if row.scenes.keys() & set(scenes) or (is_complete and not row.scenes)]
 
 
 def _lerf_ovs() -> list[Published]:
@@ -103,11 +103,13 @@ def _lerf_ovs() -> list[Published]:
         rows.append(Published(LERF_OVS, method, protocol, "mIoU", values, mean, _MAIN, notes.get(mark, "")))
     for method, protocol, *values in _VALA_ROWS:
         for metric, value in zip(("mIoU", "mAcc"), values, strict=True):
-            own = method == "VALA"
-            scenes = _VALA_SCENES if own and (protocol, metric) == ("P2", "mIoU") else {}
-            note = "" if own else "as VALA's authors report it"
+            is_own = method == "VALA"
+            scenes = _VALA_SCENES if is_own and (protocol, metric) == ("P2", "mIoU") else {}
+            note = "" if is_own else "as VALA's authors report it"
             rows.append(Published(LERF_OVS, method, protocol, metric, scenes, value, _VALA, note))
-    rows.append(Published(LERF_OVS, "LightSplat", "P2", "mIoU", {}, 47.58, _LIGHT, "taken from a list of results"))
+    rows.append(
+        Published(LERF_OVS, "LightSplat", "P2", "mIoU", {}, 47.58, _LIGHTSPLAT, "taken from a list of results")
+    )
     return rows
 
 

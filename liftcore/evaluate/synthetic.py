@@ -1,4 +1,4 @@
-"""A synthetic room of any size for speed measurements: flat splats on walls, floor and a few balls."""
+"""A synthetic room of any size for measurements of time: flat splats on walls, floor and a few balls."""
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ _COVER = 1.6  # splat radius in mean distances between neighbours: surfaces with
 
 
 def room_splats(count: int, seed: int = 0) -> Splats:
-    """``count`` splats on the inside of a cube and on balls in it; opacities mostly high, some faint."""
+    """Make ``count`` splats on the inside of a cube and on balls in it; opacities mostly high, some low."""
     rng = np.random.default_rng(seed)
     points, normals, area, _ = _surfaces(rng, count)
     radius = _COVER * np.sqrt(area / count)
@@ -30,7 +30,7 @@ def room_splats(count: int, seed: int = 0) -> Splats:
 
 
 def room_parts(count: int, seed: int = 0) -> np.ndarray:
-    """What each splat of ``room_splats`` belongs to: [P, PART_LEVELS] i64, from coarse to fine.
+    """Return the part of each splat of ``room_splats`` on each level: [P, PART_LEVELS] i64, from coarse to fine.
 
     A wall or a ball, then patches of the walls, 3, 6 and 12 a side, and half, quarter and eighth balls. Numbers are
     of a level.
@@ -48,7 +48,7 @@ def room_parts(count: int, seed: int = 0) -> np.ndarray:
 
 
 def room_cameras(count: int, width: int, height: int) -> list[Camera]:
-    """Cameras on a circle near the walls that look across the room."""
+    """Make cameras on a circle near the walls that face the middle of the room."""
     cameras = []
     for k in range(count):
         angle = 2 * np.pi * k / count
@@ -64,7 +64,7 @@ def room_cameras(count: int, width: int, height: int) -> list[Camera]:
 
 
 def room_regions(camera: Camera, seed: int, levels: int, channels: int) -> Regions:
-    """Label maps like SAM's four levels: Voronoi regions, finer level by level, over random unit vectors."""
+    """Make label maps like SAM's four levels: Voronoi regions, finer level by level, over random unit vectors."""
     from scipy.spatial import KDTree
 
     rng = np.random.default_rng(seed)
@@ -85,17 +85,17 @@ def room_regions(camera: Camera, seed: int, levels: int, channels: int) -> Regio
 
 
 def _surfaces(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
-    """Points and normals [P, 3], the area of all surfaces, and which of them a point is on: six walls, then balls."""
+    """Sample points and normals [P, 3]; return the total area and each point's surface too: six walls, then balls."""
     on_balls = count // 3
     points, normals, face = _walls(rng, count - on_balls)
     centres = rng.uniform(-0.6 * _HALF, 0.6 * _HALF, (_BALLS, 3))
     radii = rng.uniform(0.2, 0.6, _BALLS)
-    which = rng.integers(0, _BALLS, on_balls)
+    ball = rng.integers(0, _BALLS, on_balls)
     ball_normals = _unit(rng.normal(size=(on_balls, 3)))
-    points = np.concatenate([points, centres[which] + radii[which, None] * ball_normals])
+    points = np.concatenate([points, centres[ball] + radii[ball, None] * ball_normals])
     normals = np.concatenate([normals, ball_normals])
     area = 6 * (2 * _HALF) ** 2 + float((4 * np.pi * radii**2).sum())
-    return points, normals, area, np.concatenate([face, 6 + which])
+    return points, normals, area, np.concatenate([face, 6 + ball])
 
 
 def _walls(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -114,7 +114,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def _quats_to(normals: np.ndarray) -> np.ndarray:
-    """Quaternions w x y z that turn +z into the normals."""
+    """Return quaternions w x y z that rotate +z onto the normals."""
     w = 1 + normals[:, 2]
     flipped = w < 1e-6
     quats = np.stack([w, -normals[:, 1], normals[:, 0], np.zeros(len(w))], axis=1)

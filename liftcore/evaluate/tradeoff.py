@@ -1,8 +1,8 @@
 """Speed against accuracy on a scene of the user's: ``speed``, presets, smoothness, aggregation, in a budget of time.
 
 Each run is a process of its own (``python -m liftcore.evaluate.tradeoff``: a pickled `RunSpec` on stdin, figures as
-JSON on stdout), so that its memory is its own. Time is processor time: on a machine that others use too it says what
-a run costs, where wall time says who else ran.
+JSON on stdout), so that its memory is measured alone. Time is CPU time, as wall time depends on other programs of the
+machine.
 """
 
 import json
@@ -54,15 +54,15 @@ from liftcore.values.settings import LiftSettings
 from liftcore.values.views import cells_under
 
 HOLD_OUT = 8  # every n-th view is held out of the lifts
-LEAST_HELD_OUT = 6  # where there are three times as many: five that agree may do so by chance (1 of 32)
-EXACT_OVER_DRAFT = 5.0  # how much longer an exact view takes, at most, as far as the budget is planned
+LEAST_HELD_OUT = 6  # if there are three times as many: five views may agree by chance (1 of 32)
+EXACT_OVER_DRAFT = 5.0  # assumed maximum ratio of the time of an exact view to that of a draft
 EXACT_SHARE = 1 / 3  # of the budget, that the exact run may take
 LEAST_VIEWS = 4
 LONGEST = 86_400  # seconds that one run may take: longer, it hangs
-APART = ("read", "digest", "compile")  # stages that the seconds of a lift leave out
+UNTIMED = ("read", "digest", "compile")  # stages that are not part of a lift's seconds
 BAD_INPUT = 2
-MOST_PHRASES = 32  # that are asked for alone, each in
-PHRASE_VIEWS = 4  # of the views that show it
+MOST_PHRASES = 32  # queries of a single class, each in
+PHRASE_VIEWS = 4  # views that show it
 
 
 @dataclass(frozen=True)
@@ -72,12 +72,12 @@ class Candidate:
     name: str
     kind: str  # "dial" or "preset"
     settings: dict[str, Any] = field(default_factory=dict)
-    times: float = 1.0  # the seconds of the exact run, that it may take at most
+    times: float = 1.0  # assumed maximum ratio of its seconds to the exact run's
 
 
-EXACT = Candidate("exact", "dial", {"speed": "exact"})  # the settings of the order as they are
+EXACT = Candidate("exact", "dial", {"speed": "exact"})  # the caller's settings unchanged
 DRAFT = Candidate("draft", "dial", {"speed": "draft"})
-CANDIDATES = (  # in the order in which a budget is spent; others than presets keep the order's
+CANDIDATES = (  # in the order in which the budget is spent; a candidate overrides some of the caller's settings
     EXACT,
     Candidate("fast", "dial", {"speed": "fast"}),
     Candidate("default", "preset", {"preset": "default"}, 1.6),
@@ -91,23 +91,23 @@ CANDIDATES = (  # in the order in which a budget is spent; others than presets k
     Candidate("front-mass", "preset", {"preset": "front-mass"}),
     Candidate("argmax", "preset", {"preset": "argmax"}),
     Candidate("centre", "preset", {"preset": "centre"}),
-    Candidate("top-k", "preset", {"preset": "top-k"}, 1.5),  # walks tiles twice
+    Candidate("top-k", "preset", {"preset": "top-k"}, 1.5),  # traverses tiles twice
     Candidate("mean", "preset", {"preset": "mean"}),
 )
 
 
 def candidates_of(settings: Mapping[str, Any]) -> list[Candidate]:
-    """Those that the settings of an order allow, `EXACT` first; of two whose lifts would be the same the first."""
+    """List the candidates that the settings allow, `EXACT` first, without those whose lift would be the same."""
     lifts: dict[str, Candidate] = {}
     LiftSettings.of(**{**settings, **EXACT.settings})
     for candidate in CANDIDATES:
-        made = _allowed(settings, candidate)
-        if made is not None:
-            lifts.setdefault(made.model_dump_json(exclude={"preset", "speed"}), candidate)
+        lift_settings = _settings_of(settings, candidate)
+        if lift_settings is not None:
+            lifts.setdefault(lift_settings.model_dump_json(exclude={"preset", "speed"}), candidate)
     return list(lifts.values())
 
 
-def _allowed(settings: Mapping[str, Any], candidate: Candidate) -> LiftSettings | None:
+def _settings_of(settings: Mapping[str, Any], candidate: Candidate) -> LiftSettings | None:
     try:
         return LiftSettings.of(**{**settings, **candidate.settings})
     except InvalidSettings:  # as reliability without the robust step, which a preset has
@@ -116,13 +116,13 @@ def _allowed(settings: Mapping[str, Any], candidate: Candidate) -> LiftSettings 
 
 @dataclass(frozen=True)
 class SceneFiles:
-    """The files, and what to judge by.
+    """The files of a scene, and labels for the evaluation.
 
     Raises:
         InvalidInput: labels without the words of their classes.
     """
 
-    splats: Path  # any may be given as text
+    splats: Path  # or str, as the others
     cameras: Path
     features: tuple[Path, ...]
     labels: Path | None = None  # masks of views, VIEW/mask [h, w] int: numbers of classes, -1 none
@@ -140,7 +140,7 @@ class SceneFiles:
             raise InvalidInput("labels", expected="a table and the classes' words beside them", got="no words")
 
     def truth(self, cameras: Cameras) -> tuple[dict[str, Tensor], Tensor]:
-        """Camera -> its class numbers [h, w] i64, and the unit vectors [K, F] of the classes' words."""
+        """Read labels: camera -> class numbers [h, w] i64, and the unit vectors [K, F] of the classes' words."""
         if self.labels is None or self.table is None:
             return {}, torch.empty(0, 0, dtype=torch.float32)
         masks = read_masks(self.labels, len(self.classes))
@@ -150,7 +150,7 @@ class SceneFiles:
 
 @dataclass(frozen=True)
 class RunSpec:
-    """One run in a process of its own."""
+    """The input of one run, which is a process of its own."""
 
     scene: SceneFiles
     settings: dict[str, Any]
@@ -170,20 +170,20 @@ def compare(
     progress: Progress,
     kernel: Kernel | None = None,
 ) -> dict[str, Any]:
-    """Measure what fits the budget, and choose.
+    """Measure the runs that fit the budget, and choose one.
 
     Args:
-        budget: seconds. The exact run is made whatever it is, from few views if need be.
-        settings: of all runs, beside what they compare.
-        kernel: of the splats, to compile what the runs load before the budget begins: else the first of a kind on a
-            machine eats it up.
+        budget: seconds. The exact run is always made, from few views if necessary.
+        settings: of all runs, besides those that differ.
+        kernel: of the splats, to compile all kernels before the budget begins: else compilation on a new machine
+            uses it up.
 
     Returns:
-        Plain numbers: the ``runs``, what was ``skipped`` for want of time, what the settings ``refused``, which
-        ``views`` were lifted, and the ``choice``.
+        Plain numbers: the ``runs``, the names ``over_budget`` for lack of time and ``refused`` by the settings, the
+        counts of ``views``, and the ``choice``.
 
     Raises:
-        InvalidInput: the scene lacks what is needed; or whatever a lift refuses.
+        InvalidInput: the scene lacks an input, or a lift rejects one.
         Unavailable: a run did not end within a day.
     """
     candidates = candidates_of(settings)
@@ -193,36 +193,36 @@ def compare(
             for candidate in candidates:
                 warm_up_lift(kernel, device, LiftSettings.of(**{**settings, **candidate.settings}))
     progress("tradeoff", 0, len(candidates), "runs")
-    start, runs, judged, skipped = time.monotonic(), [], [], []
+    start, runs, accuracies, over_budget = time.monotonic(), [], [], []
     with scratch_folder("splatlift-tradeoff-") as folder:
         spec = _plan_runs(scene, settings, threads, folder)
         lifted = len(spec.lifted)
         spec = _fitting(spec, budget)
         for number, candidate in enumerate(candidates):
             if candidate is EXACT or time.monotonic() - start + candidate.times * runs[0]["process_s"] <= budget:
-                named = {
+                entry = {
                     "name": candidate.name,
                     "kind": candidate.kind,
                     "options": {**settings, **candidate.settings},
                 }
-                found = _run(spec, candidate)
-                judged.append(found.pop("judged"))
-                runs.append(named | found | accuracy_of(judged[-1]))
-                if runs[0]["cosine"] is None:  # no run could be set beside the exact one
+                figures = _run(spec, candidate)
+                accuracies.append(figures.pop("accuracies"))
+                runs.append(entry | figures | accuracy_of(accuracies[-1]))
+                if runs[0]["cosine"] is None:  # no run could be compared with the exact one
                     got = "an exact run that gave no splat a feature"
                     hint = "splats and cameras must share their frame, and features must not be zero"
                     raise InvalidInput("features", expected="views that lift", got=got, hint=hint)
             else:
-                skipped.append(candidate.name)
+                over_budget.append(candidate.name)
             progress("tradeoff", number + 1, len(candidates), "runs")
     for run in runs:
         for name in ("wall", "cpu", "wall_with_reading", "cpu_with_reading"):
             run[f"{name}_ratio"] = runs[0][f"{name}_s"] / run[f"{name}_s"]
     return {
         "runs": runs,
-        "skipped": skipped,
-        "refused": [candidate.name for candidate in CANDIDATES if _allowed(settings, candidate) is None],
-        "choice": choose(runs, judged),
+        "skipped": over_budget,
+        "refused": [candidate.name for candidate in CANDIDATES if _settings_of(settings, candidate) is None],
+        "choice": choose(runs, accuracies),
         "views": {"lifted": len(spec.lifted), "of": lifted, "held_out": len(spec.held_out)},
         "labelled_views": len(spec.labelled),
         "budget_s": budget,
@@ -233,7 +233,7 @@ def compare(
 
 
 def _plan_runs(scene: SceneFiles, settings: Mapping[str, Any], threads: int | None, folder: Path) -> RunSpec:
-    """The views of each kind. Every HOLD_OUT-th view is held out, and what has masks is."""
+    """Split the views: every HOLD_OUT-th view is held out, and so are views with masks."""
     cameras = read_cameras(scene.cameras)
     packs = pair(read_features(*scene.features), cameras)[0]
     names = packs.views[:: LiftSettings.of(**settings).view_stride]
@@ -247,19 +247,19 @@ def _plan_runs(scene: SceneFiles, settings: Mapping[str, Any], threads: int | No
     lifted, held_out = hold_out([name for name in names if name not in masks])
     if not lifted:
         raise InvalidInput("features", expected="views besides those with labels", got=f"{len(names)} views")
-    own = {**settings, "view_stride": 1}  # the views are named
-    return RunSpec(scene, own, tuple(lifted), tuple(held_out), tuple(sorted(masks)), threads, folder, False)
+    run_settings = {**settings, "view_stride": 1}  # the views are named
+    return RunSpec(scene, run_settings, tuple(lifted), tuple(held_out), tuple(sorted(masks)), threads, folder, False)
 
 
 def hold_out(names: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Of the views with features those that are lifted, and those that judge; they lie between each other."""
+    """Split views with features into lifted and held-out ones, which alternate regularly."""
     step = min(HOLD_OUT, max(3, len(names) // LEAST_HELD_OUT))
-    judges = list(names[step // 2 :: step] if len(names) >= HOLD_OUT else names[1:2])
-    return [name for name in names if name not in set(judges)], judges
+    held_out = list(names[step // 2 :: step] if len(names) >= HOLD_OUT else names[1:2])
+    return [name for name in names if name not in set(held_out)], held_out
 
 
 def _fitting(spec: RunSpec, budget: float) -> RunSpec:
-    """The order with so few views that the exact run fits the budget, by what the draft takes."""
+    """Reduce the views so that the exact run fits the budget, estimated from the time of a draft."""
     probe = _run(replace(spec, held_out=(), labelled=()), DRAFT)
     exact = EXACT_OVER_DRAFT * probe["wall_s"] * len(spec.lifted) / probe["views"]
     keep = EXACT_SHARE * budget / exact
@@ -268,72 +268,76 @@ def _fitting(spec: RunSpec, budget: float) -> RunSpec:
 
 
 def _run(spec: RunSpec, candidate: Candidate) -> dict[str, Any]:
-    """The figures of one candidate, from its own process."""
-    own = replace(spec, settings={**spec.settings, **candidate.settings}, exact=candidate is EXACT)
+    """Run one candidate in a process of its own, and return its figures."""
+    run_spec = replace(spec, settings={**spec.settings, **candidate.settings}, exact=candidate is EXACT)
     command, start = [sys.executable, "-m", "liftcore.evaluate.tradeoff"], time.monotonic()
     try:
-        done = subprocess.run(command, input=pickle.dumps(own), capture_output=True, check=False, timeout=LONGEST)
+        process = subprocess.run(
+            command, input=pickle.dumps(run_spec), capture_output=True, check=False, timeout=LONGEST
+        )
     except subprocess.TimeoutExpired:
         hint = "lift fewer views (view_stride=n; on the command line --set view_stride=n)"
         raise Unavailable(candidate.name, expected=f"an end within {LONGEST} s", got="none yet", hint=hint) from None
-    answer = json.loads(done.stdout.splitlines()[-1]) if done.stdout.strip() else {}
+    answer = json.loads(process.stdout.splitlines()[-1]) if process.stdout.strip() else {}
     if "error" in answer:
         fault = Unavailable if answer["kind"] == Unavailable.kind else InvalidInput
         raise fault(candidate.name, expected="a scene that lifts", got=answer["error"])
-    if done.returncode != 0:
-        told = done.stderr.decode(errors="replace").strip()[-300:]
-        raise RuntimeError(f"{candidate.name} ended with {done.returncode}: {told}")
+    if process.returncode != 0:
+        stderr = process.stderr.decode(errors="replace").strip()[-300:]
+        raise RuntimeError(f"{candidate.name} ended with {process.returncode}: {stderr}")
     return {**answer, "process_s": time.monotonic() - start}
 
 
-def measured(spec: RunSpec) -> dict[str, Any]:
-    """Lift as ordered, and give the figures of the run and of its features."""
+def measure_run(spec: RunSpec) -> dict[str, Any]:
+    """Lift, and return the figures of the run and of its features."""
     settings, scene = LiftSettings.of(**spec.settings), spec.scene
     cpu, wall = time.process_time(), time.perf_counter()
     splats, cameras, packs = open_files(scene.splats, scene.cameras, scene.features, settings)
     features = pair(packs, cameras)[0]
     lifted = features.seen_by({view: view for view in spec.lifted if view in features}, cameras)
-    read = {"cpu": time.process_time() - cpu, "wall": time.perf_counter() - wall}
+    reading = {"cpu": time.process_time() - cpu, "wall": time.perf_counter() - wall}
     warm_up_lift(splats.kernel, choose_device(settings.device), settings)  # the lift's own then takes no time
     cpu, wall = time.process_time(), time.perf_counter()
-    made = lift(splats, cameras, lifted, settings, threads=spec.threads)
+    result = lift(splats, cameras, lifted, settings, threads=spec.threads)
     seconds = {"cpu": time.process_time() - cpu, "wall": time.perf_counter() - wall}
-    made = made.cpu()
+    result = result.cpu()
     figures = {
         "cpu_s": seconds["cpu"],
         "wall_s": seconds["wall"],
-        "cpu_with_reading_s": seconds["cpu"] + read["cpu"],
-        "wall_with_reading_s": seconds["wall"] + read["wall"],
+        "cpu_with_reading_s": seconds["cpu"] + reading["cpu"],
+        "wall_with_reading_s": seconds["wall"] + reading["wall"],
         "peak_memory_bytes": peak_memory(),
         "load": None if sys.platform == "win32" else os.getloadavg()[0],
-        "views": len(made.metadata.views),
-        "settings": made.metadata.settings.model_dump(mode="json"),
-        "seen_share": float(made.seen.float().mean()),
-        "timings": {name: value for name, value in made.metadata.timings.items() if name not in APART},
+        "views": len(result.metadata.views),
+        "settings": result.metadata.settings.model_dump(mode="json"),
+        "seen_share": float(result.seen.float().mean()),
+        "timings": {name: value for name, value in result.metadata.timings.items() if name not in UNTIMED},
     }
-    return figures | _judge(spec, splats, cameras, features, made)
+    return figures | _accuracy_figures(spec, splats, cameras, features, result)
 
 
-def _judge(spec: RunSpec, splats: Splats, cameras: Cameras, features: Views, made: LiftResult) -> dict[str, Any]:
-    """How near the run is to the exact one, and what `liftcore.evaluate.ranking` judges it by, a view at a time."""
-    raster, params = open_raster(splats, CPU, spec.threads), made.metadata.settings.render_params
+def _accuracy_figures(
+    spec: RunSpec, splats: Splats, cameras: Cameras, features: Views, result: LiftResult
+) -> dict[str, Any]:
+    """Compare the run with the exact one, and measure the inputs of `liftcore.evaluate.ranking`, a view at a time."""
+    raster, params = open_raster(splats, CPU, spec.threads), result.metadata.settings.render_params
     cosines = centred_cosines(
-        raster, [(cameras[view], features[view]) for view in spec.held_out], made.features, params
+        raster, [(cameras[view], features[view]) for view in spec.held_out], result.features, params
     )
-    judged: dict[str, Any] = {"centred_cosine": cosines, "intersections": [], "unions": [], "phrase_iou": []}
+    accuracies: dict[str, Any] = {"centred_cosine": cosines, "intersections": [], "unions": [], "phrase_iou": []}
     if spec.labelled:
         masks, classes = spec.scene.truth(cameras)
         for view in spec.labelled:
-            scores = in_photo(cameras[view], lambda of: rendered_scores(raster, of, made.features, classes, params))
-            shared, joined = shared_pixels(_resized(scores.argmax(dim=2), masks[view]), masks[view], len(classes))
-            judged["intersections"].append(shared.tolist())
-            judged["unions"].append(joined.tolist())
-        judged["phrase_iou"] = _phrase_ious(spec, Scene(made, splats, cameras), masks)
-    return {**cosine_figures(made.features, *_reference(spec, made)), "judged": judged}
+            scores = in_photo(cameras[view], lambda of: rendered_scores(raster, of, result.features, classes, params))
+            shared, unions = shared_pixels(_resized(scores.argmax(dim=2), masks[view]), masks[view], len(classes))
+            accuracies["intersections"].append(shared.tolist())
+            accuracies["unions"].append(unions.tolist())
+        accuracies["phrase_iou"] = _phrase_ious(spec, Scene(result, splats, cameras), masks)
+    return {**cosine_figures(result.features, *_reference(spec, result)), "accuracies": accuracies}
 
 
 def _phrase_ious(spec: RunSpec, scene: Scene, masks: Mapping[str, Tensor]) -> list[float]:
-    """IoU of the masks that words give, each class asked for alone, in labelled views that show it."""
+    """Compute the IoU of masks of queries for each class alone, in labelled views that show it."""
     assert spec.scene.table is not None  # there are labels
     encoder, ious = TableEncoder.open(spec.scene.table), list[float]()
     showing = [
@@ -341,34 +345,34 @@ def _phrase_ious(spec: RunSpec, scene: Scene, masks: Mapping[str, Tensor]) -> li
     ]
     for number in evenly_spaced([number for number, views in enumerate(showing) if views], MOST_PHRASES):
         answer = ask(scene, Query.of(spec.scene.classes[number]), encoder)
-        found = cache(partial(objects, scene, answer))  # once for all views, if they ask for it
+        grouped = cache(partial(objects, scene, answer))  # once for all views, and on demand
         for view in evenly_spaced(showing[number], PHRASE_VIEWS):
-            seen = view_mask(scene, answer, view, group=lambda *_, found=found: found())
-            mine, real = _resized(torch.from_numpy(seen.mask), masks[view]), masks[view] == number
-            ious.append(int((mine & real).sum()) / int((mine | real).sum()))
+            answer_mask = view_mask(scene, answer, view, group=lambda *_, grouped=grouped: grouped())
+            predicted, true = _resized(torch.from_numpy(answer_mask.mask), masks[view]), masks[view] == number
+            ious.append(int((predicted & true).sum()) / int((predicted | true).sum()))
     return ious
 
 
-def evenly_spaced(items: Sequence[Any], most: int) -> list[Any]:
-    """As many of them, evenly spread."""
-    return [items[int(place)] for place in spread(len(items), min(most, len(items)))]
+def evenly_spaced(items: Sequence[Any], limit: int) -> list[Any]:
+    """Select ``limit`` items, evenly spread."""
+    return [items[int(index)] for index in spread(len(items), min(limit, len(items)))]
 
 
-def _reference(spec: RunSpec, made: LiftResult) -> tuple[Tensor, Tensor]:
-    """Features [P, F] and total weight [P] of the exact run; empty before it."""
+def _reference(spec: RunSpec, result: LiftResult) -> tuple[Tensor, Tensor]:
+    """Return features [P, F] and total weight [P] of the exact run; empty before it."""
     from safetensors.torch import load_file, save_file
 
     path = spec.reference / "exact.safetensors"
     if spec.exact:
-        save_file({"features": made.features, "total_weight": made.total_weight}, path)
+        save_file({"features": result.features, "total_weight": result.total_weight}, path)
     if not path.is_file():
-        return made.features[:0], made.total_weight[:0]
-    kept = load_file(path)
-    return kept["features"], kept["total_weight"]
+        return result.features[:0], result.total_weight[:0]
+    tensors = load_file(path)
+    return tensors["features"], tensors["total_weight"]
 
 
 def _resized(labels: Tensor, mask: Tensor) -> Tensor:
-    """The labels [H, W] at the centres of the mask's pixels, [h, w]."""
+    """Sample labels [H, W] at the centres of the mask's pixels, [h, w]."""
     rows, columns = (
         cells_under(torch.arange(size), size, cells) for size, cells in zip(mask.shape, labels.shape, strict=True)
     )
@@ -376,9 +380,9 @@ def _resized(labels: Tensor, mask: Tensor) -> Tensor:
 
 
 def main() -> int:
-    """Make the run that is described on stdin."""
+    """Run the `RunSpec` on stdin, and print its figures."""
     try:
-        figures = measured(pickle.load(sys.stdin.buffer))
+        figures = measure_run(pickle.load(sys.stdin.buffer))
     except SplatliftError as error:
         print(json.dumps({"error": str(error), "kind": error.kind}))
         return BAD_INPUT

@@ -1,4 +1,4 @@
-"""A comparison of speeds, and what it leaves behind: ``tradeoff.png``, ``.md`` and ``.json`` in a folder."""
+"""A comparison of speeds and its report: ``tradeoff.png``, ``.md`` and ``.json`` in a folder."""
 
 from __future__ import annotations
 
@@ -36,23 +36,23 @@ KEY = (
     "over draws of its views."
 )
 TITLE = "Speed against accuracy"
-LOST = 0.001  # of the splats, that are worth a sentence
+LOST_SHARE = 0.001  # of the splats, above which the verdict mentions them
 LEAST_SHARE = 0.02  # of any run's seconds, for a stage that the chart shows
 
 
 @dataclass(frozen=True)
 class SpeedComparison:
-    """Runs of a scene at several speeds and presets, and which to take."""
+    """Runs of a scene at several speeds and presets, and the recommended one."""
 
     document: dict[str, Any]
     """plain numbers, ready for JSON"""
 
     def lines(self) -> list[str]:
-        """The table with what it says and how it was made, as Markdown."""
+        """Return the table, the verdict and the conditions as lines of Markdown."""
         return page_of(self.document)
 
     def save(self, folder: Path) -> list[Path]:
-        """Write ``tradeoff.json``, ``.png`` (a chart) and ``.md`` in a folder; their paths."""
+        """Write ``tradeoff.json``, ``.png`` (a chart) and ``.md`` in a folder; return their paths."""
         return save(self.document, folder)
 
 
@@ -72,16 +72,15 @@ def compare_speeds(
     Each run is a process of its own.
 
     Args:
-        files: of the scene, and what to judge by; without labels held-out views are judged by.
-        budget: seconds. The exact run is made whatever it is, from few views if need be.
+        files: of the scene, and labels for the evaluation; without labels held-out views are used.
+        budget: seconds. The exact run is always made, from few views if necessary.
         settings: of all runs, beside ``speed``, which is compared.
-        kernel: of the splats, to compile what the runs load before the budget begins.
-        threads, progress: as `liftcore.lift` has them.
+        kernel: of the splats, to compile all kernels before the budget begins.
+        threads, progress: as in `liftcore.lift`.
         scene, command: that the report names.
 
     Raises:
-        InvalidSettings: ``speed`` among the settings. InvalidInput: the scene lacks what is needed; or whatever a
-            lift refuses.
+        InvalidSettings: ``speed`` among the settings. InvalidInput: the scene lacks an input, or a lift rejects one.
         Unavailable: matplotlib is not installed, which draws the chart; a run did not end within a day.
     """
     if not isinstance(files, SceneFiles):
@@ -105,7 +104,7 @@ def _check_chart() -> None:
 
 
 def save(document: Mapping[str, Any], out: Path) -> list[Path]:
-    """Write the three files; their paths."""
+    """Write the three files; return their paths."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -123,11 +122,11 @@ def save(document: Mapping[str, Any], out: Path) -> list[Path]:
 
 
 def page_of(document: Mapping[str, Any]) -> list[str]:
-    """The table with what it says and how it was made, as Markdown."""
+    """Return the table, the verdict and the conditions as lines of Markdown."""
     views, machine = document["views"], document["hardware"]
-    skipped = f" Not run for want of time: {', '.join(document['skipped'])}." if document["skipped"] else ""
+    over_budget = f" Not run for want of time: {', '.join(document['skipped'])}." if document["skipped"] else ""
     forbidden = ", ".join(document["refused"])
-    refused = f" Not compared, as your settings forbid it: {forbidden}." if forbidden else ""
+    invalid = f" Not compared, as your settings forbid it: {forbidden}." if forbidden else ""
     subset = "" if views["lifted"] == views["of"] else f" (every n-th of {views['of']}, to fit the budget)"
     return [
         *table_of(document),
@@ -138,24 +137,24 @@ def page_of(document: Mapping[str, Any]) -> list[str]:
         "",
         f"`{document['command']}`, {document['date']}, {document['seconds']:.0f} s; {views['lifted']} views lifted"
         f"{subset}, {views['held_out']} with features and {document['labelled_views']} with masks held out."
-        f"{skipped}{refused} {machine_line(machine)}",
+        f"{over_budget}{invalid} {machine_line(machine)}",
     ]
 
 
 def verdict_of(document: Mapping[str, Any]) -> str:
-    """What to take, or that nothing can be recommended; and which runs leave splats without a feature."""
+    """Return the recommendation, or that there is none, and the runs that leave splats without a feature."""
     choice, exact = document["choice"], document["runs"][0]["name"]
     verdict = f"**Take {choice['name']}**: {choice['why']}" if choice["recommended"] else choice["why"]
-    lost = [
+    lost_lines = [
         f"{run['name']} leaves {run['lost_share']:.1%} of the splats without the feature that {exact} gives them"
         for run in document["runs"]
-        if run["kind"] == "dial" and run["lost_share"] > LOST  # of presets the table tells it
+        if run["kind"] == "dial" and run["lost_share"] > LOST_SHARE  # of presets the table tells it
     ]
-    return ". ".join([verdict, *lost]) + "."
+    return ". ".join([verdict, *lost_lines]) + "."
 
 
 def table_of(document: Mapping[str, Any]) -> list[str]:
-    """The runs as a Markdown table, the fastest first; those of the front in bold."""
+    """Format the runs as a Markdown table, the fastest first; those of the front in bold."""
     rows = sorted(document["runs"], key=lambda run: run["cpu_s"])
     lines = [" | ".join(HEADS), "|".join("---" for _ in HEADS)]
     lines += [" | ".join(_cells(run, document["choice"])) for run in rows]
@@ -187,7 +186,7 @@ CLOSE, WIDE = 0.055, 0.22  # of the axes' height and width: labels nearer than b
 
 
 def draw(figure: Figure, document: Mapping[str, Any]) -> None:
-    """Three panels: accuracy against seconds for all runs, the dial's cosine to the exact run, and its stages."""
+    """Draw accuracy against seconds of all runs, the cosine of quality levels to the exact run, and their stages."""
     figure.set_size_inches(*SIZE)
     left, middle, right = figure.subplots(1, 3, width_ratios=(3, 2, 2))
     choice = document["choice"]
@@ -201,56 +200,56 @@ def draw(figure: Figure, document: Mapping[str, Any]) -> None:
 
 def _accuracy(axes: Axes, runs: Sequence[Mapping[str, Any]], choice: Mapping[str, Any]) -> None:
     accuracy = choice["accuracy"]
-    shown = [run for run in runs if run[accuracy] is not None]
-    front = [run for name in choice["front"] for run in shown if run["name"] == name]
+    plotted = [run for run in runs if run[accuracy] is not None]
+    front = [run for name in choice["front"] for run in plotted if run["name"] == name]
     axes.plot([run["cpu_s"] for run in front], [run[accuracy] for run in front], color="#999999", lw=1, zorder=1)
     for kind, marker in (("dial", "o"), ("preset", "s")):
-        own = [run for run in shown if run["kind"] == kind]
-        places = [run["cpu_s"] for run in own], [run[accuracy] for run in own]
+        of_kind = [run for run in plotted if run["kind"] == kind]
+        places = [run["cpu_s"] for run in of_kind], [run[accuracy] for run in of_kind]
         axes.scatter(*places, color=COLOURS[kind], marker=marker, s=34, zorder=2, label=kind)
-    taken = [run for run in shown if choice["recommended"] and run["name"] == choice["name"]]
+    recommended = [run for run in plotted if choice["recommended"] and run["name"] == choice["name"]]
     ring = {"facecolors": "none", "edgecolors": "#222222", "s": 130, "zorder": 3}
-    axes.scatter([run["cpu_s"] for run in taken], [run[accuracy] for run in taken], label="taken", **ring)
+    axes.scatter([run["cpu_s"] for run in recommended], [run[accuracy] for run in recommended], label="taken", **ring)
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter(_few_ticks)
     axes.margins(x=0.22, y=0.12)
-    _label(axes, shown, accuracy)
+    _label(axes, plotted, accuracy)
     _finish(axes, "processor seconds of the lift, without reading", NAMES[accuracy])
     axes.legend(fontsize="small", loc="lower right", frameon=False)
 
 
 def _faithful(axes: Axes, runs: Sequence[Mapping[str, Any]]) -> None:
-    dial = sorted((run for run in runs if run["kind"] == "dial"), key=lambda run: run["cpu_ratio"])
-    ratios = [run["cpu_ratio"] for run in dial]
+    quality_runs = sorted((run for run in runs if run["kind"] == "dial"), key=lambda run: run["cpu_ratio"])
+    ratios = [run["cpu_ratio"] for run in quality_runs]
     for name, label, style in (
         ("cosine", "mean by total weight", "o-"),
         ("cosine_plain", "mean over splats", "^--"),
         ("cosine_q05", "5 % of splats below", "v:"),
     ):
-        axes.plot(ratios, [run[name] for run in dial], style, label=label, color=COLOURS["dial"], ms=5, lw=1)
-    for number, (run, ratio) in enumerate(zip(dial, ratios, strict=True)):
+        axes.plot(ratios, [run[name] for run in quality_runs], style, label=label, color=COLOURS["dial"], ms=5, lw=1)
+    for number, (run, ratio) in enumerate(zip(quality_runs, ratios, strict=True)):
         place = {"textcoords": "offset points", "ha": "center", "fontsize": 8}
         axes.annotate(run["name"], (ratio, run["cosine"]), (0, 7 + 11 * (number % 2)), **place)
     axes.margins(x=0.14)
-    lowest = min((run[name] for run in dial for name in ("cosine", "cosine_plain")), default=0.0)
-    room = max(1.0 - lowest, 1e-3)
-    axes.set_ylim(lowest - 0.6 * room, 1.0 + 0.3 * room)  # the worst splats may lie far below
+    lowest = min((run[name] for run in quality_runs for name in ("cosine", "cosine_plain")), default=0.0)
+    margin = max(1.0 - lowest, 1e-3)
+    axes.set_ylim(lowest - 0.6 * margin, 1.0 + 0.3 * margin)  # the worst splats may lie far below
     _finish(axes, "times less processor time than exact", NAMES["cosine"])
     axes.legend(fontsize="small", loc="lower left", edgecolor="none", framealpha=1.0)
 
 
 def _stages(axes: Axes, runs: Sequence[Mapping[str, Any]]) -> None:
-    """The stages of the dial's runs as shares of their seconds, the fastest run above."""
-    dial = sorted((run for run in runs if run["kind"] == "dial"), key=lambda run: -run["cpu_s"])
-    names = list(dict.fromkeys(name for run in dial for name in run["timings"]))
-    begins = [0.0] * len(dial)
+    """Draw the stages of the runs of quality levels as shares of their seconds, the fastest run above."""
+    quality_runs = sorted((run for run in runs if run["kind"] == "dial"), key=lambda run: -run["cpu_s"])
+    names = list(dict.fromkeys(name for run in quality_runs for name in run["timings"]))
+    begins = [0.0] * len(quality_runs)
     for name in names:
-        wholes = [sum(run["timings"].values()) or 1.0 for run in dial]
-        shares = [run["timings"].get(name, 0.0) / whole for run, whole in zip(dial, wholes, strict=True)]
+        totals = [sum(run["timings"].values()) or 1.0 for run in quality_runs]
+        shares = [run["timings"].get(name, 0.0) / total for run, total in zip(quality_runs, totals, strict=True)]
         if max(shares) < LEAST_SHARE:
             continue
-        axes.barh([run["name"] for run in dial], shares, left=begins, label=name, height=0.7)
+        axes.barh([run["name"] for run in quality_runs], shares, left=begins, label=name, height=0.7)
         begins = [begin + share for begin, share in zip(begins, shares, strict=True)]
     axes.set_xlim(0, 1)
     _finish(axes, "share of the lift's seconds", "")
@@ -259,20 +258,20 @@ def _stages(axes: Axes, runs: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _label(axes: Axes, runs: Sequence[Mapping[str, Any]], accuracy: str) -> None:
-    """Names beside their points, moved apart where they would meet."""
+    """Write names beside their points, shifted where they would overlap."""
     from matplotlib.patheffects import withStroke
 
     halo = withStroke(linewidth=2.5, foreground="white")  # so that lines do not strike names out
     low, high = axes.get_ylim()
-    least, most = axes.get_xlim()
-    placed: list[tuple[float, float]] = []
+    left, right = axes.get_xlim()
+    positions: list[tuple[float, float]] = []
     for run in sorted(runs, key=lambda run: -run[accuracy]):
-        across = math.log(run["cpu_s"] / least) / math.log(most / least)
+        across = math.log(run["cpu_s"] / left) / math.log(right / left)
         at = (run[accuracy] - low) / (high - low)
         height = at
-        while any(abs(height - other) < CLOSE and abs(across - there) < WIDE for there, other in placed):
+        while any(abs(height - y) < CLOSE and abs(across - x) < WIDE for x, y in positions):
             height -= 0.2 * CLOSE
-        placed.append((across, height))
+        positions.append((across, height))
         place = {"xycoords": "axes fraction", "textcoords": "axes fraction", "va": "center", "fontsize": 8}
         line = {"arrowstyle": "-", "color": "#bbbbbb", "lw": 0.6} if height < at else None
         spot = (across + 0.02, height)
@@ -281,7 +280,7 @@ def _label(axes: Axes, runs: Sequence[Mapping[str, Any]], accuracy: str) -> None
 
 
 def _few_ticks(value: float, _: float) -> str:
-    """Twos and fives between the powers of ten."""
+    """Format twos and fives between the powers of ten."""
     return f"{value:g}" if f"{value:e}"[0] in "25" else ""
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import liftcore as lc
-from liftcore.evaluate.tradeoff import RunSpec, SceneFiles, measured
+from liftcore.evaluate.tradeoff import RunSpec, SceneFiles, measure_run
 from liftcore.values import region_weights as weights
 from liftcore.values.settings import Preset
 from tests import paper_card
@@ -133,5 +133,5 @@ def test_a_run_of_a_tradeoff_is_judged_off_the_card(paths: list[Path], tmp_path:
     for device in ("cpu", "cuda"):
         settings = FEW | {"preset": "row-sum", "device": device}
         run = RunSpec(scene, settings, ("left", "right"), ("middle",), (), 1, tmp_path, exact=True)
-        judged.append(measured(run)["judged"]["centred_cosine"])
+        judged.append(measure_run(run)["accuracies"]["centred_cosine"])
     assert judged[0] == pytest.approx(judged[1], abs=1e-3) and len(judged[0]) == 1

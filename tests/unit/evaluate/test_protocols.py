@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from liftcore.errors import InvalidInput
-from liftcore.evaluate.judging import judge, mean_of_scenes, means, pooled_ious
+from liftcore.evaluate.judging import compare_frame, mean_of_scenes, means, pooled_ious
 from liftcore.evaluate.labels import LabelledObject, lerf_scenes, three_d_ovs_scenes
 from liftcore.evaluate.protocols import (
     EvaluationProtocol,
@@ -54,9 +54,11 @@ def test_iou_and_its_means_are_those_of_counted_pixels() -> None:
     shape = (10, 10)
     left, middle = box(shape, 0, 0, 4, 10), box(shape, 2, 0, 6, 10)  # 40 pixels each, 20 shared: 1/3
     things = [LabelledObject("a", left, ((0, 0, 3, 9),)), LabelledObject("b", middle, ())]
-    first = judge(P3, "one", things, {"a": Prediction(left, (0, 5)), "b": Prediction(left, (0, 0))}, lifted=True)
+    first = compare_frame(
+        P3, "one", things, {"a": Prediction(left, (0, 5)), "b": Prediction(left, (0, 0))}, lifted=True
+    )
     empty = np.zeros(shape, bool)
-    second = judge(
+    second = compare_frame(
         P3,
         "two",
         [LabelledObject("a", left, ()), LabelledObject("c", empty, ())],
@@ -80,8 +82,8 @@ def test_false_alarms_of_an_absent_class_count_where_pixels_are_pooled() -> None
     shape = (4, 5)
     mask, empty = box(shape, 0, 0, 5, 2), np.zeros(shape, bool)
     rows = [
-        *judge(P2, "one", [LabelledObject("a", mask, ())], {"a": Prediction(mask, None)}, lifted=False),
-        *judge(P2, "two", [LabelledObject("a", empty, ())], {"a": Prediction(mask, None)}, lifted=False),
+        *compare_frame(P2, "one", [LabelledObject("a", mask, ())], {"a": Prediction(mask, None)}, lifted=False),
+        *compare_frame(P2, "two", [LabelledObject("a", empty, ())], {"a": Prediction(mask, None)}, lifted=False),
     ]
     assert pooled_ious(rows) == {"a": 0.5}
     assert (means(rows).object_micro, means(rows).localised) == (1.0, None)
@@ -91,8 +93,11 @@ def test_p1_is_localised_in_a_box_and_p3_in_the_mask() -> None:
     corner = LabelledObject("a", box((9, 9), 0, 0, 1, 1), ((0, 0, 4, 4), (7, 7, 8, 8)))
     for peak, in_box, in_mask in (((0, 0), True, True), ((4, 4), True, False), ((5, 4), False, False)):
         found = {"a": Prediction(corner.mask, peak)}
-        assert [judge(p, "v", [corner], found, lifted=False)[0].localised for p in (P1, P3)] == [in_box, in_mask]
-    assert judge(P1, "v", [corner], {"a": Prediction(corner.mask, (8, 7))}, lifted=False)[0].localised
+        assert [compare_frame(p, "v", [corner], found, lifted=False)[0].localised for p in (P1, P3)] == [
+            in_box,
+            in_mask,
+        ]
+    assert compare_frame(P1, "v", [corner], {"a": Prediction(corner.mask, (8, 7))}, lifted=False)[0].localised
 
 
 def plain_segment(relevance: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:

@@ -22,7 +22,7 @@ from liftcore.evaluate import tradeoff as comparison
 from liftcore.evaluate import tradeoff_report as report
 from liftcore.evaluate.accuracy import centred_cosines, class_ious, cosine_figures, shared_pixels
 from liftcore.evaluate.ranking import accuracy_of, choose
-from liftcore.evaluate.tradeoff import RunSpec, SceneFiles, candidates_of, measured
+from liftcore.evaluate.tradeoff import RunSpec, SceneFiles, candidates_of, measure_run
 from liftcore.evaluate.tradeoff_report import table_of
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.raster.reference import dense_view, reading_matrix
@@ -44,12 +44,12 @@ def run_of(name: str, seconds: float, cosines: Sequence[float] | np.ndarray, kin
     times = dict.fromkeys((f"{part}{end}" for part in ("wall", "cpu") for end in ("_s", "_ratio")), seconds)
     times |= dict.fromkeys(("process_s", "wall_with_reading_s", "cpu_with_reading_s"), seconds)
     stages = {"timings": {"plan": 0.01, "geometry": seconds / 2, "solve": seconds / 4}}
-    told = {"peak_memory_bytes": 1 << 30, "views": 3, "lost_share": 0.0, "judged": judged_by(cosines)} | stages
+    told = {"peak_memory_bytes": 1 << 30, "views": 3, "lost_share": 0.0, "accuracies": judged_by(cosines)} | stages
     return {"name": name, "kind": kind, "options": {"speed": name}, **figures, **times, **told}
 
 
 def chosen(*runs: dict[str, Any]) -> dict[str, Any]:
-    judged = [run["judged"] for run in runs]
+    judged = [run["accuracies"] for run in runs]
     return choose([run | accuracy_of(one) for run, one in zip(runs, judged, strict=True)], judged)
 
 
@@ -93,7 +93,7 @@ def test_mask_iou_over_views_is_that_of_all_their_pixels():
     found = accuracy_of(judged_by([]) | judged | {"phrase_iou": [0.5, 1.0]})
     assert found["mask_iou"] == pytest.approx(float(class_ious(labels, truth, 4).nanmean()))
     assert (found["phrase_iou"], found["centred_cosine"]) == (0.75, None)
-    with_masks = [run | {"judged": run["judged"] | judged} for run in RUNS]
+    with_masks = [run | {"accuracies": run["accuracies"] | judged} for run in RUNS]
     assert (chosen(*with_masks)["accuracy"], chosen(*with_masks)["name"]) == ("mask_iou", "unclear")
 
 
@@ -151,16 +151,16 @@ def order_of(folder: Path, **parts) -> RunSpec:
 
 def test_a_run_is_judged_by_views_that_it_did_not_lift(tmp_path):
     order = order_of(tmp_path)
-    exact = measured(order)
-    assert (exact["views"], exact["judged"]["unions"], exact["lost_share"]) == (2, [], 0)
+    exact = measure_run(order)
+    assert (exact["views"], exact["accuracies"]["unions"], exact["lost_share"]) == (2, [], 0)
     assert [exact["cosine"], exact["cosine_plain"]] == pytest.approx([1.0, 1.0])
-    assert -1 < exact["judged"]["centred_cosine"][0] < 1
+    assert -1 < exact["accuracies"]["centred_cosine"][0] < 1
     assert exact["peak_memory_bytes"] > 1 << 26
     assert exact["cpu_with_reading_s"] > exact["cpu_s"] > 0
-    other = measured(replace(order, settings={"speed": "draft"}, exact=False))
+    other = measure_run(replace(order, settings={"speed": "draft"}, exact=False))
     assert other["cosine"] < 1
-    again = measured(replace(order, lifted=("v0", "v1", "v2"), settings={}, exact=False))
-    assert again["judged"]["centred_cosine"] > exact["judged"]["centred_cosine"]  # the view was lifted
+    again = measure_run(replace(order, lifted=("v0", "v1", "v2"), settings={}, exact=False))
+    assert again["accuracies"]["centred_cosine"] > exact["accuracies"]["centred_cosine"]  # the view was lifted
 
 
 def test_masks_are_judged_by_the_words_of_their_classes(tmp_path):
@@ -172,7 +172,7 @@ def test_masks_are_judged_by_the_words_of_their_classes(tmp_path):
     figures = []
     for classes in (("cat", "dog"), ("dog", "cat")):
         order = order_of(tmp_path, classes=classes, **files)
-        judged = measured(replace(order, labelled=("v2",)))["judged"]
+        judged = measure_run(replace(order, labelled=("v2",)))["accuracies"]
         figures.append(accuracy_of(judged)["mask_iou"])
         assert [0 <= iou <= 1 for iou in judged["phrase_iou"]] == [True]  # of the class that is shown, in its view
     # A mask of zeros: the share of its pixels called "cat" over all, then "dog"; the other class has an IoU of zero.
@@ -202,7 +202,7 @@ def test_a_short_budget_takes_fewer_views_and_runs_the_exact_one_alone(tmp_path,
 
 def test_chart_table_and_json_are_written(tmp_path):
     lossy = [RUNS[0], RUNS[1], RUNS[2] | {"lost_share": 0.125}, RUNS[3]]
-    runs = [{**run, **accuracy_of(run["judged"])} for run in lossy]
+    runs = [{**run, **accuracy_of(run["accuracies"])} for run in lossy]
     document = {
         "title": "t", "scene": "s", "command": "c", "runs": runs, "skipped": ["mean"], "refused": ["argmax"],
         "choice": chosen(*RUNS),
@@ -305,5 +305,5 @@ def test_every_nth_view_is_compared_when_the_settings_say_so(tmp_path, monkeypat
     scene = SceneFiles(paths[0], paths[1], (paths[2],))
     found = comparison.compare(scene, 1e5, {"view_stride": 2}, 1, silent)
     assert (orders[-1].lifted, orders[-1].held_out) == (("v0",), ("v2",))
-    assert measured(replace(orders[-1], reference=tmp_path))["views"] == 1
+    assert measure_run(replace(orders[-1], reference=tmp_path))["views"] == 1
     assert found["runs"][0]["options"]["view_stride"] == 2
