@@ -107,7 +107,7 @@ def read_spz(path: Path, *, colour: bool = True) -> Fields:
     """
     content = path.read_bytes()
     is_plain, unpacking = content[:4] == MAGIC, zlib.decompressobj(31)
-    start = content[:STREAMS_HEADER_BYTES] if is_plain else _inflated(unpacking, content, HEADER_BYTES, path)
+    start = content[:STREAMS_HEADER_BYTES] if is_plain else _inflate(unpacking, content, HEADER_BYTES, path)
     version, count, degree, bits, flags, streams = _header(start, path)
     if is_plain != (version >= 4):
         raise _broken(path, "gzip for versions 1 to 3 and a plain header for 4", f"the other for {version}")
@@ -121,11 +121,11 @@ def read_spz(path: Path, *, colour: bool = True) -> Fields:
         frame, sections = _declared_frame(zone, path), _streams(content, table, streams, sizes, path)
         labels = read_label_record(zone, count) if flags & HAS_EXTENSIONS else None
     else:
-        body = np.frombuffer(_inflated(unpacking, unpacking.unconsumed_tail, sum(sizes), path), np.uint8)
-        behind = _inflated(unpacking, unpacking.unconsumed_tail, 0, path)
+        body = np.frombuffer(_inflate(unpacking, unpacking.unconsumed_tail, sum(sizes), path), np.uint8)
+        behind = _inflate(unpacking, unpacking.unconsumed_tail, 0, path)
         frame = _declared_frame(behind, path) if flags & HAS_EXTENSIONS else RUB
         sections, labels = np.split(body, np.cumsum(sizes)[:-1]), None
-    fields = _decoded(sections, version, degree if colour else 0, 2.0**-bits, frame, colour=colour)
+    fields = _decode(sections, version, degree if colour else 0, 2.0**-bits, frame, colour=colour)
     fields["render_mode"] = RenderMode(RenderModel.ANTIALIASED, FLAG) if flags & ANTIALIASED else None
     if labels:
         fields |= {"world": world_of(labels.document.get("world"))} | ({"extras": labels.columns} if colour else {})
@@ -133,7 +133,7 @@ def read_spz(path: Path, *, colour: bool = True) -> Fields:
 
 
 def read_spz_document(path: Path) -> dict[str, Any]:
-    """What the labels of a file of version 4 mean; empty where it has none."""
+    """Read the document of the labels in a file of version 4; empty without labels."""
     with path.open("rb") as handle:
         start = handle.read(STREAMS_HEADER_BYTES)
         if start[:4] != MAGIC:
@@ -148,10 +148,10 @@ def spz_blocks(splats: Splats, document: Mapping[str, Any] | None = None) -> Ite
     """Yield the bytes of an ``.spz`` file of any splats (`gaussian_rows`), in blocks, in the format's frame.
 
     Means have as many fractional bits as their reach leaves, 20 at most. Harmonics above degree 3 are left out.
-    Splats with extras make a file of version 4, which holds these and what they mean.
+    Splats with extras make a file of version 4, which holds these and the document.
 
     Args:
-        splats: P. document: of `liftcore.io.labels`; None: nothing is said of the extras.
+        splats: P. document: of `liftcore.io.labels`, or None.
 
     Raises:
         InvalidSplats: a mean lies beyond what 24 bits reach.
@@ -163,8 +163,8 @@ def spz_blocks(splats: Splats, document: Mapping[str, Any] | None = None) -> Ite
         raise InvalidSplats("means", expected=f"centres within {LARGEST_MEAN // 2} of the origin", got=got)
     degree = min(splats.sh_degree or 0, WRITTEN_DEGREE)
     sections: list[list[bytes]] = [[] for _ in range(6)]
-    for some in gaussian_rows(splats):
-        for section, part in zip(sections, _encoded(some, bits, (degree + 1) ** 2 - 1), strict=True):
+    for block in gaussian_rows(splats):
+        for section, part in zip(sections, _encode(block, bits, (degree + 1) ** 2 - 1), strict=True):
             section.append(part.tobytes())
     flags = ANTIALIASED if splats.antialiased else 0
     if columns := stored_columns(splats):
@@ -182,16 +182,16 @@ def spz_blocks(splats: Splats, document: Mapping[str, Any] | None = None) -> Ite
 def _version_4(head: tuple[Any, ...], extensions: bytes, sections: list[bytes]) -> Iterator[bytes]:
     import zstandard
 
-    filled = [section for section in sections if section]
-    packed = [zstandard.ZstdCompressor(level=9).compress(section) for section in filled]
+    stored_sections = [section for section in sections if section]
+    packed = [zstandard.ZstdCompressor(level=9).compress(section) for section in stored_sections]
     yield struct.pack(HEADER, *head, len(packed)) + struct.pack("<I12x", STREAMS_HEADER_BYTES + len(extensions))
     yield extensions
-    for stream, section in zip(packed, filled, strict=True):
+    for stream, section in zip(packed, stored_sections, strict=True):
         yield struct.pack("<QQ", len(stream), len(section))
     yield from packed
 
 
-def _encoded(rows: GaussianRows, bits: int, higher: int) -> tuple[np.ndarray, ...]:
+def _encode(rows: GaussianRows, bits: int, higher: int) -> tuple[np.ndarray, ...]:
     """Return the sections of some splats, as `_decoded` reads those of version 3."""
     means = np.round(rows.means * (1.0, -1.0, -1.0) * 2.0**bits).astype(np.int32)
     with np.errstate(divide="ignore"):
@@ -212,14 +212,14 @@ def _bytes(values: np.ndarray) -> np.ndarray:
 
 
 def _packed_quats(quats: np.ndarray) -> np.ndarray:
-    """[n] u32: the smallest three of x y z w of unit quaternions [n, 4] w x y z, behind the largest's place."""
+    """Pack unit quaternions [n, 4] w x y z to [n] u32: the largest's index, then the smallest three of x y z w."""
     parts = np.roll(quats, -1, axis=1)
     largest = np.abs(parts).argmax(axis=1)
-    chosen = np.take_along_axis(parts, largest[:, None], axis=1)
-    parts = np.where(chosen < 0, -parts, parts)
-    others = np.take_along_axis(parts, REST_INDICES[largest], axis=1)
-    sizes = np.round(np.abs(others) / np.sqrt(0.5) * 511).clip(0, 511).astype(np.uint32)
-    words = sizes | np.where(others < 0, 512, 0).astype(np.uint32)
+    largest_part = np.take_along_axis(parts, largest[:, None], axis=1)
+    parts = np.where(largest_part < 0, -parts, parts)
+    smallest_parts = np.take_along_axis(parts, REST_INDICES[largest], axis=1)
+    sizes = np.round(np.abs(smallest_parts) / np.sqrt(0.5) * 511).clip(0, 511).astype(np.uint32)
+    words = sizes | np.where(smallest_parts < 0, 512, 0).astype(np.uint32)
     return (largest.astype(np.uint32) << 30 | words[:, 0] << 20 | words[:, 1] << 10 | words[:, 2]).astype("<u4")
 
 
@@ -245,42 +245,44 @@ def _section_bytes(version: int, count: int, degree: int) -> list[int]:
     return [count * size for size in (6 if version == 1 else 9, 1, 3, 3, 4 if version >= 3 else 3, 3 * higher)]
 
 
-def _inflated(unpacking: zlib._Decompress, content: bytes, size: int, path: Path) -> bytes:
-    """The next ``size`` bytes of a gzip stream; with 0 what is left is looked at, where its checksum may be."""
+def _inflate(unpacking: zlib._Decompress, content: bytes, size: int, path: Path) -> bytes:
+    """Return the next ``size`` bytes of a gzip stream; with 0 the rest, up to its checksum."""
     try:
-        found = unpacking.decompress(content, size or MAX_EXTENSION_BYTES)
+        block = unpacking.decompress(content, size or MAX_EXTENSION_BYTES)
     except zlib.error as error:
         raise _broken(path, "a whole gzip stream", str(error)[:120]) from None
-    if len(found) < size:
-        raise _broken(path, f"{size} bytes in the gzip stream", f"{len(found)}")
-    return found
+    if len(block) < size:
+        raise _broken(path, f"{size} bytes in the gzip stream", f"{len(block)}")
+    return block
 
 
 def _streams(content: bytes, table: int, streams: int, sizes: list[int], path: Path) -> list[np.ndarray]:
     """Return the sections of version 4, each u8; those of no bytes have no stream."""
     import zstandard
 
-    filled = [size for size in sizes if size]
-    at = table + 16 * streams
-    if streams != len(filled) or table < STREAMS_HEADER_BYTES or at > len(content):
-        raise _broken(path, f"{len(filled)} streams whose sizes lie in the file", f"{streams} at {table}")
+    stream_sizes = [size for size in sizes if size]
+    offset = table + 16 * streams
+    if streams != len(stream_sizes) or table < STREAMS_HEADER_BYTES or offset > len(content):
+        raise _broken(path, f"{len(stream_sizes)} streams whose sizes lie in the file", f"{streams} at {table}")
     sections = []
-    for place, size in enumerate(filled):
-        packed, told = struct.unpack_from("<QQ", content, table + 16 * place)
-        if told != size or at + packed > len(content):
-            raise _broken(path, f"a stream of {size} bytes", f"{told} in {packed} of {len(content) - at} left")
-        stream = content[at : at + packed]
+    for place, size in enumerate(stream_sizes):
+        packed, announced_size = struct.unpack_from("<QQ", content, table + 16 * place)
+        if announced_size != size or offset + packed > len(content):
+            raise _broken(
+                path, f"a stream of {size} bytes", f"{announced_size} in {packed} of {len(content) - offset} left"
+            )
+        stream = content[offset : offset + packed]
         try:
-            if zstandard.frame_content_size(stream) not in (-1, size):  # else what it says would be allocated
+            if zstandard.frame_content_size(stream) not in (-1, size):  # else the announced size would be allocated
                 raise _broken(path, f"a stream of {size} bytes", "one of another size")
-            found = zstandard.ZstdDecompressor().decompress(stream, max_output_size=size)
-            if len(found) != size:
-                raise _broken(path, f"a stream of {size} bytes", f"{len(found)}")
+            section = zstandard.ZstdDecompressor().decompress(stream, max_output_size=size)
+            if len(section) != size:
+                raise _broken(path, f"a stream of {size} bytes", f"{len(section)}")
         except zstandard.ZstdError as error:
             raise _broken(path, "a whole zstd stream", str(error)[:120]) from None
-        sections.append(np.frombuffer(found, np.uint8))
-        at += packed
-    return sections + [np.empty(0, np.uint8)] * (len(sizes) - len(filled))
+        sections.append(np.frombuffer(section, np.uint8))
+        offset += packed
+    return sections + [np.empty(0, np.uint8)] * (len(sizes) - len(stream_sizes))
 
 
 def _declared_frame(extensions: bytes, path: Path) -> int:
@@ -296,19 +298,19 @@ def _declared_frame(extensions: bytes, path: Path) -> int:
 
 
 def _turn_to_rdf(frame: int) -> tuple[np.ndarray, bool]:
-    """What turns a frame into RDF: the signs [3] of its axes, and whether a quarter turn about x follows.
+    """Return the transform of a frame to RDF: signs [3] of its axes, and True if a rotation by 90 degrees follows.
 
-    The letters of a frame are all that is meant: x' is x where that points right, y' is the axis that points down
-    (or minus the one that points up), z' the one that points to the front. Frames with y up or down need signs
-    alone; where z is up or down, ``(x, y, z)`` with its signs becomes ``(x, -z, y)``. Scales stay as they are, which
-    an exchange of axes would not leave so.
+    The letters of a frame define it: x' is x where that points right, y' is the axis that points down (or minus the
+    one that points up), z' the one that points to the front. Frames with y up or down need signs alone; where z is
+    up or down, ``(x, y, z)`` with its signs becomes ``(x, -z, y)``, a rotation about x. Scales stay as they are, as
+    they would not with an exchange of axes.
     """
     x, second, third = (1.0 if letter in "RDF" else -1.0 for letter in FRAMES[frame - 1])
     has_z_up = FRAMES[frame - 1][1] in "FB"
     return np.array([x, second, -third if has_z_up else third]), has_z_up
 
 
-def _decoded(
+def _decode(
     sections: list[np.ndarray], version: int, degree: int, step: float, frame: int, *, colour: bool
 ) -> Fields:
     means, opacities, colours, scales, quats, harmonics = sections
@@ -319,8 +321,8 @@ def _decoded(
     sh_turn = np.diag([np.prod([signs[axis] for axis in axes]) for axes in SH_AXES[:higher]])
     if turns:
         for band in range(1, degree + 1):
-            own = slice(band**2 - 1, (band + 1) ** 2 - 1)
-            sh_turn[own] = band_rotation(band, QUARTER_TURN) @ sh_turn[own]
+            band_rows = slice(band**2 - 1, (band + 1) ** 2 - 1)
+            sh_turn[band_rows] = band_rotation(band, QUARTER_TURN) @ sh_turn[band_rows]
     stored = harmonics.reshape(count, -1, 3)
 
     def decode(rows: slice) -> Fields:
@@ -332,7 +334,7 @@ def _decoded(
             places = np.where(places >= 1 << 23, places - (1 << 24), places) * step
         places, rotations = places * flips, _quats(quats.reshape(count, -1)[rows]) * (1, y * z, x * z, x * y)
         if turns:
-            places, rotations = places @ QUARTER_TURN.T, _quarter_turned(rotations)
+            places, rotations = places @ QUARTER_TURN.T, _rotate_quarter(rotations)
         fields = {
             "means": places,
             "log_scales": scales.reshape(count, 3)[rows] / 16.0 - 10,
@@ -351,14 +353,14 @@ def _decoded(
     return decoded(count, field_shapes(1 + higher if colour else 0), decode)
 
 
-def _quarter_turned(quats: np.ndarray) -> np.ndarray:
-    """Quaternions [n, 4] w x y z of splats that are turned by QUARTER_TURN."""
+def _rotate_quarter(quats: np.ndarray) -> np.ndarray:
+    """Rotate quaternions [n, 4] w x y z by QUARTER_TURN."""
     w, x, y, z = quats.T * np.sqrt(0.5)
     return np.stack([w - x, x + w, y - z, z + y], axis=1)
 
 
 def _quats(stored: np.ndarray) -> np.ndarray:
-    """[n, 4] w x y z, of x y z [n, 3] u8 or of the smallest three of x y z w [n, 4] u8."""
+    """Decode quaternions [n, 4] w x y z, of x y z [n, 3] u8 or of the smallest three of x y z w [n, 4] u8."""
     if stored.shape[1] == 3:
         parts = stored / 127.5 - 1
         return np.column_stack([np.sqrt(np.maximum(0.0, 1 - (parts**2).sum(axis=1))), parts])

@@ -21,7 +21,7 @@ TYPES = ("i4", "f4")
 
 
 def label_record(stored: Mapping[str, np.ndarray], document: Mapping[str, Any] | None) -> bytes:
-    """The extension's record for columns [P] (`liftcore.io.labels.stored_columns`), and what these mean."""
+    """Encode the extension's record of columns [P] (`liftcore.io.labels.stored_columns`) and their document."""
     import zstandard
 
     columns, streams = [], []
@@ -35,7 +35,7 @@ def label_record(stored: Mapping[str, np.ndarray], document: Mapping[str, Any] |
 
 
 def read_label_record(extensions: bytes, count: int) -> Labels | None:
-    """The labels of P splats among the records of a file; None where there are none that can be read."""
+    """Return the labels of P splats among the records of a file; None if none is valid."""
     for kind, payload in records(extensions):
         if kind == EXTENSION:
             try:
@@ -46,7 +46,7 @@ def read_label_record(extensions: bytes, count: int) -> Labels | None:
 
 
 def records(extensions: bytes) -> Iterator[tuple[int, bytes]]:
-    """Number and payload of each extension; of one that is cut short what is left."""
+    """Yield number and payload of each extension; of a truncated one the rest."""
     at = 0
     while at + 8 <= len(extensions):
         kind, size = struct.unpack_from("<II", extensions, at)
@@ -55,18 +55,18 @@ def records(extensions: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _read(payload: bytes, count: int) -> Labels:
-    """Raises ValueError where the payload is none of the format."""
+    """Decode a payload, or raise ValueError if it is not of the format."""
     import zstandard
 
     (length,) = struct.unpack_from("<I", payload)
     document = json.loads(payload[4 : 4 + length])
     at, columns = 4 + length, {}
-    told = document.get("columns") if isinstance(document, dict) else None
-    if not isinstance(told, list) or len(told) > MAX_COLUMNS or document.get("format") != FORMAT:
+    entries = document.get("columns") if isinstance(document, dict) else None
+    if not isinstance(entries, list) or len(entries) > MAX_COLUMNS or document.get("format") != FORMAT:
         raise ValueError("no document of labels")
-    for one in told:
-        own = one if isinstance(one, dict) else {}
-        name, code, size = (own.get(key) for key in ("name", "type", "bytes"))
+    for item in entries:
+        entry = item if isinstance(item, dict) else {}
+        name, code, size = (entry.get(key) for key in ("name", "type", "bytes"))
         if not isinstance(name, str) or code not in TYPES or type(size) is not int or size < 0:
             raise ValueError("no column")
         stream, at = payload[at : at + size], at + size
@@ -79,6 +79,6 @@ def _read(payload: bytes, count: int) -> Labels:
         if len(values) != 4 * count:
             raise ValueError("a column of another size")
         if COLUMN.fullmatch(name) and not MODEL.fullmatch(name):
-            own = np.frombuffer(values, f"<{code}")
-            columns[name] = id_column(own) if name in IDS else own.astype(code)
+            entry = np.frombuffer(values, f"<{code}")
+            columns[name] = id_column(entry) if name in IDS else entry.astype(code)
     return Labels(columns, document | {"columns": list(columns)})

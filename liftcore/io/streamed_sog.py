@@ -27,7 +27,7 @@ MAX_DOCUMENT_BYTES = 64 << 20
 
 
 def read_streamed_sog(path: Path, *, colour: bool = True) -> Fields:
-    """The fields of the finest splats of a streamed SOG: its ``lod-meta.json``, folder, or a zip of that.
+    """Read the fields of the finest splats of a streamed SOG: its ``lod-meta.json``, folder, or a zip of that.
 
     Raises:
         InvalidSplats: a file is missing or malformed, lies outside the folder, or two leaves have the same row.
@@ -35,29 +35,29 @@ def read_streamed_sog(path: Path, *, colour: bool = True) -> Fields:
     try:
         if not is_bundled(path):
             document = _document_of(path)
-            return _joined(document, partial(_chunk_in_folder, _meta_of(path).parent, colour=colour), path)
+            return _join_chunks(document, partial(_chunk_in_folder, _meta_of(path).parent, colour=colour), path)
         with open_zip(path) as archive:
             prefix = streamed_folder(archive.namelist()) or ""
-            most = min(MAX_DOCUMENT_BYTES, MOST_GROWTH * path.stat().st_size)
-            document = json.loads(read_in_archive(archive, prefix, LOD_META, most) or b"")
-            return _joined(document, partial(_chunk_in_archive, archive, prefix, path, colour=colour), path)
+            limit = min(MAX_DOCUMENT_BYTES, MOST_GROWTH * path.stat().st_size)
+            document = json.loads(read_in_archive(archive, prefix, LOD_META, limit) or b"")
+            return _join_chunks(document, partial(_chunk_in_archive, archive, prefix, path, colour=colour), path)
     except (*BROKEN_ZIP, RecursionError) as error:
-        raise _refused(path, LOD_META, f"one that does not open ({str(error)[:120]})") from None
+        raise _error(path, LOD_META, f"one that does not open ({str(error)[:120]})") from None
 
 
 def is_streamed_document(document: Any) -> bool:
-    """Whether a JSON document is a ``lod-meta.json``."""
+    """Return True if a JSON document is a ``lod-meta.json``."""
     return isinstance(document, dict) and document.keys() >= {"tree", "filenames"}
 
 
 def streamed_folder(names: list[str]) -> str | None:
-    """The folder, with a slash if any, in which a zip of these names holds a streamed SOG; None if in none."""
-    found = [name for name in names if PurePosixPath(name).name == LOD_META and "__MACOSX/" not in name]
-    return min(found).removesuffix(LOD_META) if found else None
+    """Return the folder, with a slash if any, in which a zip of these names holds a streamed SOG; None if in none."""
+    matches = [name for name in names if PurePosixPath(name).name == LOD_META and "__MACOSX/" not in name]
+    return min(matches).removesuffix(LOD_META) if matches else None
 
 
 def streamed_files(path: Path) -> list[Path]:
-    """The files that the finest splats of a folder or ``lod-meta.json`` are read from, sorted."""
+    """Return the files that the finest splats of a folder or ``lod-meta.json`` are read from, sorted."""
     folder = _meta_of(path).parent
     try:
         names = [name for name, _ in _finest_ranges(_document_of(path), path)]
@@ -77,18 +77,18 @@ def _document_of(path: Path) -> Any:
         with open_regular(_meta_of(path)) as handle:
             return json.loads(handle.read(MAX_DOCUMENT_BYTES))
     except (ValueError, RecursionError) as error:
-        raise _refused(path, f"{LOD_META} as JSON", str(error)[:120]) from None
+        raise _error(path, f"{LOD_META} as JSON", str(error)[:120]) from None
 
 
-def _joined(document: Any, fields_of: partial[Fields], path: Path) -> Fields:
+def _join_chunks(document: Any, fields_of: partial[Fields], path: Path) -> Fields:
     parts = []
     for name, ranges in _finest_ranges(document, path):
         fields = fields_of(name)
         count, last = len(fields["means"]), ranges[-1][1]
         if last > count:
-            raise _refused(path, f"rows within the {count} of {name!r}", f"rows to {last}")
+            raise _error(path, f"rows within the {count} of {name!r}", f"rows to {last}")
         rows = np.concatenate([np.arange(first, end) for first, end in ranges])
-        arrays = {key: own[rows] for key, own in fields.items() if isinstance(own, np.ndarray)}
+        arrays = {key: values[rows] for key, values in fields.items() if isinstance(values, np.ndarray)}
         parts.append(fields | arrays)
     fields = joined_fields(parts)
     if document.get("environment") is not None:
@@ -98,54 +98,58 @@ def _joined(document: Any, fields_of: partial[Fields], path: Path) -> Fields:
 
 
 def _finest_ranges(document: Any, path: Path) -> list[tuple[str, list[tuple[int, int]]]]:
-    """Names of files, in their order, and the ranges of rows of each that are the finest, sorted.
+    """Return the names of files, in their order, and the ranges of rows of each that are the finest, sorted.
 
     Raises:
         InvalidSplats: the document is malformed, names a file outside its folder or one twice, or ranges overlap.
     """
     if not is_streamed_document(document) or not isinstance(document["filenames"], list):
-        raise _refused(path, "a 'tree' and 'filenames'", "others")
+        raise _error(path, "a 'tree' and 'filenames'", "others")
     names, ranges, nodes = document["filenames"], defaultdict(list), [document["tree"]]
     while nodes:
         node = nodes.pop()
         if not isinstance(node, dict):
-            raise _refused(path, "nodes that are objects", repr(node)[:60])
+            raise _error(path, "nodes that are objects", repr(node)[:60])
         children, levels = node.get("children", []), node.get("lods", {})
         if not isinstance(children, list) or not isinstance(levels, dict):
-            raise _refused(path, "'children' as a list and 'lods' as an object", repr(node)[:60])
+            raise _error(path, "'children' as a list and 'lods' as an object", repr(node)[:60])
         nodes += children
         if levels:
             file, first, count = _range_of(_finest(levels, path), len(names), path)
             ranges[file] += [(first, first + count)] if count else []
-    found = [(names[file], sorted(ranges[file])) for file in sorted(ranges) if ranges[file]]
-    used = [name for name, _ in found]
-    if not found or not all(isinstance(name, str) and _is_below(name) for name in used) or len({*used}) < len(used):
+    file_ranges = [(names[file], sorted(ranges[file])) for file in sorted(ranges) if ranges[file]]
+    used_names = [name for name, _ in file_ranges]
+    if (
+        not file_ranges
+        or not all(isinstance(name, str) and _is_below(name) for name in used_names)
+        or len({*used_names}) < len(used_names)
+    ):
         expected = "names of SOGs in the folder, each once"
-        raise _refused(path, expected, repr(used)[:80] if found else "none that a leaf has")
-    for name, own in found:
-        if any(following[0] < before[1] for before, following in pairwise(own)):
-            raise _refused(path, "leaves with rows of their own", f"two with the same of {name!r}")
-    return found
+        raise _error(path, expected, repr(used_names)[:80] if file_ranges else "none that a leaf has")
+    for name, intervals in file_ranges:
+        if any(following[0] < before[1] for before, following in pairwise(intervals)):
+            raise _error(path, "leaves with rows of their own", f"two with the same of {name!r}")
+    return file_ranges
 
 
 def _finest(levels: dict[str, Any], path: Path) -> Any:
     if not all(level.isdecimal() and level.isascii() and len(level) < 4 for level in levels):
-        raise _refused(path, "levels of detail by their numbers", repr(list(levels))[:60])
+        raise _error(path, "levels of detail by their numbers", repr(list(levels))[:60])
     return levels[min(levels, key=int)]
 
 
 def _range_of(level: Any, files: int, path: Path) -> tuple[int, int, int]:
-    known = level if isinstance(level, dict) else {}
-    file, offset, count = (_whole_number(known.get(key)) for key in ("file", "offset", "count"))
+    members = level if isinstance(level, dict) else {}
+    file, offset, count = (_whole_number(members.get(key)) for key in ("file", "offset", "count"))
     if file < 0 or offset < 0 or count < 0:
-        raise _refused(path, "file, offset and count of a level", repr(level)[:60])
+        raise _error(path, "file, offset and count of a level", repr(level)[:60])
     if file >= files:
-        raise _refused(path, f"one of {files} files", f"the file {file}")
+        raise _error(path, f"one of {files} files", f"the file {file}")
     return file, offset, count
 
 
 def _whole_number(value: Any) -> int:
-    """The number, or -1 for what is none of 32 bits."""
+    """Return the number, or -1 for what is none of 32 bits."""
     return value if type(value) is int and 0 <= value < 1 << 32 else -1
 
 
@@ -161,7 +165,7 @@ def _is_below(name: str) -> bool:
 
 def _chunk_in_folder(folder: Path, name: str, *, colour: bool) -> Fields:
     if not (folder / name).is_file():
-        raise _refused(folder / LOD_META, f"{name!r} beside it", "none")
+        raise _error(folder / LOD_META, f"{name!r} beside it", "none")
     return read_sog(folder / name, colour=colour)
 
 
@@ -171,5 +175,5 @@ def _chunk_in_archive(archive: zipfile.ZipFile, prefix: str, path: Path, name: s
     return decode_sog(partial(read_in_archive, archive, inside), path / name, size, colour=colour)
 
 
-def _refused(path: Path, expected: str, got: str) -> InvalidSplats:
+def _error(path: Path, expected: str, got: str) -> InvalidSplats:
     return InvalidSplats(str(path), expected=expected, got=got, hint=HINT)

@@ -38,16 +38,19 @@ from liftcore.scene.world import UNKNOWN, WorldFrame
 
 FRAME_FILE = "dataparser_transforms.json"  # as nerfstudio names it, in the folder of a run
 OWN_FRAME = (
-    "poses of nerfstudio's own files: it trains in another frame than they are in, unless it was told "
+    "poses of nerfstudio's own files: it trains in another frame than theirs, unless it was run with "
     f"--orientation-method none --center-method none --auto-scale-poses False. Put its run's {FRAME_FILE} beside them"
 )
 LEAST_UPRIGHT = 0.5  # cosine of the mean of the cameras' up axes with +Z
-TOLERANCE = 1e-3  # of a rotation's entries: they were float32 on the way
+TOLERANCE = 1e-3  # of a rotation's entries, which were stored as float32
 LEAST, LARGEST = 1e-9, 1e9  # scales
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 FISHEYE = "OPENCV_FISHEYE"
-LISTED = ("k1", "k2", "k3", "k4", "p1", "p2")  # nerfstudio's distortion_params
-READ = {True: ("k1", "k2", "k3", "k4"), False: ("k1", "k2", "k3", "p1", "p2")}  # of a fisheye, and of others
+DISTORTION_ORDER = ("k1", "k2", "k3", "k4", "p1", "p2")  # nerfstudio's distortion_params
+SUPPORTED_COEFFICIENTS = {
+    True: ("k1", "k2", "k3", "k4"),
+    False: ("k1", "k2", "k3", "p1", "p2"),
+}  # of a fisheye, and of others
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
 OTHER_LENSES = (
     "latlong",
@@ -73,7 +76,7 @@ def parse_transforms(document: Any, source: str, photos: PhotosBeside | None = N
     """Return the cameras of a transforms.json document, in the frame that its poses are in.
 
     A frame's own intrinsics come before the shared ones. A scene trained in another frame (nerfstudio
-    normalises poses unless told not to) must be exported together with its cameras.
+    normalises poses by default) must be exported together with its cameras.
 
     Args:
         document: as JSON has it. source: its file, for errors.
@@ -83,9 +86,9 @@ def parse_transforms(document: Any, source: str, photos: PhotosBeside | None = N
         InvalidCameras: a key is missing or malformed, or a camera is distorted in a way that is not read.
     """
     if not isinstance(document, dict) or "frames" not in document:
-        some = ", ".join(list(document)[:5]) if isinstance(document, dict) else type(document).__name__
+        listing = ", ".join(list(document)[:5]) if isinstance(document, dict) else type(document).__name__
         raise InvalidCameras(
-            source, expected=FORMATS, got=f"an object with {some}" if document else "an empty object"
+            source, expected=FORMATS, got=f"an object with {listing}" if document else "an empty object"
         )
     names, frames = _named_frames(document["frames"], f"{source} frames", f"{source} frame")
     scoped = [ChainMap(frame, document) for frame in frames]
@@ -145,7 +148,7 @@ def _named_frames(frames: Any, source: str, each: str) -> tuple[list[str], list[
 
 
 def nerfstudio_world(cameras: Sequence[Camera]) -> WorldFrame:
-    """+Z is up by nerfstudio's convention, where its cameras do not say otherwise; its unit is any.
+    """Return nerfstudio's convention, +Z up, unless its cameras contradict it; the unit is unknown.
 
     An ``applied_transform`` and an ``applied_scale`` lead back to the frame that the poses came in, mostly COLMAP's,
     of which neither is known. A run with the orientation method ``none`` keeps that frame's turn: then cameras stand
@@ -171,122 +174,124 @@ def transforms_of(cameras: Mapping[str, Camera]) -> dict[str, Any]:
 
 def _cameras(name: str, keys: ChainMap[str, Any], source: str, photos: PhotosBeside | None) -> list[Camera]:
     """Return the view of a frame, or the six of a panorama."""
-    where = f"{source} frame {name!r}"
+    location = f"{source} frame {name!r}"
     panorama = keys.get("camera_model") == PANORAMA
-    distortion = None if panorama else _distortion(keys, where)
-    width, height = _size(keys, where, photos)
+    distortion = None if panorama else _distortion(keys, location)
+    width, height = _size(keys, location, photos)
     with pose_from():
-        given = matrix(keys.get("transform_matrix"), (3, 4), 4, f"{where} transform_matrix")
-    if len(given) == 4 and np.abs(given[3] - LAST_ROW).max() > 1e-6:
-        got = " ".join(f"{value:g}" for value in given[3])
-        raise InvalidPose(f"{where} transform_matrix", expected="0 0 0 1 as the last row", got=got)
-    pose = viewmat_of(given[:3, :3] * CAMERA_AXES["opengl"], given[:3, 3])
+        rows = matrix(keys.get("transform_matrix"), (3, 4), 4, f"{location} transform_matrix")
+    if len(rows) == 4 and np.abs(rows[3] - LAST_ROW).max() > 1e-6:
+        got = " ".join(f"{value:g}" for value in rows[3])
+        raise InvalidPose(f"{location} transform_matrix", expected="0 0 0 1 as the last row", got=got)
+    pose = viewmat_of(rows[:3, :3] * CAMERA_AXES["opengl"], rows[:3, 3])
     if panorama:
         return faces_of(name, width, height, pose)
-    intrinsics = _intrinsics(keys, width, height, where)
+    intrinsics = _intrinsics(keys, width, height, location)
     camera = Camera.pinhole(name, width, height, *intrinsics, viewmat=pose)
     return [camera if distortion is None else behind_lens(camera, distortion)]
 
 
-def _size(keys: Mapping[str, Any], where: str, photos: PhotosBeside | None) -> tuple[int, int]:
-    """Width and height in pixels, of the frame or else of its photo."""
+def _size(keys: Mapping[str, Any], location: str, photos: PhotosBeside | None) -> tuple[int, int]:
+    """Return width and height in pixels, of the frame or else of its photo."""
     if "w" in keys and "h" in keys:
-        return pixels(keys["w"], f"{where} w"), pixels(keys["h"], f"{where} h")
+        return pixels(keys["w"], f"{location} w"), pixels(keys["h"], f"{location} h")
     file_path = str(keys["file_path"])
     try:
         header = photos.header(file_path) if photos else None
     except InvalidInput as error:
         got, hint = f"{error.got} ({error.argument})", 'add "w" and "h" at the top level of the file'
-        raise InvalidCameras(where, expected="an image size, w and h, or a photo", got=got, hint=hint) from None
+        raise InvalidCameras(location, expected="an image size, w and h, or a photo", got=got, hint=hint) from None
     if header is not None:
-        return _size_of_photo(header, keys, where)
-    looked = f", and no photo {photos.missing(file_path)}" if photos else ""
+        return _size_of_photo(header, keys, location)
+    photo_note = f", and no photo {photos.missing(file_path)}" if photos else ""
     hint = 'add the size of the photos as "w" and "h" at the top level of the file'
     hint = f"put the photos where file_path has them, or {hint}" if photos else hint
-    raise InvalidCameras(where, expected="an image size, w and h", got=f"none{looked}", hint=hint)
+    raise InvalidCameras(location, expected="an image size, w and h", got=f"none{photo_note}", hint=hint)
 
 
-def _size_of_photo(header: PhotoHeader, keys: Mapping[str, Any], where: str) -> tuple[int, int]:
-    """Width and height of a photo as stored, or as its EXIF turns it where that fits the principal point alone."""
-    centre = [number(keys[key], f"{where} {key}") if key in keys else None for key in ("cx", "cy")]
+def _size_of_photo(header: PhotoHeader, keys: Mapping[str, Any], location: str) -> tuple[int, int]:
+    """Return the size of a photo as stored, or as EXIF rotates it if only that fits the principal point."""
+    centre = [number(keys[key], f"{location} {key}") if key in keys else None for key in ("cx", "cy")]
     cx, cy = centre
     turns = cx is not None and cy is not None and cx > 0 < cy and header.turns_for((round(2 * cx), round(2 * cy)))
     width, height = header.oriented if turns else header.stored
     if (cx or 0) >= width or (cy or 0) >= height:
         expected, hint = f"a principal point within the photo of {width}x{height}", "the photo was made smaller: add"
         hint = f'{hint} "w" and "h" of the photos that the intrinsics are of at the top level of the file'
-        raise InvalidCameras(f"{where} cx, cy", expected=expected, got=f"{cx}, {cy}", hint=hint)
+        raise InvalidCameras(f"{location} cx, cy", expected=expected, got=f"{cx}, {cy}", hint=hint)
     return width, height
 
 
-def _intrinsics(keys: Mapping[str, Any], width: int, height: int, where: str) -> Intrinsics:
-    fx = _focal(keys, "x", width, where)
-    fy = _focal(keys, "y", height, where)
+def _intrinsics(keys: Mapping[str, Any], width: int, height: int, location: str) -> Intrinsics:
+    fx = _focal(keys, "x", width, location)
+    fy = _focal(keys, "y", height, location)
     fx = fy if fx is None else fx
     fy = fx if fy is None else fy
     if fx is None or fy is None:
-        found = next((key for key in OTHER_FOCALS if key in keys), None)
-        got = "neither" if found is None else f"neither, but {found!r}"
+        other_focal = next((key for key in OTHER_FOCALS if key in keys), None)
+        got = "neither" if other_focal is None else f"neither, but {other_focal!r}"
         hint = "add the focal length in pixels as fl_x and fl_y"
-        raise InvalidCameras(where, expected="fl_x or camera_angle_x", got=got, hint=hint)
-    cx = number(keys.get("cx", width / 2), f"{where} cx")
-    cy = number(keys.get("cy", height / 2), f"{where} cy")
+        raise InvalidCameras(location, expected="fl_x or camera_angle_x", got=got, hint=hint)
+    cx = number(keys.get("cx", width / 2), f"{location} cx")
+    cy = number(keys.get("cy", height / 2), f"{location} cy")
     return Intrinsics(fx, fy, cx, cy)
 
 
-def _focal(keys: Mapping[str, Any], axis: str, side: int, where: str) -> float | None:
+def _focal(keys: Mapping[str, Any], axis: str, side: int, location: str) -> float | None:
     if f"fl_{axis}" in keys:
-        return number(keys[f"fl_{axis}"], f"{where} fl_{axis}")
+        return number(keys[f"fl_{axis}"], f"{location} fl_{axis}")
     if f"camera_angle_{axis}" not in keys:
         return None
-    angle = number(keys[f"camera_angle_{axis}"], f"{where} camera_angle_{axis}")
+    angle = number(keys[f"camera_angle_{axis}"], f"{location} camera_angle_{axis}")
     if not 0 < angle < math.pi:
-        raise InvalidCameras(f"{where} camera_angle_{axis}", expected="an angle in 0..pi", got=f"{angle:g}")
+        raise InvalidCameras(f"{location} camera_angle_{axis}", expected="an angle in 0..pi", got=f"{angle:g}")
     return 0.5 * side / math.tan(0.5 * angle)
 
 
-def _distortion(keys: ChainMap[str, Any], where: str) -> Distortion | None:
+def _distortion(keys: ChainMap[str, Any], location: str) -> Distortion | None:
     """Return the distortion of a frame's photo; None where it has none."""
     model = keys.get("camera_model", "PINHOLE")
     other = next((key for scope in keys.maps for key in OTHER_LENSES if scope.get(key)), None)
     if model not in (*PERSPECTIVE, FISHEYE) or other:
         got = other or repr(model)[:60]
         raise InvalidCameras(
-            where, expected=f"a perspective camera, {FISHEYE} or {PANORAMA}", got=got, hint=UNDISTORT
+            location, expected=f"a perspective camera, {FISHEYE} or {PANORAMA}", got=got, hint=UNDISTORT
         )
     fisheye = model == FISHEYE or bool(keys.get("is_fisheye"))
-    found = [given for scope in keys.maps if (given := _given(scope, where)) is not None]
-    if any(given != found[0] for given in found):  # programs differ in which of them counts
-        told = " and ".join(_told(given) for given in found)
-        raise InvalidCameras(where, expected="the same distortion as that of all frames", got=told)
-    values = found[0] if found else {}
-    unread = next((key for key in values if key not in READ[fisheye]), None)
+    candidates = [
+        coefficients for scope in keys.maps if (coefficients := _nonzero_coefficients(scope, location)) is not None
+    ]
+    if any(coefficients != candidates[0] for coefficients in candidates):  # programs differ in which of them counts
+        alternatives = " and ".join(_format_coefficients(coefficients) for coefficients in candidates)
+        raise InvalidCameras(location, expected="the same distortion as that of all frames", got=alternatives)
+    values = candidates[0] if candidates else {}
+    unread = next((key for key in values if key not in SUPPORTED_COEFFICIENTS[fisheye]), None)
     if unread:
         kind = "a fisheye" if fisheye else "a perspective camera"
-        expected = f"{', '.join(READ[fisheye])} alone of {kind}"
-        raise InvalidCameras(where, expected=expected, got=f"{unread} = {values[unread]:g}", hint=UNDISTORT)
+        expected = f"{', '.join(SUPPORTED_COEFFICIENTS[fisheye])} alone of {kind}"
+        raise InvalidCameras(location, expected=expected, got=f"{unread} = {values[unread]:g}", hint=UNDISTORT)
     return distortion_of(values, fisheye=fisheye)
 
 
-def _given(scope: Mapping[str, Any], where: str) -> dict[str, float] | None:
+def _nonzero_coefficients(scope: Mapping[str, Any], location: str) -> dict[str, float] | None:
     """Return the parameters that are not zero, by name; None where none is named."""
-    listed = scope.get("distortion_params")
-    if listed is not None and (not isinstance(listed, list) or len(listed) not in (0, len(LISTED))):
-        expected = f"a list of the {len(LISTED)} numbers {', '.join(LISTED)}"
-        raise InvalidCameras(f"{where} distortion_params", expected=expected, got=repr(listed)[:60])
-    if not listed and not any(key in scope for key in DISTORTION):
+    params = scope.get("distortion_params")
+    if params is not None and (not isinstance(params, list) or len(params) not in (0, len(DISTORTION_ORDER))):
+        expected = f"a list of the {len(DISTORTION_ORDER)} numbers {', '.join(DISTORTION_ORDER)}"
+        raise InvalidCameras(f"{location} distortion_params", expected=expected, got=repr(params)[:60])
+    if not params and not any(key in scope for key in DISTORTION):
         return None
-    given = {key: number(scope[key], f"{where} {key}") for key in DISTORTION if key in scope}
-    named = {key: value for key, value in given.items() if value != 0}
-    values = [number(value, f"{where} distortion_params[{i}]") for i, value in enumerate(listed or [])]
-    of_list = {key: value for key, value in zip(LISTED, values, strict=False) if value != 0}
-    if named and of_list and named != of_list:
-        got = f"{_told(named)} and {_told(of_list)}"
-        raise InvalidCameras(f"{where} distortion_params", expected="what the single parameters say", got=got)
-    return of_list or named
+    by_key = {key: number(scope[key], f"{location} {key}") for key in DISTORTION if key in scope}
+    single = {key: value for key, value in by_key.items() if value != 0}
+    values = [number(value, f"{location} distortion_params[{i}]") for i, value in enumerate(params or [])]
+    of_list = {key: value for key, value in zip(DISTORTION_ORDER, values, strict=False) if value != 0}
+    if single and of_list and single != of_list:
+        got = f"{_format_coefficients(single)} and {_format_coefficients(of_list)}"
+        raise InvalidCameras(f"{location} distortion_params", expected="the values of the single parameters", got=got)
+    return of_list or single
 
 
-def _told(values: Mapping[str, float]) -> str:
+def _format_coefficients(values: Mapping[str, float]) -> str:
     return ", ".join(f"{key} = {value:g}" for key, value in values.items()) or "none"
 
 
@@ -299,15 +304,15 @@ class Similarity:
     translation: np.ndarray  # [3] f64
 
     @classmethod
-    def of(cls, moved: np.ndarray, source: str) -> Self:
+    def of(cls, matrix: np.ndarray, source: str) -> Self:
         """Return the map of an affine matrix [4, 4] f64.
 
         Raises:
-            InvalidCameras: it does more than turn, shift and scale.
+            InvalidCameras: it is no rotation, translation and scale.
         """
-        linear = moved[:3, :3]
+        linear = matrix[:3, :3]
         scale = float(np.cbrt(np.linalg.det(linear)))
-        if not LEAST <= scale <= LARGEST or not np.isfinite(moved).all():
+        if not LEAST <= scale <= LARGEST or not np.isfinite(matrix).all():
             expected = f"a proper rotation with a scale in {LEAST:g}..{LARGEST:g}"
             raise InvalidCameras(source, expected=expected, got=f"a determinant of {np.linalg.det(linear):.3g}")
         error = float(np.abs(linear @ linear.T / scale**2 - np.eye(3)).max())
@@ -316,7 +321,7 @@ class Similarity:
                 source, expected="a rotation, a shift and a scale", got=f"a matrix off by {error:.2g}"
             )
         left, _, right = np.linalg.svd(linear)  # the nearest rotation
-        return cls(scale, left @ right, moved[:3, 3])
+        return cls(scale, left @ right, matrix[:3, 3])
 
     def transformed(self, cameras: Cameras) -> Cameras:
         """Return the same views of the transformed scene: every pixel shows the same splats.
@@ -338,34 +343,34 @@ def read_frame(path: Path, applied: Mapping[str, Any], source: str) -> Similarit
     """Return the map from the frame of camera files to that of the splats.
 
     The file holds ``transform`` T [3, 4] and ``scale`` s, which take the frame of the COLMAP model to that of the
-    splats. Poses of a transforms.json have moved from there already, by its ``applied_transform`` A and
-    ``applied_scale`` a. What is left is ``(s / a) T A^-1``, as nerfstudio's data parser moves them.
+    splats. Poses of a transforms.json are transformed already, by its ``applied_transform`` A and
+    ``applied_scale`` a. The rest is ``(s / a) T A^-1``, as in nerfstudio's data parser.
 
     Args:
         path: a ``FRAME_FILE``. applied: the transforms.json that the cameras are of; empty of a COLMAP model.
         source: the name of that file.
 
     Raises:
-        InvalidCameras: a matrix or a scale is missing, malformed, or does more than turn, shift and scale.
+        InvalidCameras: a matrix or a scale is missing, malformed, or no rotation, translation and scale.
     """
     document = read_json(path)
-    moved = _affine(entry(document, "transform", str(path)), f"{path} transform")
+    transform = _affine(entry(document, "transform", str(path)), f"{path} transform")
     scale = _scale(entry(document, "scale", str(path)), f"{path} scale")
     before = np.eye(4)
     if applied.get("applied_transform") is not None:
         before = _affine(applied["applied_transform"], f"{source} applied_transform")
         Similarity.of(before, f"{source} applied_transform")
-    left = moved @ np.linalg.inv(before)
-    left[:3] *= scale / _scale(applied.get("applied_scale", 1.0), f"{source} applied_scale")
-    return Similarity.of(left, f"{path} transform")
+    combined = transform @ np.linalg.inv(before)
+    combined[:3] *= scale / _scale(applied.get("applied_scale", 1.0), f"{source} applied_scale")
+    return Similarity.of(combined, f"{path} transform")
 
 
 def _affine(value: Any, source: str) -> np.ndarray:
-    found = np.eye(4)
-    found[:3] = matrix(value, (3, 4), 4, source)[:3]
-    if float(np.abs(found).max()) > LARGEST:
-        raise InvalidCameras(source, expected=f"numbers within {LARGEST:g}", got=f"{float(np.abs(found).max()):.2g}")
-    return found
+    affine = np.eye(4)
+    affine[:3] = matrix(value, (3, 4), 4, source)[:3]
+    if float(np.abs(affine).max()) > LARGEST:
+        raise InvalidCameras(source, expected=f"numbers within {LARGEST:g}", got=f"{float(np.abs(affine).max()):.2g}")
+    return affine
 
 
 def _scale(value: Any, source: str) -> float:

@@ -1,14 +1,14 @@
 """OpenUSD 26: ``ParticleField3DGaussianSplat`` of schema usdVol, with a subset of points an object.
 
 Positions, linear scales and opacities, quaternions with the real part first, and harmonics particle by particle, the
-constant term first, ordered as 3DGS has them. The frame that is written is right, up, back (+Y up); what is read is
-turned from the stage's up axis, and each particle field by its transform. The stage's up axis and metres a unit are
-those of the splats where they are known (`liftcore.scene.world`); custom data of its layer say which of them are, as
-validators want both.
+constant term first, ordered as 3DGS has them. Files are written in the frame right, up, back (+Y up); on reading,
+the stage's up axis and the transform of each particle field are applied. The stage's up axis and metres of a unit are
+those of the splats where they are known (`liftcore.scene.world`); custom data of its layer record which of them are,
+as validators require both.
 
 Columns of splats are primvars of the field. An object is a ``GeomSubset`` with the element type ``point`` and
-``SemanticsLabelsAPI:class``; it has no family, as validators know families of point-based geometry alone. Or it is a
-field of its own, with the rows that its splats were, by which they come back in their order.
+``SemanticsLabelsAPI:class``; it has no family, as validators accept families of point-based geometry alone. Or it is
+a field of its own, with the original rows of its splats, which restore their order on reading.
 
 Files are opened by ``usd-core`` (the extra ``formats``), which follows references to other files.
 """
@@ -44,13 +44,13 @@ MOST_DEGREE = 4  # and read
 MODULES = ("Gf", "Sdf", "Tf", "Usd", "UsdGeom", "UsdSemantics", "UsdUtils", "UsdVol", "Vt")
 FIELD = "ParticleField3DGaussianSplat"
 WORLD = "splatlift_world"  # of the layer's custom data: up and metres a unit as JSON, null where not known
-ROW = "splatlift_row"  # primvar of the fields of parted splats: the rows that they were
-DOCUMENT = "splatlift"  # of the field's custom data: what labels mean, as JSON
+ROW = "splatlift_row"  # primvar of the fields of split splats: their original rows
+DOCUMENT = "splatlift"  # of the field's custom data: the labels' document as JSON
 HINT = "export it again, or as PLY"
 
 
 def open_library() -> Any:
-    """The modules of OpenUSD, by their names.
+    """Import the modules of OpenUSD, and return them by their names.
 
     Raises:
         Unavailable: they are not installed.
@@ -68,15 +68,15 @@ def open_library() -> Any:
 def usd_blocks(
     splats: Splats, document: Mapping[str, Any] | None = None, suffix: str = ".usdc", *, prims: bool = False
 ) -> Iterator[bytes]:
-    """The bytes of a USD file of any splats (`gaussian_rows`), with their extras and what these mean.
+    """Yield the bytes of a USD file of any splats (`gaussian_rows`), with their extras and the labels' document.
 
     Args:
         splats: P. document: of `liftcore.io.labels`; None: splats without labels. suffix: .usdc, .usda or .usdz.
-        prims: whether each object is a particle field of its own, ``/Scene/instance_N``, and what is of none
-            ``/Scene/Splats``; else all are one field, and an object is a subset.
+        prims: True: each object is a particle field of its own, ``/Scene/instance_N``, and splats of none are
+            ``/Scene/Splats``; False: all are one field, and an object is a subset.
 
     Raises:
-        InvalidSplats: the format does not hold the columns, or prims are asked for without ``instance_id``.
+        InvalidSplats: the format cannot store the columns, or ``prims`` is set without ``instance_id``.
         Unavailable: usd-core is not installed.
     """
     pxr, columns = open_library(), stored_columns(splats)
@@ -95,19 +95,19 @@ def usd_blocks(
         if any(splats.origin):
             place = world.placement(TO_FILE, in_metres=False)[:3, :3] @ TO_FILE @ splats.origin
             root.AddTranslateOp().Set(pxr.Gf.Vec3d(*place.tolist()))
-        if (turn := world.upright(TO_FILE).tolist())[0] < 1:
-            root.AddOrientOp(pxr.UsdGeom.XformOp.PrecisionDouble).Set(pxr.Gf.Quatd(*turn))
-        named = rows_by_id(dict(document or {}), KINDS[0])
+        if (rotation := world.upright(TO_FILE).tolist())[0] < 1:
+            root.AddOrientOp(pxr.UsdGeom.XformOp.PrecisionDouble).Set(pxr.Gf.Quatd(*rotation))
+        instance_rows = rows_by_id(dict(document or {}), KINDS[0])
         if prims:
             for number, rows in _instances(columns[IDS[0]]):
-                own = {name: column[rows] for name, column in columns.items()} | {ROW: rows.astype("i4")}
-                prim = _write_field(stage, f"instance_{number}" if number else "Splats", splats[rows], own)
-                _name(prim, named, number)
+                prim_columns = {name: column[rows] for name, column in columns.items()} | {ROW: rows.astype("i4")}
+                prim = _write_field(stage, f"instance_{number}" if number else "Splats", splats[rows], prim_columns)
+                _name(prim, instance_rows, number)
         else:
             prim = _write_field(stage, "Splats", splats, columns)
             for number, rows in _instances(columns[IDS[0]]) if IDS[0] in columns else ():
                 if number:
-                    _write_subset(stage, prim, named, number, rows)
+                    _write_subset(stage, prim, instance_rows, number, rows)
         if document:
             first = next(iter(stage.GetPrimAtPath("/Scene").GetChildren()))
             first.SetCustomDataByKey(DOCUMENT, json.dumps(document, ensure_ascii=False))
@@ -122,38 +122,38 @@ def usd_blocks(
 
 
 def _write_field(stage: Any, name: str, splats: Splats, columns: Mapping[str, np.ndarray]) -> Any:
-    """The prim of a new particle field."""
+    """Write a particle field, and return its prim."""
     pxr = open_library()
     rows = list(gaussian_rows(splats))
 
-    def joined(name: str) -> np.ndarray:
-        return np.concatenate([getattr(some, name) for some in rows])
+    def concatenate(name: str) -> np.ndarray:
+        return np.concatenate([getattr(block, name) for block in rows])
 
-    means, colours = (joined("means") @ TO_FILE).astype("f4"), joined("colours")
+    means, colours = (concatenate("means") @ TO_FILE).astype("f4"), concatenate("colours")
     sh = (
         constant_terms(colours)[:, None] if splats.sh is None else splats.sh.cpu().numpy()[:, : (MAX_DEGREE + 1) ** 2]
     )
-    turned = np.concatenate(
+    rotated = np.concatenate(
         [
             np.einsum("ij,njc->nic", band_rotation(band, TO_FILE), sh[:, band**2 : (band + 1) ** 2])
             for band in range(round(sh.shape[1] ** 0.5))
         ],
         axis=1,
     )
-    quats = np.roll(joined("quats") @ product_matrix(TO_FILE).T, -1, axis=1)  # in memory the real part is last
+    quats = np.roll(concatenate("quats") @ product_matrix(TO_FILE).T, -1, axis=1)  # in memory the real part is last
     field = pxr.UsdVol.ParticleField3DGaussianSplat.Define(stage, f"/Scene/{name}")
 
     def vectors(values: np.ndarray) -> Any:
         return pxr.Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, "f4"))
 
     field.CreatePositionsAttr(vectors(means))
-    field.CreateScalesAttr(vectors(joined("scales")))
+    field.CreateScalesAttr(vectors(concatenate("scales")))
     field.CreateOrientationsAttr(pxr.Vt.QuatfArray.FromNumpy(np.ascontiguousarray(quats, "f4")))
-    field.CreateOpacitiesAttr(pxr.Vt.FloatArray.FromNumpy(joined("opacities").astype("f4")))
+    field.CreateOpacitiesAttr(pxr.Vt.FloatArray.FromNumpy(concatenate("opacities").astype("f4")))
     field.CreateRadianceSphericalHarmonicsDegreeAttr(round(sh.shape[1] ** 0.5) - 1)
-    field.CreateRadianceSphericalHarmonicsCoefficientsAttr(vectors(turned.reshape(-1, 3)))
+    field.CreateRadianceSphericalHarmonicsCoefficientsAttr(vectors(rotated.reshape(-1, 3)))
     field.CreateSortingModeHintAttr("cameraDistance")
-    reach = 3 * joined("scales").max(axis=1, keepdims=True)
+    reach = 3 * concatenate("scales").max(axis=1, keepdims=True)
     low, high = (means - reach).min(axis=0).tolist(), (means + reach).max(axis=0).tolist()
     field.CreateExtentAttr(pxr.Vt.Vec3fArray([pxr.Gf.Vec3f(*low), pxr.Gf.Vec3f(*high)]))
     primvars = pxr.UsdGeom.PrimvarsAPI(field)
@@ -163,34 +163,36 @@ def _write_field(stage: Any, name: str, splats: Splats, columns: Mapping[str, np
         is_float = column.dtype.kind == "f"
         kind = pxr.Sdf.ValueTypeNames.FloatArray if is_float else pxr.Sdf.ValueTypeNames.IntArray
         array = pxr.Vt.FloatArray if is_float else pxr.Vt.IntArray
-        own = primvars.CreatePrimvar(key, kind, pxr.UsdGeom.Tokens.vertex)
-        own.Set(array.FromNumpy(column))
+        primvar = primvars.CreatePrimvar(key, kind, pxr.UsdGeom.Tokens.vertex)
+        primvar.Set(array.FromNumpy(column))
     return field.GetPrim()
 
 
 def _instances(instances: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """Each number of a column of ids, and its rows."""
+    """Yield each number of a column of ids, and its rows."""
     order = np.argsort(instances, kind="stable")
     numbers, firsts = np.unique(instances[order], return_index=True)
     yield from zip(numbers.tolist(), np.split(order, firsts[1:]), strict=True)
 
 
-def _write_subset(stage: Any, field: Any, named: Sequence[Mapping[str, Any]], number: int, rows: np.ndarray) -> None:
+def _write_subset(
+    stage: Any, field: Any, instance_rows: Sequence[Mapping[str, Any]], number: int, rows: np.ndarray
+) -> None:
     pxr = open_library()
     subset = pxr.UsdGeom.Subset.Define(stage, field.GetPath().AppendChild(f"instance_{number}"))
     subset.CreateElementTypeAttr(pxr.UsdGeom.Tokens.point)
     subset.CreateIndicesAttr(pxr.Vt.IntArray.FromNumpy(rows.astype("i4")))
-    _name(subset.GetPrim(), named, number)
+    _name(subset.GetPrim(), instance_rows, number)
 
 
-def _name(prim: Any, named: Sequence[Mapping[str, Any]], number: int) -> None:
+def _name(prim: Any, instance_rows: Sequence[Mapping[str, Any]], number: int) -> None:
     """Give a prim the semantic label of an instance, if it has a name."""
-    if number and number < len(named) and (name := named[number].get("name")) is not None:
+    if number and number < len(instance_rows) and (name := instance_rows[number].get("name")) is not None:
         open_library().UsdSemantics.LabelsAPI.Apply(prim, "class").CreateLabelsAttr([name])
 
 
 def read_usd(path: Path, *, colour: bool = True) -> Fields:
-    """The fields of all particle fields of a stage, in its order, in the frame of PLYs and cameras.
+    """Read the fields of all particle fields of a stage, in its order, in the frame of PLYs and cameras.
 
     Subsets of points come as ``instance_id``, where no primvar has that name.
 
@@ -210,23 +212,23 @@ def read_usd(path: Path, *, colour: bool = True) -> Fields:
 
 
 def _row_order(prims: Sequence[Any], count: int) -> np.ndarray | None:
-    """[P], places of the rows that were parted into prims; None where that is not known, or some are not there."""
-    found = [
+    """Return the order [P] that restores rows split into prims; None if it is unknown or rows are missing."""
+    stored_rows = [
         prim.GetAttribute(f"primvars:{ROW}").Get() if prim.HasAttribute(f"primvars:{ROW}") else None for prim in prims
     ]
-    rows = np.concatenate([np.array([] if one is None else one, np.int64) for one in found])
+    rows = np.concatenate([np.array([] if values is None else values, np.int64) for values in stored_rows])
     return np.argsort(rows) if len(rows) == count and len(np.unique(rows)) == count else None
 
 
 def read_usd_document(path: Path) -> dict[str, Any]:
-    """What the labels of a stage mean: our document, else the names of its subsets."""
+    """Read the document of a stage's labels: ours, else the names of its subsets."""
     pxr = open_library()
     stage = _stage(path)
     prim = _fields(stage, path)[0]
-    told = prim.GetCustomDataByKey(DOCUMENT)
-    if isinstance(told, str):
+    text = prim.GetCustomDataByKey(DOCUMENT)
+    if isinstance(text, str):
         try:
-            document = json.loads(told)
+            document = json.loads(text)
         except (ValueError, RecursionError):
             document = None
         if isinstance(document, dict):
@@ -248,24 +250,24 @@ def _stage(path: Path) -> Any:
 
 
 def _world(stage: Any) -> WorldFrame:
-    """What the layer says in our words, else what it has of the stage's metadata, in the frame of PLYs."""
-    pxr, told = open_library(), (stage.GetMetadata("customLayerData") or {}).get(WORLD)
-    if isinstance(told, str):
+    """Read our custom data of the layer, else the stage's metadata, in the frame of PLYs."""
+    pxr, text = open_library(), (stage.GetMetadata("customLayerData") or {}).get(WORLD)
+    if isinstance(text, str):
         try:
-            return world_of(json.loads(told))
+            return world_of(json.loads(text))
         except (ValueError, RecursionError):
             return UNKNOWN
-    known = {"up": UPRIGHT.up} if stage.HasAuthoredMetadata("upAxis") else {}
+    values = {"up": UPRIGHT.up} if stage.HasAuthoredMetadata("upAxis") else {}
     if pxr.UsdGeom.StageHasAuthoredMetersPerUnit(stage):
-        known["metres_per_unit"] = pxr.UsdGeom.GetStageMetersPerUnit(stage)
-    return world_of(known)
+        values["metres_per_unit"] = pxr.UsdGeom.GetStageMetersPerUnit(stage)
+    return world_of(values)
 
 
 def _fields(stage: Any, path: Path) -> list[Any]:
-    found = [prim for prim in stage.Traverse() if prim.GetTypeName() == FIELD]
-    if not found:
+    prims = [prim for prim in stage.Traverse() if prim.GetTypeName() == FIELD]
+    if not prims:
         raise InvalidSplats(str(path), expected=f"splats ({FIELD})", got="a scene without any", hint=HINT)
-    return found
+    return prims
 
 
 def _field(prim: Any, stage: Any, path: Path, *, colour: bool) -> Fields:
@@ -311,15 +313,15 @@ def _field(prim: Any, stage: Any, path: Path, *, colour: bool) -> Fields:
     rows = (degree + 1) ** 2
     terms = read(coefficients, 3 * rows).reshape(count, rows, 3).astype(np.float32)
     for band in range(degree + 1):
-        own = slice(band**2, (band + 1) ** 2)
-        terms[:, own] = np.einsum("ij,njc->nic", band_rotation(band, turn), terms[:, own])
+        band_rows = slice(band**2, (band + 1) ** 2)
+        terms[:, band_rows] = np.einsum("ij,njc->nic", band_rotation(band, turn), terms[:, band_rows])
     return fields | {"sh": terms, "extras": _extras(prim, count)}
 
 
 def _array(prim: Any, name: str, path: Path) -> np.ndarray:
-    """An attribute, or its half of less precision, as an array."""
-    for own in (name, f"{name}h"):
-        values = prim.GetAttribute(own).Get()
+    """Read an attribute, or its half-precision variant, as an array."""
+    for attribute in (name, f"{name}h"):
+        values = prim.GetAttribute(attribute).Get()
         if values is not None and len(values):
             return np.array(values)
     raise InvalidSplats(f"{path} {prim.GetPath()}", expected=f"values of {name}", got="none", hint=HINT)

@@ -92,7 +92,7 @@ BAD_TRANSFORMS = [
     ({"distortion_params": [0, 0, 0, 0, 0, "x"]}, r"distortion_params\[5\]: expected a finite number, got 'x'"),
     (
         {"k1": 0.1, "distortion_params": [0, 0, 0, 0, 0, 0.02]},
-        r"what the single parameters say, got k1 = 0\.1 and p2 = 0\.02",
+        r"values of the single parameters, got k1 = 0\.1 and p2 = 0\.02",
     ),
     (
         {"k1": 0.1, "frames": [{**GOOD_FRAME, "k1": 0}]},
