@@ -1,5 +1,5 @@
 # pyright: strict
-"""Take the things of a lift into other programs, each with the name of the nearest word.
+"""Export the objects of a lift for other programs, each named by the nearest word.
 
 python examples/exports.py scene.lift.safetensors words.safetensors out
 

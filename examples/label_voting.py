@@ -1,7 +1,7 @@
 # pyright: strict
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 # numpy, scipy and torch leave types of what they compute open
-"""Give each splat the class that most of its rays have, and say how sure that is; no encoder, no words.
+"""Give each splat the class that most of its rays have, with its share and entropy; no encoder is needed.
 
 python examples/label_voting.py scene.ply sparse/0 labels voted.ply
 
@@ -41,8 +41,8 @@ def main(splats_path: str, cameras_path: str, labels_path: str, out: str) -> Non
         "entropy": entropy.astype(np.float32),
     }
     lc.write_splats(out, splats, columns)
-    count, sure = int((total > 0).sum()), float(np.mean(columns["share"]))
-    print(f"{count} of {splats.count} splats have a class, with {sure:.2f} of their rays' weight on average")
+    count, share = int((total > 0).sum()), float(np.mean(columns["share"]))
+    print(f"{count} of {splats.count} splats have a class, with {share:.2f} of their rays' weight on average")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 # pyright: strict
-"""Lift features onto a scene, ask for a word, and write the masks of all views and the splats with their scores.
+"""Lift features onto a scene, query a word, and write the masks of all views and the splats with their scores.
 
 python examples/lift_and_mask.py scene.ply sparse/0 features.safetensors "a red mug" out
 """
@@ -22,7 +22,9 @@ def main(splats_path: str, cameras_path: str, features_path: str, word: str, out
     print(answer.explanation)
 
     masks = Path(out, "masks")
-    shares = lc.render(splats, cameras, answer.splats, normalise=True)  # of each ray's weight, what was found
+    shares = lc.render(
+        splats, cameras, answer.splats, normalise=True
+    )  # share of each ray's weight on selected splats
     for view, share in shares.items():
         picture = np.asarray(share > 0.5, dtype=np.uint8) * 255
         path = masks / f"{view}.png"

@@ -1,7 +1,7 @@
 # pyright: strict
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 # numpy, scipy and torch leave types of what they compute open
-"""Lift masks of a segmenter with a vector each, as SAM and CLIP give them, and export every thing that was found.
+"""Lift masks of a segmenter with a vector each, as SAM and CLIP give them, and export every object.
 
 python examples/sam_masks.py scene.ply sparse/0 masks things.zip
 
@@ -19,22 +19,22 @@ import liftcore as lc
 
 
 def views_of(folder: Path) -> Iterator[tuple[str, lc.Regions]]:
-    """Give one view after the other: the masks of all of them need not fit in memory."""
+    """Yield one view after the other, so that the masks of all views need not fit in memory."""
     for file in sorted(folder.glob("*.npz")):
         with np.load(file, allow_pickle=False) as arrays:
             yield file.stem, lc.Regions.from_masks(arrays["masks"], arrays["vectors"])
 
 
 def main(splats_path: str, cameras_path: str, masks_path: str, out: str) -> None:
-    """Write ``out``: a ``.zip`` of everything, or a ``.glb``, ``.ply``, ``.spz`` or ``.jsonl`` with labels."""
+    """Write ``out``: a ``.zip`` of all exports, or a ``.glb``, ``.ply``, ``.spz`` or ``.jsonl`` with labels."""
     splats, cameras = lc.read_splats(splats_path), lc.read_cameras(cameras_path)
     result = lc.lift(splats, cameras, views_of(Path(masks_path)))
     scene = result.scene(splats, cameras)
-    things = scene.catalogue()
-    print(things.explanation)
-    for thing in things.objects:
-        print(f"object {thing.id}: {thing.splats} splats about {', '.join(f'{c:.2f}' for c in thing.centre)}")
-    scene.export(out, things)
+    objects = scene.catalogue()
+    print(objects.explanation)
+    for item in objects.objects:
+        print(f"object {item.id}: {item.splats} splats about {', '.join(f'{c:.2f}' for c in item.centre)}")
+    scene.export(out, objects)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
 # pyright: strict
-"""Make a folder that another person opens: the lift with its splats and cameras, found again wherever it is put.
+"""Make a folder to share: the lift with its splats and cameras, which opens wherever the folder is moved.
 
 python examples/share_folder.py scene.ply sparse/0 features.safetensors shared
 
-Whoever has it runs ``splatlift view shared/lift.safetensors``, or opens it in Python as at the end.
+Others run ``splatlift view shared/lift.safetensors``, or open it in Python as at the end.
 """
 
 import sys

@@ -1,5 +1,5 @@
 # pyright: strict
-"""A text encoder of one's own, held to what splatlift asks of one: ``pytest examples/test_my_encoder.py``."""
+"""A custom text encoder, tested by splatlift's conformance suite: ``pytest examples/test_my_encoder.py``."""
 
 import hashlib
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from liftcore.text import check_texts
 
 
 class HashedLetters:
-    """Words as sums of random directions, one for each group of three letters: alike where they share some."""
+    """Words as sums of random directions, one for each group of three letters; shared groups make words similar."""
 
     name = "hashed letters"
     channels = 64

@@ -1,7 +1,7 @@
 # pyright: strict
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 # numpy, scipy and torch leave types of what they compute open
-"""Lift within a training loop: tensors as gsplat's trainer holds them, and a map of features a photo at a time.
+"""Lift within a training loop: tensors as gsplat's trainer has them, and one map of features a photo.
 
 python examples/training_loop.py
 """
@@ -19,7 +19,7 @@ VIEWS = 6
 
 
 def trained() -> dict[str, Tensor]:
-    """Two blobs, red and green, as parameters of a training: logarithms of scales, logits of opacities."""
+    """Return two blobs, red and green, as parameters of a training: logarithms of scales, logits of opacities."""
     noise = torch.Generator().manual_seed(0)
     side = torch.arange(400) % 2
     means = torch.randn(400, 3, generator=noise) * 0.15 + torch.stack([side * 1.2 - 0.6, side * 0, side * 0], 1)
@@ -35,7 +35,7 @@ def trained() -> dict[str, Tensor]:
 
 
 def poses() -> dict[str, lc.Camera]:
-    """Cameras on an arc before the blobs."""
+    """Return cameras on an arc in front of the blobs."""
     cameras: dict[str, lc.Camera] = {}
     K = torch.tensor([[80.0, 0, SIZE / 2], [0, 80, SIZE / 2], [0, 0, 1]])
     for number in range(VIEWS):
@@ -51,12 +51,12 @@ def poses() -> dict[str, lc.Camera]:
 
 
 def encode(photo: Tensor) -> Tensor:
-    """[h, w, 4] of a photo [H, W, 3]: in place of a network, its colour on every fourth pixel."""
+    """Return features [h, w, 4] of a photo [H, W, 3]; in place of a network, its colours at every fourth pixel."""
     return torch.cat([photo[::4, ::4], photo[::4, ::4].sum(2, keepdim=True)], 2)
 
 
 def main() -> None:
-    """Lift, and ask for what looks like the red blob."""
+    """Lift, and query the feature of the red blob."""
     parameters = trained()
     splats = lc.Splats.from_gsplat(**parameters, activated=False)  # pyright: ignore[reportArgumentType]
     cameras = poses()
@@ -64,15 +64,15 @@ def main() -> None:
 
     def features() -> Iterator[tuple[str, lc.FeatureGrid]]:  # one map in memory at a time
         for name, camera in cameras.items():
-            photo = lc.render(splats, camera, colours)  # a loop has the photo itself
+            photo = lc.render(splats, camera, colours)  # in a training loop, the real photo
             yield name, lc.FeatureGrid(encode(photo))
 
-    with torch.inference_mode():  # as loops are evaluated; the result is the same
+    with torch.inference_mode():  # as in evaluation; the result is the same
         result = lc.lift(splats, cameras, features())
     answer = result.query(encode(torch.tensor([[[1.0, 0.0, 0.0]]]))[0, 0])
     red = torch.arange(400) % 2 == 0
-    found, others = int((answer.splats & red).sum()), int((answer.splats & ~red).sum())
-    print(f"{found} of {int(red.sum())} red splats, {others} others")
+    correct, wrong = int((answer.splats & red).sum()), int((answer.splats & ~red).sum())
+    print(f"{correct} of {int(red.sum())} red splats, {wrong} others")
 
 
 if __name__ == "__main__":

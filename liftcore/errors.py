@@ -1,6 +1,6 @@
-"""Public: errors, of what can be wrong with what a user gives us::
+"""Public: errors that users can fix, with a message for them::
 
-    SplatliftError                 every error that is the user's to mend
+    SplatliftError                 every error that the user can fix
     ├── InvalidInput               a file or value is malformed      -> exit 2, HTTP 422
     │   ├── InvalidSplats
     │   ├── InvalidCameras
@@ -11,10 +11,10 @@
     │   ├── InvalidSettings
     │   └── InvalidQuery           (an unknown word, a view that is not there)
     │       └── InvalidTable       (the words themselves)
-    ├── NotFound                   a named thing does not exist      -> exit 2, HTTP 404
+    ├── NotFound                   a name does not exist             -> exit 2, HTTP 404
     └── Unavailable                a capability is missing here      -> exit 2, HTTP 422 (weights, encoders)
 
-Every error names the argument, what was expected and what came, and says what to try next.
+Every error names the argument, the expected value and the actual one, and says what to do.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ class SplatliftError(Exception):
     """An error whose message is written for the user.
 
     Args:
-        argument: the argument, file or field at fault, as the user knows it.
-        expected: what would have been right.
-        got: what came instead.
-        hint: what to try next; empty when the first three say it all.
-        nearest: of a word that cannot be asked, those that can be and are near to it, the likeliest first; None of
+        argument: the argument, file or field at fault, by the name that the user knows.
+        expected: a valid value.
+        got: the actual value.
+        hint: what to do; empty if the first three say it.
+        nearest: for an unknown word, known words near to it, the likeliest first; None for
             any other error.
     """
 
@@ -61,7 +61,7 @@ class SplatliftError(Exception):
         return " ".join(line.split())
 
     def __reduce__(self) -> tuple[object, tuple[object, ...]]:
-        # Errors cross process borders (jobs run in a child); keyword-only arguments need help there.
+        # Errors are pickled between processes (jobs run in a child), which keyword-only arguments prevent by default.
         return _rebuild, (type(self), self.argument, self.expected, self.got, self.hint, self.nearest)
 
 
@@ -98,7 +98,7 @@ class InvalidFeatures(InvalidInput):
 
 
 class InvalidMasks(InvalidInput):
-    """Masks to judge by, or their content, are malformed."""
+    """Masks of an evaluation, or their content, are malformed."""
 
     kind = "invalid-masks"
 
@@ -110,7 +110,7 @@ class InvalidPhotos(InvalidInput):
 
 
 class InvalidLift(InvalidInput):
-    """A lift file is malformed, or what it was made from moved or changed."""
+    """A lift file is malformed, or its inputs moved or changed."""
 
     kind = "invalid-lift"
 
@@ -134,7 +134,7 @@ class InvalidTable(InvalidQuery):
 
 
 class NotFound(SplatliftError, KeyError):
-    """A named thing does not exist; a KeyError, too, so that mappings may raise it."""
+    """A name does not exist; a KeyError too, so that mappings may raise it."""
 
     kind = "not-found"
 

@@ -1,4 +1,4 @@
-"""Public: files of any kind, and what their names mean, for programs that take files from others. Loads no torch.
+"""Public: kinds of files, and checks of their paths, for programs that receive files. Loads no torch.
 
 ``identify`` names the kind of a file, ``wrong_kind`` is the error for one in the place of another, ``check_output``
 looks at a path before the work that is to be written there.

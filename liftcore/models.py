@@ -1,4 +1,4 @@
-"""Public: what questions and bodies of requests are made of, for programs that serve them. Loads no torch."""
+"""Public: models of queries and of bodies of requests, for programs that serve them. Loads no torch."""
 
 from liftcore.query.edits import Edit
 from liftcore.query.question import (
