@@ -59,7 +59,7 @@ class WeightRequest:
 
     def weights(self, answer: ViewWeights) -> RegionWeights:
         """Return W of the view, with total weight scaled by the stride to all rays of the photo."""
-        part = self.codebook.counted(answer.weights)
+        part = self.codebook.weights_by_row(answer.weights)
         rays = float(self.request.params.stride**2)
         return replace(part, views=(self.request.camera.name,), total_weight=part.total_weight * rays)
 

@@ -34,10 +34,10 @@ from liftcore.solve.loss import huber_factors
 from liftcore.solve.mask_edges import weaken_edges
 from liftcore.solve.membership import Memberships, RegionGroups, memberships
 from liftcore.solve.objects import NodeVectors, RegionObjects, region_objects
-from liftcore.solve.reweight import Agreement, agreement_factors, reweighted, whole_regions
+from liftcore.solve.reweight import Reweighting, reweighting_factors, scale_weights, whole_regions
 from liftcore.solve.smooth import smooth
 from liftcore.solve.smooth_by_halves import choose_smoothness
-from liftcore.solve.sums import added
+from liftcore.solve.sums import sum_pieces
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import LiftSettings
@@ -56,7 +56,7 @@ class SceneWeights:
     sums: np.ndarray | None = None  # [P] f64, of the rows of W before reweighting; None: W is not reweighted
     threads: int | None = None  # None: the cores that this process may use
     consensus: Tensor | None = None  # [nnz] f32, until W is reweighted
-    agreement: Agreement | None = None
+    agreement: Reweighting | None = None
 
     @property
     def weights(self) -> RegionWeights:
@@ -84,7 +84,7 @@ class SceneWeights:
         Args:
             W: this W on the CPU.
         """
-        geometry = replace(self.geometry, weights=reweighted(W, factors))
+        geometry = replace(self.geometry, weights=scale_weights(W, factors))
         return replace(self, geometry=geometry, sums=self.row_sums())
 
 
@@ -133,7 +133,7 @@ class InMemory(LiftSteps[SceneWeights]):
 
     def node_vectors(self, W: SceneWeights, objects: RegionObjects) -> NodeVectors:
         codebook = W.geometry.codebook
-        totals = added(region_totals(W.on_processor, self.threads), (1, codebook.regions))[0]
+        totals = sum_pieces(region_totals(W.on_processor, self.threads), (1, codebook.regions))[0]
         return NodeVectors.of(codebook, totals, objects)
 
     def compare_masks(self, W: SceneWeights) -> SceneWeights:
@@ -143,7 +143,7 @@ class InMemory(LiftSteps[SceneWeights]):
 
     def reweight(self, W: SceneWeights, levels_apart: bool) -> tuple[SceneWeights, float | None]:
         def apply_agreement(weights: RegionWeights, on_card: bool) -> tuple[SceneWeights, float | None]:
-            agreement = agreement_factors(
+            agreement = reweighting_factors(
                 weights, W.geometry.codebook, self.settings.robust_steps, self.timings.progress,
                 principal=self.settings.robust_directions, means=self.splats.means, threads=self.threads,
                 reliability=whole_regions(self.settings.reliability, W.geometry.levels), consensus=W.consensus,
@@ -214,11 +214,11 @@ class InMemory(LiftSteps[SceneWeights]):
 
     def aggregate(self, W: SceneWeights, X: Tensor, clusters: RegionObjects | None) -> tuple[Tensor, Aggregation]:
         settings, agreement, consistency = self.settings, W.agreement, None
-        if settings.aggregation_guard and agreement and agreement.explained is not None:
-            consistency = W.on_processor, agreement.directions, agreement.explained
+        if settings.aggregation_guard and agreement and agreement.view_consistency is not None:
+            consistency = W.on_processor, agreement.directions, agreement.view_consistency
         X, aggregation = aggregate(
             X, W.geometry.total_weight().numpy(), self.splats, W.raster, W.views, settings, self.timings.progress,
-            self.threads, things=clusters, judged=consistency,
+            self.threads, objects=clusters, guard_inputs=consistency,
         )  # fmt: skip
         if not settings.aggregation_resolve:
             return X, aggregation

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
-from liftcore.raster import check_given
+from liftcore.raster import check_splats_and_threads
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
 from liftcore.solve.clusters import require_hdbscan
@@ -37,7 +37,7 @@ class LiftInputs:
     ) -> LiftInputs:
         """Check the arguments of `liftcore.lift`, and raise as it does."""
         lift_settings = LiftSettings.chosen(preset, settings)
-        splats = check_given(splats, threads)
+        splats = check_splats_and_threads(splats, threads)
         lift_settings, source_views = lift_settings.for_splats(splats), as_views(views)
         lifted = LiftViews.of(source_views, cameras, lift_settings)
         masks = lift_settings.aggregation and any(lifted.features.is_regions(name) for name in lifted.names)

@@ -14,10 +14,10 @@ from liftcore.lifting.geometry import weigh_views
 from liftcore.lifting.in_memory import InMemory, SceneWeights
 from liftcore.lifting.inputs import LiftInputs
 from liftcore.lifting.pipeline import find_objects, needs_separate_levels, reweigh
-from liftcore.raster import check_given, open_raster
+from liftcore.raster import check_splats_and_threads, open_raster
 from liftcore.runtime.device import choose_device
 from liftcore.runtime.progress import Progress, Timings, shown_progress
-from liftcore.runtime.torch_modes import callers_modes, usual_modes
+from liftcore.runtime.torch_modes import callers_modes, default_modes
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.compositing import CompositingParams, check_antialiased
 from liftcore.scene.splats import Splats, shared_tensor
@@ -49,7 +49,7 @@ def render(
     device: str | torch.device = "auto",
     threads: int | None = None,
 ) -> dict[str, Tensor]: ...
-@usual_modes()
+@default_modes()
 def render(
     splats: Splats,
     camera: Camera | Mapping[str, Camera],
@@ -80,7 +80,7 @@ def render(
             number.
         Unavailable: the device does not exist.
     """
-    splats = check_given(splats, threads)
+    splats = check_splats_and_threads(splats, threads)
     params = CompositingParams(antialiased=splats.antialiased) if params is None else params
     if not isinstance(params, CompositingParams):
         raise InvalidSettings("params", expected="CompositingParams, or None", got=repr(params)[:80])
@@ -137,7 +137,7 @@ def _refuse_gradients(values: Tensor | np.ndarray) -> None:
         raise InvalidSettings("values", expected="numbers without a gradient", got="requires_grad=True", hint=hint)
 
 
-@usual_modes()
+@default_modes()
 def region_weights(
     splats: Splats,
     cameras: Cameras | Mapping[str, Camera],

@@ -24,12 +24,12 @@ from liftcore.query.result import LiftResult
 from liftcore.runtime.device import choose_device, within_memory
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, Timings, shown_progress
-from liftcore.runtime.torch_modes import usual_modes
+from liftcore.runtime.torch_modes import default_modes
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
 from liftcore.solve.diagnostics import ViewMeasures, certify, lift_warnings
 from liftcore.solve.objects import NodeVectors, RegionObjects, object_facts
-from liftcore.solve.reweight import agreement_facts
+from liftcore.solve.reweight import reweighting_facts
 from liftcore.values.lift_options import LiftOptions
 from liftcore.values.lift_views import Given
 from liftcore.values.settings import LiftSettings, Preset
@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 MIN_LEVEL_VIEWS = 6  # for separate levels: 4 views lost a word of a small scene, 8 gained; 5 to 7 are untested
 
 
-@usual_modes()
+@default_modes()
 def lift(
     splats: Splats,
     cameras: Cameras | Mapping[str, Camera],
@@ -150,7 +150,7 @@ def _run(
             X, aggregation = steps.aggregate(W, X, clusters)
         facts["aggregation"] = aggregation.facts
     if settings.robust_steps:
-        facts["reweighting"] = agreement_facts(statistics.levels, reliability, support.confidence, levels_apart)
+        facts["reweighting"] = reweighting_facts(statistics.levels, reliability, support.confidence, levels_apart)
     if objects and node_vectors and settings.objects:
         facts["objects"] = object_facts(objects, node_vectors)
     with timings.step("certify"):
@@ -254,7 +254,7 @@ def diagnose(
     return certify(measures, support.sums, support.total_weight, settings) | dict(steps) | facts
 
 
-@usual_modes()
+@default_modes()
 def plan(
     splats: Splats,
     cameras: Cameras | Mapping[str, Camera],

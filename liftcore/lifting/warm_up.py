@@ -8,14 +8,14 @@ import numpy as np
 import torch
 
 from liftcore.raster.cpu.warm_up import warm_up
-from liftcore.solve.aggregate import explained_by
+from liftcore.solve.aggregate import cluster_consistency
 from liftcore.solve.closed_form import solve
 from liftcore.solve.codebook import Codebook, ViewCodebook
 from liftcore.solve.consensus import mask_consensus
 from liftcore.solve.directions import RegionDirections
 from liftcore.solve.loss import huber_factors
 from liftcore.solve.objects import region_objects
-from liftcore.solve.reweight import agreement_factors
+from liftcore.solve.reweight import reweighting_factors
 from liftcore.solve.smooth import warm_up_smoothing
 from liftcore.values.region_weights import one_view
 
@@ -37,10 +37,10 @@ def warm_up_lift(kernel: Kernel, device: Device, settings: LiftSettings) -> None
     if settings.consensus:
         mask_consensus(W, np.zeros(1, np.int8), 1)
     if settings.reliability:
-        agreement_factors(W, book, 1, principal=1, threads=1, reliability=torch.ones(1, dtype=torch.bool))
+        reweighting_factors(W, book, 1, principal=1, threads=1, reliability=torch.ones(1, dtype=torch.bool))
     if settings.loss == "huber":
         huber_factors(W, book, threads=1)
     if settings.smoothness:
         warm_up_smoothing()
     if settings.aggregation:
-        explained_by(W, RegionDirections.of_weights(W, book, 1), first, unit[None], 1)
+        cluster_consistency(W, RegionDirections.of_weights(W, book, 1), first, unit[None], 1)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from liftcore.errors import InvalidLift, InvalidSettings
 from liftcore.runtime.memory import free_memory, zeros
 from liftcore.runtime.progress import Progress, silent
-from liftcore.runtime.torch_modes import usual_modes
+from liftcore.runtime.torch_modes import default_modes
 from liftcore.scene.neighbours import SplatGraph
 from liftcore.solve.smooth import smooth
 from liftcore.values.settings import LiftSettings
@@ -24,7 +24,7 @@ OF_FEATURES = ("residual", "surrogate", "beta", "bound")  # of the certificate: 
 MEMORY_SHARE = 0.5  # of the free memory: larger features are held in a mapped file
 
 
-@usual_modes()
+@default_modes()
 def refine(
     lift: AnyLift, splats: Splats, smoothness: float, progress: Progress = silent, threads: int | None = None
 ) -> AnyLift:

@@ -24,7 +24,7 @@ import torch
 
 from liftcore.errors import InvalidSplats
 from liftcore.runtime.progress import Progress, silent
-from liftcore.runtime.torch_modes import usual_modes
+from liftcore.runtime.torch_modes import default_modes
 from liftcore.scene.neighbours import COLOUR_WIDTH, base_colours, set_apart
 from liftcore.scene.quaternions import rotation_matrices
 from liftcore.scene.registration import find_similarity
@@ -50,7 +50,7 @@ _BLOCK = 1 << 12  # new splats at once: [n, 16, F] features in f32
 _VALUES = ("agreement", "confidence")
 
 
-@usual_modes()
+@default_modes()
 def transfer(lift: AnyLift, old: Splats, new: Splats, matrix: Any = None, progress: Progress = silent) -> AnyLift:
     """Take a lift's features, total weight, clusters and objects to another set of splats of its scene.
 

@@ -1,4 +1,4 @@
-"""A, one view at a time: projection, depth order, compositing; and the reference that every backend is held to."""
+"""Rasterization of A, one view at a time: projection, depth order, compositing; and the float64 reference."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
 
 
-def open_raster(splats: Splats, device: Device, threads: int | None = None, kept: int = 0) -> Raster:
-    """A for one scene, on the device: compiled kernels on the CPU, Triton's on a card.
+def open_raster(splats: Splats, device: Device, threads: int | None = None, resident_bytes: int = 0) -> Raster:
+    """Return A for one scene on the device: numba kernels on the CPU, Triton kernels on a GPU.
 
     Args:
-        threads: of the CPU; None takes the cores that this process may use. The number changes no bit.
-        kept: bytes of region weights that stay on a card beside the views at work; 0 brings them back.
+        threads: CPU threads; None uses the cores that this process may use. The result is bitwise identical for any.
+        resident_bytes: region weights that may stay in GPU memory during the views; 0 copies them to the CPU.
     """
     if device.kind == "cpu":
         from liftcore.raster.cpu.raster import CpuRaster  # loads numba
@@ -26,20 +26,20 @@ def open_raster(splats: Splats, device: Device, threads: int | None = None, kept
         return CpuRaster(splats, threads)
     from liftcore.raster.gpu.raster import GpuRaster  # loads triton
 
-    return GpuRaster(splats, device.place, stays=kept > 0)
+    return GpuRaster(splats, device.place, stays=resident_bytes > 0)
 
 
-def check_given(splats: Splats, threads: int | None) -> Splats:
-    """What callers of the library give to every call that rasterizes; the splats come back on the CPU.
+def check_splats_and_threads(splats: Splats, threads: int | None) -> Splats:
+    """Check the arguments that every rasterizing call of the library shares, and return the splats on the CPU.
 
     Raises:
-        InvalidSplats: the splats are something else, such as a path.
-        InvalidSettings: threads are no whole number of one or more, and not None.
+        InvalidSplats: ``splats`` are of another type, such as a path.
+        InvalidSettings: ``threads`` is neither None nor an integer of at least one.
     """
     from liftcore.scene.splats import Splats  # loads torch
 
     if not isinstance(splats, Splats):
-        got, hint = f"{type(splats).__name__} {splats!r}"[:80], "read_splats(path) makes them of a file"
+        got, hint = f"{type(splats).__name__} {splats!r}"[:80], "read a file with read_splats(path)"
         raise InvalidSplats("splats", expected="Splats", got=got, hint=hint)
     check_count("threads", threads, "all cores")
     return splats.cpu()

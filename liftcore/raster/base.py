@@ -1,4 +1,4 @@
-"""What a raster backend offers: the uses of A, view by view, and the values that it takes and gives."""
+"""The protocol of raster backends: products with A, view by view, their arguments and results."""
 
 from __future__ import annotations
 
@@ -32,94 +32,98 @@ class RayRows:
 
 @dataclass(frozen=True)
 class ViewRequest:
-    """What a lift asks of one view."""
+    """One view to rasterize: camera, observation, compositing parameters, weighting, and rays for the diagnostics."""
 
     camera: Camera
     observation: ViewFeatures
     params: CompositingParams
     weighting: Weighting
-    pixels: Tensor  # [n, 2] i32 (x, y), whose rows of A are asked for
+    pixels: Tensor  # [n, 2] i32 (x, y), whose rows of A are returned
 
 
 @dataclass(frozen=True)
 class ViewWeights:
-    """What a lift learns of one view."""
+    """The region weights of one view, and the rows of A of the requested rays."""
 
     weights: RegionWeights
     rows: RayRows
 
 
 class Raster(Protocol):
-    """A for one scene. Every product is deterministic to the bit, whatever the number of threads."""
+    """A for one scene. Every product is bitwise identical for any number of threads."""
 
     splats: Splats
 
     def region_weights(
         self, camera: Camera, observation: ViewFeatures, params: CompositingParams, weighting: Weighting
     ) -> RegionWeights:
-        """``A'^T S`` of a view and the total weight of plain weights, over the rays that the stride leaves."""
+        """Return ``A'^T S`` of a view and the total weight of unscaled weights, over the rays of the stride."""
         ...
 
     def iterate_views(self, requests: Iterable[ViewRequest]) -> Generator[ViewWeights]:
-        """``region_weights`` and ``ray_rows`` of many views, in their order.
+        """Yield ``region_weights`` and ``ray_rows`` of many views, in their order.
 
-        A request may be taken before the views ahead of it are done, and several views may be in work at a time. An
-        error of a request or of its view ends the iterator. No view is kept at its end: the solution has the memory.
+        A request may be read before earlier views are finished, and several views may be processed at a time. An
+        error of a request or of its view ends the iterator. No view is cached at its end, so the solver has the
+        memory.
         """
         ...
 
     def render(self, camera: Camera, values: Tensor, params: CompositingParams) -> Tensor:
-        """``A X``: values [P, F] f32 -> [H, W, F] f32, background zero, not divided by the row sum; never strided."""
+        """Return ``A X``: values [P, F] f32 -> [H, W, F] f32, background zero, not normalised by the row sum.
+
+        Never strided.
+        """
         ...
 
     def adjoint(self, camera: Camera, values: Tensor, params: CompositingParams) -> Tensor:
-        """``A^T Y``: values [H, W, C] f32 -> [P, C] f32, the transpose of the render; never strided."""
+        """Return ``A^T Y``: values [H, W, C] f32 -> [P, C] f32, the transpose of the render; never strided."""
         ...
 
     def row_sums(self, camera: Camera, params: CompositingParams) -> Tensor:
-        """``A 1``: [H, W] f32 (Property 2)."""
+        """Return ``A 1``: [H, W] f32 (Property 2)."""
         ...
 
     def strongest_labels(self, camera: Camera, labels: Tensor, params: CompositingParams) -> Tensor:
-        """``argmax(A onehot(labels))``: labels [P] i32 in -1..K - 1 -> [H, W] i32.
+        """Return ``argmax(A onehot(labels))``: labels [P] i32 in -1..K - 1 -> [H, W] i32.
 
-        Label -1 is a class like the others; rays that miss the scene get -1 too. Equal sums go to the smallest label.
+        Label -1 is a class like the others; rays that miss the scene get -1 too. Ties go to the smallest label.
         """
         ...
 
     def ray_rows(self, camera: Camera, pixels: Tensor, params: CompositingParams) -> RayRows:
-        """Rows of A for the rays of pixels [n, 2] i32 (x, y) of the full view, whatever the stride."""
+        """Return the rows of A for the rays of pixels [n, 2] i32 (x, y) of the full view, for any stride."""
         ...
 
     def footprints(self, camera: Camera, params: CompositingParams) -> Tensor:
-        """Areas [P] f32 that splats may show in the whole view, px^2, at most the image's, before occlusion.
+        """Return the projected area [P] f32 of each splat in the full view, px^2, before occlusion.
 
-        That of the upright ellipse which spans the same box as the splat's outline, with the opacity's scale and
-        without it; zero where no ray of the view can meet the splat.
+        It is the area of the upright ellipse in the bounding box of the splat's outline, where the outline covers
+        scaled and unscaled opacities; at most the image's area, and zero where no ray of the view can hit the splat.
         """
         ...
 
     def forget(self) -> None:
-        """Drop what is kept of the last view for its next product."""
+        """Drop the cached projection of the last view."""
         ...
 
 
-# What every backend asks of its arguments, in one set of words.
+# Checks of arguments, shared by all backends.
 
 
 def check_params(kernel: Kernel, camera: Camera, params: CompositingParams) -> None:
-    """Refuse a stride that leaves no pixel, and compensation where it has no meaning.
+    """Refuse a stride that leaves no pixel, and antialiasing of a kernel that has none.
 
     Raises:
-        InvalidInput: a stride below one, or a first pixel outside its cell or the image.
-        InvalidSettings: antialiased splats that are no 3D Gaussians.
+        InvalidInput: the stride is below one, or the offset lies outside the stride's cell or the image.
+        InvalidSettings: antialiased is set for a kernel other than 3D Gaussians.
     """
     check_antialiased(kernel, params.antialiased)
     sides = (camera.width, camera.height)
     if params.stride < 1:
         raise InvalidInput("stride", expected="at least 1", got=str(params.stride))
     if not all(0 <= first < min(params.stride, side) for first, side in zip(params.offset, sides, strict=True)):
-        expected = f"a pixel of the image below the stride {params.stride}"
+        expected = f"a pixel (x, y) of the image, each below the stride {params.stride}"
         raise InvalidInput("offset", expected=expected, got=str(params.offset))
 
 
@@ -144,7 +148,7 @@ def check_labels(labels: Tensor, splats: int) -> None:
 
 
 def strided_places(params: CompositingParams, pixels: Tensor) -> Tensor | None:
-    """The pixels [n, 2] (x, y) as pixels of the strided view; None when some are not among its rays."""
+    """Return the pixels [n, 2] (x, y) as pixels of the strided view; None if any is not among its rays."""
     if params.stride == 1:
         return pixels
     steps = pixels - pixels.new_tensor(params.offset)

@@ -1,8 +1,7 @@
-"""The plain float64 rasterizer that every fast path is held to, in one file, nothing shared but the constants.
+"""The float64 reference rasterizer to which every fast path is compared; it shares only constants with them.
 
-Read it beside the paper: for each splat its footprint, written as it is defined; for each ray the compositing of
-Eq. 1, one splat after the other; and A [rays, splats] written out as a dense matrix. It is slow and needs R x P
-memory; use it on small scenes.
+Read it beside the paper: for each splat its footprint as defined; for each ray the compositing of Eq. 1, splat by
+splat; and A [rays, splats] as a dense matrix. It is slow and needs R x P memory; use it on small scenes.
 """
 
 from __future__ import annotations
@@ -40,39 +39,39 @@ if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera
     from liftcore.scene.splats import Splats
 
-CUT_BAND = 1e-4  # relative distance to a cut-off within which float32 may decide otherwise
-EDGE_BAND = 1e-4  # relative on weights, pixels on centres: nearer to a decision, float32 may decide otherwise
-_HORIZON_BAND = 1e-6  # of a disc's horizon, in the centre's depth over the crossing's
+CUT_BAND = 1e-4  # relative distance to a cut-off within which float32 may fall on its other side
+EDGE_BAND = 1e-4  # the same for selections: relative for weights, pixels for centres
+_HORIZON_BAND = 1e-6  # around a disc's horizon, in depth of the centre / depth of the crossing
 _SUPPORT_BAND = 1e-5  # of sigma = 1
 _STEEPEST = 16.0  # d alpha / d log(sigma) from which the rounding of sigma to float32 shows in the fifth digit
 
 
 def camera_axes(splats: Splats, j: int, camera: Camera) -> np.ndarray:
-    """[3, K] f64, the scaled axes of splat j in the camera's frame: three, or two for 2DGS.
+    """Return the scaled axes [3, K] f64 of splat j in the camera's frame: K = 3, or 2 for 2DGS.
 
-    A scale of zero is the limit of small ones: a disc that has become a line keeps its plane.
+    A scale of zero is the limit of small scales: a disc that degenerates to a line keeps its plane.
     """
     scales = np.exp(splats.log_scales[j].double().numpy().clip(min=-MAX_LOG_SCALE))
     return camera.viewmat[:3, :3] @ rotation_matrices(splats.quats[j].numpy())[:, : len(scales)] * scales
 
 
 def camera_mean(splats: Splats, j: int, camera: Camera) -> np.ndarray:
-    """[3] f64, the centre of splat j in the camera's frame."""
+    """Return the centre [3] f64 of splat j in the camera's frame."""
     pose = camera.about(splats.origin).viewmat
     return pose[:3, :3] @ splats.means[j].double().numpy() + pose[:3, 3]
 
 
 def camera_depths(splats: Splats, camera: Camera) -> np.ndarray:
-    """[P] f64, the depths of the splats' centres along the camera's axis."""
+    """Return the depths [P] f64 of the splats' centres along the camera's axis."""
     axis = camera.about(splats.origin).viewmat[2]
     return splats.means.double().numpy() @ axis[:3] + axis[3]
 
 
 def projected_gaussian(splats: Splats, j: int, camera: Camera) -> tuple[np.ndarray, np.ndarray, float]:
-    """Mean [2] in pixels, conic [2, 2] and opacity compensation of splat j (EWA: cov = J W Sigma W^T J^T + 0.3 I).
+    """Return the mean [2] in pixels, conic [2, 2] and opacity compensation of splat j.
 
-    The determinant is a sum of squares over pairs of axes (Cauchy-Binet), for products of long axes cancel. The
-    compensation is ``sqrt(det(cov) / det(cov + 0.3 I))``.
+    EWA: cov = J W Sigma W^T J^T + 0.3 I. The determinant is a sum of squares over pairs of axes (Cauchy-Binet), as
+    products of long axes cancel. The compensation is ``sqrt(det(cov) / det(cov + 0.3 I))``.
     """
     x, y, z = camera_mean(splats, j, camera)
     mean = np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
@@ -83,17 +82,20 @@ def projected_gaussian(splats: Splats, j: int, camera: Camera) -> tuple[np.ndarr
     J = np.array([[camera.fx / z, 0, -camera.fx * u / z], [0, camera.fy / z, -camera.fy * v / z]])
     L = J @ camera_axes(splats, j, camera)
     cov = L @ L.T
-    own = sum(np.linalg.det(L[:, [first, second]]) ** 2 for first, second in ((0, 1), (0, 2), (1, 2)))
-    det = own + LOW_PASS * (cov[0, 0] + cov[1, 1]) + LOW_PASS**2
+    det_sharp = sum(np.linalg.det(L[:, [first, second]]) ** 2 for first, second in ((0, 1), (0, 2), (1, 2)))
+    det = det_sharp + LOW_PASS * (cov[0, 0] + cov[1, 1]) + LOW_PASS**2
     cov += LOW_PASS * np.eye(2)
     conic = np.array([[cov[1, 1], -cov[0, 1]], [-cov[0, 1], cov[0, 0]]]) / det
-    return mean, conic, float(np.sqrt(own / det))
+    return mean, conic, float(np.sqrt(det_sharp / det))
 
 
 def alphas(
     splats: Splats, j: int, camera: Camera, params: CompositingParams, pixels: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Alpha of splat j on rays through ``pixels`` [R, 2], before the cap, and the rays [R] hard to decide."""
+    """Return alpha [R] of splat j on rays through ``pixels`` [R, 2], before the cap, and its ambiguous rays [R] bool.
+
+    A ray is ambiguous where float32 may fall on the other side of a cut-off.
+    """
     opacity = 1 / (1 + np.exp(-params.opacity_logit_scale * float(splats.opacity_logits[j])))
     if splats.kernel is Kernel.GAUSSIAN_2D:
         g, hard = disc_exponents(splats, j, camera, pixels)
@@ -110,11 +112,11 @@ def alphas(
 
 
 def disc_exponents(splats: Splats, j: int, camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """``g = min(s^2 + t^2, 2 |p - mu|^2)`` [R] of disc j, and the rays [R] near its horizon.
+    """Return ``g = min(s^2 + t^2, 2 |p - mu|^2)`` [R] of disc j, and the rays [R] bool near its horizon.
 
     ``h_u = p_x w - u``, ``h_v = p_y w - v``, ``z = h_u x h_v``, ``s = z_x / z_z``, ``t = z_y / z_z``, with the rows
-    u, v, w of the homography from (s, t, 1) to the image. A crossing counts where it lies before the camera, and on
-    no ray when the disc is seen edge-on.
+    u, v, w of the homography from (s, t, 1) to the image. A crossing must lie in front of the camera; a disc seen
+    edge-on has none.
     """
     axes, centre = camera_axes(splats, j, camera), camera_mean(splats, j, camera)
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
@@ -140,9 +142,9 @@ def _above_the_floor(raw: np.ndarray, hard: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def _beta_kernel(opacity: float, sigma: np.ndarray, beta: float) -> tuple[np.ndarray, np.ndarray]:
-    """``o (1 - sigma)^beta`` where sigma < 1, and the rays at a steep end or a jump of it: hard to decide.
+    """Return ``o (1 - sigma)^beta`` where sigma < 1, and the ambiguous rays: where it is steep or has a jump.
 
-    Powers below the smallest that float32 holds count as none, in every backend.
+    Values below the smallest normal float32 are zero in every backend.
     """
     inside = sigma < 1
     within = np.where(inside, sigma, 0.0)
@@ -157,16 +159,17 @@ def _beta_kernel(opacity: float, sigma: np.ndarray, beta: float) -> tuple[np.nda
 
 @dataclass(frozen=True)
 class DenseView:
-    """A of one view, and the rays whose value hangs on a knife's edge."""
+    """A of one view, and the ambiguous rays, on which float32 may fall on the other side of a cut-off."""
 
     A: np.ndarray  # [H * W, P] f64, row i = y * W + x
     cut: np.ndarray  # [H * W] bool: some alpha or T of the ray lies within CUT_BAND of its cut-off
 
 
 def dense_view(splats: Splats, camera: Camera, params: CompositingParams) -> DenseView:
-    """A of one view (paper Eq. 1): ``w = alpha T``, front to back, with the field's cut-offs.
+    """Return A of one view (paper Eq. 1): ``w = alpha T``, front to back, with the usual cut-offs of 3DGS.
 
-    The order is by camera depth rounded to float32, ties by row; the stop is exclusive.
+    Splats are sorted by camera depth rounded to float32, ties by row. A splat that would bring T to the stop or
+    below has no weight.
     """
     check_antialiased(splats.kernel, params.antialiased)
     y, x = np.mgrid[: camera.height, : camera.width]
@@ -176,25 +179,25 @@ def dense_view(splats: Splats, camera: Camera, params: CompositingParams) -> Den
     A = np.zeros((rays, splats.count))
     cut = np.zeros(rays, bool)
     T = np.ones(rays)
-    done = np.zeros(rays, bool)
+    is_done = np.zeros(rays, bool)
     for j in np.argsort(z.astype(np.float32), kind="stable"):
         if z[j] < NEAR_PLANE:
             continue
         raw, hard = alphas(splats, int(j), camera, params, pixels)
         alpha = np.minimum(raw, params.alpha_cap)
         after = T * (1 - alpha)
-        stops = (after <= params.transmittance_stop) & ~done
-        cut |= ~done & hard
+        stops = (after <= params.transmittance_stop) & ~is_done
+        cut |= ~is_done & hard
         if params.transmittance_stop > 0:
-            cut |= ~done & (alpha > 0) & (np.abs(after / params.transmittance_stop - 1) < CUT_BAND)
-        done |= stops
-        A[:, j] = np.where(done, 0.0, alpha * T)
-        T = np.where(done, T, after)
+            cut |= ~is_done & (alpha > 0) & (np.abs(after / params.transmittance_stop - 1) < CUT_BAND)
+        is_done |= stops
+        A[:, j] = np.where(is_done, 0.0, alpha * T)
+        T = np.where(is_done, T, after)
     return DenseView(A, cut)
 
 
 def reading_matrix(observation: ViewFeatures, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """S [rows, M] f64 and the ray of every row [rows]: one row a labelled level and ray, or one a ray for grids."""
+    """Return S [rows, M] f64 and the ray [rows] of each row: a row per ray and labelled level, per ray for grids."""
     rays = np.arange(width * height)
     x, y = rays % width, rays // width
     if isinstance(observation, Regions):
@@ -218,19 +221,19 @@ def reading_matrix(observation: ViewFeatures, width: int, height: int) -> tuple[
     return S, rays
 
 
-def counted_weights(
+def selected_weights(
     A: np.ndarray, splats: Splats, camera: Camera, params: CompositingParams, weighting: Weighting
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A' [H * W, P], the weights of A [H * W, P] that count, to their power; and the rays [H * W] hard to decide."""
+    """Return A' [H * W, P], the selected weights of A to their power, and the ambiguous rays [H * W] bool."""
     depths = camera_depths(splats, camera)
     order = np.argsort(depths.astype(np.float32), kind="stable")
     w = A[:, order]  # near to far
     if weighting.selection is Selection.TOP_K:
         counts, cut = _largest(w, weighting.count)
     elif weighting.selection is Selection.FRONT_MASS:
-        taken = np.cumsum(w, axis=1) - w  # 1 - T before the splat
-        counts = taken < weighting.mass
-        cut = ((np.abs(taken - weighting.mass) < EDGE_BAND) & (w > 0)).any(axis=1)
+        opacity_in_front = np.cumsum(w, axis=1) - w  # 1 - T before the splat
+        counts = opacity_in_front < weighting.mass
+        cut = ((np.abs(opacity_in_front - weighting.mass) < EDGE_BAND) & (w > 0)).any(axis=1)
     elif weighting.selection is Selection.CENTRE:
         counts, cut = (part[:, order] for part in _centres(A, splats, camera, params))
         cut = cut.any(axis=1)
@@ -238,20 +241,20 @@ def counted_weights(
         counts, cut = np.ones_like(w, bool), np.zeros(w.shape[0], bool)
     counts &= (w > 0) & (w >= weighting.floor)
     cut = cut | (np.abs(w - weighting.floor) < EDGE_BAND * weighting.floor).any(axis=1)
-    chosen = np.zeros_like(A)
-    chosen[:, order] = np.where(counts, w**weighting.power, 0.0)
-    return chosen, np.asarray(cut)
+    selected = np.zeros_like(A)
+    selected[:, order] = np.where(counts, w**weighting.power, 0.0)
+    return selected, np.asarray(cut)
 
 
 def strided_rays(camera: Camera, params: CompositingParams) -> np.ndarray:
-    """[H * W] bool, the rays that the stride leaves."""
+    """Return the rays of the stride as a mask [H * W] bool."""
     y, x = np.mgrid[: camera.height, : camera.width]
     left, top = params.offset
     return (((x - left) % params.stride == 0) & ((y - top) % params.stride == 0)).ravel()
 
 
 def _largest(w: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """The k largest of every row, of equal ones the first; and the rows whose k-th and next are too close to call."""
+    """Return a mask of the k largest of each row, the first of ties; and the rows whose k-th is nearly tied."""
     order = np.argsort(-w, axis=1, kind="stable")
     counts = np.zeros_like(w, bool)
     np.put_along_axis(counts, order[:, :k], values=True, axis=1)
@@ -264,7 +267,7 @@ def _largest(w: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
 def _centres(
     A: np.ndarray, splats: Splats, camera: Camera, params: CompositingParams
 ) -> tuple[np.ndarray, np.ndarray]:
-    """[H * W, P] bool: the strided ray nearest to the splat's projected centre; and rays of centres near a border."""
+    """Return masks [H * W, P]: the strided ray nearest to each centre, and the rays of centres near a border."""
     counts, cut = np.zeros_like(A, bool), np.zeros_like(A, bool)
     pose = camera.about(splats.origin).viewmat
     for j, mean in enumerate(splats.means.double().numpy()):
@@ -290,68 +293,70 @@ class ReferenceRaster:
     def region_weights(
         self, camera: Camera, observation: ViewFeatures, params: CompositingParams, weighting: Weighting
     ) -> RegionWeights:
-        """``A'^T S`` by dense products, and the total weight of plain weights."""
+        """Return ``A'^T S`` by dense products, and the total weight of unscaled weights."""
         S, ray = reading_matrix(observation, camera.width, camera.height)
         A = dense_view(self.splats, camera, params).A
         strided = strided_rays(camera, params)
-        chosen = counted_weights(A, self.splats, camera, params, weighting)[0]
-        W = chosen[ray[strided[ray]]].T @ S[strided[ray]]
-        plain = dense_view(self.splats, camera, replace(params, opacity_logit_scale=1.0)).A[strided].sum(axis=0)
+        selected = selected_weights(A, self.splats, camera, params, weighting)[0]
+        W = selected[ray[strided[ray]]].T @ S[strided[ray]]
+        total_weight = (
+            dense_view(self.splats, camera, replace(params, opacity_logit_scale=1.0)).A[strided].sum(axis=0)
+        )
         rows, columns = np.nonzero(W)
         splats, counts = np.unique(rows, return_counts=True)
-        met = np.flatnonzero(plain)
+        hit_splats = np.flatnonzero(total_weight)
         return one_view(
             torch.from_numpy(splats.astype(np.int32)),
             torch.from_numpy(np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)),
             torch.from_numpy(columns.astype(np.int32)),
             torch.from_numpy(W[rows, columns].astype(np.float32)),
-            torch.from_numpy(met.astype(np.int32)),
-            torch.from_numpy(plain[met].astype(np.float32)),
+            torch.from_numpy(hit_splats.astype(np.int32)),
+            torch.from_numpy(total_weight[hit_splats].astype(np.float32)),
             regions=observation.codebook.shape[0],
         )
 
     def iterate_views(self, requests: Iterable[ViewRequest]) -> Generator[ViewWeights]:
-        """``region_weights`` and ``ray_rows`` of views, one at a time."""
-        for one in requests:
-            weights = self.region_weights(one.camera, one.observation, one.params, one.weighting)
-            yield ViewWeights(weights, self.ray_rows(one.camera, one.pixels, one.params))
+        """Yield ``region_weights`` and ``ray_rows`` of views, one at a time."""
+        for request in requests:
+            weights = self.region_weights(request.camera, request.observation, request.params, request.weighting)
+            yield ViewWeights(weights, self.ray_rows(request.camera, request.pixels, request.params))
 
     def render(self, camera: Camera, values: Tensor, params: CompositingParams) -> Tensor:
-        """``A X`` by a dense product."""
+        """Return ``A X`` by a dense product."""
         image = dense_view(self.splats, camera, params).A @ values.double().numpy()
         return torch.from_numpy(image.astype(np.float32)).reshape(camera.height, camera.width, -1)
 
     def adjoint(self, camera: Camera, values: Tensor, params: CompositingParams) -> Tensor:
-        """``A^T Y`` by a dense product."""
+        """Return ``A^T Y`` by a dense product."""
         Y = values.double().numpy().reshape(camera.height * camera.width, -1)
         return torch.from_numpy((dense_view(self.splats, camera, params).A.T @ Y).astype(np.float32))
 
     def row_sums(self, camera: Camera, params: CompositingParams) -> Tensor:
-        """``A 1``."""
+        """Return ``A 1``."""
         return self.render(camera, torch.ones(self.splats.count, 1, dtype=torch.float32), params)[:, :, 0]
 
     def strongest_labels(self, camera: Camera, labels: Tensor, params: CompositingParams) -> Tensor:
-        """``argmax(A Gamma) - 1`` with the one-hot matrix Gamma [P, K + 1] written out, its first column for -1."""
+        """Return ``argmax(A Gamma) - 1`` with a dense one-hot matrix Gamma [P, K + 1], its first column for -1."""
         onehot = np.eye(int(labels.max()) + 2)[labels.numpy() + 1]
         sums = dense_view(self.splats, camera, params).A @ onehot
         return torch.from_numpy(sums.argmax(axis=1).astype(np.int32) - 1).reshape(camera.height, camera.width)
 
     def footprints(self, camera: Camera, params: CompositingParams) -> Tensor:
-        """Pixels whose ray a splat has an alpha on, whatever lies before it."""
+        """Count the pixels on whose ray a splat has an alpha, before occlusion."""
         y, x = np.mgrid[: camera.height, : camera.width]
         pixels = np.stack([x.ravel() + 0.5, y.ravel() + 0.5], axis=1)
         z = camera_depths(self.splats, camera)
-        ahead = (int(j) for j in np.flatnonzero(z >= NEAR_PLANE))
+        in_front = (int(j) for j in np.flatnonzero(z >= NEAR_PLANE))
         areas = np.zeros(self.splats.count, np.float32)
-        for j in ahead:
+        for j in in_front:
             areas[j] = np.count_nonzero(alphas(self.splats, j, camera, params, pixels)[0])
         return torch.from_numpy(areas)
 
     def forget(self) -> None:
-        """Nothing: no view is kept."""
+        """Do nothing: no view is cached."""
 
     def ray_rows(self, camera: Camera, pixels: Tensor, params: CompositingParams) -> RayRows:
-        """Rows of A, read off the dense matrix (in row order, not in depth order)."""
+        """Return rows of the dense A (in row order, not in depth order)."""
         A = dense_view(self.splats, camera, params).A
         rows = A[(pixels[:, 1] * camera.width + pixels[:, 0]).numpy()]
         ray, splats = np.nonzero(rows)

@@ -1,1 +1,1 @@
-"""What every module runs on: devices, threads, compiled kernels, memory, progress, the version."""
+"""The base of all modules: devices, threads, compiled kernels, memory, progress, the version."""

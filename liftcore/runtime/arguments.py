@@ -1,4 +1,4 @@
-"""Arguments of public functions: a choice that is one of its names, and one value where several may be."""
+"""Checks of arguments of public functions: choices, texts, counts, and single values in place of lists."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from liftcore.errors import InvalidInput, InvalidSettings, SplatliftError
 
 
 def one_of(names: Iterable[str]) -> str:
-    """What is expected where one of these names is."""
+    """Return the text "one of a, b, c", for errors."""
     return f"one of {', '.join(names)}"
 
 
 def check_choice(
     argument: str, value: object, names: Iterable[str], error: type[SplatliftError] = InvalidInput
 ) -> None:
-    """Refuse what is none of these names.
+    """Refuse a value that is none of these names.
 
     Raises:
-        SplatliftError: of the given type.
+        SplatliftError: of the type ``error``.
     """
     names = tuple(names)
     if not isinstance(value, str) or value not in names:
@@ -29,25 +29,25 @@ def check_choice(
 
 
 def check_text(argument: str, value: object) -> None:
-    """Refuse what is no text, or an empty one.
+    """Refuse a value that is no text, or an empty one.
 
     Raises:
-        InvalidInput: it is one of these.
+        InvalidInput: the value is refused.
     """
     if not isinstance(value, str) or not value.strip():
-        raise InvalidInput(argument, expected="a text that is not empty", got=repr(value)[:80])
+        raise InvalidInput(argument, expected="a non-empty text", got=repr(value)[:80])
 
 
 def as_list(values: Any) -> list[Any]:
-    """Several values as a list; one text, path or other value alone as a list of it."""
+    """Return several values as a list; a single text, path or other value as a list of one."""
     return list(values) if isinstance(values, Iterable) and not isinstance(values, str | PathLike) else [values]
 
 
 def check_count(argument: str, value: object, none: str = "") -> None:
-    """Refuse a count that is no whole number of one or more; None is one where ``none`` says what it stands for.
+    """Refuse a count that is no integer of at least one; None is accepted if ``none`` has its meaning.
 
     Raises:
-        InvalidSettings: it is refused.
+        InvalidSettings: the count is refused.
     """
     if none and value is None:
         return

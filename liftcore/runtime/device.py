@@ -1,4 +1,4 @@
-"""Where a lift's arithmetic runs: on the processor, or on a card that torch and Triton can use."""
+"""The device of a lift: the CPU, or a GPU that torch and Triton can use."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from liftcore.runtime.device_name import device_name
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-OLDEST_CARD = (7, 5)  # the compute capability that Triton and today's builds of torch have code for
+OLDEST_CAPABILITY = (7, 5)  # compute capability that Triton and current builds of torch support
 COMPILERS = ("gcc", "clang", "cc")
 DRIVER = Path("/proc/driver/nvidia/version")
-MEMORY_SIGNS = ("out of memory", "alloc_failed", "memoryallocation")  # CUDA's, cuBLAS's and its kin's, lower case
-_EXPECTED = "a card that CUDA, torch and Triton can use"
-_OR_CPU = "or take device=cpu"
+MEMORY_SIGNS = ("out of memory", "alloc_failed", "memoryallocation")  # of CUDA's libraries, lower case
+_EXPECTED = "a GPU that torch and Triton can use"
+_OR_CPU = "or use device=cpu"
 
 
 @dataclass(frozen=True)
 class Device:
-    """What runs the raster and the solution.
+    """The device of rasterization and solve.
 
-    ``cuda`` beside a place that is no card is Triton's interpreter, in which tests run the kernels.
+    ``kind`` is cuda with ``place`` on the CPU in Triton's interpreter, in which tests run the kernels.
     """
 
     kind: Literal["cpu", "cuda"]
@@ -44,13 +44,13 @@ class Device:
 
     @property
     def name(self) -> str:
-        """The card's name, or the processor's."""
+        """The name of the GPU or of the CPU."""
         if self.place.type == "cuda":
             return torch.cuda.get_device_name(self.place)
         return processor() if self.kind == "cpu" else f"Triton's interpreter on {processor()}"
 
     def facts(self) -> dict[str, Any]:
-        """Kind, name and the versions of what computes there, as the certificate tells them."""
+        """Return kind, name and versions of the libraries in use, for the diagnostics."""
         packages = ("torch", "numba", "numpy") if self.kind == "cpu" else ("torch", "triton", "numpy")
         versions = {"torch": torch.__version__} | {name: version(name) for name in packages[1:]}
         if self.place.type == "cuda":
@@ -58,30 +58,32 @@ class Device:
         return {"kind": self.kind, "name": self.name, "versions": versions}
 
     def free_bytes(self) -> int | None:
-        """Bytes that may still be taken there, with those that torch holds and does not use; None off a card."""
+        """Return the free bytes of a GPU, those cached by torch included; None for the CPU."""
         if self.place.type != "cuda":
             return None
-        held = torch.cuda.memory_reserved(self.place) - torch.cuda.memory_allocated(self.place)
-        return torch.cuda.mem_get_info(self.place)[0] + held
+        cached = torch.cuda.memory_reserved(self.place) - torch.cuda.memory_allocated(self.place)
+        return torch.cuda.mem_get_info(self.place)[0] + cached
 
 
 CPU = Device("cpu", torch.device("cpu"))
 
 
 def out_of_memory(error: BaseException) -> bool:
-    """Whether an error says that a device's memory ran out: torch's own, the driver's by Triton, or a library's."""
+    """Return True if the error is out of memory on the device: of torch, of the driver through Triton, or of a
+    library.
+    """
     if isinstance(error, torch.OutOfMemoryError):
         return True
-    told = str(error).lower()
-    return isinstance(error, RuntimeError) and any(sign in told for sign in MEMORY_SIGNS)
+    message = str(error).lower()
+    return isinstance(error, RuntimeError) and any(sign in message for sign in MEMORY_SIGNS)
 
 
 @contextmanager
 def within_memory(device: Device) -> Iterator[None]:
-    """Say in words that a card has no room, where work could not be cut any smaller.
+    """Convert an out-of-memory error of work that cannot be split any further.
 
     Raises:
-        Unavailable: an allocation failed there.
+        Unavailable: an allocation failed on the device.
     """
     try:
         yield
@@ -90,15 +92,15 @@ def within_memory(device: Device) -> Iterator[None]:
             raise
         free = (device.free_bytes() or 0) / 2**30
         raise Unavailable(
-            "device", expected=f"room for the lift on {device.name}", got=f"too little: {free:.1f} GiB are free now",
-            hint="end what else runs there, take fewer splats, smaller images or fewer channels, or take device=cpu",
+            "device", expected=f"enough memory for the lift on {device.name}", got=f"{free:.1f} GiB free",
+            hint="end other programs on it, use fewer splats, smaller images or fewer channels, or use device=cpu",
         ) from None  # fmt: skip
 
 
 def give_back_memory() -> None:
-    """Have the allocator return what is free; where there is no such call (glibc has it), nothing happens.
+    """Return free memory of the allocator to the system, where it has such a call (glibc).
 
-    Views leave hundreds of megabytes of pieces between what is kept, and the solution's large arrays fit in none.
+    Views leave hundreds of megabytes in fragments, none of which fits the large arrays of the solve.
     """
     trim = None if sys.platform == "win32" else getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
@@ -106,58 +108,58 @@ def give_back_memory() -> None:
 
 
 def indexed(place: torch.device) -> torch.device:
-    """A place as tensors name theirs: ``cuda`` without a number is the card that is current now."""
+    """Return the place with an index, as tensors have it: ``cuda`` becomes the current GPU."""
     if place.type == "cuda" and place.index is None:
         return torch.device("cuda", torch.cuda.current_device())
     return place
 
 
 def choose_device(name: str | torch.device) -> Device:
-    """The device that ``auto``, ``cpu`` or ``cuda`` stands for here; ``auto`` takes a card where one can be used.
+    """Return the device for ``auto``, ``cpu`` or ``cuda``; ``auto`` uses a GPU if one is available.
 
-    The current card may also be named by its number, ``cuda:0``.
+    The current GPU may also be given by its number, ``cuda:0``.
 
     Raises:
-        InvalidSettings: another name.
-        Unavailable: ``cuda`` was asked for and cannot be had.
+        InvalidSettings: any other name.
+        Unavailable: ``cuda`` was requested and is not available.
     """
-    asked = device_name(name)
-    if asked not in ("auto", "cpu", "cuda"):
-        raise InvalidSettings("device", expected="'auto', 'cpu' or 'cuda'", got=repr(asked)[:80])
-    if asked == "cpu":
+    requested = device_name(name)
+    if requested not in ("auto", "cpu", "cuda"):
+        raise InvalidSettings("device", expected="'auto', 'cpu' or 'cuda'", got=repr(requested)[:80])
+    if requested == "cpu":
         return CPU
     missing = _missing()
     if missing is None:
         return Device("cuda", torch.device("cuda", torch.cuda.current_device()))
-    if asked == "cuda":
+    if requested == "cuda":
         got, hint = missing
         raise Unavailable("device", expected=_EXPECTED, got=got, hint=f"{hint}, {_OR_CPU}")
     return CPU
 
 
 def _missing() -> tuple[str, str] | None:
-    """What keeps lifts off a card here, and what to do about it; None where nothing does."""
+    """Return why no GPU can be used, and a hint; None if one can."""
     if torch.version.cuda is None:
         return f"torch {torch.__version__}, a build without CUDA", "install a CUDA build of torch"
     if not torch.cuda.is_available():
-        known = f"the driver knows CUDA {torch.version.cuda}"
-        hint = f"see whether nvidia-smi lists one, a container was given it, and {known}"
-        return "no card that CUDA sees", hint
+        driver = f"the driver supports CUDA {torch.version.cuda}"
+        hint = f"check that nvidia-smi lists a GPU, that a container has access to it, and that {driver}"
+        return "torch.cuda.is_available() is False", hint
     if importlib.util.find_spec("triton") is None:
-        return "no triton beside torch", "install the triton that this torch asks for (CUDA builds bring it)"
+        return "no package triton", "install the triton that this torch requires (CUDA builds include it)"
     if not (os.environ.get("CC") or any(shutil.which(name) for name in COMPILERS)):
-        return "no C compiler, with which Triton makes its link to the driver", "install gcc and the headers of libc"
+        return "no C compiler, which Triton needs for its driver module", "install gcc and the headers of libc"
     capability = torch.cuda.get_device_capability()
-    if capability < OLDEST_CARD:
-        name, own = torch.cuda.get_device_name(), ".".join(map(str, capability))
-        oldest = ".".join(map(str, OLDEST_CARD))
-        return f"{name} of compute capability {own}", f"Triton needs {oldest}: choose another card"
+    if capability < OLDEST_CAPABILITY:
+        name, version_text = torch.cuda.get_device_name(), ".".join(map(str, capability))
+        oldest = ".".join(map(str, OLDEST_CAPABILITY))
+        return f"{name} of compute capability {version_text}", f"Triton needs {oldest}: choose another GPU"
     return None
 
 
 @cache
 def processor() -> str:
-    """The processor's name."""
+    """Return the name of the CPU."""
     with suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
             if line.startswith("model name"):
@@ -165,10 +167,10 @@ def processor() -> str:
     return platform.processor() or platform.machine()
 
 
-def driver_version(told: Path = DRIVER) -> str:
-    """The version of NVIDIA's kernel module, ``unknown`` where Linux does not tell."""
+def driver_version(path: Path = DRIVER) -> str:
+    """Return the version of NVIDIA's kernel module; ``unknown`` if it cannot be read."""
     with suppress(OSError):
-        found = re.search(r"Kernel Module.*?\b(\d+(?:\.\d+)+)", told.read_text(encoding="utf-8"))
-        if found:
-            return found[1]
+        match = re.search(r"Kernel Module.*?\b(\d+(?:\.\d+)+)", path.read_text(encoding="utf-8"))
+        if match:
+            return match[1]
     return "unknown"

@@ -1,4 +1,4 @@
-"""Names of devices as torch has them, in the words of the settings. Loads no torch."""
+"""Names of torch devices as values of settings. Imports no torch."""
 
 from __future__ import annotations
 
@@ -7,24 +7,22 @@ import sys
 
 from liftcore.errors import InvalidSettings
 
-_NUMBERED = re.compile(r"cuda:([0-9]{1,4})")
+_DEVICE_NUMBER = re.compile(r"cuda:([0-9]{1,4})")
 
 
 def device_name(device: object) -> object:
-    """``cuda`` for the card that is current here, as ``cuda:0`` or a ``torch.device``; anything else as it is.
+    """Return ``cuda`` for the current GPU, given as ``cuda:0`` or a ``torch.device``; other values unchanged.
 
     Raises:
-        InvalidSettings: another card, which calls of this process do not run on.
+        InvalidSettings: another GPU than the current one of this process.
     """
     name = str(device) if type(device).__module__ == "torch" else device
-    numbered = _NUMBERED.fullmatch(name) if isinstance(name, str) else None
-    if numbered is None:
+    match = _DEVICE_NUMBER.fullmatch(name) if isinstance(name, str) else None
+    if match is None:
         return name
-    torch, number = sys.modules.get("torch"), int(numbered[1])
+    torch, number = sys.modules.get("torch"), int(match[1])
     current = torch.cuda.current_device() if torch is not None and torch.cuda.is_available() else 0
     if number != current:
-        hint = f"set CUDA_VISIBLE_DEVICES={number}, or torch.cuda.set_device({number}), and take device=cuda"
-        raise InvalidSettings(
-            "device", expected=f"cuda:{current}, the card that is current", got=repr(str(name)), hint=hint
-        )
+        hint = f"set CUDA_VISIBLE_DEVICES={number}, or call torch.cuda.set_device({number}), and use device=cuda"
+        raise InvalidSettings("device", expected=f"cuda:{current}, the current GPU", got=repr(str(name)), hint=hint)
     return "cuda"

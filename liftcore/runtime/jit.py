@@ -1,8 +1,8 @@
-"""How kernels are compiled: without the interpreter lock, cached on disk by the content of the sources.
+"""Decorators of numba kernels: without the interpreter lock, cached on disk by the content of the sources.
 
-numba's cache looks at a kernel's own file only, so a change in a function that it calls from another file would go
-unseen. The cache folder is therefore named after a digest of the files that kernels of other files call or take
-constants from, so a stale kernel can never be loaded.
+numba's cache checks a kernel's own file only, and would miss a change in a function that it calls from another file.
+The cache folder is therefore named after a digest of the files from which kernels of other files call functions or
+take constants, so a stale kernel is never loaded.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from numba.core import config
 
 from liftcore.runtime.folders import cache_folder
 
-# What compiled code in other files is made of: a change in any of these compiles all kernels anew.
+# Files that kernels of other files depend on: a change in any of these recompiles all kernels.
 SHARED_SOURCES = (
     "runtime/jit.py",
     "raster/cpu/composite.py",
@@ -44,8 +44,8 @@ def _cache_folder() -> Path:
         folder.mkdir(parents=True, exist_ok=True)
     if os.access(folder, os.W_OK):
         return folder
-    # A home that cannot be written: compile anew in each process. A shared name in the temporary folder would let
-    # others plant code, for cached kernels are code.
+    # The home folder is not writable: compile in each process. A predictable name in the temporary folder would let
+    # other users plant code, as cached kernels are code.
     private = Path(tempfile.mkdtemp(prefix="splatlift-kernels-"))
     atexit.register(shutil.rmtree, private, ignore_errors=True)
     return private
@@ -55,8 +55,8 @@ if not os.environ.get("NUMBA_CACHE_DIR"):
     config.__dict__["CACHE_DIR"] = str(_cache_folder())  # a plain module of settings, filled at import
 
 kernel = njit(nogil=True, cache=True)
-# Division by zero gives an infinity or none at all, as numbers do: without a branch for it loops become vectors.
+# Division by zero gives infinity or NaN: without a branch for it, loops are vectorised.
 without_zero_checks = njit(nogil=True, cache=True, error_model="numpy")
 inlined = njit(nogil=True, cache=True, inline="always")
-# Sums may be reordered into lanes; the order is fixed at compile time, so results still repeat to the bit.
+# Sums may be reordered into lanes; the order is fixed at compile time, so results are still bitwise reproducible.
 vectorised = njit(nogil=True, cache=True, fastmath={"reassoc", "contract", "nsz"})

@@ -1,4 +1,4 @@
-"""Names of a package that are loaded when they are asked for, as its stub lists them."""
+"""Lazy import of a package's names, as its stub lists them."""
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -7,9 +7,9 @@ if TYPE_CHECKING:
 
 
 def lazy_names(package: str, file: str) -> "tuple[Callable[[str], Any], Callable[[], list[str]]]":
-    """``__getattr__`` and ``__dir__`` of a module beside whose file lies a stub (``.pyi``) of imports alone.
+    """Return ``__getattr__`` and ``__dir__`` of a module with a stub (``.pyi``) of imports beside its file.
 
-    The stub is read when the first name is asked for. ``__all__`` is its names, sorted, without ``__version__``.
+    The stub is read at the first access. ``__all__`` is its names, sorted, without ``__version__``.
     """
     modules: dict[str, str] = {}
 

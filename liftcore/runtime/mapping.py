@@ -1,15 +1,14 @@
-"""Memory by the page, as each system gives it. It knows no torch: processes without it map files too."""
+"""Anonymous memory maps on each system. Imports no torch, as processes without it map memory too."""
 
 import mmap
 import sys
 
 
 def map_anonymous(size: int, flags: int = 0) -> mmap.mmap:
-    """Map ``size`` bytes of zeros that are this process's own, of which no page is taken before it is written.
+    """Map ``size`` bytes of zeros, private to this process; pages are allocated when they are first written.
 
     Args:
-        flags: further flags of mmap, for systems that have them. Windows keeps in its page file what memory has no
-            room for.
+        flags: further flags of mmap, ignored on Windows, whose maps are backed by the page file.
     """
     if sys.platform == "win32":
         return mmap.mmap(-1, size)

@@ -1,4 +1,4 @@
-"""Large arrays: in memory, or in mapped files that have no name, which the system writes and drops as it needs."""
+"""Large arrays in memory or in unlinked mapped files, which the system can page out; and free memory."""
 
 import os
 import shutil
@@ -16,7 +16,7 @@ from liftcore.runtime.mapping import map_anonymous
 
 MOUNTS = Path("/proc/self/mounts")
 IN_MEMORY = ("tmpfs", "ramfs")
-CONTROL_GROUPS = (  # folder, and the files of limit, use and statistics: versions 2 and 1
+CONTROL_GROUPS = (  # folder, and the files of limit, usage and statistics: versions 2 and 1
     ("/sys/fs/cgroup", ("memory.max", "memory.current", "memory.stat")),
     ("/sys/fs/cgroup/memory", ("memory.limit_in_bytes", "memory.usage_in_bytes", "memory.stat")),
 )
@@ -24,26 +24,26 @@ FILE_PAGES = ("inactive_file", "active_file")
 
 
 def zeros(shape: tuple[int, ...], dtype: torch.dtype, *, name: str, in_file: bool = False) -> Tensor:
-    """Zeros on the CPU, of which no page is taken before it is written.
+    """Return zeros on the CPU, whose pages are allocated when they are first written.
 
     Args:
-        name: what errors call it. in_file: mapped from a file in the temporary folder that is gone with the tensor.
-            On Windows, which deletes no file that is mapped, the page file is that file.
+        name: of the array, for errors. in_file: map a file in the temporary folder that is removed with the tensor;
+            on Windows, which cannot delete mapped files, the page file serves.
 
     Raises:
-        Unavailable: the disk has no room. It is taken now, for a page without one would end the process later.
+        Unavailable: the disk is too full. Its space is reserved now, as a page without disk would kill the process.
     """
     size = prod(shape) * dtype.itemsize
     if not size:
         return torch.zeros(shape, dtype=dtype)
     if not in_file or sys.platform == "win32":
-        # Not numpy's, which asks for large pages: to clear those took longer than to solve. Nor torch's, which writes
-        # the zeros by one thread, where all threads write soon, or nobody does.
+        # Not numpy.zeros, which requests large pages: clearing them took longer than the solve. Not torch.zeros,
+        # which writes all zeros in one thread.
         return torch.frombuffer(map_anonymous(size), dtype=torch.uint8).view(dtype).view(shape)
     check_disk(size, name)
     handle, path = tempfile.mkstemp(prefix="splatlift-")
     try:
-        if sys.platform == "linux":  # not macOS, where a disk that fills meanwhile ends the process
+        if sys.platform == "linux":  # macOS has no such call: there a full disk kills the process
             os.posix_fallocate(handle, 0, size)
         return torch.from_file(path, shared=True, size=prod(shape), dtype=dtype).view(shape)
     except OSError as error:
@@ -54,10 +54,10 @@ def zeros(shape: tuple[int, ...], dtype: torch.dtype, *, name: str, in_file: boo
 
 
 def check_disk(size: int, name: str) -> None:
-    """See early that the disk has room for ``size`` bytes.
+    """Check early that the disk has ``size`` free bytes.
 
     Raises:
-        Unavailable: it has not.
+        Unavailable: it has fewer.
     """
     got = lack_of_disk(size)
     if got:
@@ -65,23 +65,23 @@ def check_disk(size: int, name: str) -> None:
 
 
 def lack_of_disk(size: int) -> str:
-    """What the temporary folder has in place of room for ``size`` bytes on a disk; empty where there is room."""
+    """Describe what the temporary folder has instead of ``size`` free bytes on a disk; empty if they are free."""
     folder = Path(tempfile.gettempdir())
     if file_system(folder) in IN_MEMORY:
-        return "a temporary folder that lies in memory itself"
+        return "a temporary folder in memory"
     free = shutil.disk_usage(folder).free
     return "" if free >= size else f"{free / 2**30:.1f} GiB of disk"
 
 
 def file_system(folder: Path, mounts: Path = MOUNTS) -> str:
-    """The kind of file system that a folder lies on, as Linux names it; empty where nothing says."""
+    """Return the type of a folder's file system as Linux names it; empty if it is unknown."""
     kinds: dict[Path, str] = {}
     with suppress(OSError):
         for line in mounts.read_text(encoding="utf-8", errors="replace").splitlines():
             _, place, kind, *_ = line.split(" ")
-            kinds[Path(place)] = kind  # the last one mounted there is the one seen
-    own = folder.resolve()
-    return next((kinds[place] for place in (own, *own.parents) if place in kinds), "")
+            kinds[Path(place)] = kind  # the last mount at a place hides earlier ones
+    path = folder.resolve()
+    return next((kinds[place] for place in (path, *path.parents) if place in kinds), "")
 
 
 def _no_disk(size: int, name: str, got: str) -> Unavailable:
@@ -89,27 +89,27 @@ def _no_disk(size: int, name: str, got: str) -> Unavailable:
         name,
         expected=f"{size / 2**30:.1f} GiB of memory for them, or of disk in {tempfile.gettempdir()}",
         got=got,
-        hint="set TMPDIR to a folder with more room, or try fewer views, fewer splats or fewer channels",
+        hint="set TMPDIR to a folder with more free space, or use fewer views, splats or channels",
     )
 
 
 def free_memory() -> int | None:
-    """Bytes that this process may still take: of the machine, or of its control group; None where neither says."""
-    found = []
+    """Return the bytes that this process may still allocate, by machine and control group; None if unknown."""
+    limits = []
     with suppress(OSError, ValueError):  # not Linux
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        found += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
+        limits += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
     for folder, names in CONTROL_GROUPS:
         with suppress(OSError, ValueError):  # a machine has one of the two, or none
-            limit, used, stat = (Path(folder, name).read_text(encoding="ascii") for name in names)
-            found += [group_memory(limit, used, stat)]
-    return min((room for room in found if room is not None), default=None)
+            limit, usage, stat = (Path(folder, name).read_text(encoding="ascii") for name in names)
+            limits += [group_memory(limit, usage, stat)]
+    return min((free_bytes for free_bytes in limits if free_bytes is not None), default=None)
 
 
-def group_memory(limit: str, used: str, stat: str) -> int | None:
-    """Bytes that a control group has left, from the texts of its files; None where it has no limit.
+def group_memory(limit: str, usage: str, stat: str) -> int | None:
+    """Return the free bytes of a control group, from the texts of its files; None if it has no limit.
 
-    What is used counts the files that were read, which make room when memory is asked for: they are free.
+    The usage includes the page cache of files, which is dropped on demand: it counts as free.
 
     Raises:
         ValueError: the texts are not those of a control group.
@@ -119,4 +119,4 @@ def group_memory(limit: str, used: str, stat: str) -> int | None:
     counts = dict(line.split() for line in stat.splitlines())
     names = [f"total_{name}" if f"total_{name}" in counts else name for name in FILE_PAGES]  # version 1: all below it
     cached = sum(int(counts.get(name, 0)) for name in names)
-    return max(0, int(limit) - max(0, int(used) - cached))
+    return max(0, int(limit) - max(0, int(usage) - cached))

@@ -1,4 +1,4 @@
-"""Hints that name what is most like a text, at a cost that neither its length nor that of a list runs up."""
+"""Hints with the names that are most similar to a text, at a bounded cost."""
 
 from __future__ import annotations
 
@@ -9,24 +9,25 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-_SHOWN = 80  # characters of each name, and of the text, that are compared and shown
-_COMPARED = 2000  # names that a hint looks at, fewer of long ones: all of a long list would hold up other requests
-_COMPARED_CHARACTERS = 40_000  # of these names, were all as long as the longest: a fifth of a second
+_CHARACTERS = 80  # of each name, and of the text, that are compared and printed
+_MAX_NAMES = 2000  # names that are compared; longer lists would delay other requests
+_MAX_CHARACTERS = 40_000  # of the compared names, each counted as long as the longest: a fifth of a second
 
 
 def nearest(text: str, names: Iterable[str], count: int) -> str:
-    """A hint that names the ``count`` names most like the text, of the first thousands and by their first letters.
+    """Return a hint with the ``count`` names most similar to the text, of the first thousands, by their first
+    letters.
 
-    Names that begin with the whole text come first: "car (automobile)" for "car", before "scarf".
+    Names that begin with the text as a word come first: "car (automobile)" for "car", before "scarf".
     """
-    text, cut = text[:_SHOWN], [name[:_SHOWN] for name in islice(names, _COMPARED)]
+    text, cut = text[:_CHARACTERS], [name[:_CHARACTERS] for name in islice(names, _MAX_NAMES)]
     begin = [name for name in cut if text and name.startswith(f"{text} ")]
-    most = _COMPARED_CHARACTERS // max(1, *map(len, cut), 1)
+    limit = _MAX_CHARACTERS // max(1, *map(len, cut), 1)
     matcher = SequenceMatcher(b=text)
 
     def likeness(name: str) -> float:
         matcher.set_seq1(name)
         return matcher.ratio()
 
-    alike = sorted(cut[:most], key=likeness, reverse=True)  # of names as near the first, as they were listed
-    return f"nearest: {', '.join(list(dict.fromkeys([*begin, *alike]))[:count])}"
+    ranked = sorted(cut[:limit], key=likeness, reverse=True)  # stable: equally near names keep their order
+    return f"nearest: {', '.join(list(dict.fromkeys([*begin, *ranked]))[:count])}"

@@ -1,9 +1,8 @@
-"""Torch's own modes during a call of the library: what a program sets for its models would change what is found.
+"""Default modes of torch during a call of the library, as modes that a program sets would change results.
 
-In ``torch.inference_mode`` tensors that one thread made cannot be changed by another's, ``torch.set_default_device``
-is what tensors get that are made without a word of it, and in ``torch.autocast`` products of matrices have fewer
-digits. All three are the thread's own. The default dtype is the whole process's, so it is left alone: every tensor of
-numbers is made with its dtype.
+Tensors made in ``torch.inference_mode`` cannot be changed by another thread, ``torch.set_default_device`` applies to
+tensors made without a device, and in ``torch.autocast`` matrix products have fewer digits. All three belong to the
+thread. The default dtype belongs to the process and is not changed: every tensor of numbers is made with a dtype.
 """
 
 from __future__ import annotations
@@ -23,19 +22,19 @@ CASTING = ("cpu", "cuda")  # devices whose products autocast may change
 class _Modes(NamedTuple):
     device: torch.device
     inference: bool
-    casts: tuple[torch.dtype | None, ...]  # what autocast makes of products on each of CASTING; None: nothing
+    casts: tuple[torch.dtype | None, ...]  # dtype of autocast on each of CASTING; None: off
 
 
-_USUAL = _Modes(torch.device("cpu"), False, (None,) * len(CASTING))
+_DEFAULT = _Modes(torch.device("cpu"), False, (None,) * len(CASTING))
 _callers: ContextVar[_Modes] = ContextVar("callers")
 
 
 @contextmanager
-def usual_modes() -> Iterator[None]:
-    """Torch as it is when a program begins: the CPU, neither inference mode nor autocast."""
+def default_modes() -> Iterator[None]:
+    """Set torch's initial modes: the CPU, neither inference mode nor autocast."""
     token = _callers.set(_modes())
     try:
-        with _set(_USUAL):
+        with _set(_DEFAULT):
             yield
     finally:
         _callers.reset(token)
@@ -43,9 +42,9 @@ def usual_modes() -> Iterator[None]:
 
 @contextmanager
 def callers_modes() -> Iterator[None]:
-    """Within `usual_modes`, the modes around it again: for code of the caller, such as an iterator that encodes.
+    """Within `default_modes`, restore the caller's modes for the caller's code, such as an iterator that encodes.
 
-    Threads that run such code need the context of the one that began (``contextvars.copy_context``).
+    Threads that run such code need the context of the thread that entered (``contextvars.copy_context``).
     """
     with _set(_callers.get(_modes())):
         yield
@@ -58,7 +57,7 @@ def _modes() -> _Modes:
 
 @contextmanager
 def _set(modes: _Modes) -> Iterator[None]:
-    """All modes of the thread; what they are already costs nothing."""
+    """Set all modes of the thread; modes that are set already cost nothing."""
     now = _modes()
     with ExitStack() as stack:
         if modes.inference != now.inference:

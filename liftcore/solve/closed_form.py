@@ -1,12 +1,12 @@
 """The closed form: ``x_j = sum_v W_v[j] E_v / sum W[j]`` (paper Eq. 6, App. Tikhonov for squared weights).
 
-On the CPU `liftcore.solve.shared_rows` makes the sums, on a device torch's ``embedding_bag``: one thread adds up a
-row in a fixed order, so the bits repeat for any number of threads. A product with a sparse tensor would take
-cuSPARSE's default algorithm, and ``index_add_`` atomic sums: neither has a fixed order.
+On the CPU `liftcore.solve.shared_rows` computes the sums, on a device torch's ``embedding_bag``: one thread adds a
+row in a fixed order, so the result is bitwise identical for any number of threads. A product with a sparse tensor
+would use cuSPARSE's default algorithm, and ``index_add_`` atomic sums: neither has a fixed order.
 
-Weights are divided by their sum before they meet the codebook: a mean cannot overflow where its inputs do not, and
-faint splats keep their digits. float32 adds LONG terms one by one; longer bags, of a splat behind a million regions,
-are sums of the sums of such parts: added one by one, ten million equal terms would be wrong in their first digit.
+Weights are divided by their sum before the product with the codebook: a mean cannot overflow if its inputs do not,
+and faint splats keep their precision. float32 adds LONG terms one by one; longer bags, of a splat with a million
+regions, are sums of partial sums: added one by one, ten million equal terms would be wrong in their first digit.
 """
 
 from collections.abc import Callable
@@ -27,18 +27,18 @@ from liftcore.solve.codebook import Codebook
 from liftcore.solve.shared_rows import LONG, flat_table, sum_rows
 from liftcore.values.region_weights import BLOCK_ENTRIES, BLOCK_ROWS, RegionWeights, from_zero, row_blocks, run_each
 
-DEVICE_ROWS, DEVICE_ENTRIES = 1 << 16, 1 << 24  # of a block on a device; halved where its memory runs out
-LEAST_ROWS = 256  # of a block that is halved no more
-BESIDE = 4  # blocks of a device in work together: to write one into X takes longer than to sum it up
+DEVICE_ROWS, DEVICE_ENTRIES = 1 << 16, 1 << 24  # of a block on a device; halved if its memory runs out
+LEAST_ROWS = 256  # of a block that is not halved further
+CONCURRENT_BLOCKS = 4  # on a device: copying a block to X takes longer than its sums
 
 Sums = Callable[[Tensor], tuple[Tensor, Tensor]]  # of rows [n] i64: means of vectors and of unit ones, [n, C] f32
 
 
 @dataclass(frozen=True)
 class Solution:
-    """X and how much the inputs of each splat agreed."""
+    """X and the agreement of each splat's inputs."""
 
-    features: Tensor  # [P, F] f16 or f32, zero rows where nothing was seen
+    features: Tensor  # [P, F] f16 or f32, zero rows of splats without weights
     agreement: Tensor  # [P] f32, norm of the weighted mean of unit codebook rows
 
 
@@ -54,23 +54,23 @@ def solve(
     device: Device = CPU,
     memory: int | None = None,
 ) -> Solution:
-    """``X = D^-1 W E`` and the agreement of each splat's inputs.
+    """Return ``X = D^-1 W E`` and the agreement of each splat's inputs.
 
     Args:
-        W: of all views, with a row for every splat, wherever it lies.
-        dtype: how X is stored; float16 becomes float32 when the codebooks are too large or too small for it.
+        W: of all views, with a row for every splat, on any device.
+        dtype: of X; float16 becomes float32 if the codebooks are too large or too small for it.
         means: [P, 3] of the splats: neighbours, which read the same rows, are solved together. None: in their order.
-        threads: of the CPU. None takes the cores that this process may use. The number changes no bit.
-        device: where the sums are made; X comes back to the CPU.
-        memory: bytes that X may take before it lies in a mapped file; None for no limit.
+        threads: of the CPU. None uses the cores that this process may use. The result is bitwise identical for any.
+        device: of the sums; X is returned on the CPU.
+        memory: bytes above which X is stored in a mapped file; None for no limit.
     """
     if dtype == torch.float16 and not codebook.fits_float16():
         dtype = torch.float32
     shape = W.splats.shape[0], codebook.channels
     size = shape[0] * shape[1] * dtype.itemsize
     X = zeros(shape, dtype, name="features", in_file=memory is not None and size > memory)
-    seen = torch.nonzero(W.indptr.diff())[:, 0]
-    squares = solve_rows(X, seen, W, codebook, progress, means=means, threads=threads, device=device)
+    rows = torch.nonzero(W.indptr.diff())[:, 0]
+    squares = solve_rows(X, rows, W, codebook, progress, means=means, threads=threads, device=device)
     give_back_memory()
     return Solution(X, squares.sqrt().clamp(0.0, 1.0).float())
 
@@ -88,11 +88,11 @@ def solve_rows(
     sums: Tensor | None = None,
     unit: Tensor | None = None,
 ) -> Tensor:
-    """Solve for some splats alone, by their numbers [n] i64, into their rows of X [P, F].
+    """Solve for some splats, by their numbers [n] i64, and write their rows of X [P, F].
 
     Args:
-        sums: [P] f64, of the rows of the W that this one is a part of: its part of ``D^-1 W E``. None: of its own.
-        unit: [P, F] f32, whose rows become the same means of unit vectors.
+        sums: [P] f64, row sums of the full W of which this W is a part; None: of this W.
+        unit: [P, F] f32, overwritten with the same means of unit vectors.
 
     Returns:
         [P] f64, squared lengths of the means of unit vectors; zero for the other splats.
@@ -102,8 +102,8 @@ def solve_rows(
     squares = torch.zeros(X.shape[0], dtype=torch.float64)
     if means is not None:
         rows = rows[torch.argsort(morton_codes(means.cpu()[rows.cpu()])).to(rows.device)]
-    most = (BLOCK_ROWS, BLOCK_ENTRIES) if device.kind == "cpu" else (DEVICE_ROWS, DEVICE_ENTRIES)
-    blocks = row_blocks(W.indptr.diff()[rows].cpu().numpy(), *most)
+    limits = (BLOCK_ROWS, BLOCK_ENTRIES) if device.kind == "cpu" else (DEVICE_ROWS, DEVICE_ENTRIES)
+    blocks = row_blocks(W.indptr.diff()[rows].cpu().numpy(), *limits)
     slices = list(codebook.slices())
     inverse = None if codebook.unit or codebook.inverse_lengths is None else codebook.inverse_lengths.to(device.place)
     for number, channels in enumerate(slices):
@@ -116,21 +116,21 @@ def solve_rows(
             sums_of = _sums_by_device(W, scale, table, units, inverse)
 
         def solve_block(first: int, last: int, sums_of: Sums = sums_of, channels: slice = channels) -> None:
-            own = rows[first:last]
-            sums, unit_sums = sums_of(own)
-            own = own.cpu()
-            X[:, channels].index_copy_(0, own, sums.to(X.dtype).cpu())
+            block_rows = rows[first:last]
+            sums, unit_sums = sums_of(block_rows)
+            block_rows = block_rows.cpu()
+            X[:, channels].index_copy_(0, block_rows, sums.to(X.dtype).cpu())
             if unit is not None:
-                unit[:, channels].index_copy_(0, own, unit_sums.cpu())
-            squares[own] += torch.linalg.vector_norm(unit_sums, dim=1).double().square().cpu()
+                unit[:, channels].index_copy_(0, block_rows, unit_sums.cpu())
+            squares[block_rows] += torch.linalg.vector_norm(unit_sums, dim=1).double().square().cpu()
 
         if device.kind == "cpu":
             run_each(solve_block, blocks, threads)
         else:
-            workers, late = threads or cores(), list[tuple[int, int]]()
-            run_each(partial(_unless_full, solve_block, late), blocks, min(workers, BESIDE))
-            for block in late:
-                _halved_to_fit(solve_block, *block)
+            workers, deferred = threads or cores(), list[tuple[int, int]]()
+            run_each(partial(_run_or_defer, solve_block, deferred), blocks, min(workers, CONCURRENT_BLOCKS))
+            for block in deferred:
+                _run_or_halve(solve_block, *block)
         progress("solve", number + 1, len(slices), "slices")
     return squares
 
@@ -138,23 +138,23 @@ def solve_rows(
 def _sums_by_processor(
     W: RegionWeights, scale: Tensor, table: Tensor, units: Tensor | None, inverse: Tensor | None
 ) -> Sums:
-    """Sums of rows of W on the CPU."""
+    """Return a function that sums rows of W on the CPU."""
     indptr, region, weight, scales = (part.cpu().numpy() for part in (W.indptr, W.region, W.weight, scale))
     flat, width, none = flat_table(table), table.shape[1], np.empty(0, np.float32)
     flat_units = None if units is None else flat_table(units)
     lengths = none if inverse is None else inverse.numpy()
 
-    def summed(rows: np.ndarray, table: np.ndarray, lengths: np.ndarray = none) -> Tensor:
+    def sum_table(rows: np.ndarray, table: np.ndarray, lengths: np.ndarray = none) -> Tensor:
         sums = np.empty((rows.size, width), np.float32)
         sum_rows(*[rows, indptr, region, weight, scales, lengths, table, width, sums])
         return torch.from_numpy(sums)
 
-    def sums_of(own: Tensor) -> tuple[Tensor, Tensor]:
-        rows = own.cpu().numpy()
-        sums = summed(rows, flat)
+    def sums_of(block_rows: Tensor) -> tuple[Tensor, Tensor]:
+        rows = block_rows.cpu().numpy()
+        sums = sum_table(rows, flat)
         if flat_units is not None:
-            return sums, summed(rows, flat_units)
-        return sums, sums if inverse is None else summed(rows, flat, lengths)
+            return sums, sum_table(rows, flat_units)
+        return sums, sums if inverse is None else sum_table(rows, flat, lengths)
 
     return sums_of
 
@@ -162,12 +162,12 @@ def _sums_by_processor(
 def _sums_by_device(
     W: RegionWeights, scale: Tensor, table: Tensor, units: Tensor | None, inverse: Tensor | None
 ) -> Sums:
-    """Sums of rows of W, wherever it lies, on the device of the table."""
+    """Return a function that sums rows of W, on any device, on the device of the table."""
     place = table.device
 
-    def sums_of(own: Tensor) -> tuple[Tensor, Tensor]:
-        starts, entries = W.take(own)
-        scales = scale[own].repeat_interleave(starts.diff(), output_size=entries.shape[0])
+    def sums_of(block_rows: Tensor) -> tuple[Tensor, Tensor]:
+        starts, entries = W.take(block_rows)
+        scales = scale[block_rows].repeat_interleave(starts.diff(), output_size=entries.shape[0])
         shares = (W.weight.index_select(0, entries) * scales).float().to(place)
         region, starts = W.region.index_select(0, entries).to(place), starts.to(place)
         del entries, scales
@@ -182,7 +182,7 @@ def _sums_by_device(
 
 
 def bag_sums(index: Tensor, table: Tensor, starts: Tensor, shares: Tensor | None = None) -> Tensor:
-    """``sum_k shares[k] table[index[k]]`` over bags, k in ``starts[b]..starts[b + 1]``: [B, C] f32.
+    """Return ``sum_k shares[k] table[index[k]]`` over bags, k in ``starts[b]..starts[b + 1]``: [B, C] f32.
 
     Args:
         index: [n] i32 or i64. table: [M, C] f32. starts: [B + 1] i64. shares: [n] f32; None for ones.
@@ -205,18 +205,18 @@ def _bags(index: Tensor, table: Tensor, starts: Tensor, shares: Tensor | None) -
     )
 
 
-def _unless_full(work: Callable[[int, int], None], late: list[tuple[int, int]], first: int, last: int) -> None:
-    """Do a block of work, or note it for later where the device has no room for it beside the others."""
+def _run_or_defer(work: Callable[[int, int], None], deferred: list[tuple[int, int]], first: int, last: int) -> None:
+    """Run a block, or defer it if the device has not enough memory for it beside the others."""
     try:
         work(first, last)
     except RuntimeError as error:
         if not out_of_memory(error):
             raise
-        late.append((first, last))
+        deferred.append((first, last))
 
 
-def _halved_to_fit(work: Callable[[int, int], None], first: int, last: int) -> None:
-    """Do a block of work, in halves where the device has less room than that.
+def _run_or_halve(work: Callable[[int, int], None], first: int, last: int) -> None:
+    """Run a block, in halves if the device has not enough memory.
 
     Raises:
         RuntimeError: LEAST_ROWS do not fit either (`device.out_of_memory`).
@@ -228,24 +228,24 @@ def _halved_to_fit(work: Callable[[int, int], None], first: int, last: int) -> N
             raise
     else:
         return
-    torch.cuda.empty_cache()  # out here the error no longer holds what the block held
+    torch.cuda.empty_cache()  # outside the except clause, whose error keeps the block's tensors alive
     middle = (first + last) // 2
-    _halved_to_fit(work, first, middle)
-    _halved_to_fit(work, middle, last)
+    _run_or_halve(work, first, middle)
+    _run_or_halve(work, middle, last)
 
 
 def morton_codes(points: Tensor, bounds: Tensor | None = None) -> Tensor:
-    """[n] i64: places along a curve that fills space, near to one another on it is near in space (Morton, 1966).
+    """Return positions [n] i64 along a space-filling curve that keeps neighbours close (Morton, 1966).
 
     Args:
-        points: [n, 3] f32, finite, any frame and unit; of 2^21 cells an axis between the least and the greatest.
-        bounds: [2, 3], the least and the greatest; None: of the points.
+        points: [n, 3] f32, finite, any frame and unit; quantised to 2^21 cells per axis between the bounds.
+        bounds: [2, 3], minimum and maximum; None: of the points.
     """
     codes = torch.zeros(points.shape[0], dtype=torch.int64)
     for axis, values in enumerate(points.double().T if codes.numel() else ()):
         low, high = values.aminmax() if bounds is None else bounds[:, axis].double()
         cells = ((values - low) * ((2**21 - 1) / (high - low) if high > low else 0.0)).long()
-        for shift, mask in (  # 21 bits in a row to the same with two zeros before each
+        for shift, mask in (  # spreads 21 bits, two zeros before each
             (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F),
             (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249),
         ):  # fmt: skip

@@ -1,7 +1,7 @@
 """Clusters of splats by feature: principal components, HDBSCAN on a sample, the nearest centre for all.
 
-A splat's **direction** is its unit feature less the scene's mean of these, made unit again: features of one encoder
-lie in a narrow cone, and the angle at the cone's axis tells objects apart where the angle at the origin does not.
+A splat's **direction** is its unit feature minus the scene's mean of these, normalised: features of one encoder lie
+in a narrow cone, and the angle at the cone's axis separates objects where the angle at the origin does not.
 """
 
 from collections.abc import Mapping
@@ -22,35 +22,35 @@ from liftcore.scene.touching import touching
 from liftcore.values.settings import LiftSettings
 
 NO_CLUSTER = -1
-BLOCK = 8_192  # rows widened to float32 at once; fixed, so that products have one shape on any machine
-ENOUGH_EVIDENCE = 1.0  # a splat that adds up to a whole ray is drawn with full odds, a fainter one with less
-REACH = 1.5  # a cluster takes splats up to so many times the distance from its centre
-REACH_SHARE = 0.9  # within which this share of its own sample lies: HDBSCAN's clusters have stragglers
+BLOCK = 8_192  # rows converted to float32 at once; fixed, so that products have one shape on any machine
+FULL_ODDS_WEIGHT = 1.0  # total weight, in rays, from which a splat has full odds to be sampled
+REACH = 1.5  # a cluster takes splats up to this multiple of the distance from its centre
+REACH_SHARE = 0.9  # within which this share of its sample lies, as HDBSCAN's clusters have outliers
 RESOLUTION = 1e-3  # of float16 unit vectors: nearer ones count as equal
 
 
 @dataclass(frozen=True)
 class Clustering:
-    """Which cluster each splat belongs to, and how that was found."""
+    """Clusters of splats, with facts of the clustering."""
 
-    labels: Tensor  # [P] i32, -1 = in no cluster
+    labels: Tensor  # [P] i32, -1 = no cluster
     count: int  # K
-    facts: Mapping[str, Any]  # for the certificate: what found them, and on how much
+    facts: Mapping[str, Any]  # for the diagnostics: the method and its sample
 
 
 @dataclass(frozen=True)
 class Directions:
-    """How features become coordinates: ``unit(unit(x) - centre) axes``."""
+    """The map from features to coordinates, ``unit(unit(x) - centre) axes``."""
 
     centre: np.ndarray  # [F] f32, mean of unit features
     axes: np.ndarray  # [F, D] f32, orthonormal
 
     def coordinates(self, rows: Tensor) -> np.ndarray:
-        """[n, F] f16 or f32 -> [n, D] f32; a feature at the centre has no direction and becomes zero."""
+        """Map features [n, F] f16 or f32 to [n, D] f32; a feature at the centre has no direction and becomes zero."""
         return self.of(rows) @ self.axes
 
     def of(self, rows: Tensor) -> np.ndarray:
-        """[n, F] -> [n, F] f32, the directions themselves."""
+        """Return the directions [n, F] f32 of features [n, F]."""
         return _unit(_unit(rows.to(torch.float32).numpy()) - self.centre, RESOLUTION)
 
 
@@ -61,63 +61,65 @@ def cluster_splats(
 
     Args:
         features: [P, F] f16 or f32; zero rows belong to no cluster.
-        total_weight: [P], sums of plain weights; splats are drawn for the sample with odds ``min(total_weight, 1)``.
-        settings: the ``aggregation_*`` knobs and the seed.
-        threads: None takes the cores that this process may use. The number changes no bit.
+        total_weight: [P], sums of unscaled weights; splats are sampled with odds ``min(total_weight, 1)``.
+        settings: the ``aggregation_*`` settings and the seed.
+        threads: None uses the cores that this process may use. The result is bitwise identical for any number.
     """
     count = features.shape[0]
-    known = nonzero_rows(features)
-    odds = np.where(known, np.minimum(total_weight, ENOUGH_EVIDENCE), 0.0)
+    has_feature = nonzero_rows(features)
+    odds = np.where(has_feature, np.minimum(total_weight, FULL_ODDS_WEIGHT), 0.0)
     rows = draw(odds, settings.aggregation_sample, settings.seed)
     share = rows.size / max(int((odds > 0).sum()), 1)
     smallest = max(2 * settings.aggregation_neighbours, 2, round(settings.aggregation_cluster_size * share))
     facts: dict[str, Any] = {"clustered_by": "hdbscan", "sample": rows.size, "smallest_in_sample": smallest}
     none = torch.full((count,), NO_CLUSTER, dtype=torch.int32)
-    nothing = Clustering(none, 0, facts | {"sample_noise_share": 1.0})
+    no_clusters = Clustering(none, 0, facts | {"sample_noise_share": 1.0})
     if rows.size < 2 * smallest:
-        return nothing
+        return no_clusters
     sample = features[torch.from_numpy(rows)]
     directions = directions_of(sample, settings.aggregation_channels)
     if directions is None:
-        return nothing
+        return no_clusters
     with one_thread():
         points = directions.coordinates(sample)
-    found = hdbscan_labels(points, smallest, settings.aggregation_neighbours, settings.seed)
-    clusters = int(found.max()) + 1
+    sample_labels = hdbscan_labels(points, smallest, settings.aggregation_neighbours, settings.seed)
+    clusters = int(sample_labels.max()) + 1
     if clusters == 0:
-        return nothing
-    labels = assign(features, known, directions, cluster_balls(points, found, clusters), threads)
-    facts["sample_noise_share"] = float((found < 0).mean())
+        return no_clusters
+    labels = nearest_clusters(
+        features, has_feature, directions, cluster_balls(points, sample_labels, clusters), threads
+    )
+    facts["sample_noise_share"] = float((sample_labels < 0).mean())
     return Clustering(torch.from_numpy(labels), clusters, facts)
 
 
-def parted(found: Clustering, splats: Splats, smallest: int, threads: int | None = None) -> Clustering:
-    """Each cluster's groups of splats that touch, as clusters of their own; no cluster where they are fewer.
+def split_by_touch(clustering: Clustering, splats: Splats, smallest: int, threads: int | None = None) -> Clustering:
+    """Split each cluster into groups of touching splats; groups of fewer than ``smallest`` have no cluster.
 
-    Masks show one thing: of two that look alike, neither's mask matches the footprint of both.
+    A mask shows one object: of two similar objects in one cluster, neither's mask matches the footprint of both.
     """
-    before, count = found.labels.numpy(), 0
+    before, count = clustering.labels.numpy(), 0
     labels = np.full(before.size, NO_CLUSTER, np.int32)
-    for cluster in range(found.count):
+    for cluster in range(clustering.count):
         rows = np.flatnonzero(before == cluster)
         groups = touching(splats, rows, threads)
-        kept = np.bincount(groups) >= smallest
-        numbers = np.where(kept, count + np.cumsum(kept) - 1, NO_CLUSTER)
+        is_large = np.bincount(groups) >= smallest
+        numbers = np.where(is_large, count + np.cumsum(is_large) - 1, NO_CLUSTER)
         labels[rows] = numbers[groups]
-        count += int(kept.sum())
-    return Clustering(torch.from_numpy(labels), count, {**found.facts, "clustered_by": "touching"})
+        count += int(is_large.sum())
+    return Clustering(torch.from_numpy(labels), count, {**clustering.facts, "clustered_by": "touching"})
 
 
 def nonzero_rows(features: Tensor) -> np.ndarray:
-    """[P] bool: whether any channel differs from zero."""
-    known = np.zeros(features.shape[0], bool)
+    """Return a mask [P] bool of rows with a nonzero channel."""
+    mask = np.zeros(features.shape[0], bool)
     for first in range(0, features.shape[0], BLOCK):
-        known[first : first + BLOCK] = (features[first : first + BLOCK] != 0).any(dim=1).numpy()
-    return known
+        mask[first : first + BLOCK] = (features[first : first + BLOCK] != 0).any(dim=1).numpy()
+    return mask
 
 
 def draw(odds: np.ndarray, size: int, seed: int) -> np.ndarray:
-    """Ascending rows [<= size] i64, drawn with the given odds [P], each once (Efraimidis and Spirakis 2006)."""
+    """Sample rows [<= size] i64, ascending, by odds [P], without replacement (Efraimidis and Spirakis 2006)."""
     possible = np.flatnonzero(odds > 0)
     if possible.size <= size:
         return possible
@@ -127,7 +129,7 @@ def draw(odds: np.ndarray, size: int, seed: int) -> np.ndarray:
 
 
 def directions_of(sample: Tensor, channels: int) -> Directions | None:
-    """The centre and the principal axes of a sample [n, F]; None when all its unit features are equal."""
+    """Return the centre and the principal axes of a sample [n, F]; None if all its unit features are equal."""
     unit = _unit(sample.to(torch.float32).numpy())
     centre = unit.mean(axis=0, dtype=np.float64).astype(np.float32)
     offsets = unit - centre
@@ -138,27 +140,27 @@ def directions_of(sample: Tensor, channels: int) -> Directions | None:
 
 
 def require_hdbscan() -> None:
-    """See before the work that features can be clustered.
+    """Check that features can be clustered.
 
     Raises:
         Unavailable: the package hdbscan is not installed.
     """
     if find_spec("hdbscan") is None:
         expected = "the package hdbscan, for clusters of features"
-        hint = "pip install 'splatlift[aggregation]', or take aggregation_clusters=graph where views have masks"
+        hint = "pip install 'splatlift[aggregation]', or use aggregation_clusters=graph if views have masks"
         raise Unavailable("aggregation", expected=expected, got="none", hint=hint)
 
 
 def hdbscan_labels(points: np.ndarray, smallest: int, neighbours: int, seed: int) -> np.ndarray:
-    """HDBSCAN's labels [n] i64 of points [n, D], -1 = noise (Campello, Moulavi and Sander 2013).
+    """Return HDBSCAN's labels [n] i64 of points [n, D], -1 = noise (Campello, Moulavi and Sander 2013).
 
-    Equal points would have infinite density, so each moves by the resolution of float16 first, seeded.
+    Equal points would have infinite density, so seeded noise of float16's resolution is added first.
     """
     import hdbscan
 
     shift = np.random.default_rng(seed).normal(size=points.shape)
     shift *= RESOLUTION / max(np.sqrt(points.shape[1]), 1.0)
-    # Prim's algorithm is exact, and its time depends on n alone; Boruvka's, the default, is up to twice as slow here.
+    # Prim's algorithm is exact, and its time depends on n alone; Boruvka's, the default, is up to twice as slow.
     model = hdbscan.HDBSCAN(
         min_cluster_size=smallest, min_samples=neighbours, algorithm="prims_kdtree", core_dist_n_jobs=1
     )
@@ -166,7 +168,7 @@ def hdbscan_labels(points: np.ndarray, smallest: int, neighbours: int, seed: int
 
 
 def cluster_balls(points: np.ndarray, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Centres [K, D] f32 of the clusters, and the squared distance [K] f32 up to which each takes splats."""
+    """Return the clusters' centres [K, D] f32, and the squared distance [K] f32 up to which each takes splats."""
     centres = np.zeros((count, points.shape[1]), np.float32)
     reaches = np.zeros(count, np.float32)
     for k in range(count):
@@ -177,17 +179,17 @@ def cluster_balls(points: np.ndarray, labels: np.ndarray, count: int) -> tuple[n
     return centres, reaches
 
 
-def assign(
+def nearest_clusters(
     features: Tensor,
-    known: np.ndarray,
+    eligible: np.ndarray,
     directions: Directions,
     balls: tuple[np.ndarray, np.ndarray],
     threads: int | None = None,
 ) -> np.ndarray:
-    """[P] i32: the cluster with the nearest centre, or -1 beyond its reach.
+    """Return the cluster with the nearest centre, [P] i32, or -1 beyond its reach.
 
     Args:
-        features: [P, F]. known: [P] bool, splats that may belong to a cluster. balls: of `cluster_balls`.
+        features: [P, F]. eligible: [P] bool, splats that may belong to a cluster. balls: of `cluster_balls`.
     """
     centres, reaches = balls
     halves = (centres * centres).sum(axis=1) / 2
@@ -198,7 +200,7 @@ def assign(
         points = directions.coordinates(features[block])
         nearest = (points @ centres.T - halves).argmax(axis=1)
         distances = ((points - centres[nearest]) ** 2).sum(axis=1)
-        inside = known[block] & (distances <= reaches[nearest])
+        inside = eligible[block] & (distances <= reaches[nearest])
         labels[block][inside] = nearest[inside]
 
     with one_thread(), ThreadPoolExecutor(threads or cores()) as pool:
@@ -207,29 +209,29 @@ def assign(
 
 
 def _unit(rows: np.ndarray, floor: float = 0.0) -> np.ndarray:
-    """Rows [n, F] f32 of length one; those not longer than the floor become zero."""
-    # The largest entry goes out first: the square of a small or large float32 is none.
+    """Normalise rows [n, F] f32; rows not longer than the floor become zero."""
+    # Divide by the largest entry first: squares of small or large float32 numbers underflow or overflow.
     largest = np.abs(rows).max(axis=1, keepdims=True)
     scaled = np.divide(rows, largest, out=np.zeros_like(rows), where=largest > 0)
     lengths = np.sqrt(np.einsum("nf,nf->n", scaled, scaled))[:, None]
     return np.divide(scaled, lengths, out=np.zeros_like(rows), where=lengths * largest > floor)
 
 
-EXACT_CHANNELS = 1_024  # up to here all eigenvectors at once; beyond, the cost grows with the cube of F
-_OVERSAMPLE = 16  # more directions than asked for, so that the last ones are found well too
+EXACT_CHANNELS = 1_024  # up to which all eigenvectors are computed, at a cost of the cube of F
+_OVERSAMPLE = 16  # directions beyond those requested, so that the last ones converge too
 _ITERATIONS = 6
 _SEED = 0
 
 
 def principal_axes(centred: np.ndarray, count: int) -> np.ndarray:
-    """The directions of the largest variance.
+    """Return the directions of the largest variance.
 
-    All eigenvectors of the covariance where F is small; subspace iteration from a seeded start (Halko, Martinsson
-    and Tropp 2011) where it is not. Signs are fixed: the largest entry of an axis is positive.
+    All eigenvectors of the covariance for small F; subspace iteration from a seeded start (Halko, Martinsson and
+    Tropp 2011) for large F. Signs are fixed: the largest entry of an axis is positive.
 
     Args:
         centred: [n, F] f32, a sample without its mean.
-        count: how many axes at most.
+        count: the number of axes, at most.
 
     Returns:
         [F, min(count, F)] f32, orthonormal columns, the largest variance first.
@@ -252,6 +254,6 @@ def _subspace(centred: np.ndarray, count: int) -> np.ndarray:
     basis = np.linalg.qr(start)[0]
     for _ in range(_ITERATIONS):
         basis = np.linalg.qr(centred.T @ (centred @ basis))[0]
-    shown = (centred @ basis).astype(np.float64)
-    turn = np.linalg.eigh(shown.T @ shown)[1][:, ::-1][:, :count]
-    return basis @ turn
+    projected = (centred @ basis).astype(np.float64)
+    rotation = np.linalg.eigh(projected.T @ projected)[1][:, ::-1][:, :count]
+    return basis @ rotation

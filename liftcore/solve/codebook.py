@@ -1,9 +1,9 @@
-"""E of all views: what the regions of W stand for, rows of codebooks or means of several rows.
+"""E of all views: the vectors of the regions of W, rows of codebooks or means of several rows.
 
-A ray with labels on several levels gives each of its rows the same weight, so rays of one tuple of labels need one
-region and not one a level: with ``c`` labelled levels it has c times the weight, and the mean of the c rows. That is
-the same closed form, with half of the entries on real masks of four levels. Where a single region of a tuple counts
-for itself (reweighting, regions that the aggregation drops), regions are rows.
+A ray with labels on several levels gives each of its rows the same weight, so rays with one tuple of labels need one
+region, not one per level: with ``c`` labelled levels it has c times the weight, and the mean of the c rows. That is
+the same closed form, with half of the entries on real masks of four levels. Where single regions of a tuple matter
+(reweighting, regions that the aggregation drops), regions are rows.
 """
 
 import math
@@ -20,44 +20,44 @@ from liftcore.values.levels import label_tuples
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.views import NO_LABEL, Regions, ViewFeatures
 
-ROWS = 1 << 10  # of a codebook that are widened at a time
+ROWS = 1 << 10  # of a codebook that are converted at a time
 FLOAT16_MAX = 65_504.0
 FLOAT16_STEP = 2.0**-25  # the largest rounding error of its small values
-FLOAT16_ERROR = 1e-4  # of the longest vector, which float16 must hold
+FLOAT16_ERROR = 1e-4  # of the longest vector, the largest error of a row in float16
 UNIT_TOLERANCE = 5e-3  # float16 unit vectors are off by less
-SHORTEST = 1e-30  # of the vectors whose inverse length float32 takes well
+SHORTEST = 1e-30  # length of a vector whose inverse float32 represents
 TABLE_BYTES = 1 << 28  # of float32 columns of E of all views at a time
-LEAST_CHANNELS = 8  # at a time, however many regions there are
+LEAST_CHANNELS = 8  # at a time, for any number of regions
 
 
 @dataclass(frozen=True)
 class ViewCodebook:
-    """What the regions of one view's W stand for."""
+    """The vectors of the regions of one view's W."""
 
     rows: Tensor  # E [M, F] f16 or f32
     tuples: Tensor | None = None  # [T, L] i32, the rows of a region, -1 none, at least one; None: region m is row m
 
     @property
     def regions(self) -> int:
-        """T, or M."""
+        """The number of regions, T or M."""
         return (self.rows if self.tuples is None else self.tuples).shape[0]
 
     def means(self, rows: Tensor) -> Tensor:
-        """Of some numbers of each row [M, C] f32, what the regions read: means [T, C] over each tuple, or the rows.
+        """Return the means [T, C] of values of the rows [M, C] f32 over each tuple, or the rows themselves.
 
-        Rows are divided before they are added: a mean cannot overflow where its inputs do not.
+        Rows are divided before they are added: a mean cannot overflow if its inputs do not.
         """
         if self.tuples is None:
             return rows
         tuples = self.tuples.to(rows.device)
-        named = tuples != NO_LABEL
-        shares = named.float() / named.sum(dim=1, keepdim=True)  # zero where a tuple names none
+        has_row = tuples != NO_LABEL
+        shares = has_row.float() / has_row.sum(dim=1, keepdim=True)  # zero where a tuple has no row
         means = embedding_bag(tuples.clamp_min(0), rows, mode="sum", per_sample_weights=shares)
         largest = torch.finfo(torch.float32).max
         return means.clamp_(-largest, largest)  # the rounded shares of six rows add up to more than one
 
-    def counted(self, weights: RegionWeights) -> RegionWeights:
-        """W by rays, with each entry as often as its region has rows."""
+    def weights_by_row(self, weights: RegionWeights) -> RegionWeights:
+        """Return W with each entry multiplied by the number of rows of its region."""
         if self.tuples is None:
             return weights
         counts = (self.tuples != NO_LABEL).sum(dim=1).float().to(weights.device)
@@ -66,63 +66,63 @@ class ViewCodebook:
 
 @dataclass(frozen=True)
 class Codebook:
-    """E of all views, one after the other, as the offsets of W number its regions."""
+    """E of all views, concatenated in the order of the offsets of W."""
 
     views: Sequence[ViewCodebook]
 
     @property
     def channels(self) -> int:
-        """F."""
+        """The number of channels, F."""
         return self.views[0].rows.shape[1]
 
     @property
     def regions(self) -> int:
-        """M, of all views."""
+        """The number of regions of all views, M."""
         return sum(view.regions for view in self.views)
 
     @cached_property
     def lengths(self) -> list[Tensor]:
-        """[M] f64 a view: of the rows of its codebook."""
+        """The lengths of the rows of each view's codebook, [M] f64 per view."""
         return [row_lengths(view.rows) for view in self.views]
 
     @cached_property
     def unit(self) -> bool:
-        """Whether all rows are unit vectors, as float16 has them."""
+        """True if all rows are unit vectors to float16 precision."""
         return all(bool(((length - 1).abs() < UNIT_TOLERANCE).all()) for length in self.lengths)
 
     @cached_property
     def inverse_lengths(self) -> Tensor | None:
-        """[M] f32, what makes a unit vector of what each region reads, zero for none.
+        """The inverse length [M] f32 of each region's vector, zero for zero vectors.
 
-        None where a region reads the mean of several rows, or float32 does not hold its product with a weight.
+        None if a region is the mean of several rows, or an inverse times a weight may overflow float32.
         """
         lengths = torch.cat(self.lengths)
-        known = lengths > 0
-        if any(view.tuples is not None for view in self.views) or bool((lengths[known] < SHORTEST).any()):
+        nonzero = lengths > 0
+        if any(view.tuples is not None for view in self.views) or bool((lengths[nonzero] < SHORTEST).any()):
             return None
-        return torch.where(known, 1.0 / lengths, 0.0).float()
+        return torch.where(nonzero, 1.0 / lengths, 0.0).float()
 
     def fits_float16(self) -> bool:
-        """Whether float16 holds what the rows are."""
-        return float16_holds(((view.rows, own) for view, own in zip(self.views, self.lengths, strict=True)))
+        """Return True if float16 represents the rows of all codebooks."""
+        return float16_holds(((view.rows, lengths) for view, lengths in zip(self.views, self.lengths, strict=True)))
 
     def slices(self) -> Iterator[slice]:
-        """The channels that `values` gives at a time, so that a table takes TABLE_BYTES."""
+        """Return the slices of channels for `values`, such that a table takes TABLE_BYTES."""
         step = max(LEAST_CHANNELS, TABLE_BYTES // (4 * max(self.regions, 1)))
         return (slice(begin, min(begin + step, self.channels)) for begin in range(0, self.channels, step))
 
     def values(self, channels: slice, place: torch.device) -> Tensor:
-        """Some channels of what all regions read, [M, C] f32."""
+        """Return some channels of the vectors of all regions, [M, C] f32."""
         return self._table(channels, place, lambda _, rows: rows.float())
 
     def unit_values(self, channels: slice, place: torch.device) -> Tensor:
-        """Some channels of the same of unit vectors [M, C] f32; vectors of zeros stay."""
+        """Return some channels of all vectors, from rows of unit length, [M, C] f32; zero rows stay zero."""
 
-        def divided(view: int, rows: Tensor) -> Tensor:
+        def unit_rows(view: int, rows: Tensor) -> Tensor:
             lengths = self.lengths[view].to(place)
             return (rows.double() / torch.where(lengths > 0, lengths, 1.0)[:, None]).float()
 
-        return self._table(channels, place, divided)
+        return self._table(channels, place, unit_rows)
 
     def _table(self, channels: slice, place: torch.device, of_rows: Callable[[int, Tensor], Tensor]) -> Tensor:
         table, base = new_table(self.regions, channels.stop - channels.start, place), 0
@@ -133,11 +133,11 @@ class Codebook:
 
 
 def as_regions(observation: ViewFeatures, by_rows: bool) -> tuple[ViewFeatures, ViewCodebook]:
-    """The observation for the raster, and what the regions of its W stand for then.
+    """Return the observation for the raster, and the codebook of the regions of its W.
 
-    One level of tuples in place of several of rows, unless ``by_rows``. Grids and single levels stay as they are, and
-    maps of more than L tuples for each row of the codebook: tables of those would grow too much. The raster meets no
-    channel, so what it is given has none.
+    Several levels of rows become one level of tuples, unless ``by_rows``. Grids and single levels stay unchanged, and
+    so do maps with more than L tuples per row of the codebook, whose tables would grow too much. The raster reads no
+    channels, so the observation of tuples has none.
     """
     codebook = ViewCodebook(observation.codebook)
     if by_rows or not isinstance(observation, Regions) or observation.labels.shape[0] == 1:
@@ -150,7 +150,7 @@ def as_regions(observation: ViewFeatures, by_rows: bool) -> tuple[ViewFeatures, 
 
 
 def float16_holds(books: Iterable[tuple[Tensor, Tensor]]) -> bool:
-    """Whether float16 holds every value, and the longest row to FLOAT16_ERROR.
+    """Return True if float16 represents every value, and all rows to FLOAT16_ERROR of the longest.
 
     Args:
         books: codebooks [M, F], and the lengths [M] of their rows.
@@ -166,9 +166,9 @@ def float16_holds(books: Iterable[tuple[Tensor, Tensor]]) -> bool:
 
 
 def row_lengths(rows: Tensor) -> Tensor:
-    """[M] f64: lengths of vectors [M, F] f16 or f32, some at a time: in float64 all take four times their place."""
+    """Return lengths [M] f64 of vectors [M, F] f16 or f32, in blocks, as all in float64 would take much memory."""
     parts = [
-        torch.linalg.vector_norm(part.float(), dim=1, dtype=torch.float64)  # two quick conversions for a slow one
+        torch.linalg.vector_norm(part.float(), dim=1, dtype=torch.float64)  # faster than .double()
         for part in rows.split(ROWS)
     ]
     return torch.cat(parts) if parts else torch.zeros(0, dtype=torch.float64)

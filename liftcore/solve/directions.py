@@ -1,11 +1,11 @@
-"""Directions of regions: what their vectors say beyond what all of a scene's say.
+"""Directions of regions: their vectors relative to the scene's mean.
 
 With u_m the unit vector of region m and ``mu = sum W u / sum W`` the scene's mean over all splats and views, its
 direction is ``e_m = (u_m - mu) / |u_m - mu|``: the vectors of an encoder lie in a narrow cone, so raw cosines are all
-alike. A zero vector and the mean itself have none, and are zero.
+similar. A zero vector and the mean itself have no direction, and are zero.
 
-Where the channels are many and a region has many entries, directions are written in a few principal ones. Of
-noise these keep what regions share with one another, so cosines between noisy vectors grow alike.
+With many channels and many entries per region, directions are expressed in a few principal ones. These suppress noise
+that regions do not share.
 
 Of W only the weight of each region is needed, a sum over all splats (`region_totals`); all else is a function of the
 codebook, of the size of M.
@@ -24,24 +24,24 @@ from liftcore.runtime.jit import kernel
 from liftcore.solve.clusters import EXACT_CHANNELS, principal_axes
 from liftcore.solve.codebook import LEAST_CHANNELS, TABLE_BYTES, Codebook
 from liftcore.solve.shared_rows import flat_table, new_table
-from liftcore.solve.sums import PieceSums, added, piece_sums
+from liftcore.solve.sums import PieceSums, piece_sums, sum_pieces
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import DIRECTIONS
 
 CPU = torch.device("cpu")
 ROWS = 1 << 14  # of a table in float64 at a time
-SAMPLE = 1 << 14  # regions that say which directions are principal
+SAMPLE = 1 << 14  # regions from which principal directions are computed
 FILE = "directions.safetensors"
-NO_DIRECTION = 1e-6  # a unit vector nearer to the mean than that is the mean
+NO_DIRECTION = 1e-6  # distance to the mean below which a unit vector has no direction
 
 
 class RegionDirections:
-    """e of the regions of W, [M, D] f32 in slices of its columns; work of one thread, whose bits are fixed.
+    """e of the regions of W, [M, D] f32, in slices of columns; computed in one thread, bitwise reproducible.
 
     Args:
         codebook: E, whose regions are rows.
-        totals: [M] f64, the weight of each region before any reweighting. entries: how many W has.
-        principal: D, in which cosines are taken where channels are more and regions few beside entries.
+        totals: [M] f64, the weight of each region before any reweighting. entries: number of entries of W.
+        principal: D, if there are more channels and W has many entries per region.
     """
 
     mean: Tensor  # [F] f64, mu
@@ -49,101 +49,102 @@ class RegionDirections:
 
     def __init__(self, codebook: Codebook, totals: Tensor, entries: int, principal: int = DIRECTIONS) -> None:
         self._codebook, self.totals = codebook, totals
-        self.mean, self._distances = self._measured()
-        self._axes = self._principal(entries, principal)
+        self.mean, self._distances = self._mean_and_distances()
+        self._axes = self._principal_axes(entries, principal)
 
     @classmethod
     def of_weights(
         cls, W: RegionWeights, codebook: Codebook, principal: int = DIRECTIONS, threads: int | None = None
     ) -> "RegionDirections":
-        """Those of a scene whose W, of all views by rows of codebooks, lies in one place, on the CPU."""
-        totals = added(region_totals(W, threads), (1, codebook.regions))[0]
+        """Compute from W of all views by rows of codebooks, in one piece on the CPU."""
+        totals = sum_pieces(region_totals(W, threads), (1, codebook.regions))[0]
         return cls(codebook, torch.from_numpy(totals), W.region.shape[0], principal)
 
     @property
     def width(self) -> int:
-        """D, how many numbers a direction has."""
+        """The number of columns, D."""
         return self.mean.shape[0] if self._axes is None else self._axes.shape[1]
 
     def slices(self) -> Iterator[slice]:
-        """The columns that `table` gives at a time, so that it takes TABLE_BYTES."""
+        """Return the slices of columns for `table`, such that it takes TABLE_BYTES."""
         step = max(LEAST_CHANNELS, TABLE_BYTES // (4 * max(self.totals.shape[0], 1)))
         return (slice(begin, min(begin + step, self.width)) for begin in range(0, self.width, step))
 
     def table(self, columns: slice) -> Tensor:
-        """Some columns of e of all regions, [M, C] f32; zeros for none."""
+        """Return some columns of e of all regions, [M, C] f32; zeros for regions without direction."""
         if self._axes is None:
-            return self._centred(self._codebook.unit_values(columns, CPU), columns)
+            return self._centre(self._codebook.unit_values(columns, CPU), columns)
         table = new_table(self._codebook.regions, columns.stop - columns.start, CPU).zero_()
-        for own in self._codebook.slices():
-            table += self._centred(self._codebook.unit_values(own, CPU), own) @ self._axes[own, columns]
+        for channels in self._codebook.slices():
+            table += self._centre(self._codebook.unit_values(channels, CPU), channels) @ self._axes[channels, columns]
         return table
 
     def save(self, folder: Path) -> None:
-        """Write them for `StoredDirections`: a file a table, of which each is made once."""
+        """Write the directions for `StoredDirections`, a file per table."""
         for number, columns in enumerate(self.slices()):
             write_tensors(folder / _table_file(number), {"e": torch.from_numpy(flat_table(self.table(columns)))}, {})
         axes = {} if self._axes is None else {"axes": self._axes}
         write_tensors(folder / FILE, {"mean": self.mean, "totals": self.totals, **axes}, {})
 
     def of(self, vectors: Tensor) -> Tensor:
-        """Directions [K, D] f32 of other vectors [K, F], of length one in these columns; zeros for none."""
+        """Return the directions [K, D] f32 of other vectors [K, F], normalised in these columns; zeros for none."""
         wide = vectors.double()
         lengths = torch.linalg.vector_norm(wide, dim=1, keepdim=True)
-        known = lengths > 0
-        offsets = torch.where(known, wide / torch.where(known, lengths, 1.0) - self.mean, 0.0)
+        nonzero = lengths > 0
+        offsets = torch.where(nonzero, wide / torch.where(nonzero, lengths, 1.0) - self.mean, 0.0)
         offsets[torch.linalg.vector_norm(offsets, dim=1) <= NO_DIRECTION] = 0.0
-        shown = offsets if self._axes is None else offsets @ self._axes.double()
-        return torch.nn.functional.normalize(shown, dim=1, eps=NO_DIRECTION).float()
+        projected = offsets if self._axes is None else offsets @ self._axes.double()
+        return torch.nn.functional.normalize(projected, dim=1, eps=NO_DIRECTION).float()
 
-    def _measured(self) -> tuple[Tensor, Tensor]:
-        """mu, and the distance of each region's unit vector from it [M] f64, zero where it has no direction."""
+    def _mean_and_distances(self) -> tuple[Tensor, Tensor]:
+        """Return mu, and the distance [M] f64 of each region's unit vector from it, zero without a direction."""
         codebook, totals = self._codebook, self.totals
-        known = torch.cat(codebook.lengths) > 0
-        whole = float(totals[known].sum()) or 1.0
+        nonzero = torch.cat(codebook.lengths) > 0
+        total = float(totals[nonzero].sum()) or 1.0
         mean, squares = torch.zeros(codebook.channels, dtype=torch.float64), torch.zeros_like(totals)
         for channels in codebook.slices():
             unit = codebook.unit_values(channels, CPU)
-            for part, own in zip(unit.split(ROWS), totals.split(ROWS), strict=True):
-                mean[channels] += own @ part.double() / whole
+            for part, weights in zip(unit.split(ROWS), totals.split(ROWS), strict=True):
+                mean[channels] += weights @ part.double() / total
             for part, squared in zip(unit.split(ROWS), squares.split(ROWS), strict=True):
                 squared.add_((part.double() - mean[channels]).square().sum(dim=1))
         distances = squares.sqrt()
-        return mean, torch.where((distances > NO_DIRECTION) & known, distances, 0.0)
+        return mean, torch.where((distances > NO_DIRECTION) & nonzero, distances, 0.0)
 
-    def _principal(self, entries: int, number: int) -> Tensor | None:
-        """The axes [F, number] f32 in which e spreads most, each region by its weight; None: all channels.
+    def _principal_axes(self, entries: int, number: int) -> Tensor | None:
+        """Return the principal axes [F, number] f32 of e, each region by its weight; None: all channels.
 
-        Where a dense map has a region a few entries, turning them all takes longer than comparing them whole.
+        With few entries per region, as in dense maps, projecting all regions takes longer than comparing all
+        channels.
         """
         codebook = self._codebook
         if codebook.channels <= number or entries <= number * codebook.regions:
             return None
         step = -(-codebook.regions // SAMPLE)
-        e = self._whole_rows(slice(None, None, step))
+        e = self._full_rows(slice(None, None, step))
         if codebook.channels > EXACT_CHANNELS:
             weighted = e * self.totals[::step, None].sqrt().float()
             return torch.from_numpy(principal_axes(weighted.numpy(), number))
         e = e.double()
         return torch.linalg.eigh((e * self.totals[::step, None]).T @ e)[1][:, -number:].float().contiguous()
 
-    def _whole_rows(self, chosen: slice) -> Tensor:
-        """All channels of e of some regions, [m, F] f32."""
+    def _full_rows(self, regions: slice) -> Tensor:
+        """Return all channels of e of some regions, [m, F] f32."""
         channels = list(self._codebook.slices())
-        parts = (self._centred(self._codebook.unit_values(own, CPU)[chosen], own, chosen) for own in channels)
+        parts = (self._centre(self._codebook.unit_values(part, CPU)[regions], part, regions) for part in channels)
         return torch.cat(list(parts), dim=1)
 
-    def _centred(self, unit: Tensor, channels: slice, chosen: slice = slice(None)) -> Tensor:
-        """Unit vectors of regions [m, C] f32 become e, in place."""
-        distances = self._distances[chosen]
+    def _centre(self, unit: Tensor, channels: slice, regions: slice = slice(None)) -> Tensor:
+        """Replace unit vectors of regions [m, C] f32 by e, in place."""
+        distances = self._distances[regions]
         inverse = torch.where(distances > 0, 1.0 / distances, 0.0)
-        for part, own in zip(unit.split(ROWS), inverse.split(ROWS), strict=True):
-            part.copy_((part.double() - self.mean[channels]) * own[:, None])
+        for part, scales in zip(unit.split(ROWS), inverse.split(ROWS), strict=True):
+            part.copy_((part.double() - self.mean[channels]) * scales[:, None])
         return unit
 
 
 class StoredDirections(RegionDirections):
-    """Those that `RegionDirections.save` wrote into a folder, mapped: whoever compares regions makes no table."""
+    """Directions of `RegionDirections.save`, mapped from a folder, so that jobs compute no table."""
 
     def __init__(self, folder: Path) -> None:
         arrays = {name: torch.from_numpy(array) for name, array in map_tensors(folder / FILE)[0].items()}
@@ -151,9 +152,9 @@ class StoredDirections(RegionDirections):
         self._folder = folder
 
     def table(self, columns: slice) -> Tensor:
-        """See `RegionDirections`; the columns are one of the slices."""
-        number = [own.start for own in self.slices()].index(columns.start)
-        flat = torch.from_numpy(map_tensors(self._folder / _table_file(number))[0]["e"])  # as `flat_table` has it
+        """Return some columns as `RegionDirections.table`; they must be one of the slices."""
+        number = [part.start for part in self.slices()].index(columns.start)
+        flat = torch.from_numpy(map_tensors(self._folder / _table_file(number))[0]["e"])  # of `flat_table`
         shape = self.totals.shape[0], columns.stop - columns.start
         return flat[: prod(shape)].view(shape)
 
@@ -163,7 +164,7 @@ def _table_file(number: int) -> str:
 
 
 def region_totals(W: RegionWeights, threads: int | None = None) -> Iterator[PieceSums]:
-    """The weight of each region at every piece of splats, [1, M]."""
+    """Yield the weight of each region per piece of splats, [1, M]."""
     indptr, region, weight = (part.numpy() for part in (W.indptr, W.region, W.weight))
 
     def add(first: int, last: int, table: np.ndarray) -> None:

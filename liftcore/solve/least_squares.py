@@ -1,33 +1,32 @@
-"""Least squares over all rays: steps from the closed form X0 towards the smallest ``|A X - B|^2``, and the optimum.
+"""Least squares over all rays: conjugate gradients from the closed form X0 on ``|A X - B|^2``, and the optimum.
 
 A ray has a row of B for each labelled level (one for a grid), so its row of A counts as often: with N the number of
 rows of each ray, the matrix is ``sum_v A_v^T N_v A_v``. It is never formed: each step of conjugate gradients renders
 and transposes all views, a view and a block of channels at a time.
 
-**Damping.** With a row of A for each row of B, D = A^T 1 and the damping mu, `refine` looks for the smallest of::
+**Damping.** With a row of A for each row of B, D = A^T 1 and the damping mu, `refine` minimises::
 
     |A X - B|^2 + mu |D^(1/2) (X - X0)|^2,   (A^T A + mu D)(X - X0) = A^T (B - A X0)
 
-mu has no unit: where the rows of A sum to one, ``A^T A <= D``, so mu = 1 keeps at least as much of X0 as the data
-can take from it. mu = 0 is plain least squares, a large mu the closed form. Splats that the lift did not see stay
-zero.
+mu has no unit: where the rows of A sum to one, ``A^T A <= D``, so with mu = 1 the damping is at least as strong as
+the data. mu = 0 is undamped least squares, a large mu the closed form. Splats without weights in the lift stay zero.
 
-**How far the lift is from the optimum** (`reference`): ``L(x') / L(x^)`` over all rays, beside ``1 + beta``.
+**Distance of the lift to the optimum** (`reference`): ``L(x') / L(x^)`` over all rays, with ``1 + beta``.
 
-x^ is found by conjugate gradients in r random projections ``G = E R`` of the channels. Least squares is linear in B,
-so x^ R is the solution for B R; and with R Gaussian / sqrt(r), squared lengths and so L keep their mean (the ratio's
-relative error is about sqrt(2 / r), less where residuals point many ways).
+x^ is computed by conjugate gradients in r random projections ``G = E R`` of the channels. Least squares is linear in
+B, so x^ R is the solution for B R; and with R Gaussian / sqrt(r), squared lengths and so L keep their expectation
+(the ratio's relative error is about sqrt(2 / r), less if residuals have many directions).
 
-The theorem, and which beta it is about. Where the rows of A sum to one, Jensen gives ``L(x') <= J(x')`` with
+**The theorem and its beta.** Where the rows of A sum to one, Jensen gives ``L(x') <= J(x')`` with
 ``J(x) = sum_ij A_ij |x_j - B_i|^2``, and x' minimises J, so ``L(x') <= J(x^)``. Now with
 
     mu_i = | sum_j A_ij (x^_j - B_i) |,  beta_i = sum_j A_ij |x^_j - B_i|^2 / mu_i^2 - 1
 
 mu_i^2 is the row's part of L(x^), hence ``L(x') <= J(x^) = sum_i (1 + beta_i) mu_i^2 <= (1 + max_i beta_i) L(x^)``.
-The paper writes ``mu_i = sum_j A_ij |x^_j - B_i|``, lengths before the sum; that mu_i^2 is at least the row's part of
-L, not at most, its last step does not follow, and two rays suffice for a counterexample (tests/unit/solve). So the
-bound is built from the first reading, and the second is given beside it as ``beta_of_lengths``. The whole chain holds
-for any x in the place of x^, converged or not, and in the projected channels as in any.
+The paper writes ``mu_i = sum_j A_ij |x^_j - B_i|``, lengths before the sum. That mu_i^2 is at least the row's part of
+L, not at most, so its last step does not follow; two rays suffice for a counterexample (tests/unit/solve). So the
+bound uses the first definition, and the second is reported as ``beta_of_lengths``. The chain holds for any x in place
+of x^, converged or not, and in projected channels.
 """
 
 from collections.abc import Callable, Sequence
@@ -50,15 +49,15 @@ from liftcore.solve.rays import Readout, SampledRays, read_pixels
 from liftcore.values.settings import LiftSettings
 from liftcore.values.views import NO_LABEL, Regions, ViewFeatures
 
-BLOCK = 32  # channels solved at a time: what a raster does in one pass, and memory for a few [P, 32] f32
-ROWS = 1 << 14  # rows widened at a time
-EXTRA_AXES = 8  # directions that the iteration carries beyond those asked for
+BLOCK = 32  # channels solved at a time: one pass of the raster, and memory for a few [P, 32] f32
+ROWS = 1 << 14  # rows converted at a time
+EXTRA_AXES = 8  # directions of the iteration beyond those requested
 ROUNDS = 12  # of the subspace iteration
 FLOAT16_MAX = 65_504.0
-TOLERANCE = 1e-4  # of the gradient, relative to the closed form's; float32 products give little more
-FAR_LONGER = 10.0  # than any input: a mean of inputs never is, and with damping 1 hardly a splat (tests/stability)
-FAINTEST = 1e-30  # a diagonal entry below this says nothing of its splat, and its inverse would overflow
-STEPS = 100  # of conjugate gradients towards the optimum, unless the gradient has vanished before
+TOLERANCE = 1e-4  # of the gradient, relative to the closed form's; float32 products allow little more
+FAR_LONGER = 10.0  # than any input: never for a mean of inputs, and rare with damping 1 (tests/stability)
+FAINTEST = 1e-30  # a smaller diagonal entry does not determine its splat, and its inverse would overflow
+STEPS = 100  # of conjugate gradients towards the optimum, at most
 
 Product = Callable[[np.ndarray], np.ndarray]  # [P, C] f32 -> [P, C] f32
 Watch = Callable[[int, np.ndarray, np.ndarray], None]  # step, solution, rest: after every step
@@ -70,10 +69,10 @@ class Channels:
 
     begin: int  # of the slice, or of the columns of axes
     end: int
-    axes: Tensor | None  # [F, K] f32; None takes the channels as they are
+    axes: Tensor | None  # [F, K] f32; None: the identity
 
     def project(self, rows: Tensor) -> np.ndarray:
-        """[n, F] f16 or f32 -> [n, C] f32."""
+        """Project rows [n, F] f16 or f32 to [n, C] f32."""
         result = torch.empty(rows.shape[0], self.end - self.begin, dtype=torch.float32)
         axes = None if self.axes is None else self.axes[:, self.begin : self.end].contiguous()
         with one_thread():
@@ -84,9 +83,9 @@ class Channels:
         return result.numpy()
 
     def add(self, features: Tensor, step: np.ndarray) -> Tensor:
-        """Add ``step`` [P, C] f32, put back into all channels, to the features [P, F]; gives them.
+        """Add ``step`` [P, C] f32, mapped back to all channels, to the features [P, F], and return them.
 
-        They are changed in place, unless float16 cannot hold the result: then a float32 copy is.
+        In place, unless the result overflows float16: then to a float32 copy.
         """
         axes = None if self.axes is None else self.axes[:, self.begin : self.end].T.contiguous()
         channels = slice(self.begin, self.end) if axes is None else slice(None)
@@ -101,16 +100,16 @@ class Channels:
 
 
 def blocks(channels: int, axes: Tensor | None = None) -> list[Channels]:
-    """All channels, or all columns of ``axes`` [F, K], in blocks of one pass of the raster."""
+    """Return all channels, or all columns of ``axes`` [F, K], in blocks of one pass of the raster."""
     total = channels if axes is None else axes.shape[1]
     return [Channels(begin, min(begin + BLOCK, total), axes) for begin in range(0, total, BLOCK)]
 
 
 def codebook_axes(codebooks: Sequence[Tensor], count: int) -> Tensor:
-    """The ``count`` directions [F, count] f32 that hold most of the squares of all codebook rows.
+    """Return the ``count`` leading right singular vectors [F, count] f32 of all codebook rows.
 
-    A block power iteration from a fixed start. The rows are not centred, so their mean is held too; every solution
-    is a combination of them, and with ``count`` at their rank nothing is left out.
+    A block power iteration from a fixed start. The rows are not centred, so their mean is included; every solution is
+    a combination of rows, so with ``count`` at their rank the projection is exact.
     """
     channels = codebooks[0].shape[1]
     generator = torch.Generator().manual_seed(0)
@@ -127,18 +126,18 @@ def codebook_axes(codebooks: Sequence[Tensor], count: int) -> Tensor:
 
 
 def longest_row(books: Sequence[Tensor]) -> float:
-    """The largest length of the rows of several [n, F]."""
+    """Return the largest length of the rows of several arrays [n, F]."""
     return max((float(row_lengths(book).max()) for book in books if book.numel()), default=0.0)
 
 
 def random_axes(channels: int, count: int, seed: int) -> Tensor:
-    """Gaussian projections [F, count] f32 that keep squared lengths in the mean (Johnson-Lindenstrauss)."""
+    """Return Gaussian projections [F, count] f32 that keep expected squared lengths (Johnson-Lindenstrauss)."""
     generator = torch.Generator().manual_seed(seed)
     return torch.randn(channels, count, generator=generator, dtype=torch.float32) / count**0.5
 
 
 def _gram_times(codebooks: Sequence[Tensor], axes: Tensor, scale: float) -> Tensor:
-    """``sum_v E_v^T E_v axes / scale^2``."""
+    """Return ``sum_v E_v^T E_v axes / scale^2``."""
     total = torch.zeros_like(axes)
     for book in codebooks:
         for first in range(0, book.shape[0], ROWS):
@@ -148,13 +147,13 @@ def _gram_times(codebooks: Sequence[Tensor], axes: Tensor, scale: float) -> Tens
 
 
 class AllRays:
-    """The operator. Weights are plain (power 1), whatever power the closed form takes: the aim is ``|A X - B|^2``.
+    """The operator of least squares. Weights have power 1, for any power of the closed form.
 
     Args:
         raster: A of a view. count: P.
         views: the cameras, in the order of the sums.
-        observed: view number -> what it observes, as the lift read it.
-        params: of the lift; every ray counts, whatever its stride.
+        observed: view number -> its observation, as the lift read it.
+        params: of the lift; all rays are used, for any stride.
     """
 
     def __init__(
@@ -170,7 +169,7 @@ class AllRays:
         self.views = views
         self._raster, self._observed = raster, observed
         self._params = replace(params, stride=1, offset=(0, 0))
-        self._counts: list[np.ndarray] = []  # [H, W] of every view: rows of B of each ray
+        self._counts: list[np.ndarray] = []  # [H, W] per view: rows of B of each ray
         self.row_sums = np.zeros(count)  # D = sum_v A_v^T N_v 1, [P] f64
         self.diagonal = np.zeros(count)  # of sum_v A_v^T N_v A_v, [P] f64
         self.rows = 0  # of B
@@ -179,7 +178,7 @@ class AllRays:
             progress("rays", number + 1, len(views), "views")
 
     def _count_rows(self, number: int, camera: Camera) -> None:
-        """Count the rows of a view, and add up what they say of each splat."""
+        """Count the rows of a view, and add its row sums and diagonal."""
         observation = self._observed(number)
         rays = _readout(observation, camera).rays
         counts = np.bincount(rays, minlength=camera.width * camera.height).reshape(camera.height, camera.width)
@@ -191,7 +190,7 @@ class AllRays:
             sums[weights.splats.numpy()] += weights.weight.numpy()
 
     def normal(self, X: np.ndarray) -> np.ndarray:
-        """``sum_v A_v^T N_v A_v X``: [P, C] f32 -> [P, C] f32."""
+        """Return ``sum_v A_v^T N_v A_v X``: [P, C] f32 -> [P, C] f32."""
         total = np.zeros_like(X)
         values = torch.from_numpy(X)
         for camera, counts in zip(self.views, self._counts, strict=True):
@@ -201,10 +200,10 @@ class AllRays:
         return total
 
     def gradient(self, X: np.ndarray, project: Callable[[Tensor], np.ndarray]) -> tuple[np.ndarray, float]:
-        """``A^T (B - A X)`` [P, C] f32 over all rows, and ``|A X - B|^2``.
+        """Return ``A^T (B - A X)`` [P, C] f32 over all rows, and ``|A X - B|^2``.
 
         Args:
-            X: [P, C] f32. project: rows of a codebook [M, F] -> [M, C] f32, the channels that X has.
+            X: [P, C] f32. project: rows of a codebook [M, F] -> [M, C] f32, the channels of X.
         """
         total, squares = np.zeros_like(X), 0.0
         for number, camera in enumerate(self.views):
@@ -226,7 +225,7 @@ class AllRays:
 
 @kernel
 def subtract_rows(rays, columns, shares, codebook, rendered, rest):
-    """Add ``B_i - (A X)_i`` of every row i to its ray in ``rest`` [rays, C] f32; gives the sum of their squares.
+    """Add ``B_i - (A X)_i`` of every row i to its ray in ``rest`` [rays, C] f32; return the sum of their squares.
 
     Args:
         rays: [rows] i64. columns: [rows, taps] i64. shares: [rows, taps] f64. codebook: [M, C] f32.
@@ -246,13 +245,13 @@ def subtract_rows(rays, columns, shares, codebook, rendered, rest):
 
 
 def _readout(observation: ViewFeatures, camera: Camera) -> Readout:
-    """S of all pixels of a view."""
+    """Return S of all pixels of a view."""
     y, x = np.mgrid[: camera.height, : camera.width].astype(np.int32)
     return read_pixels(observation, camera, torch.from_numpy(np.stack([x.ravel(), y.ravel()], axis=1)))
 
 
 def _labelled(observation: ViewFeatures) -> Regions:
-    """The observation with one region for all that is labelled: its region weights are sums over the rows of B."""
+    """Return an observation with one region for all labelled pixels, whose weights are sums over the rows of B."""
     if isinstance(observation, Regions):
         return Regions(observation.labels.clamp(NO_LABEL, 0), torch.ones(1, 1, dtype=torch.float32))
     return Regions(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1, dtype=torch.float32))
@@ -260,33 +259,33 @@ def _labelled(observation: ViewFeatures) -> Regions:
 
 @dataclass(frozen=True)
 class Stopping:
-    """When to stop."""
+    """The stopping criterion of conjugate gradients."""
 
-    steps: int
+    steps: int  # at most
     tolerance: float = 0.0  # of the gradient's preconditioned length, relative to the first
 
 
 @dataclass(frozen=True)
 class CgOutcome:
-    """Where it ended, and why."""
+    """The result of conjugate gradients, per channel."""
 
     solution: np.ndarray  # [P, C] f32
-    rest: np.ndarray  # [P, C] f32, R - K X as the recurrence has it
+    rest: np.ndarray  # [P, C] f32, R - K X by recurrence
     steps: int
     gradients: np.ndarray  # [steps + 1] f64: sqrt(sum_c r^T M^-1 r), relative to the first
-    converged: np.ndarray  # [C] bool: the tolerance was reached
-    broken: np.ndarray  # [C] bool: no curvature was left before that
+    converged: np.ndarray  # [C] bool, the tolerance was reached
+    broken: np.ndarray  # [C] bool, the curvature was not positive before that
 
 
 def conjugate_gradients(
     product: Product, right: np.ndarray, inverse: np.ndarray, stopping: Stopping, watch: Watch | None = None
 ) -> CgOutcome:
-    """Solve from zero.
+    """Solve ``K X = right`` from zero.
 
     Args:
         product: K.
         right: [P, C] f32. inverse: [P] f32, the preconditioner ``M^-1``; rows where it is zero stay zero.
-        watch: called after every step; an exception from it stops the work.
+        watch: called after every step; an exception from it stops the solve.
     """
     solution, rest = np.zeros_like(right), right.copy()
     slope = column_dots(rest, rest * inverse[:, None])  # r^T M^-1 r
@@ -319,7 +318,7 @@ def conjugate_gradients(
 
 
 def column_dots(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """[C] f64: the inner products of the columns of two [P, C] f32, in a fixed order."""
+    """Return the inner products [C] f64 of the columns of two arrays [P, C] f32, in a fixed order."""
     total = np.zeros(left.shape[1])
     for begin in range(0, left.shape[0], ROWS):
         block = slice(begin, begin + ROWS)
@@ -329,18 +328,18 @@ def column_dots(left: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Refinement:
-    """The refined features, and how it went."""
+    """Refined features, and statistics of the solve."""
 
-    features: Tensor  # [P, F], as they came in; float32 where float16 cannot hold them
-    stats: dict[str, Any]  # ready for JSON; result: "converged", "steps" (all were used) or "breakdown"
+    features: Tensor  # [P, F], in the dtype of the input; float32 if they overflow float16
+    stats: dict[str, Any]  # for JSON; result: "converged", "steps" (all were used) or "breakdown"
 
 
 @dataclass(frozen=True)
 class BlockOutcome:
-    """One block of channels solved."""
+    """The solution of one block of channels."""
 
     step: np.ndarray  # [P, C] f32, X - X0
-    losses: list[float]  # |A X - B|^2 in these channels: of X0 and after every step
+    losses: list[float]  # |A X - B|^2 in these channels, of X0 and after every step
     steps: int
     gradient: float  # after the last step, relative to the first
     converged: bool  # in all channels
@@ -350,7 +349,7 @@ class BlockOutcome:
 def refine(
     rays: AllRays,
     features: Tensor,
-    seen: np.ndarray,
+    has_feature: np.ndarray,
     codebooks: Sequence[Tensor],
     settings: LiftSettings,
     progress: Progress,
@@ -359,7 +358,7 @@ def refine(
 
     Args:
         features: [P, F] f16 or f32, X0; changed in place.
-        seen: [P] bool, the splats to solve for.
+        has_feature: [P] bool, the splats to solve for.
         codebooks: E_v [M, F] of every view.
     """
     reduced = 0 < settings.cg_basis < features.shape[1]
@@ -367,36 +366,36 @@ def refine(
     total = len(parts) * settings.cg_steps
     solved = []
     for number, part in enumerate(parts):
-        done = number * settings.cg_steps
+        completed = number * settings.cg_steps
 
-        def watch(step: int, *_: object, done: int = done) -> None:
-            progress("refine", done + step, total, "steps")
+        def watch(step: int, *_: object, completed: int = completed) -> None:
+            progress("refine", completed + step, total, "steps")
 
-        block = solve_block(rays, part, features, seen, settings.damping, settings.cg_steps, watch)
+        block = solve_block(rays, part, features, has_feature, settings.damping, settings.cg_steps, watch)
         features = part.add(features, block.step)
-        solved.append(replace(block, step=np.empty(0)))  # which is as large as its part of X
-        del block  # before the next one is solved beside it
-        progress("refine", done + settings.cg_steps, total, "steps")
-    made = _summary(features, solved, parts[-1].end, settings, rays.rows)
-    inputs, found = longest_row(codebooks), longest_row([features])
-    if found > FAR_LONGER * inputs:
-        told = f"least squares made features up to {found / inputs:.0f} times as long as any input"
-        made.stats["warning"] = f"{told}: see whether damping=1, which holds them back, serves better"
-    return made
+        solved.append(replace(block, step=np.empty(0)))  # the step is as large as its part of X
+        del block  # before the next one is solved
+        progress("refine", completed + settings.cg_steps, total, "steps")
+    refinement = _summary(features, solved, parts[-1].end, settings, rays.rows)
+    inputs, longest = longest_row(codebooks), longest_row([features])
+    if longest > FAR_LONGER * inputs:
+        message = f"least squares made features up to {longest / inputs:.0f} times as long as any input"
+        refinement.stats["warning"] = f"{message}: try damping=1, which bounds them"
+    return refinement
 
 
 def solve_block(
     rays: AllRays,
     part: Channels,
     features: Tensor,
-    seen: np.ndarray,
+    has_feature: np.ndarray,
     damping: float,
     steps: int,
     watch: Watch | None = None,
 ) -> BlockOutcome:
-    """``X - X0`` in one block of channels."""
-    weight = np.where(seen, damping * rays.row_sums, 0.0)
-    diagonal = np.where(seen, rays.diagonal, 0.0) + weight
+    """Compute ``X - X0`` in one block of channels."""
+    weight = np.where(has_feature, damping * rays.row_sums, 0.0)
+    diagonal = np.where(has_feature, rays.diagonal, 0.0) + weight
     inverse = np.divide(1.0, diagonal, out=np.zeros_like(diagonal), where=diagonal > FAINTEST).astype(np.float32)
     weight = weight.astype(np.float32)[:, None]
     gradient, loss = rays.gradient(part.project(features), part.project)
@@ -432,11 +431,11 @@ def _summary(
     ]
     gradient = max(block.gradient for block in solved)
     if any(block.broken for block in solved):
-        result, why = "breakdown", "a direction without curvature ended some channels early; more damping helps"
+        result, reason = "breakdown", "some channels ended early, without positive curvature; use more damping"
     elif all(block.converged for block in solved):
-        result, why = "converged", f"the gradient fell below {TOLERANCE:g} of the closed form's"
+        result, reason = "converged", f"the gradient fell below {TOLERANCE:g} of the closed form's"
     else:
-        result, why = "steps", f"the gradient is {gradient:.2g} of the closed form's; more cg_steps would go on"
+        result, reason = "steps", f"the gradient is {gradient:.2g} of the closed form's; use more cg_steps"
     change = losses[-1] / losses[0] if losses[0] > 0 else 1.0
     stats = {
         "result": result,
@@ -448,7 +447,7 @@ def _summary(
     }
     stats["message"] = (
         f"{stats['steps']} steps with damping {settings.damping:g} left {100 * change:.1f}% of the closed form's "
-        f"residual in {stats['channels']} channels: {why}."
+        f"residual in {stats['channels']} channels: {reason}."
     )
     return Refinement(features, stats)
 
@@ -456,19 +455,19 @@ def _summary(
 def reference(
     rays: AllRays,
     features: Tensor,
-    seen: np.ndarray,
+    has_feature: np.ndarray,
     samples: Sequence[SampledRays],
     codebooks: Sequence[Tensor],
     settings: LiftSettings,
     progress: Progress,
 ) -> dict[str, Any]:
-    """``L(x')``, ``L(x^)`` and their ratio over all rays; beta and the bounds at x^ on the sampled rays.
+    """Return ``L(x')``, ``L(x^)`` and their ratio over all rays; beta and the bounds at x^ on the sampled rays.
 
     Args:
-        features: [P, F], x'. seen: [P] bool. samples, codebooks: of every view.
+        features: [P, F], x'. has_feature: [P] bool. samples, codebooks: of every view.
 
     Returns:
-        Plain numbers, ready for JSON; None where nothing was sampled or measurable, or a row is met exactly.
+        Numbers for JSON; None if nothing was sampled or measurable, or a row has no residual.
     """
     axes = random_axes(features.shape[1], settings.reference_channels, settings.seed)
     parts = blocks(features.shape[1], axes)
@@ -476,18 +475,20 @@ def reference(
     lifted = best = gradient = 0.0
     steps, converged = 0, True
     for number, part in enumerate(parts):
-        block = solve_block(rays, part, features, seen, 0.0, STEPS, _teller(progress, number, len(parts)))
+        block = solve_block(
+            rays, part, features, has_feature, 0.0, STEPS, _reference_watch(progress, number, len(parts))
+        )
         solution = part.project(features) + block.step
         optimum[:, part.begin : part.end] = solution
         lifted += block.losses[0]
-        best += rays.gradient(solution, part.project)[1]  # measured, not by recurrence
+        best += rays.gradient(solution, part.project)[1]  # computed anew, not by recurrence
         gradient = max(gradient, block.gradient)
         steps, converged = max(steps, block.steps), converged and block.converged
         progress("reference", (number + 1) * STEPS, len(parts) * STEPS, "steps")
-    whole = Channels(0, axes.shape[1], axes)
-    books = [torch.from_numpy(whole.project(book)) for book in codebooks]
+    all_channels = Channels(0, axes.shape[1], axes)
+    books = [torch.from_numpy(all_channels.project(book)) for book in codebooks]
     measured = _measured(measure_samples(samples, torch.from_numpy(optimum), books))
-    found = {
+    facts = {
         "channels": axes.shape[1],
         "steps": steps,
         "converged": converged,
@@ -497,13 +498,13 @@ def reference(
         "ratio": lifted / best if best > 0 else None,
         **measured,
     }
-    return found | {"message": _message(found)}
+    return facts | {"message": _message(facts)}
 
 
 def row_betas(measures: ViewMeasures) -> np.ndarray:
-    """beta_i [rows] f64 of the theorem, ``sum_j A_ij |x_j - B_i|^2 / mu_i^2 - 1``.
+    """Return beta_i [rows] f64 of the theorem, ``sum_j A_ij |x_j - B_i|^2 / mu_i^2 - 1``.
 
-    Infinite where mu alone is zero, and NaN where the ray meets no splat.
+    Infinite where only mu is zero, and NaN where the ray hits no splat.
     """
     ratio = np.ones_like(measures.surrogates)
     np.divide(measures.surrogates, measures.residuals, out=ratio, where=measures.residuals > 0)
@@ -522,23 +523,23 @@ def _measured(measures: ViewMeasures) -> dict[str, Any]:
     }
 
 
-def _message(found: dict[str, Any]) -> str:
-    """What was found, in a sentence for the user."""
-    if found["ratio"] is None:
-        return "The optimum meets every row exactly: there is no ratio to speak of."
+def _message(facts: dict[str, Any]) -> str:
+    """Return the result in a sentence for the user."""
+    if facts["ratio"] is None:
+        return "The residual of the optimum is zero: there is no ratio."
     end = (
         "converged"
-        if found["converged"]
-        else f"not converged, so it is at least that; gradient {found['gradient']:.2g}"
+        if facts["converged"]
+        else f"not converged, so it is at least that; gradient {facts['gradient']:.2g}"
     )
-    said = f"L(x') is {found['ratio']:.3f} times L(x^) after {found['steps']} steps ({end})"
-    if found["bound"] is None or found["surrogate_bound"] is None:
-        return f"{said}; no bound, for no row was sampled or one is met exactly."
+    sentence = f"L(x') is {facts['ratio']:.3f} times L(x^) after {facts['steps']} steps ({end})"
+    if facts["bound"] is None or facts["surrogate_bound"] is None:
+        return f"{sentence}; no bound, as no row was sampled or the residual of one is zero."
     return (
-        f"{said}; on the sampled rays J(x^) / L(x^) is {found['surrogate_bound']:.3f} and 1 + beta is "
-        f"{found['bound']:.3g}. Both bound the ratio for plain weights (power 1) over all rays."
+        f"{sentence}; on the sampled rays J(x^) / L(x^) is {facts['surrogate_bound']:.3f} and 1 + beta is "
+        f"{facts['bound']:.3g}. Both bound the ratio for weights of power 1 over all rays."
     )
 
 
-def _teller(progress: Progress, number: int, parts: int) -> Watch:
+def _reference_watch(progress: Progress, number: int, parts: int) -> Watch:
     return lambda step, *_: progress("reference", number * STEPS + step, parts * STEPS, "steps")

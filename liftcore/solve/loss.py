@@ -1,14 +1,15 @@
-"""Huber's loss in place of squares: the closed form of weights that lie far less on what is far away.
+"""Huber's loss instead of squares: a closed form with smaller weights for distant regions.
 
-The closed form is the smallest ``sum_jm W_jm |x_j - e_m|^2``. With Huber's loss it is, splat by splat, that of::
+The closed form minimises ``sum_jm W_jm |x_j - e_m|^2``. With Huber's loss, splat by splat, it minimises::
 
     sum_jm W_jm rho(|x_j - e_m|),    rho(d) = d^2 / 2 up to delta, then delta (d - delta / 2)
 
-which is convex. Its smallest is found by reweighting (IRLS; Huber, *Robust Statistics*, 1981): the closed form of
-``W'_jm = W_jm min(1, delta / d_jm)``, with the distances d of the step before, never raises the sum. delta is the
-scene's mean distance at the first closed form, ``sum W d / sum W``, so that nothing depends on how long features are.
+which is convex. It is minimised by reweighting (IRLS; Huber, *Robust Statistics*, 1981): the closed form of
+``W'_jm = W_jm min(1, delta / d_jm)``, with the distances d of the step before, never increases the sum. delta is the
+scene's mean distance at the first closed form, ``sum W d / sum W``, so the result is independent of the features'
+scale.
 
-**How it splits.** delta is a sum over splats, taken by pieces; all else is a function of a splat's row of W.
+**Blocks of splats.** delta is a sum over splats, by pieces; all else is a function of a splat's row of W.
 """
 
 import math
@@ -25,7 +26,7 @@ from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, silent
 from liftcore.solve.closed_form import morton_codes
 from liftcore.solve.codebook import Codebook
-from liftcore.solve.sums import PieceSums, added, piece_sums
+from liftcore.solve.sums import PieceSums, piece_sums, sum_pieces
 from liftcore.values.region_weights import (
     BLOCK_ENTRIES,
     BLOCK_ROWS,
@@ -35,8 +36,8 @@ from liftcore.values.region_weights import (
     run_each,
 )
 
-STEPS = 3  # of reweighting, which hardly move features further
-MOST_SCALE = 126  # the power of two
+STEPS = 3  # of reweighting; more hardly change features
+MOST_SCALE = 126  # largest exponent of the power of two
 
 
 @one_thread()
@@ -49,37 +50,37 @@ def huber_factors(
     threads: int | None = None,
     delta: float | None = None,
 ) -> Tensor:
-    """What each entry of W is multiplied with, [nnz] f32 in 0..1, for its closed form to be that of Huber's loss.
+    """Return the factor of each entry of W, [nnz] f32 in 0..1, for the closed form of Huber's loss.
 
     Args:
-        W: of all views by rows of codebooks, on the CPU; of all splats, or of a block of them where delta is known.
-        means: [n, 3] of the splats; neighbours go together.
-        threads: None takes the cores that this process may use. The number changes no bit.
+        W: of all views by rows of codebooks, on the CPU; of all splats, or of a block of them if delta is given.
+        means: [n, 3] of the splats; neighbours are processed together.
+        threads: None uses the cores that this process may use. The result is bitwise identical for any number.
         delta: of the scene; None: of these splats.
     """
     distances = RegionDistances(W, codebook, means, threads)
     factors = zeros(tuple(W.weight.shape), torch.float32, name="weights", in_file=distances.in_file)
     factors += 1.0
     for step in range(STEPS):
-        found = distances.after(factors)
+        lengths = distances.after(factors)
         if delta is None:
-            delta = mean_distance(added(distances.sums(found), (2, 1)))
-        for first in range(0, found.shape[0], BLOCK_ENTRIES):
-            own = slice(first, first + BLOCK_ENTRIES)
-            factors[own] = torch.where(found[own] > delta, delta / found[own], 1.0)
+            delta = mean_distance(sum_pieces(distances.sums(lengths), (2, 1)))
+        for first in range(0, lengths.shape[0], BLOCK_ENTRIES):
+            block = slice(first, first + BLOCK_ENTRIES)
+            factors[block] = torch.where(lengths[block] > delta, delta / lengths[block], 1.0)
         progress("loss", step + 1, STEPS, "steps")
     return factors
 
 
 def mean_distance(sums: np.ndarray) -> float:
-    """delta, from the sums [2, 1] f64 of all splats (`RegionDistances.sums`)."""
+    """Return delta, from the sums [2, 1] f64 of all splats (`RegionDistances.sums`)."""
     return float(sums[0, 0]) / (float(sums[1, 0]) or 1.0)
 
 
 class RegionDistances:
-    """``|x_j - e_m|`` of the entries of a block of splats, times a power of two that the codebook gives.
+    """``|x_j - e_m|`` of the entries of a block of splats, times a power of two that depends on the codebook.
 
-    Args: as `huber_factors` has them.
+    Args: those of `huber_factors`.
     """
 
     def __init__(self, W: RegionWeights, codebook: Codebook, means: Tensor | None, threads: int | None) -> None:
@@ -88,12 +89,12 @@ class RegionDistances:
         rows = torch.nonzero(W.indptr.diff())[:, 0]
         self.rows = rows if means is None else rows[torch.argsort(morton_codes(means[rows]))]
         self.blocks = row_blocks(W.indptr.diff()[self.rows].numpy(), BLOCK_ROWS, BLOCK_ENTRIES)
-        longest = max((float(own.max()) for own in codebook.lengths if own.numel()), default=0.0)
-        # Squares of very long and short rows have no place in float32, nor has the scale of what it hardly holds.
+        longest = max((float(lengths.max()) for lengths in codebook.lengths if lengths.numel()), default=0.0)
+        # Squares of very long and very short rows overflow or underflow float32; the scale itself must not.
         self.scale = 2.0 ** min(-round(math.log2(longest)), MOST_SCALE) if longest > 0 else 1.0
 
     def after(self, factors: Tensor) -> Tensor:
-        """[nnz] f32, with x_j of the closed form of W times these factors [nnz] f32."""
+        """Return distances [nnz] f32 with x_j of the closed form of W times these factors [nnz] f32."""
         W = self.W
         squares = zeros(tuple(W.weight.shape), torch.float32, name="weights", in_file=self.in_file)
         arrays = [part.numpy() for part in (W.indptr, W.region, W.weight, factors, squares)]
@@ -104,11 +105,11 @@ class RegionDistances:
         return squares.sqrt_()
 
     def sums(self, distances: Tensor) -> Iterator[PieceSums]:
-        """``W d`` and ``W`` at every piece of the block, [2, 1]."""
-        indptr, weight, moved = (part.numpy() for part in (self.W.indptr, self.W.weight, distances))
+        """Yield the sums of ``W d`` and ``W`` of every piece of the block, [2, 1]."""
+        indptr, weight, lengths = (part.numpy() for part in (self.W.indptr, self.W.weight, distances))
 
         def add(first: int, last: int, table: np.ndarray) -> None:
-            add_distances(first, last, indptr, weight, moved, table)
+            add_distances(first, last, indptr, weight, lengths, table)
 
         return piece_sums(add, indptr.size - 1, (2, 1), self.threads)
 

@@ -1,11 +1,10 @@
-"""Memberships: which regions of a view each splat belongs to. Mask consensus and objects ask it alike.
+"""Memberships: the regions of each view to which a splat belongs, for mask consensus and objects.
 
-Splat j belongs to region m where m has at least BELONGS of the splat's weight in its group, a level of a view, and
-the group weighs more than FAINT there. A splat may lie in a region and not belong to it: on the border of two regions
-it belongs to neither.
+Splat j belongs to region m if m has at least BELONGS of the splat's weight in its group, a level of a view, and the
+group has more weight than FAINT there. A splat with an entry of a region need not belong to it: on the border of two
+regions it belongs to neither.
 
-**How a step splits.** A membership is a function of the splat's weights in one view: blocks of splats and blocks of
-views give the same.
+A membership is a function of the splat's weights in one view, so blocks of splats and blocks of views give the same.
 """
 
 from dataclasses import dataclass
@@ -15,22 +14,22 @@ import numpy as np
 from liftcore.runtime.jit import kernel
 from liftcore.values.region_weights import RegionWeights, run_each
 
-BELONGS = 0.7  # of a splat's weight in a level of a view: less, and the splat lies on the border of two regions
-FAINT = 0.05  # of rays; a level that weighs less at a splat hardly sees it
+BELONGS = 0.7  # of a splat's weight in a level of a view; with less, the splat lies on the border of two regions
+FAINT = 0.05  # sum of weights below which a level hardly sees a splat
 
 
 @dataclass(frozen=True)
 class RegionGroups:
-    """The view and the group of each region of all views. Cells of grids are in no group, and take no part."""
+    """The view and the group of each region of all views. Cells of grids have no group and are ignored."""
 
     views: int  # V
     view: np.ndarray  # [M] i32
     group: np.ndarray  # [M] i32, view * levels + level; -1 for cells of grids
-    levels: int  # that any view has, at least one
+    levels: int  # the maximum over views, at least one
 
     @classmethod
     def of(cls, offsets: np.ndarray, levels: np.ndarray) -> "RegionGroups":
-        """From the first region of each view [V + 1] i64, and the level of each region [M] i8, -1 for cells."""
+        """Build from the first region of each view [V + 1] i64 and the level of each region [M] i8, -1 for cells."""
         view = np.repeat(np.arange(offsets.size - 1), np.diff(offsets)).astype(np.int32)
         several = int(levels.max(initial=0)) + 1
         return cls(
@@ -40,29 +39,29 @@ class RegionGroups:
 
 @dataclass(frozen=True)
 class Memberships:
-    """Who belongs to what, of some splats and of some views or all."""
+    """Memberships of some splats in regions of some or all views."""
 
-    own: np.ndarray  # [nnz] bool, the entries of W whose splat belongs to their region
+    own_region: np.ndarray  # [nnz] bool, the entries of W whose splat belongs to their region
     totals: np.ndarray  # [n] f64, the sum of each row of W: t_j where W is of all views
 
 
 def memberships(W: RegionWeights, groups: RegionGroups, threads: int | None = None) -> Memberships:
-    """The memberships of some splats.
+    """Compute the memberships of some splats.
 
     Args:
-        W: of views by rows of codebooks, on the CPU; its regions have the numbers of the groups.
-        threads: None takes the cores that this process may use. The result is bitwise identical for any value.
+        W: of views by rows of codebooks, on the CPU; its regions are numbered as those of the groups.
+        threads: None uses the cores that this process may use. The result is bitwise identical for any value.
     """
     indptr, region, weight = (part.numpy() for part in (W.indptr, W.region, W.weight))
-    found = Memberships(np.zeros(region.size, np.bool_), np.zeros(indptr.size - 1))
-    arrays = indptr, region, weight, groups.view, groups.group, groups.levels, found.own, found.totals
-    run_each(lambda first, last: belong(first, last, *arrays), W.blocks(1 << 16, 1 << 18), threads)
-    return found
+    result = Memberships(np.zeros(region.size, np.bool_), np.zeros(indptr.size - 1))
+    arrays = indptr, region, weight, groups.view, groups.group, groups.levels, result.own_region, result.totals
+    run_each(lambda first, last: mark_memberships(first, last, *arrays), W.blocks(1 << 16, 1 << 18), threads)
+    return result
 
 
 @kernel
-def belong(first, last, indptr, region, weight, view, group, levels, own, totals):
-    """`memberships` of rows ``first..last``."""
+def mark_memberships(first, last, indptr, region, weight, view, group, levels, own_region, totals):
+    """Compute `memberships` of rows ``first..last``."""
     sums = np.zeros(levels)
     for j in range(first, last):
         k, end, total = indptr[j], indptr[j + 1], 0.0
@@ -77,6 +76,6 @@ def belong(first, last, indptr, region, weight, view, group, levels, own, totals
             for n in range(begin, k):
                 g = group[region[n]]
                 if g >= 0:
-                    most = sums[g - v * levels]
-                    own[n] = most > FAINT and weight[n] >= BELONGS * most
+                    group_weight = sums[g - v * levels]
+                    own_region[n] = group_weight > FAINT and weight[n] >= BELONGS * group_weight
         totals[j] = total

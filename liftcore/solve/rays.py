@@ -1,4 +1,4 @@
-"""Sampled rays of a view: their rows of A, and of S what they read of the view's codebook."""
+"""Sampled rays of a view: their rows of A and of S."""
 
 from dataclasses import dataclass
 
@@ -16,41 +16,41 @@ from liftcore.values.views import Regions, ViewFeatures, cells_under
 class Readout:
     """Rows of S for n rays; a ray has a row for each labelled level, or one for a grid."""
 
-    rays: np.ndarray  # [rows] i64, which of the rays
+    rays: np.ndarray  # [rows] i64, index of the ray
     columns: np.ndarray  # [rows, taps] i64, codebook rows
     shares: np.ndarray  # [rows, taps] f64, sum to one
 
-    def rows(self, chosen: np.ndarray) -> "Readout":
-        """Only the chosen rows, by their numbers [n] i64; rays keep theirs."""
-        return Readout(self.rays[chosen], self.columns[chosen], self.shares[chosen])
+    def rows(self, indices: np.ndarray) -> "Readout":
+        """Return some rows, by their indices [n] i64; indices of rays do not change."""
+        return Readout(self.rays[indices], self.columns[indices], self.shares[indices])
 
     def observed(self, codebook: Tensor) -> Tensor:
-        """B [rows, F] f32 of the rays."""
-        taken = codebook[torch.from_numpy(self.columns)].to(torch.float32)
-        return (taken * torch.from_numpy(self.shares).to(torch.float32)[:, :, None]).sum(dim=1)
+        """Return B [rows, F] f32 of the rays."""
+        vectors = codebook[torch.from_numpy(self.columns)].to(torch.float32)
+        return (vectors * torch.from_numpy(self.shares).to(torch.float32)[:, :, None]).sum(dim=1)
 
 
 @dataclass(frozen=True)
 class SampledRays:
-    """Some rays of one view: their rows of A and what they read of the codebook."""
+    """Some rays of one view: their rows of A and of S."""
 
     rows: RayRows
     readout: Readout
 
 
-def sample_pixels(camera: Camera, count: int, seed: tuple[int, int], walk: CompositingParams) -> Tensor:
-    """[n, 2] i32: up to ``count`` different pixels (x, y) that the walk sees, in image order, by an explicit seed."""
-    left, top = walk.offset
-    columns, rows = np.arange(left, camera.width, walk.stride), np.arange(top, camera.height, walk.stride)
+def sample_pixels(camera: Camera, count: int, seed: tuple[int, int], params: CompositingParams) -> Tensor:
+    """Sample up to ``count`` different pixels (x, y) of the strided view, [n, 2] i32 in image order."""
+    left, top = params.offset
+    columns, rows = np.arange(left, camera.width, params.stride), np.arange(top, camera.height, params.stride)
     total = columns.size * rows.size
-    chosen = np.random.default_rng(seed).choice(total, size=min(count, total), replace=False)
-    chosen.sort()
-    places = np.stack([columns[chosen % columns.size], rows[chosen // columns.size]], axis=1)
+    indices = np.random.default_rng(seed).choice(total, size=min(count, total), replace=False)
+    indices.sort()
+    places = np.stack([columns[indices % columns.size], rows[indices // columns.size]], axis=1)
     return torch.from_numpy(places.astype(np.int32))
 
 
 def read_pixels(observation: ViewFeatures, camera: Camera, pixels: Tensor) -> Readout:
-    """The rows of S of the given pixels [n, 2] (x, y)."""
+    """Return the rows of S of pixels [n, 2] (x, y)."""
     x, y = pixels.numpy().astype(np.int64).T
     if isinstance(observation, Regions):
         _, rows, columns = observation.labels.shape

@@ -1,9 +1,9 @@
-"""A step of `liftcore.solve.reweight` by a card, for a W that lies there: the same equations, by blocks of rows.
+"""A step of `liftcore.solve.reweight` on a GPU, for a W in its memory: the same equations, by blocks of rows.
 
-What `ViewConsistency` adds up entry by entry is a sum over segments here: the entries of one view and of one level at
-one splat. A **line** is the entries of one level at one splat, and a block has its entries line by line. What the
-other views say is the sum of all views less the own one, in float64: its digits are those of float32's sums of the
-views before and behind. All sums have a fixed order, so that the same lift has the same bits on one card.
+Sums of `ViewConsistency` over entries are sums over segments here: the entries of one view and one level at one
+splat. A **line** is the entries of one level at one splat, and a block has its entries line by line. The sum of the
+other views is that of all views minus the own view, in float64, as a float32 difference would lose digits. All sums
+have a fixed order: a lift is bitwise reproducible on the same GPU.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from liftcore.solve.closed_form import bag_sums
 from liftcore.solve.directions import RegionDirections
-from liftcore.solve.reweight import NO_CONSENSUS, SceneAgreement, level_numbers
+from liftcore.solve.reweight import NO_CONSENSUS, SceneConsistency, level_numbers
 from liftcore.solve.sums import PieceSums
 from liftcore.values.region_weights import RegionWeights, from_zero, segment_sums
 
@@ -30,7 +30,7 @@ class _Block:
     """Rows ``first..last`` of W on the device, and their segments: the entries of one view in one line."""
 
     rows: slice
-    entries: Tensor  # [n] i64, where they lie in W, line by line
+    entries: Tensor  # [n] i64, indices in W, line by line
     region: Tensor  # [n] i32
     weight: Tensor  # [n] f64
     share: Tensor  # [n] f64, of the line's sum, times the factors of the step before
@@ -39,7 +39,7 @@ class _Block:
     starts: Tensor  # [S + 1] i64, of segments among the entries
     line_starts: Tensor  # [lines + 1] i64, of lines among the segments
     segment_line: Tensor  # [S] i64
-    own: Tensor  # [n] f64 in 0..1, p: the share of the entry's view
+    view_share: Tensor  # [n] f64 in 0..1, p: the share of the entry's view
 
     def line_sums(self, values: Tensor) -> Tensor:
         """Sums [lines] f64 of values of the entries [n] f64."""
@@ -47,11 +47,11 @@ class _Block:
 
 
 class ViewConsistencyOnCard:
-    """See `liftcore.solve.reweight.ViewConsistency`.
+    """`liftcore.solve.reweight.ViewConsistency` on a device.
 
     Args:
         W: of all views by rows of codebooks, on the device; a row for each splat.
-        levels: [M] i8, of each region, -1 for cells of grids; None: all are of one.
+        levels: [M] i8, of each region, -1 for cells of grids; None: one level.
     """
 
     def __init__(self, W: RegionWeights, levels: np.ndarray | None = None) -> None:
@@ -63,11 +63,11 @@ class ViewConsistencyOnCard:
         self.blocks = W.blocks(BLOCK_ROWS, BLOCK_ENTRIES)
 
     def totals(self) -> Tensor:
-        """The weight of each region, [M] f64 on the CPU."""
+        """Return the weight of each region, [M] f64 on the CPU."""
         totals = torch.zeros(len(self.view), dtype=torch.float64, device=self.place)
         for first, last in self.blocks:
-            own = slice(*self.W.indptr[[first, last]].tolist())
-            totals += sums_by_region(self.W.region[own], self.W.weight[own].double()[None], len(self.view))[0]
+            entries = slice(*self.W.indptr[[first, last]].tolist())
+            totals += sums_by_region(self.W.region[entries], self.W.weight[entries].double()[None], len(self.view))[0]
         return totals.cpu()
 
     def cosines(
@@ -77,7 +77,7 @@ class ViewConsistencyOnCard:
         by_region: bool,
         add: Callable[[PieceSums], None],
     ) -> Tensor:
-        """``c_jm`` of each entry, [nnz] f32 on the device; see `ViewConsistency.cosines`."""
+        """Return ``c_jm`` of each entry, [nnz] f32 on the device; see `ViewConsistency.cosines`."""
         products, squares = torch.zeros_like(self.W.weight), torch.zeros_like(self.W.weight)
         for columns in directions.slices():
             table = directions.table(columns).to(self.place)
@@ -94,40 +94,50 @@ class ViewConsistencyOnCard:
             lines = torch.stack([block.line_sums(block.weight * wide), block.line_sums(block.weight)])
             sums[:, count:] += lines.reshape(2, -1, self.levels).sum(dim=1)
             if by_region:
-                own = factors[block.entries].double() if factors is not None else 1.0
-                others = block.weight * own * (1.0 - block.own)
-                sums[:, :count] += sums_by_region(block.region, torch.stack([others * wide, others]), count)
+                scale = factors[block.entries].double() if factors is not None else 1.0
+                other_weight = block.weight * scale * (1.0 - block.view_share)
+                sums[:, :count] += sums_by_region(
+                    block.region, torch.stack([other_weight * wide, other_weight]), count
+                )
         add(PieceSums.of(sums.cpu().numpy()))
         return products
 
     def weigh(
-        self, cosines: Tensor, factors: Tensor | None, scene: SceneAgreement, consensus: Tensor | None
+        self, cosines: Tensor, factors: Tensor | None, scene: SceneConsistency, consensus: Tensor | None
     ) -> Tensor:
-        """Cosines become factors in place; see `ViewConsistency.weigh`. Scores [2, n] f32 are on the CPU."""
+        """Replace cosines by factors in place (`ViewConsistency.weigh`); return the scores [2, n] f32 on the CPU."""
         scores = torch.zeros(2, self.W.indptr.shape[0] - 1, dtype=torch.float64, device=self.place)
-        reliable, usual, power = (part.to(self.place) for part in (scene.regions, scene.usual, scene.power))
+        reliable, mean_cosine, power = (
+            part.to(self.place) for part in (scene.regions, scene.mean_cosine, scene.power)
+        )
         for first, last in self.blocks:
             block = self._block(first, last, factors)
             cosine, level = cosines[block.entries].double(), block.line % self.levels
-            blended = (1.0 - block.own) * cosine + block.own * usual[level]
+            blended = (1.0 - block.view_share) * cosine + block.view_share * mean_cosine[level]
             unscaled = blended * reliable.index_select(0, block.region)
             if consensus is not None:
-                own = slice(*self.W.indptr[[first, last]].tolist())
-                unscaled *= consensus[own].to(self.place)[block.entries - own.start].double() ** power[level]
+                block_entries = slice(*self.W.indptr[[first, last]].tolist())
+                unscaled *= (
+                    consensus[block_entries].to(self.place)[block.entries - block_entries.start].double()
+                    ** power[level]
+                )
             before, after = block.line_sums(block.weight), block.line_sums(block.weight * unscaled)
             gain = torch.where(after > 0, before / after, 0.0)
-            own_gain, has_entries = gain[block.line], self.W.indptr[first : last + 1].diff() > 0
-            cosines[block.entries] = torch.where(own_gain > 0, unscaled * own_gain, 1.0).float()
-            whole = before.reshape(-1, self.levels).sum(dim=1)
-            for score, values, other in ((scores[0], cosine, torch.zeros_like(usual)), (scores[1], blended, usual)):
+            entry_gain, has_entries = gain[block.line], self.W.indptr[first : last + 1].diff() > 0
+            cosines[block.entries] = torch.where(entry_gain > 0, unscaled * entry_gain, 1.0).float()
+            totals = before.reshape(-1, self.levels).sum(dim=1)
+            for score, values, other in (
+                (scores[0], cosine, torch.zeros_like(mean_cosine)),
+                (scores[1], blended, mean_cosine),
+            ):
                 sums = gain * block.line_sums(block.weight * unscaled * values)
-                sums = torch.where(after > 0, sums, before * other.repeat(len(whole)))
-                mean = torch.where(whole > 0, sums.reshape(-1, self.levels).sum(dim=1) / whole, other[0])
+                sums = torch.where(after > 0, sums, before * other.repeat(len(totals)))
+                mean = torch.where(totals > 0, sums.reshape(-1, self.levels).sum(dim=1) / totals, other[0])
                 score[block.rows] = mean * has_entries
         return scores.float().cpu()
 
     def _block(self, first: int, last: int, factors: Tensor | None) -> _Block:
-        """Rows of W with the factors of the step before."""
+        """Return rows of W with the factors of the step before."""
         starts, lines = self.W.indptr[first : last + 1], (last - first) * self.levels
         begin, end = starts[[0, -1]].tolist()
         row = torch.repeat_interleave(starts.diff(), output_size=end - begin)
@@ -146,9 +156,11 @@ class ViewConsistencyOnCard:
         totals = segment_sums(segment_sums(weight, bounds), line_starts)
         share = weight * torch.where(totals > 0, 1.0 / totals, 0.0)[line]
         share = share if factors is None else share * factors[entries]
-        own = segment_sums(share, bounds).clamp_max(1.0)[segment]
+        view_share = segment_sums(share, bounds).clamp_max(1.0)[segment]
         rows = slice(first, last)
-        return _Block(rows, entries, region, weight, share, line, segment, bounds, line_starts, segment_line, own)
+        return _Block(
+            rows, entries, region, weight, share, line, segment, bounds, line_starts, segment_line, view_share
+        )
 
     def _compare(self, block: _Block, table: Tensor, products: Tensor, squares: Tensor) -> None:
         """Add ``e_m . r_jv`` and ``|r_jv|^2`` of a block's entries, over the channels of the table [M, C] f32."""
@@ -156,7 +168,7 @@ class ViewConsistencyOnCard:
         if not len(block.region):
             return
         edges = torch.arange(0, len(block.segment) + step, step, device=self.place).clamp_max(len(block.segment) - 1)
-        lines = torch.unique(block.line[edges]).tolist()  # whole lines, of about so many entries
+        lines = torch.unique(block.line[edges]).tolist()  # whole lines, of about ``step`` segments
         for first, last in zip(lines, [*lines[1:], len(block.line_starts) - 1], strict=True):
             at, to = block.line_starts[[first, last]].tolist()
             begin, end = block.starts[[at, to]].tolist()
@@ -167,18 +179,18 @@ class ViewConsistencyOnCard:
             totals = bag_sums(
                 torch.arange(to - at, device=self.place), view_sums, block.line_starts[first : last + 1] - at
             )
-            others = (totals[block.segment_line[at:to] - first] - view_sums).float()
+            other_views = (totals[block.segment_line[at:to] - first] - view_sums).float()
             segment = block.segment[begin:end] - at
-            lengths = others.square().sum(dim=1)
-            for part in range(0, end - begin, step):  # of a line with more entries than that
+            lengths = other_views.square().sum(dim=1)
+            for part in range(0, end - begin, step):  # a line may have more entries
                 few = slice(part, min(part + step, end - begin))
                 place = block.entries[begin + few.start : begin + few.stop]
-                products[place] += (table[region[few]] * others[segment[few]]).sum(dim=1)
+                products[place] += (table[region[few]] * other_views[segment[few]]).sum(dim=1)
                 squares[place] += lengths[segment[few]]
 
 
 def sums_by_region(region: Tensor, values: Tensor, count: int) -> Tensor:
-    """Sums [k, M] f64 of values [k, n] f64 of entries by their regions [n] i32, in the entries' order."""
+    """Return sums [k, M] f64 of values [k, n] f64 of entries by their regions [n] i32, in the entries' order."""
     starts = from_zero(torch.bincount(region, minlength=count))
     order = torch.argsort(region, stable=True)
     return torch.stack([segment_sums(part[order], starts) for part in values])

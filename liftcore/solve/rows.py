@@ -1,7 +1,7 @@
-"""Rows of a sparse table that lie in parts, by views, put together for a block of splats.
+"""Rows of a sparse table that is stored in parts, by views, joined for a block of splats.
 
-Each part has some rows of the block and some columns of the table, in the order of the columns: so a row of the block
-is what the parts have of it, one after the other. W, what other views say of its entries, and tuples lie so.
+Each part has some rows of the block and some columns of the table, in the order of the columns: a row of the block is
+the concatenation of its rows in all parts. W, the consensus of its entries, and tuples are stored so.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -20,13 +20,13 @@ from liftcore.values.region_weights import MEMORY_LIMIT
 class SomeRows:
     """Rows of one part."""
 
-    rows: np.ndarray  # [r] i32 or i64 ascending, their numbers in the block
-    starts: np.ndarray  # [r + 1] i64, where each begins among the values, of which the first may lie before
+    rows: np.ndarray  # [r] i32 or i64 ascending, row numbers in the block
+    starts: np.ndarray  # [r + 1] i64, offsets of the rows in the values; the first need not be 0
     values: Sequence[np.ndarray]  # each [n]
 
 
 def row_starts(parts: Iterable[SomeRows], count: int) -> np.ndarray:
-    """Where the rows of a block of so many begin, [count + 1] i64."""
+    """Return the offsets of a block's rows, [count + 1] i64."""
     lengths = np.zeros(count + 1, np.int64)
     for part in parts:
         lengths[part.rows + 1] += np.diff(part.starts)
@@ -34,7 +34,7 @@ def row_starts(parts: Iterable[SomeRows], count: int) -> np.ndarray:
 
 
 def fill_rows(parts: Iterable[SomeRows], starts: np.ndarray, targets: Sequence[np.ndarray]) -> None:
-    """Put the values of all parts into those of the block, whose rows begin at ``starts`` (`row_starts`)."""
+    """Copy the values of all parts to those of the block, whose rows begin at ``starts`` (`row_starts`)."""
     cursors = starts[:-1].copy()
     for part in parts:
         at = cursors[part.rows]
@@ -44,17 +44,17 @@ def fill_rows(parts: Iterable[SomeRows], starts: np.ndarray, targets: Sequence[n
 
 
 def values_of(count: int, dtype: torch.dtype) -> Tensor:
-    """Zeros [n], in a mapped file where they are many."""
+    """Return zeros [n], in a mapped file if they are many."""
     return zeros((count,), dtype, name="weights", in_file=count * dtype.itemsize > MEMORY_LIMIT >> 1)
 
 
 def gather_rows(
     parts: Callable[[], Iterable[SomeRows]], count: int, dtypes: Sequence[torch.dtype]
 ) -> tuple[np.ndarray, list[Tensor]]:
-    """The rows of a block of so many: where they begin [count + 1] i64, and their values, of those types.
+    """Return the offsets [count + 1] i64 of a block's rows, and their values, of the given dtypes.
 
     Args:
-        parts: gives the parts, one in memory at a time; it is called twice.
+        parts: returns an iterator over the parts, one in memory at a time; called twice.
     """
     starts = row_starts(parts(), count)
     targets = [values_of(int(starts[-1]), dtype) for dtype in dtypes]
@@ -63,16 +63,16 @@ def gather_rows(
 
 
 def take_rows(starts: np.ndarray, rows: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Some rows [r] of a table: where they begin [r + 1] i64, and their values."""
+    """Return some rows [r] of a table: their offsets [r + 1] i64, and their values."""
     begins = np.concatenate([[0], np.cumsum(np.diff(starts)[rows])])
-    taken = np.empty(begins[-1], values.dtype)
-    take(starts, rows, begins, values, taken)
-    return begins, taken
+    target = np.empty(begins[-1], values.dtype)
+    take(starts, rows, begins, values, target)
+    return begins, target
 
 
 @kernel
 def copy_rows(starts, at, source, target):
-    """Copy row i of the source, from ``starts[i]`` on, to where ``at[i]`` says."""
+    """Copy row i of the source, from ``starts[i]`` on, to ``at[i]`` of the target."""
     for i in range(at.size):
         shift = at[i] - starts[i]
         for k in range(starts[i], starts[i + 1]):
@@ -80,9 +80,9 @@ def copy_rows(starts, at, source, target):
 
 
 @kernel
-def take(starts, rows, begins, values, taken):
-    """`take_rows`."""
+def take(starts, rows, begins, values, target):
+    """Copy the rows of `take_rows`."""
     for i in range(rows.size):
         shift = begins[i] - starts[rows[i]]
         for k in range(starts[rows[i]], starts[rows[i] + 1]):
-            taken[k + shift] = values[k]
+            target[k + shift] = values[k]

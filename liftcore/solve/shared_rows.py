@@ -1,11 +1,11 @@
-"""Sums over rows of W, of four neighbours at a time: they belong to the same regions, whose vectors are read once.
+"""Sums over rows of W, of four neighbouring splats at a time, so that vectors of shared regions are loaded once.
 
-Four splats that follow one another along a curve through the scene name nearly the same regions. So the regions of a
-**group** of GROUP rows are united, each with a share a splat, zero where the splat has no such entry, and a vector
-that is read from a table is added to the sums of all four: to read it takes longer than to add it. A zero share adds
-a zero, so what a splat gets depends on no other one, bit for bit.
+Four consecutive splats on a space-filling curve have nearly the same regions. So the regions of a **group** of GROUP
+rows are united, each with a share per splat, zero if the splat has no such entry, and a vector loaded from a table is
+added to the sums of all four, as loading takes longer than adding. A zero share adds zero, so the result of a splat
+is bitwise independent of the others.
 
-float32 adds up LONG terms one by one. A row of more entries is a group of its own, which comes in pieces.
+float32 adds LONG terms one by one. A row of more entries is a group of its own, processed in pieces.
 """
 
 from collections.abc import Sequence
@@ -21,14 +21,14 @@ from torch import Tensor
 from liftcore.raster.cpu.simd import compiled
 from liftcore.runtime.jit import kernel
 
-GROUP = 4  # rows; the code below names each
-LONG = 256  # terms of a sum that float32 adds up one by one
-LANES = 32  # channels that one instruction of LLVM's takes, whatever the machine's vectors hold
+GROUP = 4  # rows; the code below is unrolled over them
+LONG = 256  # terms of a sum that float32 adds one by one
+LANES = 32  # channels per LLVM vector; LLVM splits it into the machine's registers
 NO_REGION = np.int32(2**31 - 1)
 
 
 def new_table(rows: int, columns: int, place: torch.device) -> Tensor:
-    """A table [rows, columns] f32 of anything, whose storage goes on for LANES zeros more (`flat_table`)."""
+    """Return an uninitialised table [rows, columns] f32, whose storage has LANES zeros more (`flat_table`)."""
     size = rows * columns
     flat = torch.empty(size + LANES, dtype=torch.float32, device=place)
     flat[size:] = 0.0
@@ -36,9 +36,9 @@ def new_table(rows: int, columns: int, place: torch.device) -> Tensor:
 
 
 def flat_table(table: Tensor) -> np.ndarray:
-    """The rows of a table [M, C] f32 on the CPU, one after the other, and LANES finite numbers more.
+    """Return the rows of a table [M, C] f32 on the CPU, flattened, with LANES finite numbers more.
 
-    A copy, unless `new_table` made its storage: vectors are read LANES at a time, beyond the last row too.
+    A copy, unless its storage is of `new_table`: vectors are loaded LANES at a time, also beyond the last row.
     """
     size, storage = table.numel() + LANES, table.untyped_storage()
     if table.is_contiguous() and table.storage_offset() == 0 and storage.nbytes() == 4 * size:
@@ -50,7 +50,7 @@ def flat_table(table: Tensor) -> np.ndarray:
 
 
 class _Lanes(types.Type):
-    """LANES float32 values, which LLVM cuts into the registers of the machine."""
+    """LANES float32 values as a numba type; LLVM splits them into the machine's registers."""
 
     def __init__(self) -> None:
         super().__init__(name=f"Lanes{LANES}")
@@ -64,7 +64,7 @@ _FUSE = ("contract",)  # a*b + c may become one fused instruction
 
 @register_model(_Lanes)
 class _LanesModel(models.PrimitiveModel):
-    """What numba makes of them: an LLVM vector."""
+    """The data model of ``_Lanes``: an LLVM vector."""
 
     def __init__(self, manager, kind) -> None:
         super().__init__(manager, kind, FLOATS)
@@ -85,13 +85,13 @@ def _fused(builder, left, right, total):
 
 @compiled
 def no_lanes(typingctx):
-    """Zeros."""
+    """Return zeros."""
     return ALL(), lambda context, builder, signature, args: ir.Constant(FLOATS, [0.0] * LANES)
 
 
 @compiled
 def lanes_at(typingctx, values, offset):
-    """``values[offset + i]``."""
+    """Load ``values[offset + i]``."""
 
     def codegen(context, builder, signature, args):
         return builder.load(_pointer(context, builder, signature.args[0], *args), align=4)
@@ -100,8 +100,8 @@ def lanes_at(typingctx, values, offset):
 
 
 @compiled
-def keep_lanes(typingctx, values, offset, lanes):
-    """``values[offset + i] = lanes[i]``."""
+def store_lanes(typingctx, values, offset, lanes):
+    """Store ``values[offset + i] = lanes[i]``."""
 
     def codegen(context, builder, signature, args):
         builder.store(args[2], _pointer(context, builder, signature.args[0], *args[:2]), align=4)
@@ -112,44 +112,44 @@ def keep_lanes(typingctx, values, offset, lanes):
 
 @compiled
 def plus_times(typingctx, total, factor, lanes):
-    """``total[i] + factor lanes[i]``, for one factor."""
+    """Return ``total[i] + factor lanes[i]``, for one factor."""
 
     def codegen(context, builder, signature, args):
-        nothing = ir.Constant(FLOATS, ir.Undefined)
-        first = builder.insert_element(nothing, args[1], ir.Constant(ir.IntType(32), 0))
-        return _fused(builder, builder.shuffle_vector(first, nothing, _numbers([0] * LANES)), args[2], args[0])
+        undefined = ir.Constant(FLOATS, ir.Undefined)
+        first = builder.insert_element(undefined, args[1], ir.Constant(ir.IntType(32), 0))
+        return _fused(builder, builder.shuffle_vector(first, undefined, _numbers([0] * LANES)), args[2], args[0])
 
     return ALL(ALL, types.float32, ALL), codegen
 
 
 @compiled
 def plus_product(typingctx, total, left, right):
-    """``total[i] + left[i] right[i]``."""
+    """Return ``total[i] + left[i] right[i]``."""
     return ALL(ALL, ALL, ALL), lambda context, builder, signature, args: _fused(builder, args[1], args[2], args[0])
 
 
 @compiled
 def plus(typingctx, left, right):
-    """``left[i] + right[i]``."""
+    """Return ``left[i] + right[i]``."""
     return ALL(ALL, ALL), lambda context, builder, signature, args: builder.fadd(*args)
 
 
 @compiled
 def minus(typingctx, left, right):
-    """``left[i] - right[i]``."""
+    """Return ``left[i] - right[i]``."""
     return ALL(ALL, ALL), lambda context, builder, signature, args: builder.fsub(*args)
 
 
 @compiled
 def first_lanes(typingctx, lanes, count):
-    """``lanes[i]`` below that number, and zeros."""
+    """Return ``lanes[i]`` for i < count, else zero."""
 
     def codegen(context, builder, signature, args):
         numbers = ir.VectorType(ir.IntType(32), LANES)
-        nothing = ir.Constant(numbers, ir.Undefined)
+        undefined = ir.Constant(numbers, ir.Undefined)
         count = builder.trunc(args[1], ir.IntType(32))
-        first = builder.insert_element(nothing, count, ir.Constant(ir.IntType(32), 0))
-        counts = builder.shuffle_vector(first, nothing, _numbers([0] * LANES))
+        first = builder.insert_element(undefined, count, ir.Constant(ir.IntType(32), 0))
+        counts = builder.shuffle_vector(first, undefined, _numbers([0] * LANES))
         return builder.select(
             builder.icmp_signed("<", _numbers(range(LANES)), counts), args[0], ir.Constant(FLOATS, [0.0] * LANES)
         )
@@ -159,16 +159,16 @@ def first_lanes(typingctx, lanes, count):
 
 @compiled
 def sum_of_lanes(typingctx, lanes):
-    """The sum of all, in a fixed tree."""
+    """Return the sum of the lanes, in a fixed tree."""
 
     def codegen(context, builder, signature, args):
-        found, size = args[0], LANES
+        total, size = args[0], LANES
         while size > 1:
             size //= 2
-            nothing = ir.Constant(found.type, ir.Undefined)
-            halves = [builder.shuffle_vector(found, nothing, _numbers(range(at, at + size))) for at in (0, size)]
-            found = builder.fadd(*halves)
-        return builder.extract_element(found, ir.Constant(ir.IntType(32), 0))
+            undefined = ir.Constant(total.type, ir.Undefined)
+            halves = [builder.shuffle_vector(total, undefined, _numbers(range(at, at + size))) for at in (0, size)]
+            total = builder.fadd(*halves)
+        return builder.extract_element(total, ir.Constant(ir.IntType(32), 0))
 
     return types.float32(ALL), codegen
 
@@ -178,7 +178,7 @@ def sum_of_lanes(typingctx, lanes):
 
 @kernel
 def group_end(rows, first, indptr):
-    """The number after the last row of the group that begins at row number ``first``."""
+    """Return the end of the group that begins at row number ``first``."""
     last = first + 1
     if indptr[rows[first] + 1] - indptr[rows[first]] > LONG:
         return last
@@ -191,12 +191,12 @@ def group_end(rows, first, indptr):
 def unite_rows(
     rows, first, last, piece, indptr, region, weight, factors, level, inverse, regions, shares, entries
 ):  # fmt: skip
-    """Write the regions of a group, ascending, with the share and the entry of each row, and give their number.
+    """Write the regions of a group, ascending, with the share and the entry of each row; return their number.
 
     Args:
-        rows: of W, of which those numbered ``first..last`` are the group. piece: its entries of LONG, of a row alone.
+        rows: of W; those numbered ``first..last`` are the group. piece: block of LONG entries of a long row.
         factors: [nnz] f32 of entries, or [0] for none. level: [M] i32 of regions, or [0] for one level.
-        inverse: [levels GROUP] f64, what makes shares of a row's weights of a level.
+        inverse: [levels GROUP] f64, 1 / the row's sum of weights of a level.
         regions: [GROUP LONG] i32. shares: [GROUP GROUP LONG] f32, zero for none. entries: i64 likewise, -1 for none.
     """
     k, ends, heads = np.zeros(GROUP, np.int64), np.zeros(GROUP, np.int64), np.full(GROUP, NO_REGION, np.int32)
@@ -212,13 +212,13 @@ def unite_rows(
         if least == NO_REGION:
             return count
         regions[count] = least
-        own = GROUP * level[least] if level.size > 0 else 0
+        base = GROUP * level[least] if level.size > 0 else 0
         for j in range(GROUP):
             place = GROUP * count + j
             if heads[j] == least:
                 n = k[j]
                 factor = factors[n] if factors.size > 0 else np.float32(1.0)
-                shares[place], entries[place] = weight[n] * factor * inverse[own + j], n
+                shares[place], entries[place] = weight[n] * factor * inverse[base + j], n
                 k[j] = n + 1
                 heads[j] = region[n + 1] if n + 1 < ends[j] else NO_REGION
             else:
@@ -228,7 +228,7 @@ def unite_rows(
 
 @kernel
 def order_by_level(regions, count, level, levels, starts, order):
-    """The united regions of each level, ascending: ``order[starts[a]..starts[a + 1]]`` are their numbers."""
+    """Sort the united regions by level: ``order[starts[a]..starts[a + 1]]`` are the numbers of level a, ascending."""
     starts[:] = 0
     for n in range(count):
         starts[level[regions[n]] + 1] += 1
@@ -243,25 +243,25 @@ def order_by_level(regions, count, level, levels, starts, order):
 
 @kernel
 def sum_rows(rows, indptr, region, weight, inverse, lengths, table, width, sums):
-    """``sum_k W_jk inverse_j table[region_k]`` of some rows.
+    """Compute ``sum_k W_jk inverse_j table[region_k]`` of some rows.
 
     Args:
-        rows: [n] i64, of W. inverse: [P] f64. lengths: [M] f32, what the vector of a region is multiplied with too;
-            [0] for none.
+        rows: [n] i64, of W. inverse: [P] f64. lengths: [M] f32, further factors of the regions' vectors; [0] for
+            none.
         table: `flat_table` [M, width]. sums: [n, width] f32.
     """
     regions, shares = np.empty(GROUP * LONG, np.int32), np.empty(GROUP * GROUP * LONG, np.float32)
     entries, none = np.empty(GROUP * GROUP * LONG, np.int64), np.empty(0, np.float32)
     scales, no_level = np.zeros(GROUP), np.empty(0, np.int32)
     stride = width + LANES
-    found, several = np.empty(GROUP * stride, np.float32), np.empty(width)
+    group_sums, piece_totals = np.empty(GROUP * stride, np.float32), np.empty(width)
     first = 0
     while first < rows.size:
         last = group_end(rows, first, indptr)
         pieces = (
             max((indptr[rows[first] + 1] - indptr[rows[first]] + LONG - 1) // LONG, 1) if last == first + 1 else 1
         )
-        several[:] = 0.0
+        piece_totals[:] = 0.0
         for j in range(last - first):
             scales[j] = inverse[rows[first + j]]
         for piece in range(pieces):
@@ -278,20 +278,20 @@ def sum_rows(rows, indptr, region, weight, inverse, lengths, table, width, sums)
                     b = plus_times(b, shares[GROUP * n + 1], vector)
                     d = plus_times(d, shares[GROUP * n + 2], vector)
                     e = plus_times(e, shares[GROUP * n + 3], vector)
-                keep_lanes(found, c, a)
-                keep_lanes(found, stride + c, b)
-                keep_lanes(found, 2 * stride + c, d)
-                keep_lanes(found, 3 * stride + c, e)
+                store_lanes(group_sums, c, a)
+                store_lanes(group_sums, stride + c, b)
+                store_lanes(group_sums, 2 * stride + c, d)
+                store_lanes(group_sums, 3 * stride + c, e)
             if pieces > 1:
                 for c in range(width):
-                    several[c] += found[c]
+                    piece_totals[c] += group_sums[c]
         if pieces > 1:
             for c in range(width):
-                sums[first, c] = several[c]
+                sums[first, c] = piece_totals[c]
         else:
             for j in range(last - first):
                 for c in range(width):
-                    sums[first + j, c] = found[j * stride + c]
+                    sums[first + j, c] = group_sums[j * stride + c]
         first = last
 
 
@@ -305,9 +305,9 @@ def compare_rows(
 ) -> None:
     """Add ``e_m . r_jv`` and ``|r_jv|^2`` of the entries of some rows, over the channels of a table of e.
 
-    Each level is compared by itself, by shares of what it weighs at a splat. r_jv is the sum of all views less that
-    of view v, but for a view of over half of that weight: there a difference of two float32 sums would be mostly
-    rounding, and the sums of the others are added up.
+    Levels are compared separately, by shares of their weight at a splat. r_jv is the sum of all views minus that of
+    view v, except for a view of over half of the weight: there the difference of two float32 sums would be mostly
+    rounding error, and the other views are summed directly.
 
     Args:
         rows: [n] i64, of W.
@@ -320,19 +320,23 @@ def compare_rows(
 
 @kernel
 def add_products(rows, indptr, region, weight, factors, view, level, table, width, products, squares):
-    """`compare_rows`."""
+    """Add the products of `compare_rows`."""
     regions, shares = np.empty(GROUP * LONG, np.int32), np.empty(GROUP * GROUP * LONG, np.float32)
     entries = np.empty(GROUP * GROUP * LONG, np.int64)
-    most, levels = np.int64(GROUP * LONG), np.int64(0)
+    view_limit, levels = np.int64(GROUP * LONG), np.int64(0)
     for row in rows:
-        most = max(most, indptr[row + 1] - indptr[row])
+        view_limit = max(view_limit, indptr[row + 1] - indptr[row])
         for k in range(indptr[row], indptr[row + 1]):
             levels = max(levels, level[region[k]] + 1)
-    most = min(most, np.int64(view[-1]) + 1)
+    view_limit = min(view_limit, np.int64(view[-1]) + 1)
     stride = (width + LANES - 1) // LANES * LANES
     size = GROUP * stride
-    said, whole, others = np.empty(most * size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
-    rest, own = np.empty(size, np.float32), np.empty(most * GROUP)
+    view_sums, total, other_views = (
+        np.empty(view_limit * size, np.float32),
+        np.empty(size, np.float32),
+        np.empty(size, np.float32),
+    )
+    other_sums, view_shares = np.empty(size, np.float32), np.empty(view_limit * GROUP)
     heavy, square = np.empty(GROUP, np.int64), np.empty(GROUP, np.float32)
     inverse, starts, order = (
         np.empty(levels * GROUP),
@@ -342,7 +346,7 @@ def add_products(rows, indptr, region, weight, factors, view, level, table, widt
     first = 0
     while first < rows.size:
         last = group_end(rows, first, indptr)
-        pieces = max(-(-(indptr[rows[first] + 1] - indptr[rows[first]]) // LONG), 1)  # more than one of a row alone
+        pieces = max(-(-(indptr[rows[first] + 1] - indptr[rows[first]]) // LONG), 1)  # several for a long row
         inverse[:] = 0.0
         for j in range(last - first):
             for k in range(indptr[rows[first + j]], indptr[rows[first + j] + 1]):
@@ -354,7 +358,7 @@ def add_products(rows, indptr, region, weight, factors, view, level, table, widt
             order_by_level(regions, unite_rows(rows, first, last, 0, *arrays), level, levels, starts, order)
         for a in range(levels):
             number, v = np.int64(-1), -1
-            for piece in range(pieces):  # what each view says, and all
+            for piece in range(pieces):  # sums of each view
                 if pieces > 1:
                     count = unite_rows(rows, first, last, piece, *arrays)
                     order_by_level(regions, count, level, levels, starts, order)
@@ -363,10 +367,10 @@ def add_products(rows, indptr, region, weight, factors, view, level, table, widt
                     new, end = view[regions[order[begin]]] != v, begin
                     if new:
                         v, number = view[regions[order[begin]]], number + 1
-                        own[GROUP * number : GROUP * (number + 1)] = 0.0
+                        view_shares[GROUP * number : GROUP * (number + 1)] = 0.0
                     while end < starts[a + 1] and view[regions[order[end]]] == v:
                         for j in range(GROUP):
-                            own[GROUP * number + j] += shares[GROUP * order[end] + j]
+                            view_shares[GROUP * number + j] += shares[GROUP * order[end] + j]
                         end += 1
                     for c in range(0, width, LANES):
                         p = q = s = t = no_lanes()
@@ -382,32 +386,35 @@ def add_products(rows, indptr, region, weight, factors, view, level, table, widt
                             s, t = first_lanes(s, width - c), first_lanes(t, width - c)
                         at = number * size + c
                         if not new:
-                            p, q = plus(p, lanes_at(said, at)), plus(q, lanes_at(said, at + stride))
-                            s, t = plus(s, lanes_at(said, at + 2 * stride)), plus(t, lanes_at(said, at + 3 * stride))
-                        keep_lanes(said, at, p)
-                        keep_lanes(said, at + stride, q)
-                        keep_lanes(said, at + 2 * stride, s)
-                        keep_lanes(said, at + 3 * stride, t)
+                            p, q = plus(p, lanes_at(view_sums, at)), plus(q, lanes_at(view_sums, at + stride))
+                            s, t = (
+                                plus(s, lanes_at(view_sums, at + 2 * stride)),
+                                plus(t, lanes_at(view_sums, at + 3 * stride)),
+                            )
+                        store_lanes(view_sums, at, p)
+                        store_lanes(view_sums, at + stride, q)
+                        store_lanes(view_sums, at + 2 * stride, s)
+                        store_lanes(view_sums, at + 3 * stride, t)
                     begin = end
             for c in range(0, size, LANES):
                 p = no_lanes()
                 for n in range(number + 1):
-                    p = plus(p, lanes_at(said, n * size + c))
-                keep_lanes(whole, c, p)
+                    p = plus(p, lanes_at(view_sums, n * size + c))
+                store_lanes(total, c, p)
             for j in range(GROUP):
                 heavy[j] = -1
                 for n in range(number + 1):
-                    if own[GROUP * n + j] > 0.5:
+                    if view_shares[GROUP * n + j] > 0.5:
                         heavy[j] = n
                 if heavy[j] >= 0:
                     for c in range(j * stride, (j + 1) * stride, LANES):
                         p = no_lanes()
                         for n in range(number + 1):
                             if n != heavy[j]:
-                                p = plus(p, lanes_at(said, n * size + c))
-                        keep_lanes(rest, c, p)
+                                p = plus(p, lanes_at(view_sums, n * size + c))
+                        store_lanes(other_sums, c, p)
             number, v = np.int64(-1), -1
-            for piece in range(pieces):  # what the others say, against each region
+            for piece in range(pieces):  # each region against the other views
                 if pieces > 1:
                     count = unite_rows(rows, first, last, piece, *arrays)
                     order_by_level(regions, count, level, levels, starts, order)
@@ -419,19 +426,19 @@ def add_products(rows, indptr, region, weight, factors, view, level, table, widt
                             p = no_lanes()
                             for c in range(j * stride, (j + 1) * stride, LANES):
                                 if number == heavy[j]:
-                                    q = lanes_at(rest, c)
+                                    q = lanes_at(other_sums, c)
                                 else:
-                                    q = minus(lanes_at(whole, c), lanes_at(said, number * size + c))
-                                keep_lanes(others, c, q)
+                                    q = minus(lanes_at(total, c), lanes_at(view_sums, number * size + c))
+                                store_lanes(other_views, c, q)
                                 p = plus_product(p, q, q)
                             square[j] = sum_of_lanes(p)
                     p = q = s = t = no_lanes()
                     for c in range(0, width, LANES):
                         vector = lanes_at(table, np.int64(regions[n]) * width + c)
-                        p = plus_product(p, vector, lanes_at(others, c))
-                        q = plus_product(q, vector, lanes_at(others, stride + c))
-                        s = plus_product(s, vector, lanes_at(others, 2 * stride + c))
-                        t = plus_product(t, vector, lanes_at(others, 3 * stride + c))
+                        p = plus_product(p, vector, lanes_at(other_views, c))
+                        q = plus_product(q, vector, lanes_at(other_views, stride + c))
+                        s = plus_product(s, vector, lanes_at(other_views, 2 * stride + c))
+                        t = plus_product(t, vector, lanes_at(other_views, 3 * stride + c))
                     at = GROUP * n
                     if entries[at] >= 0:
                         products[entries[at]] += sum_of_lanes(p)

@@ -1,22 +1,22 @@
-"""Features that know their neighbours: Tikhonov's regularisation, carried from each splat to the scene.
+"""Smooth features: Tikhonov regularisation over the graph of neighbouring splats.
 
-After the closed form, X0, with total weight D, confidence c and affinities a_jk (`liftcore.scene.neighbours`)::
+From the closed form X0, with total weight D, confidence c and affinities a_jk (`liftcore.scene.neighbours`)::
 
     min over X of  sum_j w_j |x_j - x0_j|^2  +  lambda sum_jk a_jk sqrt(w_j w_k) |x_j - x_k|^2,   each pair once
     w_j = D_j max(c_j, 0.02)
 
-Conjugate gradients from X0 on, with the diagonal as preconditioner: float32 with sums in float64. All channels share
-a matrix, so they share the steps, too: those that are best for PROBES random sums of channels, which know every
-channel by its energy. In the form of Stiefel (1958) a step needs the last two iterates alone,
+Solved by conjugate gradients from X0, with the diagonal as preconditioner, in float32 with sums in float64. All
+channels have the same matrix, so they use the same steps: those of PROBES random sums of channels, in which every
+channel is represented by its energy. In the form of Stiefel (1958) a step needs only the last two iterates,
 
     x <- x + alpha M^-1 (b - K x) + beta (x - x_before),
 
-and with alpha and beta known it is one pass over the graph, by blocks of channels, without any sum over the scene.
-Every sum has a fixed order, so that the number of threads changes no bit. The solution
-is a mean of X0's rows, so no channel of it leaves the range of X0's; nor does what is delivered.
+and with alpha and beta given it is one pass over the graph, by blocks of channels, without a sum over the scene.
+Every sum has a fixed order: the result is bitwise identical for any number of threads. The solution is a mean of X0's
+rows, so each channel stays in the range of X0; the result is clipped to it.
 
-A splat without weight has no term of its own. It takes the limit of the solution for w_j towards zero, the mean of
-its neighbours by ``a_jk sqrt(w_k)``, and those behind it the mean of these, ring by ring.
+A splat without total weight has no data term. It takes the limit of the solution for w_j to zero, the mean of its
+neighbours by ``a_jk sqrt(w_k)``; splats further from any total weight take the mean of these, ring by ring.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from liftcore.raster.cpu.simd import LANES, in_all_lanes, keep_lanes, lanes_at, plus, plus_product, times
+from liftcore.raster.cpu.simd import LANES, in_all_lanes, lanes_at, plus, plus_product, store_lanes, times
 from liftcore.runtime.cores import cores
 from liftcore.runtime.device import CPU, Device
 from liftcore.runtime.jit import kernel
@@ -41,33 +41,34 @@ from liftcore.scene.neighbours import SplatGraph
 from liftcore.scene.splats import Splats
 from liftcore.solve.smooth_on_card import SmoothingSystem
 
-LEAST_CONFIDENCE = 0.02  # that a splat counts by: one view alone says something, too
+LEAST_CONFIDENCE = 0.02  # lower bound of c, for splats of a single view
 LEAST_WEIGHT = 1e-30  # of the largest; a splat below it has no total weight
 BLOCK = 8 * LANES  # channels solved at a time: three [P, 64] f32
-ROWS = 1 << 13  # splats of one piece of work
-PROBES = LANES  # random sums of all channels, by which steps are found
-TOLERANCE = 2e-3  # of the gradient, relative to that at X0, over sqrt(1 + lambda): what varies slowly over the scene
-# has little of the gradient, the less the larger lambda
-ROUGHLY = 2e-2  # a tolerance by which features are compared, not delivered
-STEPS = 200  # of conjugate gradients at most; with lambda 4 about 20 are enough
+ROWS = 1 << 13  # splats per task
+PROBES = LANES  # random sums of all channels, whose steps are used
+# Of the gradient, relative to that at X0, over sqrt(1 + lambda): components that vary slowly over the scene have a
+# small share of the gradient, smaller for larger lambda.
+TOLERANCE = 2e-3
+ROUGHLY = 2e-2  # tolerance for comparisons of features that are not returned
+STEPS = 200  # of conjugate gradients at most; about 20 are enough for lambda 4
 
 Step = tuple[np.float32, np.float32]  # alpha and beta
 
 
 @dataclass(frozen=True)
 class _System:
-    """The matrix of the minimum, ``diag(w) + lambda L``, with rows in the graph's order."""
+    """The matrix ``diag(w) + lambda L``, with rows in the graph's order."""
 
     graph: SplatGraph
-    weights: np.ndarray  # [P] f32, w over its largest value; zero without weight
+    weights: np.ndarray  # [P] f32, w over its largest value; zero without total weight
     couplings: np.ndarray  # [E] f32, lambda a_jk sqrt(w_j w_k)
-    diagonal: np.ndarray  # [P] f32, w and the sum of a row's couplings
-    inverse: np.ndarray  # [P] f32, of the diagonal; zero without weight
+    diagonal: np.ndarray  # [P] f32, w plus the sum of a row's couplings
+    inverse: np.ndarray  # [P] f32, of the diagonal; zero without total weight
     tolerance: float  # of the gradient, relative to that at X0
 
     @classmethod
     def of(cls, graph: SplatGraph, weights: np.ndarray, smoothness: float, tolerance: float = TOLERANCE) -> _System:
-        """Of weights [P] f64 in the graph's order, at most one."""
+        """Build from weights [P] f64 in the graph's order, at most one."""
         roots, counts = np.sqrt(weights), np.diff(graph.starts)
         couplings = (smoothness * graph.affinities * np.repeat(roots, counts) * roots[graph.neighbours]).astype(
             np.float32
@@ -80,7 +81,7 @@ class _System:
         return cls(graph, weights.astype(np.float32), couplings, diagonal, inverse, relative)
 
     def on_card(self, place: torch.device) -> SmoothingSystem:
-        """The same on a device."""
+        """Return the system on a device."""
         indices = (
             torch.from_numpy(part).to(place, torch.int64) for part in (self.graph.starts, self.graph.neighbours)
         )
@@ -94,31 +95,31 @@ def smooth(
     graph: SplatGraph,
     total_weight: Tensor,
     confidence: Tensor | None,
-    seen: Tensor,
+    solved: Tensor,
     smoothness: float,
     progress: Progress = silent,
     threads: int | None = None,
     *,
     device: Device = CPU,
 ) -> tuple[Tensor, dict[str, Any]]:
-    """Draw the features of splats that are near in place and colour together.
+    """Smooth the features of splats that are near in position and colour.
 
     Args:
         X: [P, F] f16 or f32 on the CPU, changed in place.
-        graph: of the P splats that were lifted.
-        total_weight: [P] f32, sums of plain weights. confidence: [P] f32; None counts as one everywhere.
-        seen: [P] bool, the splats whose row of X was solved for; the others take their neighbours' features.
-        smoothness: lambda; zero leaves X as it is.
-        threads: None takes the cores that this process may use. The number changes no bit.
-        device: that takes the steps.
+        graph: of the P lifted splats.
+        total_weight: [P] f32, sums of unscaled weights. confidence: [P] f32; None: one everywhere.
+        solved: [P] bool, the splats with a row of X from the solve; the others take their neighbours' features.
+        smoothness: lambda; zero does not change X.
+        threads: None uses the cores that this process may use. The result is bitwise identical for any number.
+        device: of the steps.
 
     Returns:
         X, and its facts for the diagnostics: ``smoothness``, the ``steps``, the ``residual`` (the preconditioned
         gradient's length over that at X0, of the probes), ``moved`` (the root of
-        ``sum_j w_j |x_j - x0_j|^2 / sum_j w_j |x0_j|^2``), ``filled``, the splats without weight that took a
-        feature, and whether ``colours`` counted.
+        ``sum_j w_j |x_j - x0_j|^2 / sum_j w_j |x0_j|^2``), ``filled``, the number of splats without total weight that
+        took a feature, and ``colours``, True if the graph uses colours.
     """
-    weights = smoothing_weights(torch.where(seen, total_weight, 0.0), confidence)[graph.order]
+    weights = smoothing_weights(torch.where(solved, total_weight, 0.0), confidence)[graph.order]
     rings = _rings(graph, weights) if smoothness else []
     system = _System.of(graph, weights, smoothness)
     has_weight, has_feature = weights > 0, weights > 0
@@ -138,7 +139,7 @@ def smooth(
                 width = min(block, channels - begin)
 
                 def read(rows: slice, begin: int = begin, width: int = width) -> tuple[np.ndarray, np.ndarray]:
-                    """Take rows of X in the graph's order; their least and greatest value in each channel."""
+                    """Copy rows of X in the graph's order; return the minimum and maximum of each channel."""
                     take_rows(rows.start, rows.stop, graph.order, source, begin // block * target.shape[1], target)
                     torch.from_numpy(values[rows, :width]).copy_(staged[rows, :width])
                     low, high = np.full(width, np.inf, np.float32), np.full(width, -np.inf, np.float32)
@@ -163,26 +164,26 @@ def smooth(
                 def write(
                     rows: slice, begin: int = begin, width: int = width, solution: np.ndarray = solution
                 ) -> None:
-                    """Put rows into their places in X."""
+                    """Copy rows back to X."""
                     staged[rows, :width].copy_(torch.from_numpy(solution[rows, :width]))
                     first_word = begin // block * target.shape[1]
                     put_rows(rows.start, rows.stop, graph.order, has_feature, target, first_word, source)
 
                 _map_rows(write, count, pool)
                 progress("smooth", begin + width, channels, "channels")
-    moved, whole = squares.sum(axis=1).tolist()
+    change, norm = squares.sum(axis=1).tolist()
     facts: dict[str, Any] = {
         "smoothness": smoothness,
         "steps": len(steps),
         "residual": residual,
-        "moved": float(np.sqrt(moved / whole)) if whole > 0 and np.isfinite(whole) else None,
+        "moved": float(np.sqrt(change / norm)) if norm > 0 and np.isfinite(norm) else None,
         "filled": sum(len(rows) for rows, _ in rings),
         "colours": graph.coloured,
     }
     if residual > system.tolerance:
         facts["warning"] = (
             f"smoothness={smoothness:g} ended after {len(steps)} steps with {residual:.1g} of the gradient left: "
-            "features are less smooth than asked for"
+            "features are less smooth than requested"
         )
     return X, facts
 
@@ -190,14 +191,14 @@ def smooth(
 def smooth_channels(
     graph: SplatGraph, values: np.ndarray, weights: np.ndarray, smoothness: float, pool: Executor
 ) -> np.ndarray:
-    """Smooth features [P, C] f32 with weights [P] f64 up to one, in the graph's order, as well as comparisons need.
+    """Smooth features [P, C] f32 with weights [P] f64 up to one, in the graph's order, to the tolerance ROUGHLY.
 
-    Splats without weight come back as zeros.
+    Splats without total weight are zero.
     """
-    known = np.zeros((len(values), -(-values.shape[1] // LANES) * LANES), np.float32)
-    np.copyto(known[:, : values.shape[1]], values, where=weights[:, None] > 0)
+    padded = np.zeros((len(values), -(-values.shape[1] // LANES) * LANES), np.float32)
+    np.copyto(padded[:, : values.shape[1]], values, where=weights[:, None] > 0)
     system = _System.of(graph, weights, smoothness, ROUGHLY)
-    return _conjugate_gradients(system, known, pool)[0][:, : values.shape[1]]
+    return _conjugate_gradients(system, padded, pool)[0][:, : values.shape[1]]
 
 
 def warm_up_smoothing() -> None:
@@ -209,18 +210,19 @@ def warm_up_smoothing() -> None:
 
 
 def smoothing_weights(total_weight: Tensor, confidence: Tensor | None) -> np.ndarray:
-    """[P] f64, w over its largest value: zero where a splat has no total weight."""
+    """Return w over its largest value, [P] f64; zero for splats without total weight."""
     weights = total_weight.double()
     if confidence is not None:
         weights *= confidence.double().clamp_min(LEAST_CONFIDENCE)
     values = weights.nan_to_num(0.0).numpy()
-    most = float(values.max(initial=0.0))
-    values = values / most if most > 0 else values
+    largest = float(values.max(initial=0.0))
+    values = values / largest if largest > 0 else values
     return np.where(values >= LEAST_WEIGHT, values, 0.0)
 
 
 def _rings(graph: SplatGraph, weights: np.ndarray) -> list[tuple[np.ndarray, Any]]:
-    """Rows without weight, ring by ring from those that have some, with what they take of rows that have a feature.
+    """Return the rows without total weight, ring by ring from those with total weight, and their shares of rows with
+    a feature.
 
     Args:
         weights: [P] f64, in the graph's order.
@@ -230,12 +232,12 @@ def _rings(graph: SplatGraph, weights: np.ndarray) -> list[tuple[np.ndarray, Any
     """
     from scipy.sparse import csr_array
 
-    count, left = len(weights), np.flatnonzero(weights == 0)
-    if not 0 < left.size < count:
+    count, remaining = len(weights), np.flatnonzero(weights == 0)
+    if not 0 < remaining.size < count:
         return []
-    affinities = csr_array((graph.affinities, graph.neighbours, graph.starts), shape=(count, count))[left]
+    affinities = csr_array((graph.affinities, graph.neighbours, graph.starts), shape=(count, count))[remaining]
     roots, rings = np.sqrt(weights), list[tuple[np.ndarray, Any]]()
-    while left.size:
+    while remaining.size:
         shares = csr_array(affinities.multiply(roots[None]))
         shares.eliminate_zeros()
         sums = np.asarray(shares.sum(axis=1), np.float64)
@@ -243,27 +245,27 @@ def _rings(graph: SplatGraph, weights: np.ndarray) -> list[tuple[np.ndarray, Any
         if not ring.size:
             break
         shares = csr_array(shares[ring].multiply(1.0 / sums[ring][:, None])).astype(np.float32)
-        rings.append((left[ring], shares))
-        roots = np.zeros_like(roots)  # rows of the next ring have no neighbour in those before this one
-        roots[left[ring]] = 1.0
-        rest = np.delete(np.arange(left.size), ring)
-        left, affinities = left[rest], affinities[rest]
+        rings.append((remaining[ring], shares))
+        roots = np.zeros_like(roots)  # the next ring has neighbours in this ring only
+        roots[remaining[ring]] = 1.0
+        rest = np.delete(np.arange(remaining.size), ring)
+        remaining, affinities = remaining[rest], affinities[rest]
     return rings
 
 
-def _probe(X: Tensor, order: np.ndarray, known: np.ndarray, pool: Executor) -> np.ndarray:
-    """[P, PROBES] f32, in the graph's order: sums of X's channels with random signs, zero where not known [P]."""
+def _probe(X: Tensor, order: np.ndarray, mask: np.ndarray, pool: Executor) -> np.ndarray:
+    """Return sums of X's channels with random signs, [P, PROBES] f32 in the graph's order, zero outside the mask."""
     signs = torch.from_numpy(np.random.default_rng(0).choice(np.array([-1.0, 1.0], np.float32), (X.shape[1], PROBES)))
 
     def add(rows: slice) -> np.ndarray:
         return (X.index_select(0, torch.from_numpy(order[rows])).float() @ signs).numpy()
 
     sums = np.concatenate(_map_rows(add, len(X), pool))
-    return np.where(known[:, None] & np.isfinite(sums), sums, np.float32(0.0))
+    return np.where(mask[:, None] & np.isfinite(sums), sums, np.float32(0.0))
 
 
 def _conjugate_gradients(system: _System, start: np.ndarray, pool: Executor) -> tuple[np.ndarray, list[Step], float]:
-    """Minimise from X0 [P, C] f32 on, all channels as one vector: X, its steps, and the relative gradient left.
+    """Minimise from X0 [P, C] f32, all channels as one vector; return X, the steps, and the final relative gradient.
 
     C is a multiple of LANES.
     """
@@ -279,8 +281,8 @@ def _conjugate_gradients(system: _System, start: np.ndarray, pool: Executor) -> 
         return run(multiply_rows, graph.starts, graph.neighbours, system.couplings, weights, *flat)
 
     multiply(np.zeros_like(system.weights))  # lambda L X0, the gradient at X0
-    one, zero = np.float32(1.0), np.float32(0.0)
-    first = slope = run(advance_rows, system.inverse, one, direction, image, zero, X, rest)
+    unit, zero = np.float32(1.0), np.float32(0.0)
+    first = slope = run(advance_rows, system.inverse, unit, direction, image, zero, X, rest)
     run(turn_rows, system.inverse, zero, rest, direction)
     turn = length = zero
     while 0 < slope < np.inf and slope > system.tolerance**2 * first and len(steps) < STEPS:
@@ -298,7 +300,7 @@ def _conjugate_gradients(system: _System, start: np.ndarray, pool: Executor) -> 
 def _descend(
     system: _System, start: np.ndarray, iterates: Sequence[np.ndarray], steps: Sequence[Step], pool: Executor
 ) -> np.ndarray:
-    """Take steps that are known from X0 [P, BLOCK] f32 on; the one of two copies of it that is the last iterate."""
+    """Take the given steps from X0 [P, BLOCK] f32, in two copies of it; return the one with the last iterate."""
     graph, (X, before) = system.graph, iterates
     arrays = graph.starts, graph.neighbours, system.couplings, system.weights, system.diagonal, start.reshape(-1)
 
@@ -315,23 +317,23 @@ def _descend(
 def step_rows(
     first, last, starts, neighbours, couplings, weights, diagonal, start, X, before, length, turn
 ):  # fmt: skip
-    """Write the iterate after X over that before it, in rows first..last of flat [P, 64] arrays."""
-    less, turned = in_all_lanes(np.float32(-1.0)), in_all_lanes(turn)
+    """Overwrite the iterate before X by that after it, in rows first..last of flat [P, 64] arrays."""
+    minus_one, momentum = in_all_lanes(np.float32(-1.0)), in_all_lanes(turn)
     for j in range(first, last):
-        at, own, minus = BLOCK * j, in_all_lanes(weights[j]), in_all_lanes(-diagonal[j])
+        at, weight, minus = BLOCK * j, in_all_lanes(weights[j]), in_all_lanes(-diagonal[j])
         far = in_all_lanes(length / diagonal[j] if diagonal[j] > 0 else np.float32(0.0))
         x0, x1 = lanes_at(X, at), lanes_at(X, at + 8)
         x2, x3 = lanes_at(X, at + 16), lanes_at(X, at + 24)
         x4, x5 = lanes_at(X, at + 32), lanes_at(X, at + 40)
         x6, x7 = lanes_at(X, at + 48), lanes_at(X, at + 56)
-        r0 = plus_product(times(own, lanes_at(start, at)), minus, x0)
-        r1 = plus_product(times(own, lanes_at(start, at + 8)), minus, x1)
-        r2 = plus_product(times(own, lanes_at(start, at + 16)), minus, x2)
-        r3 = plus_product(times(own, lanes_at(start, at + 24)), minus, x3)
-        r4 = plus_product(times(own, lanes_at(start, at + 32)), minus, x4)
-        r5 = plus_product(times(own, lanes_at(start, at + 40)), minus, x5)
-        r6 = plus_product(times(own, lanes_at(start, at + 48)), minus, x6)
-        r7 = plus_product(times(own, lanes_at(start, at + 56)), minus, x7)
+        r0 = plus_product(times(weight, lanes_at(start, at)), minus, x0)
+        r1 = plus_product(times(weight, lanes_at(start, at + 8)), minus, x1)
+        r2 = plus_product(times(weight, lanes_at(start, at + 16)), minus, x2)
+        r3 = plus_product(times(weight, lanes_at(start, at + 24)), minus, x3)
+        r4 = plus_product(times(weight, lanes_at(start, at + 32)), minus, x4)
+        r5 = plus_product(times(weight, lanes_at(start, at + 40)), minus, x5)
+        r6 = plus_product(times(weight, lanes_at(start, at + 48)), minus, x6)
+        r7 = plus_product(times(weight, lanes_at(start, at + 56)), minus, x7)
         for n in range(starts[j], starts[j + 1]):
             k, coupling = BLOCK * np.int64(neighbours[n]), in_all_lanes(couplings[n])
             r0 = plus_product(r0, coupling, lanes_at(X, k))
@@ -345,23 +347,23 @@ def step_rows(
         rows = ((x0, r0), (x1, r1), (x2, r2), (x3, r3), (x4, r4), (x5, r5), (x6, r6), (x7, r7))
         for part, (x, rest) in enumerate(rows):
             place = at + LANES * part
-            moved = plus(x, times(less, lanes_at(before, place)))
-            keep_lanes(before, place, plus_product(plus_product(x, far, rest), turned, moved))
+            change = plus(x, times(minus_one, lanes_at(before, place)))
+            store_lanes(before, place, plus_product(plus_product(x, far, rest), momentum, change))
 
 
 @kernel
 def multiply_rows(first, last, starts, neighbours, couplings, weights, direction, image, dots):
     """Write ``(diag(w) + lambda L) P`` of rows first..last of flat [P, C] arrays; add ``p^T K p`` to dots [1] f64."""
-    less, channels = in_all_lanes(np.float32(-1.0)), direction.size // weights.size
+    minus_one, channels = in_all_lanes(np.float32(-1.0)), direction.size // weights.size
     for j in range(first, last):
         for c in range(0, channels, LANES):
-            at, own = channels * j + c, in_all_lanes(weights[j])
+            at, weight = channels * j + c, in_all_lanes(weights[j])
             values = lanes_at(direction, at)
-            product = times(own, values)
+            product = times(weight, values)
             for n in range(starts[j], starts[j + 1]):
                 near = lanes_at(direction, channels * np.int64(neighbours[n]) + c)
-                product = plus_product(product, in_all_lanes(couplings[n]), plus(values, times(less, near)))
-            keep_lanes(image, at, product)
+                product = plus_product(product, in_all_lanes(couplings[n]), plus(values, times(minus_one, near)))
+            store_lanes(image, at, product)
             for lane in range(at, at + LANES):
                 dots[0] += np.float64(direction[lane]) * image[lane]
 
@@ -372,9 +374,9 @@ def advance_rows(first, last, inverse, fall, direction, image, length, X, rest, 
     for j in range(first, last):
         for c in range(X.shape[1]):
             X[j, c] += length * direction[j, c]
-            left = rest[j, c] - fall * image[j, c]
-            rest[j, c] = left
-            dots[0] += np.float64(left) * left * inverse[j]
+            residual = rest[j, c] - fall * image[j, c]
+            rest[j, c] = residual
+            dots[0] += np.float64(residual) * residual * inverse[j]
 
 
 @kernel
@@ -386,14 +388,14 @@ def turn_rows(first, last, inverse, turn, rest, direction, dots):
 
 
 def _in_words(*tables: Tensor) -> list[np.ndarray]:
-    """The same memory as integers: of 64 bits, where rows are a number of these, else of 16. They copy faster."""
+    """View tables as integers of 64 bits, if rows are whole numbers of these, else of 16; they are copied faster."""
     arrays = [table.numpy() for table in tables]
-    whole = all(
+    is_aligned = all(
         size % 8 == 0
         for array in arrays
         for size in (array.ctypes.data, array.strides[0], array.shape[1] * array.itemsize)
     )
-    return [array.view(np.int64 if whole else np.int16) for array in arrays]
+    return [array.view(np.int64 if is_aligned else np.int16) for array in arrays]
 
 
 @kernel
@@ -407,7 +409,7 @@ def take_rows(first, last, order, source, begin, target):
 
 @kernel
 def put_rows(first, last, order, has_feature, source, begin, target):
-    """Copy rows first..last of a block that have a feature back to their places in X, as `take_rows` took them."""
+    """Copy rows first..last of a block that have a feature back to X, inverse to `take_rows`."""
     for j in range(first, last):
         if has_feature[j]:
             row = order[j]
@@ -417,7 +419,7 @@ def put_rows(first, last, order, has_feature, source, begin, target):
 
 @kernel
 def bound_rows(first, last, has_weight, values, low, high):
-    """Set rows first..last without weight to zero; widen low and high [C] f32 by the others. NaN stays NaN."""
+    """Zero rows first..last without total weight; extend low and high [C] f32 by the others. NaN propagates."""
     for j in range(first, last):
         if not has_weight[j]:
             values[j] = 0.0
@@ -430,7 +432,7 @@ def bound_rows(first, last, has_weight, values, low, high):
 
 @kernel
 def clip_rows(first, last, weights, before, low, high, after, sums):
-    """Clip rows first..last of ``after`` to low..high [C] f32; add what they moved, and what they were, to sums.
+    """Clip rows first..last of ``after`` to low..high [C] f32; add squares of the change, and of ``before``, to sums.
 
     Sums [2, C] f64 are ``sum_j w_j (x_j - x0_j)^2`` and ``sum_j w_j x0_j^2`` of each channel.
     """
@@ -441,20 +443,20 @@ def clip_rows(first, last, weights, before, low, high, after, sums):
             after[j, c] = high[c] if value > high[c] or np.isnan(high[c]) else value
         for c in range(low.size):
             value = np.float64(before[j, c])
-            apart = after[j, c] - value
-            sums[0, c] += weights[j] * apart * apart
+            change = after[j, c] - value
+            sums[0, c] += weights[j] * change * change
             sums[1, c] += weights[j] * value * value
 
 
 def _map_rows(work: Callable[[slice], Any], count: int, pool: Executor) -> list[Any]:
-    """What ``work`` returns for each piece of ``count`` rows, in their order."""
+    """Run ``work`` for each piece of ``count`` rows; return the results in order."""
     return list(pool.map(work, (slice(first, min(first + ROWS, count)) for first in range(0, count, ROWS))))
 
 
 def _row_sums(
     work: Callable[..., Any], arguments: tuple[Any, ...], shape: tuple[int, ...], count: int, pool: Executor
 ) -> np.ndarray:
-    """What ``work(first, last, *arguments, sums)`` adds up over pieces of ``count`` rows: f64 of the shape."""
+    """Sum ``work(first, last, *arguments, sums)`` over pieces of ``count`` rows in order, f64 of the shape."""
 
     def add(rows: slice) -> np.ndarray:
         part = np.zeros(shape)

@@ -1,6 +1,6 @@
-"""The steps of `liftcore.solve.smooth` by a card, in float64.
+"""The steps of `liftcore.solve.smooth` on a GPU, in float64.
 
-``embedding_bag`` takes the sums of rows, each in a fixed order: the same lift has the same bits on one card.
+``embedding_bag`` sums each row in a fixed order: a lift is bitwise reproducible on the same GPU.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-TABLE_BYTES = 1 << 29  # of each of the five tables [P, C] f64 that a block of channels takes
+TABLE_BYTES = 1 << 29  # of each of the five tables [P, C] f64 of a block of channels
 
 
 @dataclass(frozen=True)
@@ -27,11 +27,11 @@ class SmoothingSystem:
 
     @property
     def channels(self) -> int:
-        """How many are solved at a time: a multiple of four, which are at least 64 bits."""
+        """The number of channels per block, a multiple of four, so that rows of float16 are whole 64-bit words."""
         return 4 * max(TABLE_BYTES // (32 * max(len(self.weights), 1)), 1)
 
     def descend(self, start: Tensor, steps: Sequence[tuple[float, float]]) -> Tensor:
-        """Take steps that are known from X0 [P, C] f64 on; [P, C] f64."""
+        """Take the given steps from X0 [P, C] f64; return X [P, C] f64."""
         diagonal = (self.weights[:, None] + self._bags(torch.ones_like(start[:, :1]))).contiguous()
         pull, inverse = self.weights[:, None] * start, self.inverse[:, None]
         X = before = start
@@ -41,7 +41,7 @@ class SmoothingSystem:
         return X
 
     def _bags(self, values: Tensor) -> Tensor:
-        """``sum_k lambda a_jk sqrt(w_j w_k) x_k`` of each row, [P, C]."""
+        """Return ``sum_k lambda a_jk sqrt(w_j w_k) x_k`` of each row, [P, C]."""
         return embedding_bag(
             self.neighbours, values, self.starts, mode="sum", per_sample_weights=self.couplings,
             include_last_offset=True,

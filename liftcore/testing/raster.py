@@ -1,4 +1,4 @@
-"""Checks of a raster against the dense float64 oracle (`liftcore.raster.reference`), and a suite for pytest."""
+"""Checks of a raster against the dense float64 reference (`liftcore.raster.reference`), and a suite for pytest."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from liftcore.raster.base import ViewRequest
-from liftcore.raster.reference import counted_weights, dense_view, reading_matrix, strided_rays
+from liftcore.raster.reference import dense_view, reading_matrix, selected_weights, strided_rays
 from liftcore.scene.compositing import CompositingParams, Selection, Weighting
 from liftcore.scene.kernel import Kernel
 from liftcore.testing.scenes import random_camera, random_grid, random_regions, random_splats
@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from liftcore.values.views import ViewFeatures
 
 INSIDE = 1e-5  # absolute, on weights
-FLIPS = 1e-2  # of rays: on tiny random images one ray in a hundred may flip at a cut-off
-SEEDS = 3  # scenes of a kernel in the suite
-SPLATS = 40  # of each
+FLIPS = 1e-2  # of rays: on tiny random images one ray in a hundred may fall on the other side of a cut-off
+SEEDS = 3  # scenes per kernel
+SPLATS = 40  # per scene
 
 
 def check_render(raster: Raster, splats: Splats, camera: Camera, params: CompositingParams) -> None:
-    """Hold a render of three channels to ``A X``: tight but for rays at a cut-off, of which few may differ."""
+    """Compare a render of three channels with ``A X``: within INSIDE except for few rays at a cut-off."""
     values = torch.tensor(np.random.default_rng(0).uniform(0, 1, (splats.count, 3)), dtype=torch.float32)
     view = dense_view(splats, camera, params)
     expected = (view.A @ values.double().numpy()).reshape(camera.height, camera.width, 3)
@@ -45,11 +45,11 @@ def check_render(raster: Raster, splats: Splats, camera: Camera, params: Composi
 
 
 def check_footprints(raster: Raster, splats: Splats, camera: Camera, params: CompositingParams) -> None:
-    """See that splats that a ray meets have an area, and none a larger one than the image."""
+    """Check that splats hit by a ray have an area, and that no area exceeds the image."""
     areas = raster.footprints(camera, params).numpy()
     view = dense_view(splats, camera, params)
-    met = (view.A[~view.cut] > 0).any(axis=0)
-    assert (areas[met] > 0).all()
+    hit = (view.A[~view.cut] > 0).any(axis=0)
+    assert (areas[hit] > 0).all()
     assert areas.dtype == np.float32 and areas.max(initial=0) <= camera.width * camera.height
 
 
@@ -61,97 +61,97 @@ def check_region_weights(
     params: CompositingParams,
     weighting: Weighting,
 ) -> None:
-    """Hold W and the total weight of a view to the oracle, where no ray lies at a cut-off.
+    """Compare W and the total weight of a view with the reference, in views without a ray at a cut-off.
 
     Args:
         weighting: a power of all weights.
     """
-    walked = strided_rays(camera, params)
+    strided = strided_rays(camera, params)
     weights = raster.region_weights(camera, observation, params, weighting)
-    plain = dense_view(splats, camera, replace(params, opacity_logit_scale=1.0))
-    if plain.cut.any():
+    unscaled = dense_view(splats, camera, replace(params, opacity_logit_scale=1.0))
+    if unscaled.cut.any():
         return
     total_weight = np.zeros(splats.count)
     total_weight[weights.total_weight_splats.numpy()] = weights.total_weight.numpy()
-    expected = plain.A[walked].sum(axis=0)  # whatever the gain and the power
+    expected = unscaled.A[strided].sum(axis=0)  # for any gain and power
     assert np.abs(total_weight - expected).max() < INSIDE * max(1.0, expected.max())
     view = dense_view(splats, camera, params)
     if view.cut.any():
         return
     S, ray = reading_matrix(observation, camera.width, camera.height)
-    chosen = counted_weights(view.A, splats, camera, params, weighting)[0]
-    expected = chosen[ray[walked[ray]]].T @ S[walked[ray]]
+    selected = selected_weights(view.A, splats, camera, params, weighting)[0]
+    expected = selected[ray[strided[ray]]].T @ S[strided[ray]]
     W = dense(weights, splats.count, observation.codebook.shape[0])
     assert np.abs(W - expected).max(initial=0) < INSIDE * max(1.0, expected.max(initial=0))
 
 
-def check_counted_weights(
+def check_selected_weights(
     raster: Raster, splats: Splats, camera: Camera, params: CompositingParams, weighting: Weighting
 ) -> None:
-    """Hold the weights that count to the oracle ray by ray, but for rays that are too close to call."""
+    """Compare the selected weights with the reference ray by ray, except for ambiguous rays."""
     view = dense_view(splats, camera, params)
-    chosen, close = counted_weights(view.A, splats, camera, params, weighting)
-    found = raster.region_weights(camera, one_region_a_ray(camera), params, weighting)
-    W = dense(found, splats.count, camera.width * camera.height)
-    walked = strided_rays(camera, params)
-    assert W[:, ~walked].max(initial=0) == 0
-    assert np.abs(W.T - chosen)[walked & ~view.cut & ~close].max(initial=0) < INSIDE
+    selected, close = selected_weights(view.A, splats, camera, params, weighting)
+    weights = raster.region_weights(camera, one_region_a_ray(camera), params, weighting)
+    W = dense(weights, splats.count, camera.width * camera.height)
+    strided = strided_rays(camera, params)
+    assert W[:, ~strided].max(initial=0) == 0
+    assert np.abs(W.T - selected)[strided & ~view.cut & ~close].max(initial=0) < INSIDE
 
 
 def check_ray_rows(
-    raster: Raster, splats: Splats, camera: Camera, params: CompositingParams, most: int = 2_000
+    raster: Raster, splats: Splats, camera: Camera, params: CompositingParams, limit: int = 2_000
 ) -> None:
-    """Hold rows of A, of at most so many rays, to the oracle's."""
+    """Compare rows of A, of at most ``limit`` rays, with the reference."""
     view = dense_view(splats, camera, params)
-    some = np.arange(view.A.shape[0])[:: -(-view.A.shape[0] // most)]
-    rows = raster.ray_rows(camera, pixels_of(camera)[some], params)
-    A = np.zeros((len(some), splats.count))
-    A[np.repeat(np.arange(len(some)), np.diff(rows.indptr.numpy())), rows.splats.numpy()] = rows.weights.numpy()
-    assert np.abs(A - view.A[some])[~view.cut[some]].max(initial=0) < INSIDE
+    sample = np.arange(view.A.shape[0])[:: -(-view.A.shape[0] // limit)]
+    rows = raster.ray_rows(camera, pixels_of(camera)[sample], params)
+    A = np.zeros((len(sample), splats.count))
+    A[np.repeat(np.arange(len(sample)), np.diff(rows.indptr.numpy())), rows.splats.numpy()] = rows.weights.numpy()
+    assert np.abs(A - view.A[sample])[~view.cut[sample]].max(initial=0) < INSIDE
 
 
 def check_adjoint(
     raster: Raster, splats: Splats, camera: Camera, params: CompositingParams, channels: int = 3
 ) -> None:
-    """Hold the adjoint of an image of so many channels to ``A^T Y``."""
+    """Compare the adjoint of an image with ``A^T Y``."""
     view = dense_view(splats, camera, params)
     Y = random_image(camera, channels)
-    Y[torch.from_numpy(view.cut.reshape(camera.height, camera.width))] = 0  # the render's check counts the flips
+    Y[torch.from_numpy(view.cut.reshape(camera.height, camera.width))] = 0  # `check_render` counts the flips
     expected = view.A.T @ Y.double().numpy().reshape(-1, channels)
-    found = raster.adjoint(camera, Y, params).numpy()
-    assert found.shape == (splats.count, channels)
-    assert np.abs(found - expected).max(initial=0) < INSIDE * max(1.0, view.A.sum(axis=0).max(initial=0))
+    adjoint = raster.adjoint(camera, Y, params).numpy()
+    assert adjoint.shape == (splats.count, channels)
+    assert np.abs(adjoint - expected).max(initial=0) < INSIDE * max(1.0, view.A.sum(axis=0).max(initial=0))
 
 
 def check_inner_product(raster: Raster, splats: Splats, camera: Camera, params: CompositingParams) -> None:
-    """See that ``<A X, Y> = <X, A^T Y>``: render and adjoint are of one A."""
+    """Check that ``<A X, Y> = <X, A^T Y>``: render and adjoint have the same A."""
     X = torch.tensor(np.random.default_rng(2).normal(0, 1, (splats.count, 4)), dtype=torch.float32)
     Y = random_image(camera, 4)
     image, sums = raster.render(camera, X, params), raster.adjoint(camera, Y, params)
     left, right = float((image.double() * Y).sum()), float((X * sums.double()).sum())
-    scale = float((raster.render(camera, X.abs(), params).double() * Y.abs()).sum())  # no cancellation in it
+    scale = float((raster.render(camera, X.abs(), params).double() * Y.abs()).sum())  # free of cancellation
     assert abs(left - right) <= 1e-6 * scale + 1e-12
 
 
 def check_strongest_labels(raster: Raster, splats: Splats, camera: Camera, params: CompositingParams) -> float:
-    """Hold labels to the largest channel of the one-hot render; return the share of rays that were clear."""
+    """Compare labels with the largest channel of the one-hot render; return the share of unambiguous rays."""
     seed = splats.count + camera.width
     labels = torch.tensor(np.random.default_rng(seed).integers(-1, 60, splats.count), dtype=torch.int32)
     view = dense_view(splats, camera, params)
     sums = view.A @ np.eye(61)[labels.numpy() + 1]
     ranked = np.sort(sums, axis=1)
     clear = (ranked[:, -1] - ranked[:, -2] > 1e-4) & ~view.cut
-    found = raster.strongest_labels(camera, labels, params).numpy().ravel()
-    assert np.array_equal(found[clear], (sums.argmax(axis=1) - 1)[clear])
-    assert (found[view.A.sum(axis=1) == 0] == -1).all()
+    actual = raster.strongest_labels(camera, labels, params).numpy().ravel()
+    assert np.array_equal(actual[clear], (sums.argmax(axis=1) - 1)[clear])
+    assert (actual[view.A.sum(axis=1) == 0] == -1).all()
     return float(clear.mean())
 
 
-def check_iterated_views(iterated: Raster, alone: Raster, params: CompositingParams) -> None:
-    """See that views in a row are those alone, to the bit.
+def check_iterated_views(iterated: Raster, reference: Raster, params: CompositingParams) -> None:
+    """Check that iterated views are bitwise identical to single ones.
 
     Args:
-        iterated: the raster. alone: another one of the same splats.
+        iterated: the raster. reference: another raster of the same splats.
     """
     pixels = (torch.tensor([[3, 4], [10, 11]], dtype=torch.int32), torch.empty(0, 2, dtype=torch.int32))
     gains = [replace(params, opacity_logit_scale=1.0 + k % 2 / 5) for k in range(3)]
@@ -162,16 +162,16 @@ def check_iterated_views(iterated: Raster, alone: Raster, params: CompositingPar
     answers = list(iterated.iterate_views(iter(requests)))
     assert len(answers) == len(requests)
     for request, answer in zip(requests, answers, strict=True):
-        own = alone.region_weights(request.camera, request.observation, request.params, Weighting())
-        assert same_bits(answer.weights, own)
+        expected = reference.region_weights(request.camera, request.observation, request.params, Weighting())
+        assert same_bits(answer.weights, expected)
         if len(request.pixels):
-            assert same_bits(answer.rows, alone.ray_rows(request.camera, request.pixels, request.params))
+            assert same_bits(answer.rows, reference.ray_rows(request.camera, request.pixels, request.params))
         else:
             assert answer.rows.indptr.tolist() == [0]
 
 
 def dense(weights: RegionWeights, splats: int, regions: int) -> np.ndarray:
-    """W as a dense [P, M] f64 matrix."""
+    """Return W as a dense matrix [P, M] f64."""
     W = np.zeros((splats, regions))
     lengths = np.diff(weights.indptr.numpy())
     W[np.repeat(weights.splats.numpy(), lengths), weights.region.numpy()] = weights.weight.numpy()
@@ -179,37 +179,37 @@ def dense(weights: RegionWeights, splats: int, regions: int) -> np.ndarray:
 
 
 def one_region_a_ray(camera: Camera) -> Regions:
-    """A region a pixel, so that W^T is A' itself."""
+    """Return a region map with one region per pixel, so that W^T is A'."""
     rays = camera.width * camera.height
     labels = torch.arange(rays, dtype=torch.int32).reshape(1, camera.height, camera.width)
     return Regions(labels, torch.ones(rays, 1))
 
 
 def random_image(camera: Camera, channels: int) -> Tensor:
-    """[H, W, C] f32."""
+    """Return a random image [H, W, C] f32."""
     values = np.random.default_rng(1).normal(0, 1, (camera.height, camera.width, channels))
     return torch.tensor(values, dtype=torch.float32)
 
 
 def pixels_of(camera: Camera) -> Tensor:
-    """[H * W, 2] i32 (x, y)."""
+    """Return all pixels (x, y) of a camera, [H * W, 2] i32."""
     y, x = np.mgrid[: camera.height, : camera.width]
     return torch.tensor(np.stack([x.ravel(), y.ravel()], axis=1), dtype=torch.int32)
 
 
-def same_bits(one: RegionWeights | RayRows, other: RegionWeights | RayRows) -> bool:
-    """Tell whether all tensors of the two are equal to the bit."""
-    parts = ([part for part in vars(of).values() if isinstance(part, torch.Tensor)] for of in (one, other))
+def same_bits(left: RegionWeights | RayRows, right: RegionWeights | RayRows) -> bool:
+    """Return True if all tensors of both are bitwise identical."""
+    parts = ([part for part in vars(of).values() if isinstance(part, torch.Tensor)] for of in (left, right))
     return all(map(torch.equal, *parts))
 
 
 class RasterConformance(ABC):
-    """Tests that a `Raster` passes, for pytest: derive a class ``Test...`` and open yours.
+    """Tests of a `Raster` for pytest: derive a class ``Test...`` and open your raster.
 
-    Scenes are small and seeded, so that a slow interpreter of kernels can take them.
+    Scenes are small and seeded, for slow interpreters of kernels.
     """
 
-    kernels: tuple[Kernel, ...] = tuple(Kernel)  # that the raster can do
+    kernels: tuple[Kernel, ...] = tuple(Kernel)  # that the raster supports
     params: tuple[CompositingParams, ...] = (CompositingParams(), CompositingParams(opacity_logit_scale=1.2))
 
     @abstractmethod
@@ -217,7 +217,7 @@ class RasterConformance(ABC):
         """Open the raster of splats."""
 
     def scenes(self) -> Iterator[tuple[Splats, Camera, CompositingParams]]:
-        """Splats of each kernel, a view of them, and how rays meet them."""
+        """Yield splats of each kernel, a camera, and compositing parameters."""
         for kernel in self.kernels:
             for seed in range(SEEDS):
                 splats = random_splats(seed, SPLATS, kernel=kernel)
@@ -242,12 +242,12 @@ class RasterConformance(ABC):
         selections = Weighting(1, Selection.TOP_K, count=3), Weighting(2, Selection.FRONT_MASS, mass=0.6)
         for splats, camera, params in self.scenes():
             for weighting in (*selections, Weighting(1, Selection.CENTRE)):
-                check_counted_weights(self.open_raster(splats), splats, camera, params, weighting)
+                check_selected_weights(self.open_raster(splats), splats, camera, params, weighting)
 
     def test_strides_leave_the_other_rays_out(self) -> None:
         for splats, camera, params in self.scenes():
             strided = replace(params, stride=3, offset=(1, 2))
-            check_counted_weights(self.open_raster(splats), splats, camera, strided, Weighting())
+            check_selected_weights(self.open_raster(splats), splats, camera, strided, Weighting())
 
     def test_rows_labels_and_footprints_equal_the_oracle(self) -> None:
         for splats, camera, params in self.scenes():

@@ -1,4 +1,4 @@
-"""Small random scenes, views and observations, the same for the same seed."""
+"""Small random scenes, cameras and observations, reproducible by their seeds."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from liftcore.values.views import FeatureGrid, Regions
 
 
 def of_kernel(splats: Splats, kernel: Kernel, betas: Tensor) -> Splats:
-    """The same numbers read as splats of another kernel: 2DGS takes the first two scales, DBS the betas [P]."""
+    """Return the splats as those of another kernel: 2DGS uses the first two scales, DBS the betas [P]."""
     if kernel is Kernel.GAUSSIAN_2D:
         return replace(splats, kernel=kernel, log_scales=splats.log_scales[:, :2].contiguous())
     return replace(splats, kernel=kernel, beta=betas) if kernel is Kernel.BETA else splats
 
 
 def random_splats(seed: int, count: int = 40, spread: float = 1.0, kernel: Kernel = Kernel.GAUSSIAN_3D) -> Splats:
-    """Splats around the origin: needles, discs and balls, faint and opaque; for DBS with falloffs flat and steep."""
+    """Return splats around the origin: needles, discs and balls, faint and opaque, with flat and steep falloffs."""
     rng = np.random.default_rng(seed)
     splats = Splats(
         means=torch.tensor(rng.normal(0, spread, (count, 3)), dtype=torch.float32),
@@ -36,7 +36,7 @@ def random_splats(seed: int, count: int = 40, spread: float = 1.0, kernel: Kerne
 
 
 def look_at(name: str, centre: np.ndarray, width: int, height: int, focal: float) -> Camera:
-    """A camera at ``centre`` that looks at the origin."""
+    """Return a camera at ``centre`` that looks at the origin."""
     forward = -centre / np.linalg.norm(centre)
     helper = np.array([0.0, 1.0, 0.0]) if abs(forward[1]) < 0.9 else np.array([1.0, 0.0, 0.0])
     right = np.cross(helper, forward)
@@ -49,7 +49,7 @@ def look_at(name: str, centre: np.ndarray, width: int, height: int, focal: float
 
 
 def random_camera(seed: int, width: int = 37, height: int = 29, name: str = "v0") -> Camera:
-    """A camera somewhere around the scene; the size is no multiple of a tile."""
+    """Return a random camera around the scene; its size is no multiple of a tile."""
     rng = np.random.default_rng(seed + 1_000)
     direction = rng.normal(0, 1, 3)
     centre = direction / np.linalg.norm(direction) * rng.uniform(2.5, 5.0)
@@ -59,7 +59,7 @@ def random_camera(seed: int, width: int = 37, height: int = 29, name: str = "v0"
 def random_regions(
     seed: int, levels: int = 2, rows: int = 5, size: tuple[int, int] = (15, 18), F: int = 6
 ) -> Regions:
-    """Blocky label maps of another size than the image, some pixels unlabelled."""
+    """Return blocky label maps of another size than the image, with unlabelled pixels."""
     rng = np.random.default_rng(seed + 2_000)
     coarse = rng.integers(-1, rows, (levels, -(-size[0] // 3), -(-size[1] // 4)))
     labels = np.repeat(np.repeat(coarse, 3, axis=1), 4, axis=2)[:, : size[0], : size[1]]
@@ -69,6 +69,6 @@ def random_regions(
 
 
 def random_grid(seed: int, size: tuple[int, int] = (7, 9), F: int = 6) -> FeatureGrid:
-    """A grid of random vectors."""
+    """Return a grid of random vectors."""
     rng = np.random.default_rng(seed + 3_000)
     return FeatureGrid(torch.tensor(rng.normal(0, 1, (*size, F)), dtype=torch.float32))

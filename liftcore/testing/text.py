@@ -1,4 +1,4 @@
-"""A suite for pytest that text encoders pass."""
+"""A conformance suite of text encoders for pytest."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from liftcore.errors import InvalidQuery
 if TYPE_CHECKING:
     from liftcore.text import TextEncoder
 
-CLOSE = 1e-5  # of a vector's entries, whatever texts stand beside it
+CLOSE = 1e-5  # on a vector's entries, for any other texts in the batch
 
 
 class TextEncoderConformance(ABC):
-    """Tests that a `TextEncoder` passes, for pytest: derive a class ``Test...`` and open yours."""
+    """Tests of a `TextEncoder` for pytest: derive a class ``Test...`` and open your encoder."""
 
-    texts: tuple[str, ...] = ("mug", "chair", "banana")  # different ones that it can read
+    texts: tuple[str, ...] = ("mug", "chair", "banana")  # different texts that the encoder supports
 
     @abstractmethod
     def open_encoder(self) -> TextEncoder:
@@ -34,14 +34,14 @@ class TextEncoderConformance(ABC):
         rows = encoder.encode(list(self.texts))
         assert rows.shape == (len(self.texts), encoder.channels) and rows.dtype == np.float32
         np.testing.assert_allclose(np.linalg.norm(rows, axis=1), 1.0, atol=1e-4)
-        alone = np.concatenate([encoder.encode([text]) for text in self.texts])
-        np.testing.assert_allclose(rows, alone, atol=CLOSE)
+        single_rows = np.concatenate([encoder.encode([text]) for text in self.texts])
+        np.testing.assert_allclose(rows, single_rows, atol=CLOSE)
         np.testing.assert_allclose(encoder.encode(list(reversed(self.texts))), rows[::-1], atol=CLOSE)
         assert len(np.unique(rows.round(4), axis=0)) == len(self.texts)
 
     def test_same_text_has_the_same_bits(self) -> None:
-        first, again = (self.open_encoder().encode(list(self.texts)) for _ in range(2))
-        assert np.array_equal(first, again)
+        first, second = (self.open_encoder().encode(list(self.texts)) for _ in range(2))
+        assert np.array_equal(first, second)
 
     def test_no_texts_are_no_rows(self) -> None:
         encoder = self.open_encoder()

@@ -25,7 +25,7 @@ import torch
 import liftcore as lc
 from liftcore.evaluate.synthetic import room_cameras, room_parts, room_splats
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.solve.reweight import Agreement, agreement_factors
+from liftcore.solve.reweight import Reweighting, reweighting_factors
 from liftcore.values.views import NO_LABEL, ViewFeatures
 from tests.benchmarks.base import command_line, tell
 from tests.benchmarks.tabletop import Truth, counted
@@ -220,13 +220,13 @@ def unit(rows: np.ndarray) -> np.ndarray:
 @contextmanager
 def levels_together() -> Iterator[None]:
     """Have lifts judge all levels as one."""
-    with patch("liftcore.lifting.in_memory.agreement_factors", without_level_numbers):
+    with patch("liftcore.lifting.in_memory.reweighting_factors", without_level_numbers):
         yield
 
 
-def without_level_numbers(*arguments: Any, **named: Any) -> Agreement:
-    """`agreement_factors` without levels."""
-    return agreement_factors(*arguments, **named | {"levels": None})
+def without_level_numbers(*arguments: Any, **named: Any) -> Reweighting:
+    """`reweighting_factors` without levels."""
+    return reweighting_factors(*arguments, **named | {"levels": None})
 
 
 def measured(kind: Kind) -> dict[str, Any]:

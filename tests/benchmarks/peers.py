@@ -32,7 +32,7 @@ from liftcore.evaluate.bench import weigh_regions
 from liftcore.evaluate.synthetic import room_cameras, room_regions, room_splats
 from liftcore.raster import open_raster
 from liftcore.raster.cpu.composite import Frame
-from liftcore.raster.cpu.project import CUTOFF, KY, MX, MY, OPACITY, ROOT_X, SLOPE
+from liftcore.raster.cpu.project import CUTOFF, MX, MY, OPACITY, SLOPE, SQRT_A, C
 from liftcore.raster.cpu.raster import CpuRaster
 from liftcore.runtime.cores import cores
 from liftcore.runtime.device import CPU, Device
@@ -154,14 +154,14 @@ def _add_shares(thread, threads, edges, frame, target, sums):
 def _add_splat(frame, record, box, light, target, row):
     """One splat's weights on one tile, times the pixels, onto its row of sums [F + 1]; light ends at 0."""
     x0, y0, width, height = box
-    opacity, kx, cap = np.float32(record[OPACITY]), np.float32(record[ROOT_X] ** 2), np.float32(frame.alpha_cap)
+    opacity, kx, cap = np.float32(record[OPACITY]), np.float32(record[SQRT_A] ** 2), np.float32(frame.alpha_cap)
     for y in range(height):
         dy = y0 + y + 0.5 - record[MY]
-        base = record[KY] * dy * dy
+        base = record[C] * dy * dy
         if base > record[CUTOFF]:
             continue
         centre = record[MX] + record[SLOPE] * dy - x0 - 0.5
-        half = math.sqrt(record[CUTOFF] - base) / record[ROOT_X]
+        half = math.sqrt(record[CUTOFF] - base) / record[SQRT_A]
         for x in range(max(0, math.ceil(centre - half)), min(width - 1, math.floor(centre + half)) + 1):
             before = light[y, x]
             if before <= 0:
@@ -240,9 +240,9 @@ def _alphas(frame: Frame, members: Tensor, there: Tensor, tiles: Tensor) -> Tens
         (corner[:, None] * TILE + torch.arange(TILE) + 0.5)[:, :, None] - own[:, None, :, centre]
         for corner, centre in ((tiles % frame.columns, MX), (tiles // frame.columns, MY))
     )
-    root = own[:, None, :, ROOT_X]
+    root = own[:, None, :, SQRT_A]
     across = (root * x).float()[:, None] - (root * own[:, None, :, SLOPE] * y).float()[:, :, None]
-    exponents = across.square_().add_((own[:, None, :, KY] * y * y).float()[:, :, None])
+    exponents = across.square_().add_((own[:, None, :, C] * y * y).float()[:, :, None])
     opacity = torch.where(there, own[:, :, OPACITY], 0.0).float()
     return threshold(exponents.neg_().exp2_() * opacity[:, None, None], ALPHA_FLOOR, 0.0).flatten(1, 2)
 

@@ -131,7 +131,7 @@ def test_memory_that_runs_out_for_good_is_told_in_words(monkeypatch, error):
 
     raster = gpu_raster(random_splats(0, 4))
     monkeypatch.setattr("liftcore.raster.gpu.raster.Frame", full)
-    with pytest.raises(Unavailable, match="projected splats and lists of a view") as caught:
+    with pytest.raises(Unavailable, match="projected splats and tile lists of a view") as caught:
         raster.row_sums(random_camera(0), CompositingParams())
     assert caught.value.got == str(error) and caught.value.hint
     monkeypatch.setattr("liftcore.raster.gpu.raster.Frame", lambda *_: broken())

@@ -15,8 +15,8 @@ from liftcore.raster.cpu.simd import (
     BetaSegment,
     GaussianSegment,
     blend_lanes,
-    keep_lanes,
     new_state,
+    store_lanes,
 )
 from liftcore.runtime.jit import kernel
 from liftcore.scene.compositing import ALPHA_FLOOR
@@ -28,7 +28,7 @@ F = np.float32
 
 @kernel
 def blended(state, shape, fade):
-    keep_lanes(state, WEIGHTS, blend_lanes(state, 0, shape, fade))
+    store_lanes(state, WEIGHTS, blend_lanes(state, 0, shape, fade))
 
 
 def active(floor: float = ALPHA_FLOOR, cap: float = CAP, light: float = 1.0) -> np.ndarray:

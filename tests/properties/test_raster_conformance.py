@@ -12,19 +12,19 @@ from hypothesis import strategies as st
 
 from liftcore.errors import InvalidInput, InvalidSettings
 from liftcore.raster.cpu.raster import CpuRaster
-from liftcore.raster.reference import ReferenceRaster, counted_weights, dense_view, reading_matrix
+from liftcore.raster.reference import ReferenceRaster, dense_view, reading_matrix, selected_weights
 from liftcore.scene.compositing import CompositingParams, Selection, Weighting
 from liftcore.scene.splats import Kernel, Splats
 from liftcore.testing.raster import (
     INSIDE,
     check_adjoint,
-    check_counted_weights,
     check_footprints,
     check_inner_product,
     check_iterated_views,
     check_ray_rows,
     check_region_weights,
     check_render,
+    check_selected_weights,
     check_strongest_labels,
     dense,
     one_region_a_ray,
@@ -132,7 +132,7 @@ def test_weights_that_count_equal_the_oracle_ray_by_ray(footprint, backend):
     @backend.holds(st.data(), st.sampled_from(SELECTIONS))
     def check(data, weighting) -> None:
         splats, camera, _, walk = drawn(data, footprint, backend, strided=True)
-        check_counted_weights(backend.open(splats), splats, camera, walk, weighting)
+        check_selected_weights(backend.open(splats), splats, camera, walk, weighting)
 
 
 @every_backend
@@ -145,7 +145,7 @@ def test_every_weighting_equals_the_oracle_and_few_rays_are_too_close_to_call(ba
     for weighting in SELECTIONS:
         undecided = []
         for splats, camera, raster, view in views:
-            chosen, close = counted_weights(view.A, splats, camera, CompositingParams(), weighting)
+            chosen, close = selected_weights(view.A, splats, camera, CompositingParams(), weighting)
             found = raster.region_weights(camera, one_region_a_ray(camera), CompositingParams(), weighting)
             W = dense(found, splats.count, width * height)
             assert np.abs(W.T - chosen)[~view.cut & ~close].max() < INSIDE, weighting

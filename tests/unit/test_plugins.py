@@ -79,7 +79,7 @@ def test_broken_plugins_are_named_with_their_package(install, tmp_path: Path) ->
     formats = {"bad": "broken", "odd": "other", "gone": "nothing"}
     install("ours", text_encoders=formats, image_encoders=formats, splat_formats=formats)
     for name, message in (
-        ("bad", "plugin 'bad' of the package ours: expected one that works, got ZeroDivisionError"),
+        ("bad", "plugin 'bad' of the package ours: expected a working plugin, got ZeroDivisionError"),
         ("odd", "plugin 'odd' of the package ours: expected a value with .*, got int without"),
         ("gone", "plugin 'gone' of the package ours: .* AttributeError.*theirs:nothing imports and runs"),
     ):

@@ -102,4 +102,4 @@ def test_a_view_is_cut_where_all_its_lists_together_are_too_long(threads, monkey
     for most, cut in ((len(whole.items), False), (len(whole.items) - 1, True), (0, True)):
         monkeypatch.setattr(tiles, "MOST_LISTED", most)
         afresh = CpuRaster(raster.splats, threads)
-        assert (afresh._bands(CAMERA, CompositingParams())._whole is None) is cut
+        assert (afresh._bands(CAMERA, CompositingParams())._single_frame is None) is cut

@@ -42,20 +42,20 @@ from liftcore.scene.splats import Splats
 from liftcore.solve.aggregate import MASKS_MADE, Aggregation, aggregation_facts, cluster_means
 from liftcore.solve.clusters import Clustering
 from liftcore.solve.consensus import mean_share
-from liftcore.solve.diagnostics import ViewMeasures, joined, measure_view
+from liftcore.solve.diagnostics import ViewMeasures, join_measures, measure_view
 from liftcore.solve.directions import RegionDirections
 from liftcore.solve.loss import mean_distance
 from liftcore.solve.objects import (
     NodeVectors,
     RegionObjects,
+    add_regions,
     choose_nodes,
     node_numbering,
-    numbered,
-    with_others,
+    number_objects,
 )
 from liftcore.solve.region_tree import RegionTree, region_tree
-from liftcore.solve.reweight import SceneAgreement, level_numbers, whole_regions
-from liftcore.solve.sums import added, unpacked
+from liftcore.solve.reweight import SceneConsistency, level_numbers, whole_regions
+from liftcore.solve.sums import sum_pieces, unpack_sums
 from liftcore.values.lift_views import LiftViews
 from liftcore.values.pack import NO_ROOM, Views, write_pack
 from liftcore.values.region_weights import MOST_REGIONS
@@ -278,15 +278,15 @@ class InBlocks(LiftSteps[Job]):
         number = tree.parents.size
         if number and other_masks.size:
             self._label(W, 0, tree)
-            tree = with_others(
-                tree, other_masks, (part for file in _pieces(W, "labels-0") for part in unpacked(file))
+            tree = add_regions(
+                tree, other_masks, (part for file in _pieces(W, "labels-0") for part in unpack_sums(file))
             )
         self._label(W, 1, tree)
         labels, total_weight = _column(W, "labels-1", "labels"), _column(W, "rows", "total_weight")
         weights = _sums(W, "labels-1", (1, number * groups.views))
         numbers = node_numbering(labels, total_weight, tree)
         steps.write_piece(W.folder / steps.OBJECTS, {"object": numbers.object})
-        return numbered(labels, tree, numbers, weights.reshape(number, groups.views))
+        return number_objects(labels, tree, numbers, weights.reshape(number, groups.views))
 
     def _label(self, job: Job, step: int, tree: RegionTree) -> None:
         steps.write_piece(job.folder / steps.TREE.format(step), vars(tree))
@@ -317,7 +317,7 @@ class InBlocks(LiftSteps[Job]):
             self.run(
                 "robust", steps.compare, replace(W, step=step, by_region=region_mask is not None), W.splat_pieces
             )
-            scene = SceneAgreement.of(_sums(W, f"cosines-{step}", shape), region_mask, level)
+            scene = SceneConsistency.of(_sums(W, f"cosines-{step}", shape), region_mask, level)
             steps.write_agreement(W, step, scene)
         return W, scene.reliability if scene else None
 
@@ -365,7 +365,7 @@ class InBlocks(LiftSteps[Job]):
     def measure(self, W: Job, X: Tensor) -> ViewMeasures:
         """See the protocol: a view at a time."""
         views = (read_view(W.view_file(number)) for number in range(len(W.names)))
-        return joined([measure_view(view.sample, X, view.codebook.rows) for view in views])
+        return join_measures([measure_view(view.sample, X, view.codebook.rows) for view in views])
 
     def deliver(self, W: Job, lift: LiftResult) -> LiftResult:
         """See the protocol: a lift mapped from shards; their files may be deleted while it is open."""
@@ -389,7 +389,7 @@ def _pieces(job: Job, step: str) -> Iterator[dict[str, np.ndarray]]:
 
 def _sums(job: Job, step: str, shape: tuple[int, int]) -> np.ndarray:
     """Add up the sums in the files of a step."""
-    return added((part for arrays in _pieces(job, step) for part in unpacked(arrays)), shape)
+    return sum_pieces((part for arrays in _pieces(job, step) for part in unpack_sums(arrays)), shape)
 
 
 def _column(job: Job, step: str, name: str) -> np.ndarray:

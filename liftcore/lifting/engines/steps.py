@@ -38,8 +38,8 @@ from liftcore.lifting.engines import blocks
 from liftcore.lifting.engines.blocks import Job, file_version, read_weights, scene_of
 from liftcore.runtime.device import choose_device
 from liftcore.runtime.one_thread import one_thread
+from liftcore.solve.aggregate import assign_features as give_features
 from liftcore.solve.aggregate import cluster_sums, guard, with_feature
-from liftcore.solve.aggregate import spread as give_features
 from liftcore.solve.closed_form import solve_rows
 from liftcore.solve.codebook import Codebook, ViewCodebook
 from liftcore.solve.consensus import SplatTuples, along_curve, region_shares, splat_tuples, with_mean
@@ -55,9 +55,9 @@ from liftcore.solve.objects import (
     view_shares,
 )
 from liftcore.solve.region_tree import RegionTree
-from liftcore.solve.reweight import SceneAgreement, ViewConsistency, reweighted
+from liftcore.solve.reweight import SceneConsistency, ViewConsistency, scale_weights
 from liftcore.solve.rows import SomeRows, fill_rows, gather_rows, take_rows, values_of
-from liftcore.solve.sums import PieceSums, packed
+from liftcore.solve.sums import PieceSums, pack_sums
 from liftcore.values.region_weights import RegionWeights
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ def groups_of(job: Job) -> RegionGroups:
 def write_piece(path: Path, arrays: dict[str, Any], sums: Sequence[PieceSums] = ()) -> None:
     """Write the arrays or tensors of a piece, and sums of its pieces of splats."""
     tensors = {name: part if isinstance(part, Tensor) else torch.from_numpy(part) for name, part in arrays.items()}
-    write_tensors(path, tensors | (packed(sums) if sums else {}), {})
+    write_tensors(path, tensors | (pack_sums(sums) if sums else {}), {})
 
 
 Piece = tuple[dict[str, Any], Sequence[PieceSums]]  # arrays by name, and sums of its pieces of splats
@@ -170,7 +170,7 @@ def _weights(starts: np.ndarray, region: Tensor, weight: Tensor, offsets: np.nda
 def relate(job: Job, piece: int, threads: int | None) -> Piece:
     """Write the tuples of the splats of some views, and the count of splats in each of their regions."""
     block, groups = _view_block(job, piece), groups_of(job)
-    own_region = memberships(block.W, groups, threads).own
+    own_region = memberships(block.W, groups, threads).own_region
     tuples = splat_tuples(block.W, own_region, groups, np.arange(block.splats.size), threads)
     sizes = np.bincount(block.W.region.numpy()[own_region] - block.base, minlength=int(block.W.offsets[-1]))
     arrays = {"splats": block.splats, "sizes": sizes}
@@ -207,7 +207,7 @@ def _take_tuples(tuples: SplatTuples, rows: np.ndarray) -> SplatTuples:
 def contain(job: Job, piece: int, threads: int | None) -> Piece:
     """Write the nodes that contain those of some views."""
     block, groups, nodes = _view_block(job, piece), groups_of(job), mapped(job.folder / NODES)["nodes"]
-    own_region = memberships(block.W, groups, threads).own
+    own_region = memberships(block.W, groups, threads).own_region
     begins, rows = sampled_splats(block.W, own_region, nodes, block.base)
     sampled = np.zeros(block.splats.size, np.bool_)
     sampled[rows] = True
@@ -221,14 +221,14 @@ def contain(job: Job, piece: int, threads: int | None) -> Piece:
 def share(job: Job, piece: int, threads: int | None) -> Piece:
     """Write the consensus of other views about the entries of some views."""
     block, groups = _view_block(job, piece), groups_of(job)
-    own_region, splats = memberships(block.W, groups, threads).own, torch.from_numpy(block.splats).long()
+    own_region, splats = memberships(block.W, groups, threads).own_region, torch.from_numpy(block.splats).long()
     bounds = torch.from_numpy(mapped(job.folder / CURVE)["bounds"])
     rows = along_curve(scene_of(job).means[splats], bounds)
     tuples, totals = _tuples_of(job, block.splats)
     tuples = _take_tuples(tuples, rows)
     shares = region_shares(block.W, own_region, groups, rows, totals[rows], tuples, base=block.base, threads=threads)
     arrays = {"splats": block.splats, "starts": block.W.indptr, "sums": shares.sums, "views": shares.views}
-    return arrays | {"shares": np.array([shares.told, shares.asked])}, ()
+    return arrays | {"shares": np.array([shares.share_sum, shares.share_count])}, ()
 
 
 # ---- blocks of splats
@@ -353,18 +353,18 @@ def _consensus(job: Job, block: SplatBlock, threads: int | None) -> Tensor | Non
     return sums
 
 
-def scene_agreement(job: Job, step: int) -> SceneAgreement:
+def scene_agreement(job: Job, step: int) -> SceneConsistency:
     """Read the driver's totals of a robust step."""
     arrays = map_tensors(job.folder / AGREEMENT.format(step))[0]
     mean_cosine, regions, power = (torch.from_numpy(arrays[name]) for name in ("mean_cosine", "regions", "power"))
     reliability = float(arrays["reliability"][0])
-    return SceneAgreement(mean_cosine, regions, power, None if np.isnan(reliability) else reliability)
+    return SceneConsistency(mean_cosine, regions, power, None if np.isnan(reliability) else reliability)
 
 
-def write_agreement(job: Job, step: int, scene: SceneAgreement) -> None:
+def write_agreement(job: Job, step: int, scene: SceneConsistency) -> None:
     """Write the driver's totals of a robust step."""
     reliability = np.nan if scene.reliability is None else scene.reliability
-    arrays = {"regions": scene.regions, "mean_cosine": scene.usual, "power": scene.power}
+    arrays = {"regions": scene.regions, "mean_cosine": scene.mean_cosine, "power": scene.power}
     arrays["reliability"] = torch.tensor([reliability], dtype=torch.float64)
     write_tensors(job.folder / AGREEMENT.format(step), arrays, {})
 
@@ -414,7 +414,7 @@ def _reweighted(job: Job, piece: int, block: SplatBlock, threads: int | None) ->
         return block.W, None
     consistency = _view_consistency(job, block, threads)
     factors, scores = _factors_after(job, piece, block, consistency, job.settings.robust_steps, threads)
-    return reweighted(block.W, factors), scores
+    return scale_weights(block.W, factors), scores
 
 
 @piece_of("measure")
@@ -435,7 +435,7 @@ def solve(job: Job, piece: int, threads: int | None) -> None:
     block, codebook, settings = _splat_block(job, piece), codebook_of(job), job.settings
     W, scores = _reweighted(job, piece, block, threads)
     if settings.loss == "huber":
-        W = reweighted(W, huber_factors(W, codebook, means=block.means, threads=threads, delta=job.delta))
+        W = scale_weights(W, huber_factors(W, codebook, means=block.means, threads=threads, delta=job.delta))
     X = torch.zeros(block.last - block.first, job.channels, dtype=job.dtype)
     rows, device = torch.nonzero(W.indptr.diff())[:, 0], choose_device(settings.device)
     squares = solve_rows(X, rows, W, codebook, means=block.means, threads=threads, device=device)

@@ -28,13 +28,13 @@ from liftcore.lifting.geometry import strided
 from liftcore.lifting.planning.contradictions import LEAST_IN_VIEW, LEAST_ROW_SUM, empty, unseen
 from liftcore.lifting.planning.plan import PlannedScene, first_names, planned_scene, scene_warnings
 from liftcore.lifting.planning.views import SAMPLE, WELL_COVERED, greedy, spread
-from liftcore.raster import check_given, open_raster
+from liftcore.raster import check_splats_and_threads, open_raster
 from liftcore.raster.base import Raster, ViewRequest
 from liftcore.runtime.device import CPU
 from liftcore.runtime.one_line import one_line
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, shown_progress, silent
-from liftcore.runtime.torch_modes import usual_modes
+from liftcore.runtime.torch_modes import default_modes
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.compositing import CompositingParams
 from liftcore.scene.splats import Splats
@@ -98,7 +98,7 @@ class PhotoPlan(PlannedScene):
         yield from (f"warning: {warning}" for warning in self.warnings)
 
 
-@usual_modes()
+@default_modes()
 def plan_photos(
     splats: Splats,
     cameras: Cameras | Mapping[str, Camera],
@@ -119,7 +119,7 @@ def plan_photos(
         InvalidSettings: ``antialiased`` does not suit the splats' kernel.
     """
     settings = LiftSettings.or_default(settings)
-    splats = check_given(splats, threads)
+    splats = check_splats_and_threads(splats, threads)
     settings = settings.for_splats(splats)
     all_cameras = cameras if isinstance(cameras, Cameras) else Cameras(cameras)
     views = list(all_cameras.values())[:: settings.view_stride]

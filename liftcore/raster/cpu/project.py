@@ -1,12 +1,11 @@
-"""From splats and a camera to projected splats: 3DGS and DBS by EWA, 2DGS by the ray's crossing of the disc's plane.
+"""Projection of splats: 3DGS and DBS by EWA, 2DGS by the intersection of ray and disc plane.
 
-A projected splat is a row of [P, COLUMNS] f64. Its outline is an ellipse written row by row, which needs no
-subtraction of large numbers::
+A projected splat is a row of [P, COLUMNS] f64. Its outline is an ellipse in a form that subtracts no large numbers::
 
-    e(x, y) = (ROOT_X (x - MX - SLOPE dy))^2 + KY dy^2 <= CUTOFF,   dy = y - MY
+    e(x, y) = (SQRT_A (x - MX - SLOPE dy))^2 + C dy^2 <= CUTOFF,   dy = y - MY
 
-For 3DGS (e, with ``alpha = opacity 2^-e``) and DBS (sigma) it is the footprint itself; for 2DGS it holds all pixels
-whose ray can cross the disc.
+For 3DGS (e, with ``alpha = opacity 2^-e``) and DBS (sigma) it is the footprint itself; for 2DGS it contains all
+pixels whose ray can cross the disc.
 """
 
 from __future__ import annotations
@@ -35,46 +34,48 @@ if TYPE_CHECKING:
     from liftcore.scene.origin import Origin
     from liftcore.scene.splats import Splats
 
-# Columns of a projected splat. PLAIN is the opacity without the logits' scale, FADE is -log2(OPACITY); LEAN is dy at
-# the outline's rightmost point.
-MX, MY, SLOPE, ROOT_X, KY, CUTOFF, FADE, EXTENT_X, EXTENT_Y, LEAN, OPACITY, PLAIN = range(12)
+# Columns of a projected splat. UNSCALED_OPACITY is the opacity without the scale of logits; RIGHTMOST_DY is dy at the
+# rightmost point of the outline.
+MX, MY, SLOPE, SQRT_A, C, CUTOFF, NEG_LOG2_OPACITY, EXTENT_X, EXTENT_Y, RIGHTMOST_DY, OPACITY, UNSCALED_OPACITY = (
+    range(12)
+)
 BETA = 12  # DBS: the exponent beta = 4 exp(b)
-# 2DGS: the projected centre; the circle around it that the low-pass reaches, px; and three forms in the distance
-# (dx, dy) from it, with s = S_X dx + S_Y dy, t alike, d = D_ZERO + D_X dx + D_Y dy: the ray crosses the disc's plane
-# at (s, t) / d, in units of the axes, times sqrt(log2(e) / 2), so that e is their square; d is the depth of the
-# centre over that of the crossing.
+# 2DGS: the projected centre; the radius around it that the low-pass reaches, px; and three linear forms of the
+# distance (dx, dy) from it: s = S_X dx + S_Y dy, t likewise, d = D_ZERO + D_X dx + D_Y dy. The ray crosses the disc's
+# plane at (s, t) / d, in units of the axes times sqrt(log2(e) / 2), so that e is the squared norm; d is the depth of
+# the centre / depth of the crossing.
 CENTRE_X, CENTRE_Y, NEARBY, S_X, S_Y, T_X, T_Y, D_ZERO, D_X, D_Y = range(12, 22)
 COLUMNS = {Kernel.GAUSSIAN_3D: 12, Kernel.BETA: 13, Kernel.GAUSSIAN_2D: 22}
 
 HALF_LOG2_E = 0.5 / math.log(2.0)  # 2^-(HALF_LOG2_E q) = exp(-q / 2)
-LARGEST_BETA = 1e30  # such a kernel is a point; larger ones would leave float32
+LARGEST_BETA = 1e30  # such a kernel is a point; larger values overflow float32
 
 
 class Scene(NamedTuple):
-    """The splats, activated, as the compiled code takes them: numbers of one kind lie side by side, for vectors."""
+    """The activated splats as a structure of arrays, for the compiled code."""
 
-    means: np.ndarray  # [3, P] f32, world less the splats' origin
+    means: np.ndarray  # [3, P] f32, world frame minus the splats' origin
     axes: np.ndarray  # [3, 3, P] f64 ([3, 2, P] for 2DGS), scaled axes in columns, world
     opacity: np.ndarray  # [P] f64, sigmoid(opacity_logit_scale theta)
-    fade: np.ndarray  # [P] f64, -log2 of it
-    plain: np.ndarray  # [P] f64, sigmoid(theta)
+    neg_log2_opacity: np.ndarray  # [P] f64, -log2(opacity)
+    unscaled_opacity: np.ndarray  # [P] f64, sigmoid(theta)
     cutoff: np.ndarray  # [P] f64, the largest e (or sigma) with a weight; negative for none
     beta: np.ndarray  # [P] f64, DBS only ([0] otherwise): the exponent
 
 
 class View(NamedTuple):
-    """A camera as the compiled code takes it, for the pixels that a stride leaves."""
+    """A camera for the compiled code, for the pixels of a stride."""
 
-    pose: np.ndarray  # [3, 4] f64, world less the splats' origin to camera
+    pose: np.ndarray  # [3, 4] f64, world frame minus the splats' origin -> camera
     intrinsics: np.ndarray  # [4] f64, fx fy cx cy, pixels
     limits: np.ndarray  # [4] f64, x/z and y/z bounds for the Jacobian: -x +x -y +y
     width: int
     height: int
-    low_pass: float  # px^2, of the view's own pixels: coarser pixels have a smaller one
+    low_pass: float  # px^2, in pixels of the strided view
 
 
 class Targets(NamedTuple):
-    """Where a projection writes, a row a splat."""
+    """The output buffers of a projection, one row per splat."""
 
     projected: np.ndarray  # [P, COLUMNS] f64
     depths: np.ndarray  # [P] f32
@@ -82,16 +83,15 @@ class Targets(NamedTuple):
 
 
 def view_of(camera: Camera, params: CompositingParams, origin: Origin) -> View:
-    """The camera for the rays that the stride leaves, with its Jacobian limits: 1.3 times the half field.
+    """Return the camera for the rays of the stride, with its Jacobian limits: 1.3 times the half field of view.
 
-    With ``u' = (u - offset - 1/2) / n + 1/2``, whole numbers and a half fall on each other, so the rays of the
-    strided view are rays of the full one, and its A are rows of the full A: a projected covariance, low-pass
-    included, shrinks by ``n^2`` as its distances do. The limits are those of the full view, measured from each side's
-    edge.
+    ``u' = (u - offset - 1/2) / n + 1/2`` maps pixel centres to pixel centres, so the rays of the strided view are
+    rays of the full view, and its A are rows of the full A: a projected covariance, low-pass included, shrinks by
+    ``n^2`` as squared distances do. The limits are those of the full view, measured from each edge.
 
     Args:
-        camera: in the world frame. params: the stride and its offset. origin: of the splats, which the pose is then
-            about: nothing of it is rounded to float32 before.
+        camera: in the world frame. params: the stride and its offset. origin: of the splats; the pose is made
+            relative to it in float64, before anything is rounded to float32.
     """
     margin_x = FIELD_MARGIN * 0.5 * camera.width / camera.fx
     margin_y = FIELD_MARGIN * 0.5 * camera.height / camera.fy
@@ -113,43 +113,43 @@ def view_of(camera: Camera, params: CompositingParams, origin: Origin) -> View:
     return View(pose, intrinsics, limits, width, height, LOW_PASS / n**2)
 
 
-def activated(splats: Splats, scale: float) -> Scene:
-    """The splats with their opacities, ``sigmoid(scale theta)``, and how far they reach."""
+def activate_splats(splats: Splats, scale: float) -> Scene:
+    """Return the splats with their opacities, ``sigmoid(scale theta)``, and the cut-offs of their footprints."""
     means, empty = np.ascontiguousarray(splats.means.numpy().T), np.empty(0)
     scene = Scene(means, _axes_of(splats), empty, empty, _opacities(splats, 1.0), empty, _betas(splats))
     return with_opacities(scene, splats, scale)
 
 
 def with_opacities(scene: Scene, splats: Splats, scale: float) -> Scene:
-    """The same splats with another scale of their opacity logits."""
-    opacity = scene.plain if scale == 1.0 else _opacities(splats, scale)
-    strongest = np.maximum(opacity, scene.plain)
+    """Return the same splats with another scale of their opacity logits."""
+    opacity = scene.unscaled_opacity if scale == 1.0 else _opacities(splats, scale)
+    strongest = np.maximum(opacity, scene.unscaled_opacity)
     with np.errstate(divide="ignore"):
-        fade = -np.log2(opacity)
+        neg_log2_opacity = -np.log2(opacity)
         if splats.kernel is Kernel.BETA:
-            furthest = -np.expm1(-math.log(2.0) * LARGEST_EXPONENT / scene.beta)  # smaller falloffs count as none
+            furthest = -np.expm1(-math.log(2.0) * LARGEST_EXPONENT / scene.beta)  # smaller falloffs are zero
             cutoff = np.where(strongest > 0, furthest, -1.0)
         else:
             cutoff = np.log2(np.maximum(strongest, ALPHA_FLOOR / 2) / ALPHA_FLOOR)
-    return scene._replace(opacity=opacity, fade=fade, cutoff=cutoff)
+    return scene._replace(opacity=opacity, neg_log2_opacity=neg_log2_opacity, cutoff=cutoff)
 
 
 def _opacities(splats: Splats, scale: float) -> np.ndarray:
-    """[P] f64, ``sigmoid(scale theta)``, without overflow at any logit."""
+    """Return ``sigmoid(scale theta)`` [P] f64, without overflow at any logit."""
     theta = scale * splats.opacity_logits.numpy().astype(np.float64)
     small = np.exp(-np.abs(theta))
     return np.where(theta >= 0, 1.0, small) / (1.0 + small)
 
 
 def _betas(splats: Splats) -> np.ndarray:
-    """[P] f64, ``4 exp(b)``; [0] for the kernels that have none."""
+    """Return ``4 exp(b)`` [P] f64; [0] for kernels without a beta."""
     if splats.beta is None:
         return np.empty(0)
     return 4.0 * np.exp(np.minimum(splats.beta.numpy().astype(np.float64), math.log(LARGEST_BETA / 4.0)))
 
 
 def _axes_of(splats: Splats) -> np.ndarray:
-    """[3, 3, P] f64, ``R diag(exp(log_scales))``: column k is the splat's axis k, world frame; two axes for 2DGS."""
+    """Return ``R diag(exp(log_scales))`` [3, 3, P] f64: column k is axis k, world frame; [3, 2, P] for 2DGS."""
     quats = splats.quats.numpy().astype(np.float64)
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     unit = np.where(norms > 0, quats / np.where(norms > 0, norms, 1.0), np.array([1.0, 0.0, 0.0, 0.0]))
@@ -159,14 +159,16 @@ def _axes_of(splats: Splats) -> np.ndarray:
 
 
 def low_pass_curvature(view: View) -> float:
-    """Of the low-pass of 2DGS, ``exp(-g / 2)`` with ``g = 2 |p - mu|^2`` in pixels of the full view."""
+    """Return the curvature of 2DGS's low-pass: ``exp(-g / 2)``, ``g = 2 |p - mu|^2`` in pixels of the full view."""
     return 2.0 * HALF_LOG2_E * LOW_PASS / view.low_pass
 
 
 def project(
     bounds: tuple[int, int], scene: Scene, view: View, kernel: Kernel, antialiased: bool, targets: Targets
 ) -> int:
-    """Project the splats in ``bounds``; those that touch the image are packed from its first row on. Their number."""
+    """Project the splats in ``bounds`` and pack those that touch the image from its first row on; return their
+    number.
+    """
     if kernel is Kernel.GAUSSIAN_2D:
         return _project_discs(*bounds, scene, view, low_pass_curvature(view), targets)
     unit = 1.0 if kernel is Kernel.BETA else HALF_LOG2_E
@@ -175,28 +177,28 @@ def project(
 
 # ------------------------------------------------------------------------------------------------------ 3DGS and DBS
 #
-# kx = ROOT_X^2 = unit cov_yy / det, ky = unit / cov_yy, slope = cov_xy / cov_yy. For 3DGS the unit is log2(e) / 2,
-# for DBS it is one, and e is sigma. The determinant is a sum of squares (Cauchy-Binet over the three axes), so
-# needles a thousand pixels long keep all their digits.
+# a = SQRT_A^2 = unit cov_yy / det, c = unit / cov_yy, slope = cov_xy / cov_yy. For 3DGS the unit is log2(e) / 2, for
+# DBS it is one, and e is sigma. The determinant is a sum of squares (Cauchy-Binet over the three axes), so needles a
+# thousand pixels long keep their precision.
 #
-# Some splats at a time go through three loops without branches, which become vector instructions: splats behind the
-# camera are projected like the others, to whatever comes of it. Only then are those that touch the image kept.
+# A block of splats goes through three loops without branches, which become vector instructions: splats behind the
+# camera are projected like the others, to meaningless numbers. Only then are those that touch the image kept.
 
-SIDE_BY_SIDE = 64  # splats at a time: their numbers stay in the nearest cache
+SIDE_BY_SIDE = 64  # splats of a block: their numbers stay in the L1 cache
 
-# Rows of numbers of these splats: those of a projected splat in its columns, and what else there is on the way.
-_OWN = COLUMNS[Kernel.GAUSSIAN_3D]
-DEPTH, FADED, TOUCHES, XX, YY, XY, MINORS, DET = range(_OWN, _OWN + 8)
-_NUMBERS = _OWN + 8
+# Rows of numbers of a block: the columns of a projected splat, then intermediate values.
+_FIRST_EXTRA = COLUMNS[Kernel.GAUSSIAN_3D]
+DEPTH, COMPENSATION, TOUCHES, XX, YY, XY, MINORS, DET = range(_FIRST_EXTRA, _FIRST_EXTRA + 8)
+_NUMBERS = _FIRST_EXTRA + 8
 
 
 @without_zero_checks
 def _project_ellipses(first, last, scene, view, unit, antialiased, targets):
-    """Those of the splats ``first..last`` that touch the image, packed from row ``first`` on.
+    """Project the splats ``first..last`` and pack those that touch the image from row ``first`` on.
 
     Args:
         scene: Scene. view: View. unit: of e, see above. targets: Targets, written.
-        antialiased: opacities times ``sqrt(det(cov) / det(cov + low-pass))`` (the mip filter's compensation).
+        antialiased: multiply opacities by ``sqrt(det(cov) / det(cov + low-pass))`` (the mip filter's compensation).
 
     Returns:
         The number of rows written.
@@ -207,7 +209,7 @@ def _project_ellipses(first, last, scene, view, unit, antialiased, targets):
         end = min(begin + SIDE_BY_SIDE, last)
         _project_covariances(begin, end, scene, view, numbers)
         if antialiased:
-            _fade(end - begin, numbers)
+            _compensate_low_pass(end - begin, numbers)
         _measure_outlines(end - begin, view, unit, numbers)
         row = _keep_touching(begin, end, scene, antialiased, numbers, targets, row)
     return row - first
@@ -215,14 +217,14 @@ def _project_ellipses(first, last, scene, view, unit, antialiased, targets):
 
 @inlined
 def _project_covariances(begin, end, scene, view, numbers):
-    """Centre and covariance in the image of the splats ``begin..end``, as if all lay before the camera."""
+    """Compute image centre and covariance of the splats ``begin..end``, as if all lay in front of the camera."""
     pose, intrinsics, limits, low_pass = view.pose, view.intrinsics, view.limits, view.low_pass
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     left, right, top, bottom = -limits[0], limits[1], -limits[2], limits[3]
     x_0, x_1, x_2, x_3 = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
     y_0, y_1, y_2, y_3 = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
     z_0, z_1, z_2, z_3 = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
-    # Of these splats alone: an index that might be negative would make of each read a gather.
+    # Slices, because an index that might be negative would turn each read into a gather.
     at_x, at_y, at_z = scene.means[0, begin:end], scene.means[1, begin:end], scene.means[2, begin:end]
     axes, cutoffs = scene.axes, scene.cutoff[begin:end]
     x_of_0, y_of_0, z_of_0 = axes[0, 0, begin:end], axes[1, 0, begin:end], axes[2, 0, begin:end]
@@ -255,8 +257,8 @@ def _project_covariances(begin, end, scene, view, numbers):
         v_2 = fy / z * (y_0 * a + y_1 * b + y_2 * c) - slope_y * towards
         xx = low_pass + u_0 * u_0 + u_1 * u_1 + u_2 * u_2
         yy = low_pass + v_0 * v_0 + v_1 * v_1 + v_2 * v_2
-        one, two, three = u_0 * v_1 - v_0 * u_1, u_1 * v_2 - v_1 * u_2, u_0 * v_2 - v_0 * u_2
-        minors = one * one + two * two + three * three
+        minor_01, minor_12, minor_02 = u_0 * v_1 - v_0 * u_1, u_1 * v_2 - v_1 * u_2, u_0 * v_2 - v_0 * u_2
+        minors = minor_01 * minor_01 + minor_12 * minor_12 + minor_02 * minor_02
         mx[i] = fx * x / z + cx
         my[i] = fy * y / z + cy
         cov_xx[i] = xx
@@ -269,56 +271,60 @@ def _project_covariances(begin, end, scene, view, numbers):
 
 
 @inlined
-def _fade(count, numbers):
-    """What the low-pass takes of the opacities, and of how far they reach."""
+def _compensate_low_pass(count, numbers):
+    """Compute the opacity compensation of the low-pass, and subtract it from the cut-offs."""
     for i in range(count):
-        faded = math.sqrt(numbers[MINORS, i] / numbers[DET, i]) if numbers[DET, i] > 0 else 0.0
-        numbers[FADED, i] = faded
-        if faded < 1.0:
-            numbers[CUTOFF, i] += math.log2(faded) if faded > 0 else -math.inf
+        compensation = math.sqrt(numbers[MINORS, i] / numbers[DET, i]) if numbers[DET, i] > 0 else 0.0
+        numbers[COMPENSATION, i] = compensation
+        if compensation < 1.0:
+            numbers[CUTOFF, i] += math.log2(compensation) if compensation > 0 else -math.inf
 
 
 @inlined
 def _measure_outlines(count, view, unit, numbers):
-    """The numbers of projected splats, and which of them touch the image."""
+    """Compute the outlines of projected splats, and flag those that touch the image."""
     # The nearest pixel centres lie half a pixel inside the image.
     right, bottom = view.width - 0.5, view.height - 0.5
     mx, my, depth, cutoff = numbers[MX], numbers[MY], numbers[DEPTH], numbers[CUTOFF]
     cov_xx, cov_yy, cov_xy, det = numbers[XX], numbers[YY], numbers[XY], numbers[DET]
-    slope, root_x, ky, lean = numbers[SLOPE], numbers[ROOT_X], numbers[KY], numbers[LEAN]
+    slope, sqrt_a, c, rightmost_dy = numbers[SLOPE], numbers[SQRT_A], numbers[C], numbers[RIGHTMOST_DY]
     extent_x, extent_y, touches = numbers[EXTENT_X], numbers[EXTENT_Y], numbers[TOUCHES]
     for i in range(count):
         xx, yy, xy = cov_xx[i], cov_yy[i], cov_xy[i]
         spread = math.sqrt((cutoff[i] if cutoff[i] > 0 else 0.0) / unit)
         wide, high = spread * math.sqrt(xx), spread * math.sqrt(yy)
         slope[i] = xy / yy
-        root_x[i] = math.sqrt(unit * yy / det[i])
-        ky[i] = unit / yy
-        lean[i] = xy / xx * wide
+        sqrt_a[i] = math.sqrt(unit * yy / det[i])
+        c[i] = unit / yy
+        rightmost_dy[i] = xy / xx * wide
         extent_x[i], extent_y[i] = wide, high
-        # What is not a number touches nothing.
+        # NaN touches nothing.
         inside = (mx[i] + wide >= 0.5) & (mx[i] - wide <= right) & (my[i] + high >= 0.5) & (my[i] - high <= bottom)
         touches[i] = 1.0 if inside & (cutoff[i] >= 0) & (depth[i] >= NEAR_PLANE) else 0.0
 
 
 @inlined
 def _keep_touching(begin, end, scene, antialiased, numbers, targets, row):
-    """Write those that touch the image from ``row`` on; the row after the last."""
+    """Write the splats that touch the image from ``row`` on; return the row after the last."""
     projected, has_beta = targets.projected, scene.beta.shape[0] > 0
     for j in range(begin, end):
         i = j - begin
         if numbers[TOUCHES, i] == 0:
             continue
-        own = projected[row]
-        for number in (MX, MY, SLOPE, ROOT_X, KY, CUTOFF, EXTENT_X, EXTENT_Y, LEAN):
-            own[number] = numbers[number, i]
-        own[OPACITY], own[FADE], own[PLAIN] = scene.opacity[j], scene.fade[j], scene.plain[j]
+        splat = projected[row]
+        for number in (MX, MY, SLOPE, SQRT_A, C, CUTOFF, EXTENT_X, EXTENT_Y, RIGHTMOST_DY):
+            splat[number] = numbers[number, i]
+        splat[OPACITY], splat[NEG_LOG2_OPACITY], splat[UNSCALED_OPACITY] = (
+            scene.opacity[j],
+            scene.neg_log2_opacity[j],
+            scene.unscaled_opacity[j],
+        )
         if antialiased:
-            own[OPACITY] *= numbers[FADED, i]
-            own[PLAIN] *= numbers[FADED, i]
-            own[FADE] = -math.log2(own[OPACITY]) if own[OPACITY] > 0 else math.inf
+            splat[OPACITY] *= numbers[COMPENSATION, i]
+            splat[UNSCALED_OPACITY] *= numbers[COMPENSATION, i]
+            splat[NEG_LOG2_OPACITY] = -math.log2(splat[OPACITY]) if splat[OPACITY] > 0 else math.inf
         if has_beta:
-            own[BETA] = scene.beta[j]
+            splat[BETA] = scene.beta[j]
         targets.depths[row] = numbers[DEPTH, i]
         targets.ids[row] = j
         row += 1
@@ -332,19 +338,19 @@ def _keep_touching(begin, end, scene, antialiased, numbers, targets, row):
 #
 #     s = (b x c) r / (n r),   t = (c x a) r / (n r),   depth = (n c) / (n r)
 #
-# (the paper's homogeneous h_u x h_v up to a factor). All three are affine in the pixel. Taken from the projected
-# centre on and divided by n r there, the first two lose their constants and the third becomes d = depth of the centre
+# (the paper's homogeneous h_u x h_v up to a factor). All three are affine in the pixel. Relative to the projected
+# centre and divided by n r there, the first two lose their constants and the third becomes d = depth of the centre
 # / depth of the crossing, so no large numbers are subtracted. Crossings behind the camera (d <= 0) are not on the ray
-# and count as none; where there is none, the low-pass 2 |p - mu|^2 stays.
+# and are ignored; without a crossing, only the low-pass 2 |p - mu|^2 applies.
 
-MARGIN = 1e-3  # px that an outline is wider than the crossings, for float32 at its edge
-RELATIVE = 1e-4  # and this share of its size
-HORIZON = 1e-9  # a disc that comes this near to the camera's plane, in its depth squared, has a box for an outline
+MARGIN = 1e-3  # px by which an outline is wider than the crossings, for rounding to float32 at its edge
+RELATIVE = 1e-4  # the same as a share of its size
+HORIZON = 1e-9  # a disc this near to the camera's plane, in its depth squared, has a box for an outline
 
 
 @inlined
 def _to_camera(pose, vectors, j):
-    """Point j of [3, P] in the camera's frame."""
+    """Return point j of [3, P] in the camera's frame."""
     px, py, pz = vectors[0, j], vectors[1, j], vectors[2, j]
     x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]
     y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]
@@ -353,8 +359,8 @@ def _to_camera(pose, vectors, j):
 
 
 @inlined
-def _turned(pose, axes, j, k):
-    """Axis k of splat j in the camera's frame."""
+def _rotate_to_camera(pose, axes, j, k):
+    """Return axis k of splat j in the camera's frame."""
     px, py, pz = axes[0, k, j], axes[1, k, j], axes[2, k, j]
     x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz
     y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz
@@ -364,7 +370,7 @@ def _turned(pose, axes, j, k):
 
 @kernel
 def _project_discs(first, last, scene, view, curvature, targets):
-    """Those of the discs ``first..last`` that touch the image, packed from row ``first`` on.
+    """Project the discs ``first..last`` and pack those that touch the image from row ``first`` on.
 
     Args:
         scene: Scene. view: View. curvature: of the low-pass, as in Discs. targets: Targets, written.
@@ -383,26 +389,26 @@ def _project_discs(first, last, scene, view, curvature, targets):
         centre = _to_camera(pose, means, j)
         if not centre[2] >= NEAR_PLANE:
             continue
-        a, b = _turned(pose, axes, j, 0), _turned(pose, axes, j, 1)
-        own = projected[row]
+        a, b = _rotate_to_camera(pose, axes, j, 0), _rotate_to_camera(pose, axes, j, 1)
+        splat = projected[row]
         mx = fx * centre[0] / centre[2] + intrinsics[2]
         my = fy * centre[1] / centre[2] + intrinsics[3]
-        own[CENTRE_X], own[CENTRE_Y], own[NEARBY] = mx, my, math.sqrt(cutoff / curvature)
-        if _write_crossing(own, centre, a, b, fx, fy):
-            _write_outline(own, centre, a, b, cutoff / HALF_LOG2_E, view)
+        splat[CENTRE_X], splat[CENTRE_Y], splat[NEARBY] = mx, my, math.sqrt(cutoff / curvature)
+        if _write_crossing(splat, centre, a, b, fx, fy):
+            _write_outline(splat, centre, a, b, cutoff / HALF_LOG2_E, view)
         else:
-            _write_circle(own)
-        near = own[NEARBY]
-        left = min(mx - near, own[MX] - own[EXTENT_X])
-        right = max(mx + near, own[MX] + own[EXTENT_X])
-        top = min(my - near, own[MY] - own[EXTENT_Y])
-        bottom = max(my + near, own[MY] + own[EXTENT_Y])
+            _write_circle(splat)
+        near = splat[NEARBY]
+        left = min(mx - near, splat[MX] - splat[EXTENT_X])
+        right = max(mx + near, splat[MX] + splat[EXTENT_X])
+        top = min(my - near, splat[MY] - splat[EXTENT_Y])
+        bottom = max(my + near, splat[MY] + splat[EXTENT_Y])
         # The nearest pixel centres lie half a pixel inside the image.
         if not (right >= 0.5 and left <= view.width - 0.5 and bottom >= 0.5 and top <= view.height - 0.5):
             continue
-        own[OPACITY] = scene.opacity[j]
-        own[FADE] = scene.fade[j]
-        own[PLAIN] = scene.plain[j]
+        splat[OPACITY] = scene.opacity[j]
+        splat[NEG_LOG2_OPACITY] = scene.neg_log2_opacity[j]
+        splat[UNSCALED_OPACITY] = scene.unscaled_opacity[j]
         targets.depths[row] = centre[2]
         targets.ids[row] = j
         row += 1
@@ -420,91 +426,92 @@ def _dot(p, q):
 
 
 @inlined
-def _write_crossing(own, centre, a, b, fx, fy):
-    """The forms s, t and d by pixel; whether there are any, for a disc seen edge-on has none."""
+def _write_crossing(splat, centre, a, b, fx, fy):
+    """Write the linear forms s, t and d; return False for a disc seen edge-on, which has none."""
     normal = _cross(a, b)
     facing = _dot(normal, centre)
-    own[S_X] = own[S_Y] = own[T_X] = own[T_Y] = own[D_X] = own[D_Y] = 0.0
-    own[D_ZERO] = -1.0
+    splat[S_X] = splat[S_Y] = splat[T_X] = splat[T_Y] = splat[D_X] = splat[D_Y] = 0.0
+    splat[D_ZERO] = -1.0
     if not abs(facing) > EDGE_ON * math.sqrt(_dot(normal, normal) * _dot(centre, centre)):
         return False
     scale = centre[2] / facing
     unit = scale * math.sqrt(HALF_LOG2_E)
     along_a, along_b = _cross(b, centre), _cross(centre, a)
-    own[S_X], own[S_Y] = unit * along_a[0] / fx, unit * along_a[1] / fy
-    own[T_X], own[T_Y] = unit * along_b[0] / fx, unit * along_b[1] / fy
-    own[D_X], own[D_Y] = scale * normal[0] / fx, scale * normal[1] / fy
-    own[D_ZERO] = 1.0
+    splat[S_X], splat[S_Y] = unit * along_a[0] / fx, unit * along_a[1] / fy
+    splat[T_X], splat[T_Y] = unit * along_b[0] / fx, unit * along_b[1] / fy
+    splat[D_X], splat[D_Y] = scale * normal[0] / fx, scale * normal[1] / fy
+    splat[D_ZERO] = 1.0
     return True
 
 
 @inlined
-def _write_ellipse(own, middle, covariance, det):
-    """An outline ``(p - middle)^T covariance^-1 (p - middle) <= 1``; the determinant has digits of its own."""
+def _write_ellipse(splat, middle, covariance, det):
+    """Write the outline ``(p - middle)^T covariance^-1 (p - middle) <= 1``; det comes apart, at full precision."""
     xx, xy, yy = covariance
-    own[MX], own[MY] = middle
-    own[SLOPE] = xy / yy
-    own[ROOT_X] = math.sqrt(yy / det)
-    own[KY] = 1.0 / yy
-    own[CUTOFF] = 1.0
-    own[EXTENT_X] = math.sqrt(xx)
-    own[EXTENT_Y] = math.sqrt(yy)
-    own[LEAN] = xy / math.sqrt(xx)
+    splat[MX], splat[MY] = middle
+    splat[SLOPE] = xy / yy
+    splat[SQRT_A] = math.sqrt(yy / det)
+    splat[C] = 1.0 / yy
+    splat[CUTOFF] = 1.0
+    splat[EXTENT_X] = math.sqrt(xx)
+    splat[EXTENT_Y] = math.sqrt(yy)
+    splat[RIGHTMOST_DY] = xy / math.sqrt(xx)
 
 
 @inlined
-def _write_circle(own):
-    """The low-pass alone."""
-    square = own[NEARBY] ** 2 + MARGIN**2
-    _write_ellipse(own, (own[CENTRE_X], own[CENTRE_Y]), (square, 0.0, square), square * square)
+def _write_circle(splat):
+    """Write the outline of the low-pass alone."""
+    square = splat[NEARBY] ** 2 + MARGIN**2
+    _write_ellipse(splat, (splat[CENTRE_X], splat[CENTRE_Y]), (square, 0.0, square), square * square)
 
 
 @inlined
-def _write_outline(own, centre, a, b, largest, view):
-    """All pixels whose ray can cross the disc ``s^2 + t^2 <= largest``.
+def _write_outline(splat, centre, a, b, largest, view):
+    """Write an outline around all pixels whose ray can cross the disc ``s^2 + t^2 <= largest``.
 
-    The projected centre taken as origin, the disc's points ``q = (s, t)`` come to ``(U q, V q) / (z + W q)``. Where
-    all of them lie before the camera, that is an ellipse with the covariance ``m m^T + g [U V]^T [U V]`` about
-    ``m = -g [U V]^T W``, with ``g = largest / (z^2 - largest |W|^2)``. Where the disc passes the camera's plane, it
-    is a box.
+    Relative to the projected centre, the disc's points ``q = (s, t)`` project to ``(U q, V q) / (z + W q)``. If all
+    of them lie in front of the camera, that is an ellipse with the covariance ``m m^T + g [U V]^T [U V]`` about
+    ``m = -g [U V]^T W``, with ``g = largest / (z^2 - largest |W|^2)``. If the disc crosses the camera's plane, the
+    outline contains a box.
     """
     fx, fy = view.intrinsics[0], view.intrinsics[1]
     x, y, z = centre
     u = fx * (a[0] - x / z * a[2]), fx * (b[0] - x / z * b[2])
     v = fy * (a[1] - y / z * a[2]), fy * (b[1] - y / z * b[2])
     w = a[2], b[2]
-    room = z * z - largest * (w[0] * w[0] + w[1] * w[1])
+    clearance = z * z - largest * (w[0] * w[0] + w[1] * w[1])
     uu, vv, uv = u[0] * u[0] + u[1] * u[1], v[0] * v[0] + v[1] * v[1], u[0] * v[0] + u[1] * v[1]
     uw, vw = u[0] * w[0] + u[1] * w[1], v[0] * w[0] + v[1] * w[1]
-    if room > HORIZON * z * z:
-        g = largest / room
+    if clearance > HORIZON * z * z:
+        g = largest / clearance
         x0, y0 = -g * uw, -g * vw
         xx, yy = x0 * x0 + g * uu, y0 * y0 + g * vv
         minor = g * (u[0] * v[1] - u[1] * v[0])
         margin = MARGIN**2 + RELATIVE**2 * (xx + yy)
-        det = minor * minor * (z * z / room) + margin * (xx + yy) + margin * margin
+        det = minor * minor * (z * z / clearance) + margin * (xx + yy) + margin * margin
         covariance = xx + margin, x0 * y0 + g * uv, yy + margin
-        _write_ellipse(own, (own[CENTRE_X] + x0, own[CENTRE_Y] + y0), covariance, det)
+        _write_ellipse(splat, (splat[CENTRE_X] + x0, splat[CENTRE_Y] + y0), covariance, det)
         return
-    left, right = _reached(own[CENTRE_X], largest * uw, largest * uu, room, view.width)
-    top, bottom = _reached(own[CENTRE_Y], largest * vw, largest * vv, room, view.height)
+    left, right = _clip_to_side(splat[CENTRE_X], largest * uw, largest * uu, clearance, view.width)
+    top, bottom = _clip_to_side(splat[CENTRE_Y], largest * vw, largest * vv, clearance, view.height)
     half_x, half_y = 0.5 * (right - left), 0.5 * (bottom - top)
-    own[MX], own[MY] = left + half_x, top + half_y
-    own[EXTENT_X], own[EXTENT_Y] = half_x, half_y
-    own[SLOPE] = own[LEAN] = 0.0
-    # Half of the cutoff for each side: the ellipse through the corners of the box, of which the tiles know the sides.
-    own[ROOT_X] = 1.0 / max(MARGIN, half_x)
-    own[KY] = 1.0 / max(MARGIN, half_y) ** 2
-    own[CUTOFF] = 2.0
+    splat[MX], splat[MY] = left + half_x, top + half_y
+    splat[EXTENT_X], splat[EXTENT_Y] = half_x, half_y
+    splat[SLOPE] = splat[RIGHTMOST_DY] = 0.0
+    # Half of the cut-off per side: an ellipse through the corners of the box; the extents are those of the box.
+    splat[SQRT_A] = 1.0 / max(MARGIN, half_x)
+    splat[C] = 1.0 / max(MARGIN, half_y) ** 2
+    splat[CUTOFF] = 2.0
 
 
 @inlined
-def _reached(origin, p, q, room, size):
-    """Where an image's side can meet a disc that passes the camera's plane, clipped a pixel outside the image.
+def _clip_to_side(origin, p, q, clearance, size):
+    """Return the range along one side of the image that a disc crossing the camera's plane can hit.
 
-    A point at distance o of the projected centre is met where ``room o^2 + 2 p o - q <= 0``, on the branch of o = 0.
+    A point at distance o from the projected centre is hit where ``clearance o^2 + 2 p o - q <= 0``, on the branch of
+    o = 0. The range is clipped one pixel outside the image.
     """
-    square = p * p + room * q
+    square = p * p + clearance * q
     low, high = -math.inf, math.inf
     if square >= 0:
         root = math.sqrt(square)

@@ -1,6 +1,6 @@
-"""The CPU backend: A on two cores or on sixty, the same to the bit.
+"""The CPU backend: A by numba kernels, bitwise identical for any number of threads.
 
-Work is cut into a fixed number of shares, each with places of its own to write to; threads only decide who does
+Work is split into a fixed number of shares that write to separate memory; threads only change which one computes
 which share. The compiled kernels release the interpreter lock.
 """
 
@@ -36,7 +36,7 @@ from liftcore.raster.cpu.composite import (
     add_sums,
     choice_of,
     gather_tiles,
-    joined_rows,
+    join_rows,
     kernel_in,
     render_tiles,
     strongest_tiles,
@@ -47,13 +47,13 @@ from liftcore.raster.cpu.project import (
     EXTENT_X,
     EXTENT_Y,
     Targets,
-    activated,
+    activate_splats,
     project,
     view_of,
     with_opacities,
 )
 from liftcore.raster.cpu.tiles import Bands, depth_order
-from liftcore.raster.cpu.weights import entries_of, merged, reading_of, weigh_tiles
+from liftcore.raster.cpu.weights import entries_of, merge_entries, reading_of, weigh_tiles
 from liftcore.runtime.cores import cores
 from liftcore.runtime.device import give_back_memory
 from liftcore.scene.compositing import TILE, CompositingParams, Weighting, every_pixel
@@ -70,99 +70,99 @@ if TYPE_CHECKING:
     from liftcore.scene.splats import Splats
     from liftcore.values.views import ViewFeatures
 
-SPLAT_SHARES = 8  # shares of the projection and the binning
-TILE_SHARES = 48  # shares of the compositing; more of them even out crowded tiles
-CHANNELS = 32  # a pass of the render, so that a tile's sums stay in the cache
-VIEWS = 4  # at a time, at most: each needs projected splats and tile lists of its own
+SPLAT_SHARES = 8  # shares of projection and binning
+TILE_SHARES = 48  # shares of compositing; more shares balance tiles with many splats
+CHANNELS = 32  # per pass of the render, so that a tile's sums stay in the cache
+VIEWS = 4  # processed at a time, at most: each has its own projected splats and tile lists
 
 
 class CpuRaster:
     """A for one scene, of any kernel (``liftcore.raster.base.Raster``).
 
-    One call at a time: the projected splats of the view at hand live in buffers that the next view overwrites.
-    ``iterate_views`` works on several views at a time with rasters like this one, each with buffers of its own.
+    One call at a time: the next view overwrites the buffers of projected splats. ``iterate_views`` processes several
+    views at a time with copies of this raster, each with its own buffers.
 
     Args:
         splats: the scene.
-        threads: how many threads work; None takes the cores that this process may use. The number changes no bit.
+        threads: None uses the cores that this process may use. The result is bitwise identical for any number.
     """
 
     def __init__(self, splats: Splats, threads: int | None = None) -> None:
         self.splats = splats
-        self._scene = activated(splats, 1.0)
+        self._scene = activate_splats(splats, 1.0)
         self._scale = 1.0  # of the scene's opacity logits
         self._allocate(threads or cores())
 
     def _allocate(self, threads: int) -> None:
-        """Threads and buffers of its own."""
+        """Allocate the thread pool and the buffers of projected splats."""
         self.threads = threads
         self._pool = ThreadPoolExecutor(threads)
         self._projected = np.empty((self.splats.count, COLUMNS[self.splats.kernel]))
         self._depths = np.empty(self.splats.count, np.float32)
-        self._kept: tuple[tuple[Camera, CompositingParams], Bands] | None = None
+        self._last_view: tuple[tuple[Camera, CompositingParams], Bands] | None = None
 
     def region_weights(
         self, camera: Camera, observation: ViewFeatures, params: CompositingParams, weighting: Weighting
     ) -> RegionWeights:
-        """``A'^T S`` of a view and the total weight of plain weights. See the protocol."""
+        """Return ``A'^T S`` of a view and the total weight of unscaled weights. See the protocol."""
         choice = choice_of(weighting)
         bands = self._bands(camera, params)
         reading = reading_of(observation, camera.width, camera.height, params)
         squared, gate = choice.power == 2, choice if choice.gated else None
-        plain = True if params.opacity_logit_scale != 1.0 else None
+        with_unscaled = True if params.opacity_logit_scale != 1.0 else None
 
-        def weigh(first: int, last: int, frame: Frame) -> tuple[np.ndarray, ...]:
-            return weigh_tiles(first, last, frame, reading, squared, gate, plain)
+        def weigh_share(first: int, last: int, frame: Frame) -> tuple[np.ndarray, ...]:
+            return weigh_tiles(first, last, frame, reading, squared, gate, with_unscaled)
 
         frames = iter(bands)
         frame = next(frames)
-        found = self._merge(frame, self._over_tiles(frame, weigh), reading.codebook_rows)
+        W = self._merge(frame, self._over_tiles(frame, weigh_share), reading.codebook_rows)
         for frame in frames:
-            before = entries_of(found, frame.ids, reading.codebook_rows, reading.levels)
-            found = self._merge(frame, [before, *self._over_tiles(frame, weigh)], reading.codebook_rows)
-        return found
+            before = entries_of(W, frame.ids, reading.codebook_rows, reading.levels)
+            W = self._merge(frame, [before, *self._over_tiles(frame, weigh_share)], reading.codebook_rows)
+        return W
 
     def iterate_views(self, requests: Iterable[ViewRequest]) -> Generator[ViewWeights]:
-        """``region_weights`` and ``ray_rows`` of views, ``views_at_a_time`` side by side.
+        """Yield ``region_weights`` and ``ray_rows`` of views, ``views_at_a_time`` in parallel.
 
-        Dense maps one after the other: what is found of one takes gigabytes.
+        Dense maps are processed one after the other, as the weights of one take gigabytes.
         """
         requests = iter(requests)
-        first = list(islice(requests, views_at_a_time(self.threads)))  # fewer views than that have more threads each
+        first = list(islice(requests, views_at_a_time(self.threads)))  # with fewer views, each has more threads
         if not first:
             return
-        self._activated(first[0].params.opacity_logit_scale)  # once for all: the views of a lift have one
-        together = 1 if any(map(_is_dense, first)) else len(first)
-        rasters = [self._beside(end - begin) for begin, end in _shares(self.threads, together)]
+        self._scene_with(first[0].params.opacity_logit_scale)  # once: all views of a lift have the same scale
+        raster_count = 1 if any(map(_is_dense, first)) else len(first)
+        rasters = [self._copy_with_threads(end - begin) for begin, end in _shares(self.threads, raster_count)]
         try:
             yield from side_by_side(rasters, chain(first, requests))
         finally:
             rasters.clear()
             give_back_memory()
 
-    def _beside(self, threads: int) -> CpuRaster:
-        """Another raster of the same scene, which may work at the same time."""
+    def _copy_with_threads(self, threads: int) -> CpuRaster:
+        """Return another raster of the same scene, with its own threads and buffers."""
         other = copy.copy(self)
         other._allocate(threads)
         return other
 
     def render(self, camera: Camera, values: Tensor, params: CompositingParams) -> Tensor:
-        """``A X``: values [P, C] f32 -> [H, W, C] f32. See the protocol."""
+        """Return ``A X``: values [P, C] f32 -> [H, W, C] f32. See the protocol."""
         check_rows(values, self.splats.count)
         bands, channels = self._bands(camera, every_pixel(params)), values.shape[1]
         image = np.zeros((camera.height, camera.width, channels), np.float32)
         for begin in range(0, channels, CHANNELS):
             block = np.ascontiguousarray(values[:, begin : begin + CHANNELS].to(torch.float32).numpy())
-            alone = block.shape[1] == channels
-            target = image if alone else np.zeros((camera.height, camera.width, block.shape[1]), np.float32)
+            is_one_pass = block.shape[1] == channels
+            target = image if is_one_pass else np.zeros((camera.height, camera.width, block.shape[1]), np.float32)
             for frame in bands:
                 self._over_tiles(frame, partial(_render, block, target))
-            if not alone:
+            if not is_one_pass:
                 image[:, :, begin : begin + CHANNELS] = target
         return torch.from_numpy(image)
 
     def adjoint(self, camera: Camera, values: Tensor, params: CompositingParams) -> Tensor:
-        """``A^T Y``: values [H, W, C] f32 -> [P, C] f32, the transpose of the render. See the protocol."""
+        """Return ``A^T Y``: values [H, W, C] f32 -> [P, C] f32, the transpose of the render. See the protocol."""
         check_image(values, camera)
         bands, channels = self._bands(camera, every_pixel(params)), values.shape[2]
         result = np.zeros((self.splats.count, channels), np.float32)
@@ -173,22 +173,22 @@ class CpuRaster:
         return torch.from_numpy(result)
 
     def _add_adjoint(self, frame: Frame, image: np.ndarray, result: np.ndarray, begin: int) -> None:
-        """Add what the frame's tiles give back of a few channels of the image to ``result``, from ``begin`` on."""
+        """Add the adjoint of the frame's tiles, for a block of channels, to ``result`` from channel ``begin`` on."""
         shares = self._over_tiles(frame, lambda first, last, frame: gather_tiles(first, last, frame, image))
 
         def merge(first: int, last: int) -> None:
             for rows, sums in shares:
                 add_sums(first, last, rows, sums, frame.ids, result, begin)
 
-        # Each row is in one range and its shares come in order, so the number of ranges changes no sum.
+        # Each row is in one range and its shares are added in order, so no sum depends on the number of ranges.
         self._map(merge, _shares(self.splats.count, self.threads))
 
     def row_sums(self, camera: Camera, params: CompositingParams) -> Tensor:
-        """``A 1``: [H, W] f32."""
+        """Return ``A 1``: [H, W] f32."""
         return self.render(camera, torch.ones(self.splats.count, 1, dtype=torch.float32), params)[:, :, 0]
 
     def strongest_labels(self, camera: Camera, labels: Tensor, params: CompositingParams) -> Tensor:
-        """``argmax(A onehot(labels))``: labels [P] i32 in -1..K - 1 -> [H, W] i32. See the protocol."""
+        """Return ``argmax(A onehot(labels))``: labels [P] i32 in -1..K - 1 -> [H, W] i32. See the protocol."""
         check_labels(labels, self.splats.count)
         flat, count = np.ascontiguousarray(labels.to(torch.int32).numpy()), int(labels.max()) + 1
         image = np.full((camera.height, camera.width), -1, np.int32)
@@ -201,18 +201,18 @@ class CpuRaster:
         return torch.from_numpy(image)
 
     def ray_rows(self, camera: Camera, pixels: Tensor, params: CompositingParams) -> RayRows:
-        """Rows of A for single pixels [n, 2] (x, y). See the protocol."""
+        """Return rows of A for single pixels [n, 2] (x, y). See the protocol."""
         places = strided_places(params, pixels)
-        if places is None:  # not all of them are rays of the strided view
+        if places is None:  # some are no rays of the strided view
             places, params = pixels, every_pixel(params)
         rays = np.ascontiguousarray(places.to(torch.int32).numpy())
-        rows = joined_rows([trace_rays(frame, rays) for frame in self._bands(camera, params)])
+        rows = join_rows([trace_rays(frame, rays) for frame in self._bands(camera, params)])
         return RayRows(*map(torch.from_numpy, rows))
 
     def footprints(self, camera: Camera, params: CompositingParams) -> Tensor:
-        """Areas of the splats' outlines, [P] f32. See the protocol."""
+        """Return the areas [P] f32 of the splats' outlines. See the protocol."""
         check_params(self.splats.kernel, camera, params)
-        self.forget()  # its projected splats are overwritten
+        self.forget()  # the projection below overwrites its splats
         ids, rows = self._project(view_of(camera, every_pixel(params), self.splats.origin), params)
         outlines = math.pi * self._projected[rows, EXTENT_X] * self._projected[rows, EXTENT_Y]
         areas = np.zeros(self.splats.count, np.float32)
@@ -220,31 +220,31 @@ class CpuRaster:
         return torch.from_numpy(areas)
 
     def forget(self) -> None:
-        """Drop the projected view that is kept for the next product."""
-        self._kept = None
+        """Drop the cached projection of the last view."""
+        self._last_view = None
 
     def _bands(self, camera: Camera, params: CompositingParams) -> Bands:
-        """The view projected and binned; the last one is kept."""
+        """Project and bin the view; the last view is cached."""
         key = (camera, params)
-        if self._kept is None or self._kept[0] != key:
+        if self._last_view is None or self._last_view[0] != key:
             check_params(self.splats.kernel, camera, params)
-            self.forget()  # before the next, so that one view's memory is the most ever held
+            self.forget()  # first, so that at most one view is in memory
             view = view_of(camera, params, self.splats.origin)
-            self._kept = key, self._bin(view, params, *self._project(view, params))
-        return self._kept[1]
+            self._last_view = key, self._bin(view, params, *self._project(view, params))
+        return self._last_view[1]
 
     def _project(self, view: View, params: CompositingParams) -> tuple[np.ndarray, np.ndarray]:
-        """Fill the projected splats; give the splat of every row [P] i32 and the depth order [n] i32."""
+        """Fill the projected splats; return the splat of each row [P] i32 and the depth order [n] i32."""
         targets = Targets(self._projected, self._depths, np.full(self.splats.count, -1, np.int32))
-        scene, kernel = self._activated(params.opacity_logit_scale), self.splats.kernel
+        scene, kernel = self._scene_with(params.opacity_logit_scale), self.splats.kernel
         bounds = _shares(self.splats.count, SPLAT_SHARES)
         counts = self._map(
             lambda first, last: project((first, last), scene, view, kernel, params.antialiased, targets), bounds
         )
-        used = [
+        rows_by_share = [
             np.arange(first, first + count, dtype=np.int32) for (first, _), count in zip(bounds, counts, strict=True)
         ]
-        rows = np.concatenate(used) if used else np.empty(0, np.int32)
+        rows = np.concatenate(rows_by_share) if rows_by_share else np.empty(0, np.int32)
         return targets.ids, depth_order(self._depths[rows].view(np.uint32), rows)
 
     def _bin(self, view: View, params: CompositingParams, ids: np.ndarray, order: np.ndarray) -> Bands:
@@ -258,17 +258,17 @@ class CpuRaster:
         return Bands(frame, parts, self._map)
 
     def _merge(self, frame: Frame, entries: list, codebook_rows: int) -> RegionWeights:
-        """Entries of all tile shares -> one row a splat."""
-        found = merged(entries, frame.ids, codebook_rows, self.threads, self._map)
-        return one_view(*map(torch.from_numpy, found), regions=codebook_rows)
+        """Merge the entries of all tile shares into one row per splat."""
+        rows = merge_entries(entries, frame.ids, codebook_rows, self.threads, self._map)
+        return one_view(*map(torch.from_numpy, rows), regions=codebook_rows)
 
-    def _activated(self, scale: float) -> Scene:
+    def _scene_with(self, scale: float) -> Scene:
         if scale != self._scale:
             self._scene, self._scale = with_opacities(self._scene, self.splats, scale), scale
         return self._scene
 
     def _over_tiles(self, frame: Frame, work: Callable) -> list:
-        """Run ``work(first, last, frame)`` over tile shares of about equal length in list items."""
+        """Run ``work(first, last, frame)`` over tile shares with about as many list items each."""
         tiles = frame.columns * frame.rows
         marks = np.linspace(0, frame.starts[-1], TILE_SHARES + 1)
         edges = np.unique(np.concatenate([[0], np.searchsorted(frame.starts, marks[1:-1]), [tiles]]))
@@ -285,23 +285,22 @@ def _render(values: np.ndarray, image: np.ndarray, first: int, last: int, frame:
 
 
 def _shares(total: int, count: int) -> list[tuple[int, int]]:
-    """``count`` ranges that cover ``total`` items."""
+    """Return ``count`` ranges that cover ``total`` items."""
     edges = [total * k // count for k in range(count + 1)]
     return list(pairwise(edges))
 
 
-# Views one after the other, or several at a time: two views on a core each leave nothing waiting for the last share
-# of a stage, and the few steps of a view that have one thread only are made beside those of another. On two cores
-# that takes a fifth off the time.
+# Several views at a time: with a view per core no core waits for the last share of a stage, and the single-threaded
+# steps of one view overlap with the work of another. On two cores this saves a fifth of the time.
 
 
 def views_at_a_time(threads: int) -> int:
-    """How many views so many threads work on side by side."""
+    """Return the number of views that this many threads process in parallel."""
     return min(threads, VIEWS)
 
 
 def one_by_one(raster: Raster, requests: Iterable[ViewRequest]) -> Generator[ViewWeights]:
-    """``Raster.iterate_views`` with one view at a time."""
+    """Yield the results of ``Raster.iterate_views``, one view at a time."""
     try:
         for request in requests:
             yield _weights_of(raster, request)
@@ -310,11 +309,11 @@ def one_by_one(raster: Raster, requests: Iterable[ViewRequest]) -> Generator[Vie
 
 
 def side_by_side(rasters: Sequence[Raster], requests: Iterable[ViewRequest]) -> Generator[ViewWeights]:
-    """``Raster.iterate_views`` with as many views at a time as there are rasters of the scene.
+    """Yield the results of ``Raster.iterate_views`` with one view at a time on each of the rasters of the scene.
 
-    The next request is taken, and its view read, while the others are in work. Results come in the order of the
-    requests; what they are does not depend on which raster worked where. When the iterator is closed, the views in
-    work are awaited. Of dense maps one is in work, beside others that are not.
+    The next request and its view are read while others are processed. Results come in the order of the requests and
+    do not depend on the raster. Closing the iterator waits for the views in progress. At most one dense map is
+    processed at a time, in parallel with other views.
     """
     if len(rasters) == 1:
         yield from one_by_one(rasters[0], requests)
@@ -351,7 +350,7 @@ def _is_dense(request: ViewRequest) -> bool:
 
 
 def _weights_of(raster: Raster, request: ViewRequest) -> ViewWeights:
-    """What a lift needs of one view."""
+    """Return the region weights of one view, and the rows of A of its requested rays."""
     camera, params = request.camera, request.params
     weights = raster.region_weights(camera, request.observation, params, request.weighting)
     if len(request.pixels):

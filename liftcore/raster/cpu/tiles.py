@@ -1,9 +1,9 @@
-"""Depth order and tile lists: which splats touch which 16 x 16 pixel tile, near to far.
+"""Depth order and tile lists: the splats that touch each 16 x 16 pixel tile, near to far.
 
 The depth order is a stable sort of float32 depths; ties keep the order of the splats' rows, so the order, and with it
-every product, is unique. It is cut into a fixed number of shares; each share lists its tiles and counts them, a
-prefix sum gives every (tile, share) its place, and each share writes there. No two threads write the same place and
-the order inside a tile is the depth order, so the result does not depend on the number of threads.
+every product, is unique. It is split into a fixed number of shares; each share lists and counts its tiles, a prefix
+sum gives every (tile, share) its offset, and each share writes there. No two threads write to the same memory and the
+order inside a tile is the depth order, so the result does not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from liftcore.raster.cpu.composite import circle_of
-from liftcore.raster.cpu.project import CUTOFF, EXTENT_X, EXTENT_Y, KY, LEAN, MX, MY, ROOT_X, SLOPE
+from liftcore.raster.cpu.project import CUTOFF, EXTENT_X, EXTENT_Y, MX, MY, RIGHTMOST_DY, SLOPE, SQRT_A, C
 from liftcore.raster.cpu.simd import fetch_row
 from liftcore.runtime.jit import inlined, kernel
 from liftcore.scene.compositing import TILE
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
     from liftcore.raster.cpu.composite import Frame
 
-MOST_LISTED = 1 << 26  # tiles that all splats together may list before the view is cut into bands
-BAND_ITEMS = 1 << 24  # of a band's lists, unless one tile has more: there may be several entries of W to each
+MOST_LISTED = 1 << 26  # items of all tile lists above which the view is split into bands
+BAND_ITEMS = 1 << 24  # items of a band's lists, unless one tile has more; an item may have several entries of W
 _NO_LIMIT = int(np.iinfo(np.int64).max)
-_AHEAD = 8  # splats between asking for a row and reading it: in the order of depth they lie anywhere
-_DIGIT = 11  # bits a pass of the sort; three passes cover a float32
+_PREFETCH = 8  # splats by which rows are prefetched: in depth order they are scattered in memory
+_DIGIT = 11  # bits per pass of the radix sort; three passes cover a float32
 _BUCKETS = 1 << _DIGIT
 
 
@@ -39,8 +39,8 @@ def depth_order(keys, places):
     """Sort ``places`` by their keys.
 
     Args:
-        keys: [n] u32, the bits of positive float32 depths (they order like the depths).
-        places: [n] i32, what to sort.
+        keys: [n] u32, the bits of positive float32 depths (they sort like the depths).
+        places: [n] i32, rows of projected splats.
 
     Returns:
         [n] i32, the places from near to far.
@@ -49,8 +49,8 @@ def depth_order(keys, places):
     other_keys = np.empty_like(keys)
     other_places = np.empty_like(places)
     counts = np.empty(_BUCKETS, np.int64)
-    for turn in range(3):
-        shift = np.uint32(turn * _DIGIT)
+    for digit in range(3):
+        shift = np.uint32(digit * _DIGIT)
         counts[:] = 0
         for i in range(n):
             counts[(keys[i] >> shift) & np.uint32(_BUCKETS - 1)] += 1
@@ -72,35 +72,37 @@ def depth_order(keys, places):
 
 @inlined
 def _tiles_between(low, high):
-    """First and last tile of a row or column whose pixel centres lie between two places; none when none does."""
+    """Return the first and last tile of a row or column with pixel centres in low..high; first > last if there is
+    none.
+    """
     return np.floor(np.ceil(low - 0.5) / TILE), np.floor(np.floor(high - 0.5) / TILE)
 
 
 class _Outline(NamedTuple):
-    """The outline of a projected splat, as numbers: an array would be counted at each use."""
+    """The outline of a projected splat, as scalars: numba would count references to an array at each use."""
 
     mx: float
     my: float
     extent_x: float
     extent_y: float
     slope: float
-    root_x: float
-    ky: float
+    sqrt_a: float
+    c: float
     cutoff: float
-    lean: float
+    rightmost_dy: float
 
 
 @inlined
 def _outline(splat):
     return _Outline(
         splat[MX], splat[MY], splat[EXTENT_X], splat[EXTENT_Y], splat[SLOPE],
-        splat[ROOT_X], splat[KY], splat[CUTOFF], splat[LEAN],
+        splat[SQRT_A], splat[C], splat[CUTOFF], splat[RIGHTMOST_DY],
     )  # fmt: skip
 
 
 @inlined
 def _tile_rows(outline, circle, rows):
-    """First and last tile row whose pixel centres the splat can reach."""
+    """Return the first and last tile row whose pixel centres the splat can cover."""
     top, bottom = _tiles_between(outline.my - outline.extent_y, outline.my + outline.extent_y)
     if circle[2] >= 0:
         near_top, near_bottom = _tiles_between(circle[1] - circle[2], circle[1] + circle[2])
@@ -110,30 +112,36 @@ def _tile_rows(outline, circle, rows):
 
 @inlined
 def _edge(outline, dy, side):
-    """x of the outline's left (-1) or right (+1) edge at dy, relative to its centre."""
-    room = max(0.0, outline.cutoff - outline.ky * dy * dy)
-    return outline.slope * dy + side * math.sqrt(room) / outline.root_x
+    """Return x of the outline's left (-1) or right (+1) edge at dy, relative to its centre."""
+    remainder = max(0.0, outline.cutoff - outline.c * dy * dy)
+    return outline.slope * dy + side * math.sqrt(remainder) / outline.sqrt_a
 
 
 @inlined
 def _outline_columns(outline, tile_row):
-    """First and last tile column that the outline touches between a tile row's first and last pixel centres."""
+    """Return the first and last tile column that the outline touches between the pixel centres of a tile row."""
     narrow, wide = _tiles_between(outline.mx - outline.extent_x, outline.mx + outline.extent_x)
-    if narrow == wide:  # one column at most: no need to look closer
+    if narrow == wide:  # at most one column: no closer bound is needed
         return narrow, wide
     low = max(tile_row * TILE + 0.5 - outline.my, -outline.extent_y)
     high = min(tile_row * TILE + TILE - 0.5 - outline.my, outline.extent_y)
     if low > high:
         return 0.0, -1.0
-    lean = outline.lean
-    right = outline.extent_x if low <= lean <= high else _edge(outline, low if lean < low else high, 1.0)
-    left = -outline.extent_x if low <= -lean <= high else _edge(outline, low if -lean < low else high, -1.0)
+    rightmost_dy = outline.rightmost_dy
+    right = (
+        outline.extent_x if low <= rightmost_dy <= high else _edge(outline, low if rightmost_dy < low else high, 1.0)
+    )
+    left = (
+        -outline.extent_x
+        if low <= -rightmost_dy <= high
+        else _edge(outline, low if -rightmost_dy < low else high, -1.0)
+    )
     return _tiles_between(outline.mx + left, outline.mx + right)
 
 
 @inlined
 def _tile_columns(outline, circle, tile_row, columns):
-    """First and last tile column that the splat touches in a tile row."""
+    """Return the first and last tile column that the splat touches in a tile row."""
     first, last = _outline_columns(outline, tile_row)
     if circle[2] >= 0 and abs(tile_row * TILE + 0.5 * TILE - circle[1]) <= circle[2] + 0.5 * TILE:
         near_first, near_last = _tiles_between(circle[0] - circle[2], circle[0] + circle[2])
@@ -144,46 +152,48 @@ def _tile_columns(outline, circle, tile_row, columns):
     return max(0.0, first), min(columns - 1.0, last)
 
 
-def list_tiles(order, frame, span, most, counts) -> tuple[np.ndarray, np.ndarray]:
-    """The tiles that each of ``order``'s splats touches, one splat after the other.
+def list_tiles(order, frame, span, limit, counts) -> tuple[np.ndarray, np.ndarray]:
+    """List the tiles that each of ``order``'s splats touches, splat by splat.
 
     Args:
-        order: [n] i32, rows of projected splats. frame: the view, whose lists are still to be made.
-        span: (first, last), the tiles that are listed, others are passed over.
-        most: where more tiles than that are found, the list may end there.
-        counts: [rows * columns] i64, zeros; receives how many splats touch each tile.
+        order: [n] i32, rows of projected splats. frame: the view, still without lists.
+        span: (first, last), the range of tiles to list.
+        limit: tiles above which the list may end early.
+        counts: [rows * columns] i64, zeros; receives the number of splats of each tile.
 
     Returns:
-        lengths [n] i32, how many tiles each splat touches; tiles [sum] i32, row by row.
+        lengths [n] i32, the number of tiles of each splat; tiles [sum] i32, row by row.
     """
     lengths, width = np.zeros(len(order), np.int32), span[1] - span[0]
     tiles = np.empty(4 * len(order) + width, np.int32)
     size = frame.rows, frame.columns
-    done = count = 0
+    first = count = 0
     while True:
         lists = lengths, tiles
-        done, count = _list_while_room(order, (done, count), frame.kernel, frame.projected, size, span, counts, lists)
-        if done == len(order) or count > most:
+        first, count = _list_until_full(
+            order, (first, count), frame.kernel, frame.projected, size, span, counts, lists
+        )
+        if first == len(order) or count > limit:
             return lengths, tiles[:count]
         tiles = np.concatenate((tiles, np.empty(len(tiles) + width, np.int32)))
 
 
 @kernel
-def _list_while_room(order, begin, kernel, projected, size, span, counts, lists):
-    """``list_tiles`` from ``begin = (splat, tile of the list)`` on, while one that touches all tiles has room.
+def _list_until_full(order, begin, kernel, projected, size, span, counts, lists):
+    """Continue ``list_tiles`` from ``begin = (splat, item of the list)`` on, until a splat might not fit.
 
     Args:
         size: (rows, columns) of tiles. lists: (lengths, tiles), written.
 
     Returns:
-        Where it ended, like ``begin``.
+        The next splat and item, as ``begin``.
     """
     (first_one, count), (rows, columns), (start, end), (lengths, tiles) = begin, size, span, lists
     first_row, last_row = start // columns, (end - 1) // columns
     for i in range(first_one, order.shape[0]):
         if count + end - start > tiles.shape[0]:
             return i, count
-        fetch_row(projected, order[min(i + _AHEAD, order.shape[0] - 1)])
+        fetch_row(projected, order[min(i + _PREFETCH, order.shape[0] - 1)])
         before, splat = count, projected[order[i]]
         outline, circle = _outline(splat), circle_of(kernel, splat)
         top, bottom = _tile_rows(outline, circle, rows)
@@ -211,7 +221,7 @@ def fill_tiles(order, lengths, tiles, cursors, items):
 
 
 def _tile_places(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where every share writes.
+    """Return the offsets at which every share writes.
 
     Args:
         counts: [shares, tiles] i64.
@@ -219,7 +229,7 @@ def _tile_places(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Returns:
         starts [tiles + 1] i64 of each tile's list, cursors [shares, tiles] i64 of each share inside it.
     """
-    by_tile = counts.T  # a tile's list holds the shares in depth order
+    by_tile = counts.T  # in a tile's list the shares follow in depth order
     ends = np.cumsum(by_tile.ravel()).reshape(by_tile.shape)
     cursors = np.ascontiguousarray((ends - by_tile).T)
     starts = np.concatenate([[0], ends[:, -1]]).astype(np.int64)
@@ -227,46 +237,48 @@ def _tile_places(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Bands:
-    """A projected view as frames that have the lists of some of its tiles: one frame of all tiles, as a rule.
+    """A projected view as frames with the lists of some of its tiles: usually one frame with all tiles.
 
-    Where the cuts lie depends on the splats alone, not on the threads.
+    The split depends on the splats alone, not on the threads.
 
     Args:
-        frame: the view, its lists empty.
-        parts: the depth order, shared out.
-        run: runs a function for each of a list of tuples of arguments, and gives what it returned.
+        frame: the view, with empty lists.
+        parts: the depth order, in shares.
+        run: calls a function for each of a list of argument tuples, and returns the list of results.
     """
 
     def __init__(self, frame: Frame, parts: list[np.ndarray], run: Callable[[Callable, list], list]) -> None:
         self._bare, self._parts, self._run = frame, parts, run
         tiles = frame.rows * frame.columns
         self._edges = [0, tiles]
-        self._whole = self._frame((0, tiles), MOST_LISTED)
-        if self._whole is None:
-            self._edges = _cuts(self._counted(), BAND_ITEMS)
+        self._single_frame = self._frame((0, tiles), MOST_LISTED)
+        if self._single_frame is None:
+            self._edges = _cuts(self._count_by_tile(), BAND_ITEMS)
 
     def __iter__(self) -> Iterator[Frame]:
-        """The frames, each made when it is asked for; other tiles than its own have empty lists."""
+        """Yield the frames, each built on demand; tiles of other bands have empty lists."""
         for span in pairwise(self._edges):
-            frame = self._whole or self._frame(span, _NO_LIMIT)
+            frame = self._single_frame or self._frame(span, _NO_LIMIT)
             assert frame is not None
             yield frame
 
-    def _frame(self, span: tuple[int, int], most: int) -> Frame | None:
-        """The frame of the tiles from ``span[0]`` to ``span[1]``; None where there are more than ``most`` items."""
+    def _frame(self, span: tuple[int, int], limit: int) -> Frame | None:
+        """Return the frame of the tiles ``span[0]..span[1]``; None if they have more than ``limit`` items."""
         counts = np.zeros((len(self._parts), self._bare.rows * self._bare.columns), np.int64)
-        found, lock = 0, Lock()
+        total, lock = 0, Lock()
 
-        def listed(part: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            nonlocal found
-            room = most - found
-            lengths, tiles = list_tiles(part if room >= 0 else part[:0], self._bare, span, max(0, room), counts)
+        def fill_lists(part: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            nonlocal total
+            capacity = limit - total
+            lengths, tiles = list_tiles(
+                part if capacity >= 0 else part[:0], self._bare, span, max(0, capacity), counts
+            )
             with lock:
-                found += len(tiles)
+                total += len(tiles)
             return lengths, tiles
 
-        lists = self._run(listed, list(zip(self._parts, counts, strict=True)))
-        if found > most:
+        lists = self._run(fill_lists, list(zip(self._parts, counts, strict=True)))
+        if total > limit:
             return None
         starts, cursors = _tile_places(counts)
         items = np.empty(starts[-1], np.int32)
@@ -277,24 +289,24 @@ class Bands:
         self._run(fill, list(zip(self._parts, lists, cursors, strict=True)))
         return self._bare._replace(starts=starts, items=items)
 
-    def _counted(self) -> np.ndarray:
-        """[tiles] i64: how many splats touch each tile, by lists that are not kept."""
+    def _count_by_tile(self) -> np.ndarray:
+        """Count the splats of each tile, [tiles] i64, without keeping the lists."""
         tiles = self._bare.rows * self._bare.columns
         at_a_time = max(1, BAND_ITEMS // tiles)
 
-        def counted(part: np.ndarray) -> np.ndarray:
+        def count_lists(part: np.ndarray) -> np.ndarray:
             counts = np.zeros(tiles, np.int64)
             for first in range(0, len(part), at_a_time):
                 list_tiles(part[first : first + at_a_time], self._bare, (0, tiles), _NO_LIMIT, counts)
             return counts
 
-        return np.sum(self._run(counted, [(part,) for part in self._parts]), axis=0)
+        return np.sum(self._run(count_lists, [(part,) for part in self._parts]), axis=0)
 
 
-def _cuts(counts: np.ndarray, most: int) -> list[int]:
-    """Cuts between tiles such that runs of them have at most so many items, or are single tiles."""
+def _cuts(counts: np.ndarray, limit: int) -> list[int]:
+    """Return cuts between tiles such that runs of them have at most ``limit`` items, or are single tiles."""
     ends, edges = np.cumsum(counts), [0]
     while edges[-1] < len(counts):
         before = ends[edges[-1] - 1] if edges[-1] else 0
-        edges.append(max(edges[-1] + 1, int(np.searchsorted(ends, before + most, side="right"))))
+        edges.append(max(edges[-1] + 1, int(np.searchsorted(ends, before + limit, side="right"))))
     return edges

@@ -1,4 +1,4 @@
-"""Compile a device's kernels, or load them from the disk cache, before anything is timed."""
+"""Compilation of a device's kernels, or loading from the disk cache, ahead of the first lift or query."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from liftcore.scene.kernel import Kernel, scale_count
 from liftcore.scene.splats import Splats
 from liftcore.values.views import FeatureGrid, Regions
 
-PLAIN, ALL = CompositingParams(), Weighting()
+DEFAULT_PARAMS, ALL_WEIGHTS = CompositingParams(), Weighting()
 
 
 def warm_up(
     kernel: Kernel = Kernel.GAUSSIAN_3D,
     device: Device = CPU,
-    params: CompositingParams = PLAIN,
-    weighting: Weighting = ALL,
+    params: CompositingParams = DEFAULT_PARAMS,
+    weighting: Weighting = ALL_WEIGHTS,
 ) -> None:
-    """Run on one splat what a lift and a query of a kernel need. The first run compiles, later ones load from disk.
+    """Run the products of a lift and a query on one splat. The first run compiles, later runs load from disk.
 
-    Each kernel is compiled for itself, so a scene waits for its own alone; so are plain logits, and selections of the
-    weights. What few ask for (the adjoint, labels) is compiled when first called. A card compiles each weighting.
+    Each splat kernel, unscaled opacities and selections of weights are compiled separately, so a scene waits only for
+    what it uses. Rare products (the adjoint, labels) compile at their first call. On a GPU each weighting compiles.
 
     Args:
-        params: of the lift. weighting: likewise.
+        params: compositing parameters of the lift. weighting: of the lift.
     """
     splats = Splats(
         torch.tensor([[0.0, 0.0, 2.0]], dtype=torch.float32),

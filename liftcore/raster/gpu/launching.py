@@ -1,7 +1,7 @@
-"""The border to Triton: where kernels can run, and how they are started.
+"""The interface to Triton: checks of devices, compilation and launches of kernels.
 
-Triton's own types describe neither launches nor what happens inside a kernel, so a kernel is a plain ``Any`` from
-here on. All launches pass through ``launch``, with the same options.
+Triton's types describe neither launches nor the code inside a kernel, so kernels have the type ``Any`` here. All
+kernels are launched by ``launch``, with the same options.
 """
 
 from __future__ import annotations
@@ -20,36 +20,36 @@ from liftcore.errors import Unavailable
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-lang: Any = triton.language  # the same module as ``tl``, for the functions whose types are not what kernels get
+lang: Any = triton.language  # the same module as ``tl``, for functions whose types do not fit inside kernels
 _triton: Any = triton
 
-WARPS = 4  # of 32 threads, a program: two pixels of a tile a thread
+WARPS = 4  # per program, of 32 threads: two pixels of a tile per thread
 
 
-# Numbers that change from view to view. A kernel of its own for 1 and for multiples of 16 would be compiled in the
-# middle of a lift.
+# Arguments that change from view to view. Triton would specialise a kernel on 1 and on multiples of 16, and compile
+# it in the middle of a lift.
 COUNTS = frozenset(
     {"band_tile", "own_tile", "slots_tile", "columns", "width", "height", "count", "runs"}
 )  # fmt: skip
 
 
 def jit(function: Callable) -> Any:
-    """A Triton kernel, or a function that kernels call."""
+    """Return a Triton kernel, or a function that kernels call."""
     return _triton.jit(
         function, do_not_specialize=[name for name in signature(function).parameters if name in COUNTS]
     )
 
 
 def interpreted() -> bool:
-    """Whether kernels run in Triton's interpreter: so when TRITON_INTERPRET=1 was set before triton was imported."""
+    """Return True if kernels run in Triton's interpreter: TRITON_INTERPRET=1 was set before triton was imported."""
     return bool(_triton.knobs.runtime.interpret)
 
 
 def check_device(device: torch.device) -> None:
-    """Refuse a device that no kernel can run on.
+    """Refuse a device that cannot run the kernels.
 
     Raises:
-        Unavailable: neither a CUDA device that is there, nor the CPU under Triton's interpreter.
+        Unavailable: neither an available CUDA device, nor the CPU under Triton's interpreter.
     """
     if device.type == "cuda":
         if torch.cuda.is_available():
@@ -58,7 +58,7 @@ def check_device(device: torch.device) -> None:
             "device",
             expected="a CUDA device that torch can use",
             got="none",
-            hint="install a CUDA build of torch on a machine with an NVIDIA card, or take the device cpu",
+            hint="install a CUDA build of torch on a machine with an NVIDIA GPU, or use device='cpu'",
         )
     if device.type == "cpu" and interpreted():
         return
@@ -66,19 +66,22 @@ def check_device(device: torch.device) -> None:
         "device",
         expected="a CUDA device",
         got=str(device),
-        hint="on the CPU the GPU's kernels run in Triton's interpreter alone, for tests: set TRITON_INTERPRET=1",
+        hint="for tests, set TRITON_INTERPRET=1 to run GPU kernels on the CPU in Triton's interpreter",
     )
 
 
 def launch(kernel: Any, programs: int, *arguments: object, warps: int = WARPS, **constants: object) -> None:
-    """Run ``programs`` programs of a kernel.
+    """Launch ``programs`` programs of a kernel.
 
-    Products are not fused into sums, as the interpreter does not; exponentials and quotients are the card's.
-    Loads are not moved into earlier rounds of a loop, for scratch is written there.
+    Products and sums are not fused, as the interpreter does not fuse them; exponentials and quotients are the GPU's.
+    ``num_stages=1`` keeps loads in their iteration of a loop, as earlier iterations write to scratch.
     """
     if programs == 0:
         return
     device = next(argument.device for argument in arguments if isinstance(argument, torch.Tensor))
-    here = torch.cuda.device(device) if device.type == "cuda" else nullcontext()  # Triton starts on the current card
-    with here, np.errstate(all="ignore"):  # the interpreter computes in numpy; infinities are the kernels' business
+    current_device = torch.cuda.device(device) if device.type == "cuda" else nullcontext()  # as Triton's
+    with (
+        current_device,
+        np.errstate(all="ignore"),
+    ):  # numpy, in the interpreter: kernels expect infinities
         kernel[(programs,)](*arguments, **constants, num_warps=warps, num_stages=1, enable_fp_fusion=False)

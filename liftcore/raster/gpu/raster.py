@@ -1,9 +1,9 @@
-"""The GPU backend: A by Triton kernels, the same to the bit in every run.
+"""The GPU backend: A by Triton kernels, bitwise identical in every run.
 
-Projection and tile lists are tensor operations in float64 (``project``, ``tiles``), but for the tile columns of a
-splat, which a kernel finds. One program a tile composites its rays (``composite``), and a product takes the weights
-as a matrix (``weights``, ``render``). Sums over tiles are float64 in a fixed order. No kernel adds to memory that
-another adds to. On tensors of the CPU it runs in Triton's interpreter: so it is tested where there is no card.
+Projection and tile lists are float64 tensor operations (``project``, ``tiles``), except for the tile columns of a
+splat, which a kernel computes. One program per tile composites its rays (``composite``), and a product loads the
+weights as a matrix (``weights``, ``render``). Sums over tiles are float64 in a fixed order. No two programs add to
+the same memory. On CPU tensors it runs in Triton's interpreter, for tests without a GPU.
 """
 
 import math
@@ -29,7 +29,7 @@ from liftcore.raster.base import (
     strided_places,
 )
 from liftcore.raster.cpu.composite import choice_of
-from liftcore.raster.cpu.project import activated, view_of, with_opacities
+from liftcore.raster.cpu.project import activate_splats, view_of, with_opacities
 from liftcore.raster.gpu import render, weights
 from liftcore.raster.gpu.launching import check_device
 from liftcore.raster.gpu.project import DeviceScene, project, scene_on, with_opacity
@@ -46,47 +46,48 @@ from liftcore.values.views import ViewFeatures
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 Item = TypeVar("Item")
-Made = TypeVar("Made")
+Output = TypeVar("Output")
 
-LEAST_BLOCK = 1 << 14  # items: a product that does not fit in blocks of so few fits into none
+LEAST_BLOCK = 1 << 14  # items: the smallest block that is tried
 
 
 def _within_memory(product: Callable[Concatenate["GpuRaster", Arguments], Result]) -> Callable[..., Result]:
-    """A product that is made again in blocks of half the size when the device's memory runs out.
+    """Decorate a product to retry with blocks of half the size when the device's memory runs out.
 
-    No bit depends on the block, so it matters to nobody how often that was.
+    The result is bitwise identical for any block.
     """
 
     @wraps(product)
-    def guarded(self: "GpuRaster", *arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
+    def run_within_memory(self: "GpuRaster", *arguments: Arguments.args, **keywords: Arguments.kwargs) -> Result:
         while True:
             try:
-                return product(self, *arguments, **named)
+                return product(self, *arguments, **keywords)
             except RuntimeError as error:
                 if not out_of_memory(error):
                     raise
-                told = str(error).splitlines()[0] if str(error) else type(error).__name__
-            if not self.halve_block():  # out here the error no longer holds what the product held
+                message = str(error).splitlines()[0] if str(error) else type(error).__name__
+            if not self.halve_block():  # outside the except clause, whose error keeps the product's tensors alive
                 raise Unavailable(
                     "device",
-                    expected="a GPU with free memory for the scene, and for the projected splats and lists of a view",
-                    got=told,
-                    hint="free memory on the device, lower the images' resolution, or take the device cpu",
+                    expected="a GPU with free memory for the scene and the projected splats and tile lists of a view",
+                    got=message,
+                    hint="free memory on the device, lower the images' resolution, or use device='cpu'",
                 )
 
-    return guarded
+    return run_within_memory
 
 
 class GpuRaster:
-    """A for one scene, of any kernel (``liftcore.raster.base.Raster``). Tensors come and go on the CPU.
+    """A for one scene, of any kernel (``liftcore.raster.base.Raster``). Arguments and results are CPU tensors.
 
-    One call at a time: the view at hand is kept for the next product.
+    One call at a time: the projection of the last view is cached for the next product.
 
     Args:
-        splats: the scene; it lies whole on the device, about 110 bytes a splat.
-        device: a CUDA device; the CPU where Triton's interpreter is on.
-        block: items of tile lists that are held at a time. It is halved where memory runs out; no bit depends on it.
-        stays: whether region weights stay on the device, for a solution there.
+        splats: the scene; it is copied to the device, about 110 bytes per splat.
+        device: a CUDA device; the CPU if Triton's interpreter is on.
+        block: items of tile lists in memory at a time, halved where memory runs out. The result is bitwise identical
+            for any value.
+        stays: leave region weights on the device, for a solve there.
 
     Raises:
         Unavailable: the device cannot run the kernels.
@@ -97,14 +98,14 @@ class GpuRaster:
         self.splats = splats
         self.device = indexed(device)
         self._block, self._stays = block, stays
-        self._host = activated(splats, 1.0)
-        self._scale = 1.0  # on the opacity logits of the scene
+        self._host = activate_splats(splats, 1.0)
+        self._scale = 1.0  # of the scene's opacity logits
         self._scene: DeviceScene | None = None
-        self._kept: tuple[Camera, CompositingParams, Frame] | None = None
+        self._last_view: tuple[Camera, CompositingParams, Frame] | None = None
 
     def halve_block(self) -> bool:
-        """Let go of everything and cut the work into blocks of half the size; False where they are the least."""
-        self._scene = self._kept = None
+        """Free all device memory and halve the block; return False if the block is already the smallest."""
+        self._scene = self._last_view = None
         if self.device.type == "cuda":
             torch.cuda.empty_cache()
         if self._block <= LEAST_BLOCK:
@@ -115,31 +116,38 @@ class GpuRaster:
     def region_weights(
         self, camera: Camera, observation: ViewFeatures, params: CompositingParams, weighting: Weighting
     ) -> RegionWeights:
-        """``A'^T S`` of a view and the total weight of plain weights. See the protocol."""
-        return self._brought(self._weighed(self._read(observation, camera, params), camera, params, weighting))
+        """Return ``A'^T S`` of a view and the total weight of unscaled weights. See the protocol."""
+        return self._to_output_device(
+            self._view_weights(self._read(observation, camera, params), camera, params, weighting)
+        )
 
     @_within_memory
-    def _weighed(
+    def _view_weights(
         self, reading: DeviceReading, camera: Camera, params: CompositingParams, weighting: Weighting
     ) -> RegionWeights:
         choice, frame = choice_of(weighting), self._frame(camera, params)
         return weights.region_weights(frame, reading, choice, params.opacity_logit_scale != 1.0, self.splats.count)
 
-    def _brought(self, weights: RegionWeights) -> RegionWeights:
-        """Where they are wanted. A host without room for them is no reason for smaller pieces on the device."""
+    def _to_output_device(self, weights: RegionWeights) -> RegionWeights:
+        """Return the weights on the device if they stay there, else on the CPU.
+
+        Not decorated to retry: smaller blocks on the device do not help a host without memory.
+        """
         return weights if self._stays else weights.cpu()
 
     def iterate_views(self, requests: Iterable[ViewRequest]) -> Generator[ViewWeights]:
-        """``region_weights`` and ``ray_rows`` of views, one at a time; the next one is read while the card walks."""
+        """Yield ``region_weights`` and ``ray_rows`` of views, one at a time; the next is read while the GPU works."""
 
         def read(request: ViewRequest) -> DeviceReading:
             return self._read(request.observation, request.camera, request.params)
 
         try:
-            with closing(made_ahead(requests, read)) as ahead:
-                for request, reading in ahead:
-                    yield ViewWeights(  # without a name, which would hold it beside the next one
-                        self._brought(self._weighed(reading, request.camera, request.params, request.weighting)),
+            with closing(prefetch(requests, read)) as views:
+                for request, reading in views:
+                    yield ViewWeights(  # not bound to a name, which would keep it in memory with the next one
+                        self._to_output_device(
+                            self._view_weights(reading, request.camera, request.params, request.weighting)
+                        ),
                         self.ray_rows(request.camera, request.pixels, request.params),
                     )
         finally:
@@ -151,7 +159,7 @@ class GpuRaster:
 
     @_within_memory
     def render(self, camera: Camera, values: Tensor, params: CompositingParams) -> Tensor:
-        """``A X``: values [P, C] f32 -> [H, W, C] f32. See the protocol."""
+        """Return ``A X``: values [P, C] f32 -> [H, W, C] f32. See the protocol."""
         check_rows(values, self.splats.count)
         frame = self._frame(camera, every_pixel(params))
         image = torch.empty(camera.height, camera.width, values.shape[1], dtype=torch.float32)
@@ -162,7 +170,7 @@ class GpuRaster:
 
     @_within_memory
     def adjoint(self, camera: Camera, values: Tensor, params: CompositingParams) -> Tensor:
-        """``A^T Y``: values [H, W, C] f32 -> [P, C] f32. See the protocol."""
+        """Return ``A^T Y``: values [H, W, C] f32 -> [P, C] f32. See the protocol."""
         check_image(values, camera)
         frame = self._frame(camera, every_pixel(params))
         result = torch.empty(self.splats.count, values.shape[2], dtype=torch.float32)
@@ -172,54 +180,54 @@ class GpuRaster:
         return result
 
     def row_sums(self, camera: Camera, params: CompositingParams) -> Tensor:
-        """``A 1``: [H, W] f32."""
+        """Return ``A 1``: [H, W] f32."""
         return self.render(camera, torch.ones(self.splats.count, 1, dtype=torch.float32), params)[:, :, 0]
 
     @_within_memory
     def strongest_labels(self, camera: Camera, labels: Tensor, params: CompositingParams) -> Tensor:
-        """``argmax(A onehot(labels))``: labels [P] i32 in -1..K - 1 -> [H, W] i32. See the protocol."""
+        """Return ``argmax(A onehot(labels))``: labels [P] i32 in -1..K - 1 -> [H, W] i32. See the protocol."""
         check_labels(labels, self.splats.count)
         frame = self._frame(camera, every_pixel(params))
         return render.strongest_labels(frame, labels.to(torch.int32)).cpu()
 
     @_within_memory
     def ray_rows(self, camera: Camera, pixels: Tensor, params: CompositingParams) -> RayRows:
-        """Rows of A for single pixels [n, 2] (x, y). See the protocol."""
+        """Return rows of A for single pixels [n, 2] (x, y). See the protocol."""
         places = strided_places(params, pixels)
-        if places is None:  # not all of them are rays of the strided view
+        if places is None:  # some are no rays of the strided view
             places, params = pixels, every_pixel(params)
         return ray_rows(self._frame(camera, params), places)
 
     @_within_memory
     def footprints(self, camera: Camera, params: CompositingParams) -> Tensor:
-        """Areas of the splats' outlines, [P] f32, on the CPU. See the protocol."""
+        """Return the areas [P] f32 of the splats' outlines, on the CPU. See the protocol."""
         check_params(self.splats.kernel, camera, params)
         scene = self._scene_with(params.opacity_logit_scale)
         view = view_of(camera, every_pixel(params), self.splats.origin)
-        seen = project(scene, view, self.splats.kernel, params.antialiased, max(1, self._block >> 4))
-        outlines = math.pi * seen.outlines.extent_x * seen.outlines.extent_y
-        least, most = torch.finfo(torch.float32).tiny, camera.width * camera.height
+        projected = project(scene, view, self.splats.kernel, params.antialiased, max(1, self._block >> 4))
+        outlines = math.pi * projected.outlines.extent_x * projected.outlines.extent_y
+        smallest, largest = torch.finfo(torch.float32).tiny, camera.width * camera.height
         areas = torch.zeros(self.splats.count, dtype=torch.float32, device=self.device)
-        areas[seen.ids.long()] = outlines.clamp(least, most).float()
+        areas[projected.ids.long()] = outlines.clamp(smallest, largest).float()
         return areas.cpu()
 
     def forget(self) -> None:
-        """Drop the projected view that is kept for the next product."""
-        self._kept = None
+        """Drop the cached projection of the last view."""
+        self._last_view = None
 
     def _frame(self, camera: Camera, params: CompositingParams) -> Frame:
-        """The view projected; the last one is kept."""
-        if self._kept is not None and self._kept[0] is camera and self._kept[1] == params:
-            return self._kept[2]
+        """Project the view; the last view is cached."""
+        if self._last_view is not None and self._last_view[0] is camera and self._last_view[1] == params:
+            return self._last_view[2]
         check_params(self.splats.kernel, camera, params)
-        self._kept = None  # before, so that one frame's memory is the most ever held
+        self._last_view = None  # first, so that at most one view is in memory
         scene = self._scene_with(params.opacity_logit_scale)
         frame = Frame(scene, view_of(camera, params, self.splats.origin), self.splats.kernel, params, self._block)
-        self._kept = camera, params, frame
+        self._last_view = camera, params, frame
         return frame
 
     def _scene_with(self, scale: float) -> DeviceScene:
-        """The splats on the device, with that scale on their opacity logits."""
+        """Return the splats on the device, with this scale of their opacity logits."""
         if scale != self._scale:
             self._host, self._scale = with_opacities(self._host, self.splats, scale), scale
             self._scene = None if self._scene is None else with_opacity(self._scene, self._host)
@@ -228,22 +236,22 @@ class GpuRaster:
         return self._scene
 
 
-def made_ahead(items: Iterable[Item], make: Callable[[Item], Made]) -> Generator[tuple[Item, Made]]:
-    """Every item and what is made of it, in their order; a thread takes and makes the next one meanwhile.
+def prefetch(items: Iterable[Item], make: Callable[[Item], Output]) -> Generator[tuple[Item, Output]]:
+    """Yield every item and ``make(item)``, in order, while a thread prepares the next one.
 
     Raises:
-        Exception: what the items or ``make`` raise, in their turn.
+        Exception: an error of the iterator or of ``make``, raised at its item.
     """
     source = iter(items)
 
-    def following() -> tuple[Item, Made] | None:
+    def following() -> tuple[Item, Output] | None:
         for item in source:
             return item, make(item)
         return None
 
-    context = copy_context()  # of the caller, whose code may be among the items
+    context = copy_context()  # of the caller, as the iterator may be the caller's code
     with ThreadPoolExecutor(1, "view-ahead") as pool:
         waiting = pool.submit(context.run, following)
-        while (found := waiting.result()) is not None:
+        while (result := waiting.result()) is not None:
             waiting = pool.submit(context.run, following)
-            yield found
+            yield result

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.solve.clusters import NO_CLUSTER, Clustering, cluster_splats, draw, parted, principal_axes
+from liftcore.solve.clusters import NO_CLUSTER, Clustering, cluster_splats, draw, principal_axes, split_by_touch
 from liftcore.values.settings import LiftSettings
 from tests.scenes import random_splats
 
@@ -119,7 +119,7 @@ def test_groups_that_lie_apart_are_clusters_of_their_own_unless_few() -> None:
     splats.means[:, 0] += torch.from_numpy(100.0 * place).float()
     labels = np.where(place < 2, 0, np.where(place == 2, 2, 0)).astype(np.int32)  # no splat in cluster 1
     labels[np.flatnonzero(place == 2)[:4]] = NO_CLUSTER
-    found = parted(Clustering(torch.from_numpy(labels), 3, {}), splats, 6)
+    found = split_by_touch(Clustering(torch.from_numpy(labels), 3, {}), splats, 6)
     numbers = found.labels.numpy()
     assert found.count == 3
     assert (numbers[(place == 3) | (labels == NO_CLUSTER)] == NO_CLUSTER).all()

@@ -35,7 +35,7 @@ def weighed(maps: list[Regions], by_rows: bool, power: int = 1) -> tuple[RegionW
     read = [as_regions(own, by_rows) for own in maps]
     weighting = Weighting(power)
     found = [
-        codebook.counted(RASTER.region_weights(CAMERA, regions, CompositingParams(), weighting))
+        codebook.weights_by_row(RASTER.region_weights(CAMERA, regions, CompositingParams(), weighting))
         for regions, codebook in read
     ]
     return stacked(found, RASTER.splats.count), Codebook([codebook for _, codebook in read])

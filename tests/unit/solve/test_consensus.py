@@ -11,7 +11,7 @@ import torch
 from liftcore.solve import consensus
 from liftcore.solve.consensus import OBSERVES, PRIOR, mask_consensus
 from liftcore.solve.membership import BELONGS, FAINT
-from liftcore.solve.reweight import SHARPNESS, Agreement, agreement_factors
+from liftcore.solve.reweight import SHARPNESS, Reweighting, reweighting_factors
 from liftcore.values.levels import region_levels
 from liftcore.values.region_weights import RegionWeights, stacked
 from liftcore.values.views import Regions
@@ -206,13 +206,13 @@ def test_reliability_and_confidence_equal_their_definition(seed: int, on_card: b
     masks[: int(W.offsets[seed % 3])] = False  # of some views, as those of grids
     books, q = books_of(W, seed), mask_consensus(W, levels)
     consensus = torch.from_numpy(q)
-    got = agreement_factors(W, codebook_of(books), 1, reliability=masks, consensus=consensus, on_card=on_card)
+    got = reweighting_factors(W, codebook_of(books), 1, reliability=masks, consensus=consensus, on_card=on_card)
     after, (confidence, explained), median = step_of(W, books, entries(W, q), masks.numpy())
     assert got.reliability == pytest.approx(median, rel=1e-4)
     np.testing.assert_allclose(entries(W, (W.weight * got.factors).numpy()), after, rtol=2e-3, atol=1e-5)
-    assert got.confidence is not None and got.explained is not None
+    assert got.confidence is not None and got.view_consistency is not None
     np.testing.assert_allclose(got.confidence.numpy(), confidence, rtol=2e-3, atol=1e-5)
-    met = got.explained.numpy()[W.row_sums().numpy() > 0]
+    met = got.view_consistency.numpy()[W.row_sums().numpy() > 0]
     np.testing.assert_allclose(met, explained[W.row_sums().numpy() > 0], rtol=2e-3, atol=1e-5)
 
 
@@ -220,8 +220,8 @@ def test_reliability_changes_no_bit_with_threads() -> None:
     W, levels = random_scene(3, views=6)
     q = torch.from_numpy(mask_consensus(W, levels))
 
-    def made(threads: int) -> Agreement:
-        return agreement_factors(
+    def made(threads: int) -> Reweighting:
+        return reweighting_factors(
             W, codebook_of(books_of(W, 3)), 1, threads=threads, reliability=every(W), consensus=q
         )
 
@@ -237,10 +237,10 @@ def test_a_region_with_a_wrong_word_loses_weight_everywhere() -> None:
     wrong = words[[1, 1, 2, 3]]  # of the last view's first region
     books = [words] * 4 + [wrong]
     plain, relied = (
-        agreement_factors(W, codebook_of(books), 1, reliability=told).factors for told in (None, every(W))
+        reweighting_factors(W, codebook_of(books), 1, reliability=told).factors for told in (None, every(W))
     )
     lying = int(W.offsets[4])
     assert float(relied[W.region == lying].max()) <= float(plain[W.region == lying].min())
-    got = agreement_factors(W, codebook_of(books), 1, reliability=every(W))
+    got = reweighting_factors(W, codebook_of(books), 1, reliability=every(W))
     assert got.confidence is not None
     assert float(got.confidence[15:].min()) > 0.5

@@ -21,7 +21,7 @@ from liftcore.query.question import Query
 from liftcore.query.result import LiftResult, load_lift
 from liftcore.query.scene import Scene
 from liftcore.query.terms import Region
-from liftcore.raster.reference import counted_weights, dense_view, reading_matrix, strided_rays
+from liftcore.raster.reference import dense_view, reading_matrix, selected_weights, strided_rays
 from liftcore.scene.cameras import Cameras
 from liftcore.scene.compositing import CompositingParams, Selection, Weighting
 from liftcore.scene.splats import Kernel, Splats
@@ -86,7 +86,7 @@ def dense_lift(seed: int, grids: bool, case: Case, splats: Splats, cameras: Came
         observation, walk = observed(seed, k, grids), strided(case.walk, settings, camera, k)
         view, walked = dense_view(splats, camera, walk), strided_rays(camera, walk)
         S, ray = reading_matrix(observation, camera.width, camera.height)
-        chosen, close = counted_weights(view.A, splats, camera, walk, case.weighting)
+        chosen, close = selected_weights(view.A, splats, camera, walk, case.weighting)
         own = walked[ray]
         weights = chosen[ray[own]]
         numerator += weights.T @ (S[own] @ observation.codebook.double().numpy())

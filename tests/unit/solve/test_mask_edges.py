@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from liftcore.scene.neighbours import SplatGraph
-from liftcore.solve.mask_edges import MOST, one_thing, weaken_edges
+from liftcore.solve.mask_edges import MOST_VIEWS, same_object_probability, weaken_edges
 from liftcore.solve.smooth import smooth
 from liftcore.values.region_weights import stacked
 from tests.scenes import random_splats
@@ -30,20 +30,20 @@ def test_edges_weaken_as_often_as_views_part_them(seed: int, threads: int) -> No
         together, seen = own @ own.T, own.sum(axis=1)
         joined += together
         parted += np.outer(seen, seen) - together
-    edges, before = np.zeros((MOST + 1, MOST + 1)), dense(graph)
+    edges, before = np.zeros((MOST_VIEWS + 1, MOST_VIEWS + 1)), dense(graph)
     np.add.at(edges, (joined[before > 0], parted[before > 0]), 1)
     weakened, share = weaken_edges(graph, W, levels, threads)
-    np.testing.assert_allclose(dense(weakened), before * one_thing(edges)[joined, parted], rtol=1e-5)
+    np.testing.assert_allclose(dense(weakened), before * same_object_probability(edges)[joined, parted], rtol=1e-5)
     assert 0 < share < 1
 
 
 def test_masks_that_are_often_wrong_say_less() -> None:
     def said(split: float, merged: float) -> np.ndarray:
-        rng, edges = np.random.default_rng(0), np.zeros((MOST + 1, MOST + 1))
+        rng, edges = np.random.default_rng(0), np.zeros((MOST_VIEWS + 1, MOST_VIEWS + 1))
         for count, rate in ((95_000, split), (5_000, 1 - merged)):
             parted = rng.binomial(5, rate, count)
             np.add.at(edges, (5 - parted, parted), 1)
-        return one_thing(edges)
+        return same_object_probability(edges)
 
     right, wrong = said(0.01, 0.05), said(0.2, 0.3)
     assert right[0, 0] == wrong[0, 0] == 1

@@ -7,7 +7,7 @@ import pytest
 
 from liftcore.solve import objects
 from liftcore.solve.objects import CONTAINS, OBSERVES, region_objects
-from liftcore.solve.region_tree import LEAST_VIEWS, TOGETHER
+from liftcore.solve.region_tree import LEAST_VIEWS, MERGE_RATE
 from liftcore.values.region_weights import RegionWeights, stacked
 from tests.unit.solve.sparse_views import dense, of_dense
 from tests.unit.solve.test_consensus import SPLATS, belonging, of_things, random_scene
@@ -57,7 +57,7 @@ def defined(W: RegionWeights, levels: np.ndarray) -> np.ndarray:
                 pair = np.ix_(clusters[i], clusters[j])
                 rates[i, j] = supports[pair].sum() / max(observes[pair].sum(), 1e-9)
         i, j = max(rates, key=lambda pair: rates[pair])
-        if rates[i, j] < TOGETHER:
+        if rates[i, j] < MERGE_RATE:
             break
         clusters[j] += clusters.pop(i)
     found = np.full(size, -1)

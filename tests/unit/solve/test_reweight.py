@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from liftcore.lifting.files import lift_files
-from liftcore.solve.aggregate import explained_by
+from liftcore.solve.aggregate import cluster_consistency
 from liftcore.solve.closed_form import LONG
 from liftcore.solve.directions import RegionDirections
-from liftcore.solve.reweight import NO_CONSENSUS, agreement_factors, reweighted
+from liftcore.solve.reweight import NO_CONSENSUS, reweighting_factors, scale_weights
 from liftcore.values.region_weights import RegionWeights, stacked
 from liftcore.values.settings import LiftSettings
 from tests.scenes import write_scene
@@ -40,7 +40,7 @@ class Scene:
     def after(self, steps: int, **how) -> list[np.ndarray]:
         """The weights of every view after so many steps, dense."""
         W = self.stacked()
-        found = reweighted(W, agreement_factors(W, codebook_of(self.books), steps, **how).factors)
+        found = scale_weights(W, reweighting_factors(W, codebook_of(self.books), steps, **how).factors)
         whole = dense(found, len(self.weights[0])).astype(np.float32)
         return np.split(whole, W.offsets.numpy()[1:-1], axis=1)
 
@@ -154,8 +154,8 @@ def test_neither_threads_nor_files_nor_order_change_a_bit_and_the_first_weights_
     assert_same(threads=2)
     W = scene.stacked()
     before = W.weight.clone()
-    assert (agreement_factors(W, codebook_of(scene.books), 0).factors == 1).all()
-    agreement_factors(W, codebook_of(scene.books), 2)
+    assert (reweighting_factors(W, codebook_of(scene.books), 0).factors == 1).all()
+    reweighting_factors(W, codebook_of(scene.books), 2)
     assert torch.equal(W.weight, before)
 
 
@@ -181,8 +181,8 @@ def test_what_a_cluster_explains_is_its_mean_cosine_in_float64(monkeypatch, tabl
     merged[3] = 0  # a cluster without a feature explains nothing
     W, given = scene.stacked(), (torch.from_numpy(labels).int(), torch.from_numpy(merged).float())
     directions = RegionDirections.of_weights(W, codebook_of(scene.books))
-    found = explained_by(W, directions, *given, threads=1)
-    assert torch.equal(found, explained_by(W, directions, *given, threads=3))
+    found = cluster_consistency(W, directions, *given, threads=1)
+    assert torch.equal(found, cluster_consistency(W, directions, *given, threads=3))
     mean, e = defined_directions(scene)
     away = np.where(
         merged.any(axis=1, keepdims=True), over(merged, np.linalg.norm(merged, axis=1)[:, None]) - mean, 0

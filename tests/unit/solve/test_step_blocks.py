@@ -25,9 +25,9 @@ from liftcore.solve.directions import RegionDirections, region_totals
 from liftcore.solve.loss import RegionDistances, huber_factors, mean_distance
 from liftcore.solve.membership import RegionGroups, memberships
 from liftcore.solve.region_tree import region_tree
-from liftcore.solve.reweight import SceneAgreement, ViewConsistency, agreement_factors
+from liftcore.solve.reweight import SceneConsistency, ViewConsistency, reweighting_factors
 from liftcore.solve.rows import SomeRows, gather_rows, take_rows
-from liftcore.solve.sums import PIECE, PieceSums, added, packed, unpacked
+from liftcore.solve.sums import PIECE, PieceSums, pack_sums, sum_pieces, unpack_sums
 from liftcore.values.region_weights import RegionWeights, one_view, stacked
 from tests.unit.solve.sparse_views import codebook_of
 
@@ -83,7 +83,7 @@ def blocks(request: pytest.FixtureRequest) -> list[tuple[int, int]]:
 
 def over_files(parts: list[PieceSums]) -> Iterator[PieceSums]:
     """The sums of a block's pieces as those who read them from its file have them."""
-    return unpacked({name: tensor.numpy() for name, tensor in packed(parts).items()})
+    return unpack_sums({name: tensor.numpy() for name, tensor in pack_sums(parts).items()})
 
 
 def test_robust_steps_in_blocks_are_those_of_the_whole_scene(
@@ -91,13 +91,13 @@ def test_robust_steps_in_blocks_are_those_of_the_whole_scene(
 ) -> None:
     masks, steps = torch.from_numpy(LEVELS == 0), 2
     consensus = torch.rand(W.weight.shape, generator=torch.manual_seed(3))
-    whole = agreement_factors(
+    whole = reweighting_factors(
         W, codebook, steps, means=means, threads=2, reliability=masks, consensus=consensus, levels=LEVELS
     )
     parts = [W.of_splats(*ends) for ends in blocks]
     judges = [ViewConsistency(part, means[a:b], 1, LEVELS) for part, (a, b) in zip(parts, blocks, strict=True)]
     sums = (sums for part in parts for sums in over_files(list(region_totals(part, 1))))
-    totals = torch.from_numpy(added(sums, (1, codebook.regions))[0])
+    totals = torch.from_numpy(sum_pieces(sums, (1, codebook.regions))[0])
     directions = RegionDirections(codebook, totals, W.region.shape[0])
     own = [slice(int(W.indptr[a]), int(W.indptr[b])) for a, b in blocks]
     factors, scores, scene = [None] * len(blocks), [], None
@@ -107,8 +107,8 @@ def test_robust_steps_in_blocks_are_those_of_the_whole_scene(
             judge.cosines(directions, before, True, found.append)
             for judge, before in zip(judges, factors, strict=True)
         ]
-        sums = added(over_files(found), (2, codebook.regions + judges[0].levels))
-        scene = SceneAgreement.of(sums, masks, judges[0].level)
+        sums = sum_pieces(over_files(found), (2, codebook.regions + judges[0].levels))
+        scene = SceneConsistency.of(sums, masks, judges[0].level)
         scores = [
             judge.weigh(cosine, before, scene, consensus[entries])
             for judge, cosine, before, entries in zip(judges, cosines, factors, own, strict=True)
@@ -118,7 +118,7 @@ def test_robust_steps_in_blocks_are_those_of_the_whole_scene(
     assert torch.equal(torch.cat([part for part in factors if part is not None]), whole.factors)
     confidence, explained = torch.cat(scores, dim=1)
     assert whole.confidence is not None and torch.equal(confidence, whole.confidence)
-    assert whole.explained is not None and torch.equal(explained, whole.explained)
+    assert whole.view_consistency is not None and torch.equal(explained, whole.view_consistency)
     assert len(torch.unique(whole.factors)) > 1000
 
 
@@ -129,7 +129,7 @@ class ViewBlock:
     base: int  # the first region
     splats: np.ndarray  # [n] i64
     W: RegionWeights
-    own: np.ndarray  # who belongs to what
+    own_region: np.ndarray  # who belongs to what
     tuples: SplatTuples  # of these views alone
 
 
@@ -140,7 +140,7 @@ def view_blocks(views: list[RegionWeights], groups: RegionGroups, size: int) -> 
         splats, base = np.flatnonzero(whole.indptr.diff().numpy()), first * REGIONS
         indptr = torch.cat([whole.indptr[:1], whole.indptr[1:][torch.from_numpy(splats)]])
         W = replace(whole, indptr=indptr, region=whole.region + base)
-        own = memberships(W, groups, 1).own
+        own = memberships(W, groups, 1).own_region
         tuples = splat_tuples(W, own, groups, np.arange(splats.size), 1)
         blocks.append(ViewBlock(base, splats, W, own, tuples))
     return blocks
@@ -174,8 +174,10 @@ def test_consensus_by_blocks_of_views_is_that_of_the_whole_scene(
         rows = along_curve(means[torch.from_numpy(part.splats)], bounds)
         splats = part.splats[rows]
         own = SplatTuples(*take_rows(tuples.starts, splats, tuples.tuples), tuples.parents, tuples.members)
-        shares.append(region_shares(part.W, part.own, groups, rows, totals[splats], own, base=part.base, threads=1))
-    usual = mean_share(sum(part.told for part in shares), sum(part.asked for part in shares))
+        shares.append(
+            region_shares(part.W, part.own_region, groups, rows, totals[splats], own, base=part.base, threads=1)
+        )
+    usual = mean_share(sum(part.share_sum for part in shares), sum(part.share_count for part in shares))
     _, (sums, counts) = gather_rows(
         lambda: (
             SomeRows(part.splats, part.W.indptr.numpy(), [share.sums, share.views])
@@ -199,12 +201,14 @@ def test_objects_by_blocks_are_those_of_the_whole_scene(
     groups = RegionGroups.of(W.offsets.numpy(), LEVELS)
     parts, totals = view_blocks(views, groups, 2), W.row_sums().numpy()
     tuples = all_tuples(parts)
-    sizes = np.concatenate([np.bincount(p.W.region.numpy()[p.own] - p.base, minlength=2 * REGIONS) for p in parts])
+    sizes = np.concatenate(
+        [np.bincount(p.W.region.numpy()[p.own_region] - p.base, minlength=2 * REGIONS) for p in parts]
+    )
     nodes, others = objects.choose_nodes(groups, sizes)
     assert nodes.size and others.size
     found = []
     for part in parts:
-        begins, rows = objects.sampled_splats(part.W, part.own, nodes, part.base)
+        begins, rows = objects.sampled_splats(part.W, part.own_region, nodes, part.base)
         local, numbers = np.unique(rows, return_inverse=True)
         splats = part.splats[local]
         own = SplatTuples(*take_rows(tuples.starts, splats, tuples.tuples), tuples.parents, tuples.members)
@@ -219,16 +223,16 @@ def test_objects_by_blocks_are_those_of_the_whole_scene(
         for part, own in zip(cut, labels, strict=True)
         for sums in objects.node_shares(part, own, number, others, 1)
     ]
-    tree = objects.with_others(tree, others, over_files(shares))
+    tree = objects.add_regions(tree, others, over_files(shares))
     labels = [objects.node_labels(part, groups, tree, 1) for part in cut]
     sums = [
         sums
         for part, own in zip(cut, labels, strict=True)
         for sums in objects.view_shares(part, groups, own, number, 1)
     ]
-    shown = added(over_files(sums), (1, number * VIEWS)).reshape(number, VIEWS)
+    shown = sum_pieces(over_files(sums), (1, number * VIEWS)).reshape(number, VIEWS)
     every = np.concatenate(labels)
-    got = objects.numbered(every, tree, objects.node_numbering(every, total_weight, tree), shown)
+    got = objects.number_objects(every, tree, objects.node_numbering(every, total_weight, tree), shown)
     assert (got.labels >= 0).any() and len(got.views) > 1
     for name in ("labels", "node", "node_views"):
         np.testing.assert_array_equal(getattr(got, name), getattr(whole, name))
@@ -238,7 +242,7 @@ def test_objects_by_blocks_are_those_of_the_whole_scene(
 
 def test_shares_of_regions_in_nodes_are_plain_sums(W: RegionWeights) -> None:
     labels, others = np.random.default_rng(5).integers(-1, 4, SPLATS).astype(np.int32), np.array([1, 4, 5])
-    table = added(over_files(list(objects.node_shares(W, labels, 4, others, 2))), (1, 5 * others.size))
+    table = sum_pieces(over_files(list(objects.node_shares(W, labels, 4, others, 2))), (1, 5 * others.size))
     dense = np.zeros((SPLATS, int(W.offsets[-1])))
     rows = np.repeat(np.arange(SPLATS), np.diff(W.indptr.numpy()))
     np.add.at(dense, (rows, W.region.numpy()), W.weight.double().numpy())
@@ -256,7 +260,7 @@ def test_hubers_loss_in_blocks_is_that_of_the_whole_scene(
     for part, own in parts:
         distances = RegionDistances(part, codebook, own, 1)
         sums += distances.sums(distances.after(torch.ones_like(part.weight)))
-    delta = mean_distance(added(over_files(sums), (2, 1)))
+    delta = mean_distance(sum_pieces(over_files(sums), (2, 1)))
     factors = [huber_factors(part, codebook, means=own, threads=1, delta=delta) for part, own in parts]
     assert torch.equal(torch.cat(factors), whole) and len(torch.unique(whole)) > 1000
 
@@ -268,9 +272,9 @@ def test_clusters_of_blocks_have_the_features_of_the_whole_scene(
     features = torch.from_numpy(rng.normal(size=(SPLATS, 9)).astype(np.float16))
     labels, total_weight = rng.integers(-1, 4, SPLATS).astype(np.int32), rng.random(SPLATS).astype(np.float32)
     directions, own = RegionDirections.of_weights(W, codebook), torch.full((SPLATS,), 0.2)
-    whole = cluster_means(added(cluster_sums(features, total_weight, labels, 4, 2), (10, 4)), torch.float32)
+    whole = cluster_means(sum_pieces(cluster_sums(features, total_weight, labels, 4, 2), (10, 4)), torch.float32)
     sums = [part for a, b in blocks for part in cluster_sums(features[a:b], total_weight[a:b], labels[a:b], 4, 1)]
-    merged = cluster_means(added(over_files(sums), (10, 4)), torch.float32)
+    merged = cluster_means(sum_pieces(over_files(sums), (10, 4)), torch.float32)
     assert torch.equal(merged, whole)
     weights = features.double().numpy() * total_weight[:, None]
     expected = [weights[labels == k].sum(axis=0) / total_weight[labels == k].sum(dtype=np.float64) for k in range(4)]
