@@ -158,7 +158,7 @@ def weigh_regions(
             yield ViewRequest(camera, regions, *parameters, no_pixels)
 
     answers = enumerate(raster.iterate_views(requests()))
-    parts = [codebooks[number].counted(view.weights) for number, view in answers]
+    parts = [codebooks[number].weights_by_row(view.weights) for number, view in answers]
     return stacked(parts, count, threads), Codebook(tuple(codebooks))
 
 
