@@ -104,7 +104,7 @@ def create_app(settings: ServiceSettings, store: Store, runner: Supervisor, work
     app.state.readers = settings.cors_origins
     app.state.stopping, app.state.metrics, app.state.documents = stopping, metrics, operations.Documents(app)
     app.add_middleware(AnswerHead)
-    app.add_middleware(AuthMiddleware, keys=store.keys, settings=settings, stopping=lambda: stopping.begun)
+    app.add_middleware(AuthMiddleware, keys=store.keys, settings=settings, stopping=lambda: stopping.has_begun)
     app.add_middleware(ConcurrencyLimit)
     problems.install(app)
     app.include_router(operations.router)  # probes and links to the page accept any parameter

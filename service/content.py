@@ -101,8 +101,7 @@ def file_answer(
 
 
 def _range_of(header: str, size: int) -> tuple[int, int] | None:
-    """Return the first and the last byte of a Range header; None if it must be ignored: several ranges, or malformed
-    ones (RFC 9110, 14.2).
+    """Return the first and the last byte of a Range header; None for several or malformed ones (RFC 9110, 14.2).
 
     Raises:
         RangeNotSatisfiable: it begins beyond the end.

@@ -108,7 +108,7 @@ class Answers:
     def warm_up(self, encoder: str, version: object) -> None:
         """Load what the first query would wait for: an encoder and the compiled kernels.
 
-        An encoder that does not open is told to whoever asks for it.
+        The error of an encoder that does not open goes to the queries that need it.
         """
         with contextlib.suppress(SplatliftError), self._opening:
             self._encoder(encoder, version).encode([WARM_UP_TEXT])

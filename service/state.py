@@ -41,23 +41,23 @@ log = logging.getLogger(__name__)
 class Stopping:
     """The orderly stop: refuse work, end streams, requeue running jobs, and then close the port.
 
-    Begun once, from the event loop; anybody may ask whether it has.
+    It begins once, from the event loop; any thread may read `has_begun`.
     """
 
     def __init__(self, streams: EventStreams, runner: Supervisor, *, notice_seconds: float = 0.0) -> None:
         self._streams = streams
         self._runner = runner
         self._notice = notice_seconds
-        self.begun = False
+        self.has_begun = False
 
     async def begin(self, hurried: Callable[[], bool]) -> None:
         """Stop taking work; return when no job runs and proxies had `notice_seconds` to notice.
 
         Args:
-            hurried: whether the notice is to end now; asked a few times a second.
+            hurried: returns True if the notice is to end now; called a few times a second.
         """
         start = time.monotonic()
-        self.begun = True
+        self.has_begun = True
         log.info("stopping: no new work, running jobs go back in line")
         self._streams.close()
         await anyio.to_thread.run_sync(self._runner.stop)
@@ -82,9 +82,9 @@ class Readiness:
             ),
         }
         self._turn = anyio.CapacityLimiter(1)
-        self._looked = -FRESH_SECONDS
-        self._looking_at = CHECKS[0]
-        self._found: dict[str, str] = {}
+        self._checked_at = -FRESH_SECONDS
+        self._current_check = CHECKS[0]
+        self._failures: dict[str, str] = {}
 
     async def require(self) -> None:
         """Return if all checks pass.
@@ -92,33 +92,33 @@ class Readiness:
         Raises:
             NotReady: the service stops, or a check failed; it says which.
         """
-        if self._stopping.begun:
+        if self._stopping.has_begun:
             raise NotReady("stopping", expected="a service that goes on", got="one that stops")
-        failures = self._found if self._fresh() else await self._look_in_time()
+        failures = self._failures if self._fresh() else await self._run_checks_in_time()
         if failures:  # the reasons go to the log only: they may name private files
             failed = ", ".join(failures)
             raise NotReady(failed, expected="checks that pass", got=f"{failed} failed", hint="the log says why")
 
-    async def _look_in_time(self) -> dict[str, str]:
+    async def _run_checks_in_time(self) -> dict[str, str]:
         with anyio.move_on_after(PATIENCE_SECONDS):
             # A check that hangs keeps the lock: later probes time out, and no second thread hangs.
-            return await anyio.to_thread.run_sync(self._look, limiter=self._turn, abandon_on_cancel=True)
-        return {self._looking_at: f"no answer within {PATIENCE_SECONDS:g} s"}
+            return await anyio.to_thread.run_sync(self._run_checks, limiter=self._turn, abandon_on_cancel=True)
+        return {self._current_check: f"no answer within {PATIENCE_SECONDS:g} s"}
 
-    def _look(self) -> dict[str, str]:
+    def _run_checks(self) -> dict[str, str]:
         if not self._fresh():  # another probe may just have run the checks
             results = {}
             for name, check in self._checks.items():
-                self._looking_at = name
+                self._current_check = name
                 results[name] = check()
-            self._found = {name: reason for name, reason in results.items() if reason is not None}
-            for name, reason in self._found.items():
+            self._failures = {name: reason for name, reason in results.items() if reason is not None}
+            for name, reason in self._failures.items():
                 log.warning("the check of the %s failed: %s", name, reason)
-            self._looked = time.monotonic()
-        return self._found
+            self._checked_at = time.monotonic()
+        return self._failures
 
     def _fresh(self) -> bool:
-        return time.monotonic() - self._looked < FRESH_SECONDS
+        return time.monotonic() - self._checked_at < FRESH_SECONDS
 
 
 def _prove_disk(store: Store) -> None:

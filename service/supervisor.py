@@ -1,4 +1,4 @@
-"""The supervisor: takes queued jobs and runs each in a child process, some at the same time.
+"""Run queued jobs, each in a child process, some at the same time.
 
 An attempt at a job is a child process, the conversation with it, and what comes of it.
 """
@@ -32,28 +32,28 @@ from service.store.lifts import FinishedLift, FinishedTradeoff
 from service.store.owners import SERVICE
 from service.store.store import Store
 
-IDLE_SECONDS = 5.0  # a forgotten wake-up costs at most this
-TROUBLED_SECONDS = (1.0, 30.0)  # first and longest pause after an attempt that the server could not keep up
-ROOM_SECONDS = 60.0  # how long an attempt waits for room on the disk before it tries without
-TICK_SECONDS = 0.2  # how soon a cancel, a stop or a limit is seen
-RETRY_SECONDS = 1.0  # between tries to note what could not be noted
-LEASE_POLLS = 4  # a child that is silent for this part of its lease is looked at
-BUSY_SECONDS = 0.1  # of a processor: a silent child that takes so much meanwhile is alive
+IDLE_SECONDS = 5.0  # the longest delay after a missed wake-up
+TROUBLED_SECONDS = (1.0, 30.0)  # first and longest pause after an attempt that failed by an error of the server
+ROOM_SECONDS = 60.0  # the longest wait for free disk before an attempt
+TICK_SECONDS = 0.2  # the delay after a cancel, a stop or a limit
+RETRY_SECONDS = 1.0  # between attempts to write to the database
+LEASE_POLLS = 4  # polls of a silent child during its lease
+BUSY_SECONDS = 0.1  # of CPU time: a silent child that used so much is alive
 CHILD = (sys.executable, "-m", "service.job_child")
-DRAFTS = {JobKind.LIFT: ".safetensors", JobKind.TRADEOFF: ".png"}  # what a child writes
-GONE_SECONDS = 3.0  # the kernel takes a moment to end a group
-LONGEST = 8192  # bytes of a record of the log; what is longer without an end of line comes in pieces
-MARK = "SPLATLIFT_JOB_PROCESS"  # a job's processes carry its id under this name, for who looks at a machine
-TRANSIENT_ERRORS = (OSError, sqlite3.OperationalError)  # of the server: a full disk, a locked database
+DRAFTS = {JobKind.LIFT: ".safetensors", JobKind.TRADEOFF: ".png"}  # suffix of a child's output
+GONE_SECONDS = 3.0  # for the kernel to end a process group
+LONGEST = 8192  # bytes of a log record; longer lines are split
+MARK = "SPLATLIFT_JOB_PROCESS"  # environment variable with the job's id, to identify processes
+TRANSIENT_ERRORS = (OSError, sqlite3.OperationalError)  # errors of the server: a full disk, a locked database
 
 log = logging.getLogger(__name__)
-process_log = logging.getLogger("service.jobs.process")  # what their processes print
+process_log = logging.getLogger("service.jobs.process")  # output of job processes
 
-Clock = Callable[[], float]  # seconds
+Clock = Callable[[], float]  # returns seconds
 
 
 class Supervisor:
-    """Threads that own the running jobs, one each. Only they change a job after it was submitted or canceled.
+    """Threads that run jobs, one each. Only they change a job after it was submitted or canceled.
 
     Args:
         store: that holds the jobs.
@@ -74,33 +74,33 @@ class Supervisor:
         self._stopping = threading.Event()
         self._callback: Callable[[str, float], None] | None = None
         self._beginning = threading.Lock()
-        self._left_behind = True  # jobs of the server before us may seem to run
+        self._left_behind = True  # jobs of an earlier server may still be marked as running
         self._threads = [
             threading.Thread(target=self._loop, name=f"supervisor-{number}", daemon=True)
             for number in range(limits.parallel)
         ]
 
     def start(self) -> None:
-        """Begin to take jobs."""
+        """Start the threads."""
         for thread in self._threads:
             thread.start()
 
     def on_attempt_finished(self, callback: Callable[[str, float], None]) -> None:
-        """Call this after each attempt, with the state that its job came to and the seconds that it took."""
+        """Call `callback` after each attempt, with the state of its job and the seconds that it took."""
         self._callback = callback
 
     def alive(self) -> bool:
-        """Whether all threads live."""
+        """Return True if all threads live."""
         return all(thread.is_alive() for thread in self._threads)
 
     def wake(self) -> None:
-        """Say that there is a new job."""
+        """Wake a thread: there is a new job."""
         with self._condition:
             self._rung += 1
             self._condition.notify_all()
 
     def stop(self) -> None:
-        """End the running children and put their jobs back in line; returns when no child is left."""
+        """End the running children and requeue their jobs; return when no child is left."""
         self._stopping.set()
         self.wake()
         for thread in self._threads:
@@ -108,7 +108,7 @@ class Supervisor:
                 thread.join()
 
     def _loop(self) -> None:
-        troubled = 0  # attempts in a row that the server could not keep up
+        troubled = 0  # consecutive attempts that failed by an error of the server
         while not self._stopping.is_set():
             rung = self._rung
             try:
@@ -117,12 +117,12 @@ class Supervisor:
                     troubled = 0 if self._run(job) else troubled + 1
                     self._pause(troubled)
                     continue
-            except Exception:  # the thread must outlive a full disk or a locked database
+            except Exception:  # the thread must survive a full disk or a locked database
                 log.exception("the supervisor stumbled")
             self._rest(rung)
 
     def _next(self) -> JobRecord | None:
-        """Claim a job; before the first one, those of the server before us go back in line."""
+        """Claim a job; before the first one, requeue those of an earlier server."""
         with self._beginning:
             if self._left_behind:
                 self._store.jobs.release_all("the server died")
@@ -130,13 +130,14 @@ class Supervisor:
         return self._store.jobs.claim()
 
     def _rest(self, rung: int) -> None:
-        """Wait for a ring of the bell after that one, for a stop, or for IDLE_SECONDS."""
+        """Wait for a wake-up after that one, for a stop, or for IDLE_SECONDS."""
         with self._condition:
             self._condition.wait_for(lambda: self._rung != rung or self._stopping.is_set(), IDLE_SECONDS)
 
     def _pause(self, troubled: int) -> None:
-        """Wait while the server has trouble: longer each time, then for a disk above its floor, though not for ever:
-        what fills it may be what the next job goes on from.
+        """Wait while the server has errors: longer each time, then for free disk, though not for ever.
+
+        A checkpoint of the next job may fill the disk.
         """
         first, longest = TROUBLED_SECONDS
         if troubled:
@@ -150,7 +151,7 @@ class Supervisor:
                 self._stopping.wait(first)
 
     def _run(self, job: JobRecord) -> bool:
-        """Run a job; whether its attempt came to an end of its own."""
+        """Run a job; return True if its attempt was decided by the job itself."""
         start, attempts, kept_up = time.monotonic(), self._store.jobs, True
         with working_for(job.request_id):
             log.info("job %s, attempt %d begins", job.id, job.attempt)
@@ -173,7 +174,7 @@ class Supervisor:
 
 
 class Lease:
-    """Whether a child is still to be waited for: it speaks or computes now and then.
+    """Lease of a child: it must write or compute now and then.
 
     Args:
         seconds: how long it may do neither.
@@ -187,12 +188,12 @@ class Lease:
         self.renew()
 
     def renew(self) -> None:
-        """The child gave a sign of life."""
+        """Renew the lease: the child gave a sign of life."""
         self._alive = self._clock()
-        self._cpu_seconds: float | None = None  # processor seconds when it was found silent
+        self._cpu_seconds: float | None = None  # CPU seconds when it was found silent
 
     def over(self, processor_seconds: Callable[[], float]) -> bool:
-        """Whether the child is given up; called several times in a lease.
+        """Return True if the lease is over; called several times in a lease.
 
         Args:
             processor_seconds: what the child has taken. One call into a library (HDBSCAN on many splats) may keep
@@ -200,13 +201,11 @@ class Lease:
         """
         now = self._clock()
         if now - self._polled_at > self._seconds / 2:
-            self.renew()  # it was the server that slept: the child has a lease from now on
+            self.renew()  # the server itself slept: restart the lease
         self._polled_at = now
         if now - self._alive > self._seconds / LEASE_POLLS:
             seconds = processor_seconds()
-            if (
-                self._cpu_seconds is None or seconds < self._cpu_seconds
-            ):  # less when one that it had started has ended
+            if self._cpu_seconds is None or seconds < self._cpu_seconds:  # less if a process of the child has ended
                 self._cpu_seconds = seconds
             elif seconds - self._cpu_seconds > BUSY_SECONDS:
                 self.renew()
@@ -214,7 +213,7 @@ class Lease:
 
 
 class AttemptLog:
-    """What an attempt tells of itself. What cannot be noted now is noted later, and stops nobody."""
+    """Reports of an attempt. If the database cannot be written now, they are written later."""
 
     def __init__(self, job: JobRecord, store: Store) -> None:
         self._job = job
@@ -227,7 +226,7 @@ class AttemptLog:
         self._retry_at = 0.0
 
     def add(self, kind: EventKind, data: Any) -> None:
-        """Note a line of the log, the plan or how far the work is; of the last two the latest counts."""
+        """Keep a line of the log, the plan or the progress; of the last two the latest counts."""
         if kind is not EventKind.LOG:
             for earlier in [note for note in self._waiting if note[0] is kind]:
                 self._waiting.remove(earlier)
@@ -235,7 +234,7 @@ class AttemptLog:
         self.write()
 
     def write(self) -> None:
-        """Write what waits, unless that failed a moment ago."""
+        """Write the reports, unless a write failed a moment ago."""
         if not self._waiting or time.monotonic() < self._retry_at:
             return
         try:
@@ -245,7 +244,7 @@ class AttemptLog:
             self._retry_at = time.monotonic() + RETRY_SECONDS
 
     def flush(self) -> None:
-        """Write what waits.
+        """Write the reports.
 
         Raises:
             TRANSIENT_ERRORS: it cannot be written now, and waits on.
@@ -257,7 +256,7 @@ class AttemptLog:
 
 
 class Attempt:
-    """Runs in a thread of the supervisor, which is the only one that changes its job.
+    """One attempt at a job, in a thread of the supervisor. No other thread changes the job.
 
     Args:
         job: as it was claimed.
@@ -276,10 +275,10 @@ class Attempt:
         self._begin = time.monotonic()
         self._notes = AttemptLog(job, store)
         self._pace = StagePace()
-        self._answer: dict[str, Any] | None = None  # the child's last word
+        self._answer: dict[str, Any] | None = None  # the last message of the child
 
     def run(self, stopping: threading.Event) -> None:
-        """From the start of the child to the end of its process group, and the state that follows from it.
+        """Run the child to the end of its process group; set the state that follows.
 
         Raises:
             TRANSIENT_ERRORS: the server could not keep it up; no process of it is left, and its state is as it was.
@@ -300,9 +299,9 @@ class Attempt:
             files.forget_work(self._job.id)
 
     def _follow(self, process: JobProcess, stopping: threading.Event) -> str | SplatliftError | None:
-        """Listen until the child has ended or must end; why it must, None when it ended by itself."""
+        """Read messages until the child has ended or must end; return the reason if it must end, else None."""
         while True:
-            has_ended = process.ended()  # before listening, so that its last words are heard
+            has_ended = process.has_ended()  # before the last messages are read
             for message in process.listen(0 if has_ended else TICK_SECONDS):
                 self._take(message)
             if has_ended:
@@ -345,11 +344,11 @@ class Attempt:
     def _is_wanted(self) -> bool:
         try:
             return self._store.jobs.state(SERVICE, self._job.id) is JobState.RUNNING
-        except TRANSIENT_ERRORS:  # nobody can have canceled it in a database that cannot be read
+        except TRANSIENT_ERRORS:  # if the database cannot be read, nobody can have canceled the job
             return True
 
     def _settle(self, draft: Path, reason: str | SplatliftError, stopping: bool) -> None:
-        """No process of this attempt is left; what becomes true now stays true."""
+        """Record the result; no process of this attempt is left."""
         self._notes.flush()
         job, attempts, answer = self._job, self._store.jobs, self._answer or {"event": "none"}
         if answer["event"] == "done" and draft.exists():
@@ -368,7 +367,7 @@ class Attempt:
             attempts.lose(job.id, job.attempt, reason)
 
     def _keep(self, draft: Path, answer: dict[str, Any]) -> bool:
-        """Make the result true, and the job succeeded with it; False when the attempt may not."""
+        """Record the result and the job's success; return False if the attempt is no longer valid."""
         job, store = self._job, self._store
         if job.kind is JobKind.TRADEOFF:
             tradeoff = FinishedTradeoff(answer["document"], answer["page"], draft.read_bytes())
@@ -394,7 +393,7 @@ class Attempt:
             "kind": job.kind,
             "parameters": job.parameters,
             "splats": str(assets[0].path),
-            "kernel": kernel_of(assets[0], job.settings),  # to compile for
+            "kernel": kernel_of(assets[0], job.settings),  # compiled kernels to load
             "cameras": str(assets[1].path),
             "features": [str(asset.path) for asset in assets[2:]],
             "labels": {str(asset.kind): str(asset.path) for asset in labels},
@@ -411,7 +410,7 @@ class Attempt:
 
 
 class StagePace:
-    """Adds to the progress that a child reports how long its stage will still take, from its pace so far."""
+    """Estimate of the remaining seconds of a stage, from its speed so far."""
 
     def __init__(self) -> None:
         self._stage = ""
@@ -419,11 +418,11 @@ class StagePace:
         self._done_at_begin = 0
 
     def begins(self, message: dict[str, Any]) -> bool:
-        """Whether a message is the first of another stage."""
+        """Return True if a message is the first of another stage."""
         return message["stage"] != self._stage
 
     def progress(self, message: dict[str, Any]) -> dict[str, Any]:
-        """The message as `service.models.Progress` has it."""
+        """Return the message as `service.models.Progress` has it."""
         now = time.monotonic()
         completed, total = message["done"], message["total"]
         if self.begins(message):
@@ -440,7 +439,7 @@ class StagePace:
 
 
 def retry_until_committed(note: Callable[[], None], stopping: threading.Event) -> None:
-    """Note the end of an attempt, however long the disk is full: else its job would seem to run for ever.
+    """Record the end of an attempt, also after a long time with a full disk: else its job would seem to run for ever.
 
     A stop ends that; the next start then finds the job running, and puts it back in line.
     """
@@ -464,20 +463,20 @@ def _describe_exit(status: int) -> str:
 
 @dataclass(frozen=True)
 class JobLimits:
-    """What jobs may take, and how their processes are watched."""
+    """Limits of jobs and of their processes."""
 
     parallel: int = 1  # jobs at the same time
-    threads: int | None = None  # of a job; None shares the cores out
+    threads: int | None = None  # of a job; None: divide the cores
     seconds: float = 86_400.0  # wall time of an attempt
     memory_bytes: int | None = None  # private memory of a job's processes; None sets no limit
     lease_seconds: float = 30.0  # silence after which an attempt is lost, unless it computes
-    engine: str | None = None  # who lifts in blocks; None: lifts are made in memory
-    ray_address: str = "auto"  # of that cluster
-    checkpoint_seconds: float = 2.0  # work that a killed lift may lose, beside the views in work
+    engine: str | None = None  # of lifts in blocks; None: lift in memory
+    ray_address: str = "auto"  # of a Ray cluster
+    checkpoint_seconds: float = 2.0  # work that a killed lift may lose, beside unfinished views
 
 
 class JobProcess:
-    """Started in a process group of its own, heard in JSON lines, and ended with its whole group.
+    """Child process of a job: it leads a process group, writes JSON lines, and ends with its group.
 
     What it prints on its standard error goes to the server's log, line by line. Its standard input is a lifeline: it
     closes when the server ends, however the server ends.
@@ -505,28 +504,28 @@ class JobProcess:
 
     @property
     def pid(self) -> int:
-        """The child's process id, which is also its group's."""
+        """The child's process id, also of its group."""
         return self._process.pid
 
-    def ended(self) -> bool:
-        """Whether the child itself has ended."""
+    def has_ended(self) -> bool:
+        """Return True if the child has ended."""
         return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is not None
 
     def private_bytes(self) -> int:
-        """Memory of the child and of all that it started, but for mapped files. 0 where Linux does not tell."""
+        """Return the memory of the child and its descendants without mapped files; 0 if Linux does not report it."""
         return sum(memory_of(pid, "RssAnon") for pid in _family(self.pid))
 
     def processor_seconds(self) -> float:
-        """Of the child and of all that it started and that runs still. 0 where Linux does not tell."""
+        """Return the CPU seconds of the child and its running descendants; 0 if Linux does not report it."""
         return sum(_processor_seconds(pid) for pid in _family(self.pid))
 
     def end(self) -> int:
-        """End the whole group at once; the child's exit status, negative for a signal. No process is left after this.
+        """Kill the whole group; return the child's exit status, negative for a signal. No process is left after this.
 
         The child writes drafts and checkpoints only, and those are whole or absent, so nothing is lost by haste.
         """
         if self._status is None:
-            # The leader is not reaped yet, so the number of the group is still ours.
+            # the leader is not reaped yet, so the group's number is still valid
             os.killpg(self.pid, signal.SIGKILL)
             self._status = self._process.wait()
             self._await_group()
@@ -545,7 +544,7 @@ class JobProcess:
 
 
 def log_lines(pipe: IO[bytes], job: str) -> threading.Thread:
-    """Log each line that comes through a pipe as a warning, until its other ends are closed; the thread that does.
+    """Log each line of a pipe as a warning until its other ends are closed; return the thread that does.
 
     The records have the job's id, and that of the request that this thread works for.
     """
@@ -571,7 +570,7 @@ def _processor_seconds(pid: int) -> float:
 
 
 def _family(pid: int) -> Iterator[int]:
-    """A process and what it started, as far as Linux tells; whoever ends meanwhile is left out."""
+    """Return a process and its descendants, as Linux reports them; those that end meanwhile are left out."""
     yield pid
     for child in children_of(pid):
         yield from _family(child)

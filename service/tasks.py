@@ -40,20 +40,20 @@ from service.uploads import INVALID, LIFT
 if TYPE_CHECKING:
     from service.job_child import Reporter
 
-BLOCK_ROWS = 1 << 14  # of a lift, looked at together
-SHOWN_DIGITS = 12  # of the splats' digest, by which the chart of a trade-off names the scene
+BLOCK_ROWS = 1 << 14  # of a lift, checked at a time
+SHOWN_DIGITS = 12  # of the splats' digest, in the title of a trade-off's chart
 
 log = logging.getLogger(__name__)
 
 
 def _describe(path: Path, kind: AssetKind) -> dict[str, Any]:
-    """What a file of that kind holds, read whole; of none that may run code as it is read."""
+    """Describe the content of a file of that kind, read whole; files that can run code are refused."""
     description = inspect_file(path, kind, trusted=False)
     return {name: value for name, value in description.items() if name not in ("kind", "bytes")}
 
 
 def check_splats(path: Path) -> dict[str, Any]:
-    """Read and describe every splat; checkpoints are pickles, and are not opened here."""
+    """Read and describe every splat; checkpoints are pickles and are not opened here."""
     return {"found": _describe(path, AssetKind.SPLATS), "suffix": identify(path).suffix}
 
 
@@ -64,9 +64,9 @@ def check_cameras(path: Path) -> dict[str, Any]:
 
 
 def require_texts(argument: str, texts: Sequence[str], longest: int, error: type[InvalidInput]) -> None:
-    """See that a query can say each of these names or words, and that lists of them are not without end."""
+    """Require names or words of a length that a query can have, and lists of a limited length."""
     for text in texts:
-        if len(text) > longest or not (text or argument == "word"):  # a table may keep a row for nothing
+        if len(text) > longest or not (text or argument == "word"):  # a table may have a row without a word
             raise error(
                 argument, expected=f"1 to {longest} characters",
                 got=f"{len(text)}: {text[:40]!r}..." if text else "an empty one",
@@ -94,7 +94,7 @@ def check_masks(path: Path) -> dict[str, Any]:
 
 
 def check_table(path: Path) -> dict[str, Any]:
-    """Read every row, and keep all words: orders are held to them."""
+    """Read every row, and keep all words: orders are checked against them."""
     words = list(TableEncoder.open(path).words)
     return {"suffix": ".safetensors", "found": _describe(path, AssetKind.TABLE) | {"words": words}}
 
@@ -105,7 +105,7 @@ def check_photos(path: Path) -> dict[str, Any]:
 
 
 def check_lift(path: Path, cameras: Path | None = None) -> dict[str, Any]:
-    """Read every number of a lift, and bound what its metadata say; its names of views must be ones to query by.
+    """Read every number of a lift, and limit its metadata; its names of views must be valid in queries.
 
     ``cameras`` are an asset that stands for those that it was made with: they must see what these saw.
     """
@@ -126,7 +126,7 @@ def check_lift(path: Path, cameras: Path | None = None) -> dict[str, Any]:
         raise InvalidLift("lift", expected="splats of each object", got=f"none of object {min(missing)}")
     require_texts("view name", metadata["views"], models.VIEW_CHARACTERS, InvalidLift)
     require_texts("word", metadata["words"], models.WORD_CHARACTERS, InvalidLift)
-    if None in metadata["timings"].values():  # as JSON has what is not finite
+    if None in metadata["timings"].values():  # JSON has no infinite numbers
         raise InvalidLift("lift", expected="finite timings", got="others", hint="a list of lifts tells them")
     brief = len(json.dumps({name: value for name, value in metadata.items() if name not in LONG}))
     if brief > SHOWN_BYTES:
@@ -148,13 +148,13 @@ CHECKS: dict[UploadKind, Callable[..., dict[str, Any]]] = {
 }
 
 
-def check(named: str, file: str, *arguments: str) -> dict[str, Any]:
-    """Check one file of a kind: ``valid`` with what was found, or ``invalid`` with the error.
+def check(kind_name: str, file: str, *arguments: str) -> dict[str, Any]:
+    """Check one file of a kind: ``valid`` with its description, or ``invalid`` with the error.
 
     Args:
         more: of a lift, the path of its cameras where these have another digest than it remembers.
     """
-    kind: UploadKind = LIFT if named == LIFT else AssetKind(named)
+    kind: UploadKind = LIFT if kind_name == LIFT else AssetKind(kind_name)
     path = Path(file)
     try:
         result = CHECKS[kind](path, *map(Path, arguments))
@@ -179,7 +179,7 @@ def _invalid(error: SplatliftError, kind: UploadKind, path: Path) -> dict[str, A
 
 
 def _of_another_kind(kind: UploadKind, path: Path) -> InvalidInput | None:
-    """What to say of a file that belongs elsewhere; None where it looks like what it was sent as, or like nothing."""
+    """Return a hint for a file of another kind; None if it looks right, or unknown."""
     identity = identify(path)
     actual = identity.kind
     if identity.suffix in (".sog", ".zip") and not zipfile.is_zipfile(path):
@@ -200,15 +200,14 @@ def _out_of_memory(kind: UploadKind) -> InvalidInput:
 
 
 def rename(pack: str, changes: str, header: str) -> dict[str, Any]:
-    """Write what a checked pack begins with, its length and its header, under other names: ``valid``, or ``invalid``
-    with the error.
+    """Write the length and the header of a checked pack with other names: ``valid``, or ``invalid`` with the error.
 
     Args:
         changes: the names, a JSON object. header: the file to write.
     """
     path = Path(pack)
     try:
-        read_features(path)  # somebody may have been at it since it was stored
+        read_features(path)  # it may have changed since it was stored
     except SplatliftError as error:
         return _invalid(error, AssetKind.FEATURES, path)
     Path(header).write_bytes(next(with_metadata(path, json.loads(changes))))
@@ -216,7 +215,7 @@ def rename(pack: str, changes: str, header: str) -> dict[str, Any]:
 
 
 def plan(file: str) -> dict[str, Any]:
-    """Plan by the JSON file of a job's order: ``valid`` with the plan, or ``invalid`` with the error."""
+    """Plan the order of a job, a JSON file: ``valid`` with the plan, or ``invalid`` with the error."""
     order = json.loads(Path(file).read_bytes())
     try:
         settings = LiftSettings.of(**order["settings"])
@@ -227,11 +226,11 @@ def plan(file: str) -> dict[str, Any]:
         return {"event": "invalid", "fault": fault_of(error, order["names"])}
 
 
-# What jobs do: a lift, or a trade-off
+# Work of jobs: a lift, or a trade-off
 
 
 def lift_as_ordered(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
-    """Lift, and save the lift at ``output``.
+    """Lift, and write the lift to ``output``.
 
     Returns:
         What the job's last message tells of it.
@@ -241,7 +240,7 @@ def lift_as_ordered(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
     """
 
     def planned(plan: Plan) -> None:
-        for warning in plan.warnings:  # the operator's log has them too
+        for warning in plan.warnings:  # also in the operator's log
             log.warning(warning)
         report.plan(plan_document(plan, order["names"]))
 
@@ -266,23 +265,21 @@ def lift_as_ordered(order: dict[str, Any], report: Reporter) -> dict[str, Any]:
         "sha256": sha256_of(output),
         "count": lift.features.shape[0],
         "channels": lift.features.shape[1],
-        # Through JSON and not model_dump: what is not finite must become null before it reaches a client.
+        # Through JSON, not model_dump: infinite numbers must become null.
         "metadata": json.loads(lift.metadata.model_dump_json()),
     }
 
 
 def plan_document(plan: Plan, names: Mapping[str, str]) -> dict[str, Any]:
-    """A plan as `service.models.Plan` has it, with the names that clients know in place of paths."""
+    """Return a plan as `service.models.Plan` has it, with clients' names in place of paths."""
     warnings = [replace_names(warning, names) for warning in (*plan.warnings, *plan.told)]
     return finite({"summary": list(plan.summary()), "warnings": warnings, **plan.facts()})
 
 
 def _as_clients_know(lift: LiftResult, names: Mapping[str, str]) -> LiftResult:
-    """The inputs by the names under which clients download them: whoever has the lift may have them beside it, and
-    paths of this machine are nobody's business.
-    """
+    """Return the inputs by the names of clients' downloads: a lift finds them beside it, without private paths."""
     metadata = lift.metadata
-    resolved = {str(Path(path).resolve()): name for path, name in names.items()}  # data may lie behind a link
+    resolved = {str(Path(path).resolve()): name for path, name in names.items()}  # data may be behind a link
     inputs = metadata.splats, metadata.cameras, *metadata.features
     splats, cameras, *features = (
         file.model_copy(update={"path": resolved[str(Path(file.path).resolve())]}) for file in inputs
@@ -292,7 +289,7 @@ def _as_clients_know(lift: LiftResult, names: Mapping[str, str]) -> LiftResult:
 
 
 def compare_as_ordered(order: dict[str, Any], progress: Reporter) -> dict[str, Any]:
-    """Compare, and draw the chart at ``output``. Each run is a process of our group, with our environment.
+    """Compare, and draw the chart to ``output``. Each run is a process of this group, with this environment.
 
     Returns:
         What the job's last message tells of it: ``document`` and ``page``.
@@ -300,7 +297,7 @@ def compare_as_ordered(order: dict[str, Any], progress: Reporter) -> dict[str, A
     Raises:
         SplatliftError: as `liftcore.evaluate.compare_speeds` has it.
     """
-    from liftcore.evaluate import SceneFiles, compare_speeds  # with matplotlib, which no lift needs
+    from liftcore.evaluate import SceneFiles, compare_speeds  # imports matplotlib, which lifts do not need
 
     settings, parameters, labels = order["settings"], order["parameters"], order["labels"]
     files = Path(order["splats"]), Path(order["cameras"]), tuple(Path(path) for path in order["features"])
@@ -315,7 +312,7 @@ def compare_as_ordered(order: dict[str, Any], progress: Reporter) -> dict[str, A
         kernel=Kernel(order["kernel"]),
         threads=order["threads"],
         progress=progress,
-        scene=f"splats {scene.splats.stem[:SHOWN_DIGITS]}",  # a blob is named by its digest
+        scene=f"splats {scene.splats.stem[:SHOWN_DIGITS]}",  # a blob's name is its digest
         command=f"POST /tradeoff {json.dumps(parameters | {'settings': settings})}",
     )
     with tempfile.TemporaryDirectory(prefix="splatlift-chart-") as folder:

@@ -1,4 +1,4 @@
-"""Uploads: a body on its way to a checked file, counted and digested as it comes, then read in a child process."""
+"""Uploads: receive a body, count and digest it, and check the file in a child process."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from service.store.store import Store
 
 LIFT = "lift"
 
-# What a malformed file of a kind is told as.
+# Error class of a malformed file, by kind.
 INVALID: dict[UploadKind, type[InvalidInput]] = {
     kind: getattr(errors, f"Invalid{kind.capitalize()}") for kind in (*AssetKind, LIFT)
 }
 
-STEP = 4 << 20  # bytes of content between two looks at what may still be stored
+STEP = 4 << 20  # bytes between two checks of the free space
 CHECK_BASE_BYTES, CHECK_FACTOR = 1 << 30, 16  # private memory of a check: a reader holds several copies of a file
 HINTS: dict[UploadKind, str] = {AssetKind.FEATURES: "several feature packs may make one lift, so features can be cut"}
 
@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 
 
 def require_size(kind: UploadKind, count: int, limit: int) -> None:
-    """See that a body of so many bytes may come.
+    """Require that a body of that size is allowed.
 
     Raises:
         TooLarge: it may not.
@@ -71,7 +71,7 @@ class Intake(ABC, Generic[Record]):
         self._file: BinaryIO | None = None
 
     def open(self) -> None:
-        """Begin a draft where there may be one.
+        """Create the draft, if there is space.
 
         Raises:
             NoSpace, OverQuota: there may not.
@@ -82,7 +82,7 @@ class Intake(ABC, Generic[Record]):
         self._file = self._open.enter_context(self._draft.open("wb"))
 
     def close(self) -> None:
-        """Remove what is left of it."""
+        """Remove the draft."""
         self._open.close()
 
     def feed(self, chunk: bytes) -> None:
@@ -95,7 +95,7 @@ class Intake(ABC, Generic[Record]):
         assert self._file is not None
         self._received_bytes += len(chunk)
         require_size(self._kind, self._received_bytes, self._limit)
-        if self._received_bytes > self._permitted_bytes:  # a body may come without its length
+        if self._received_bytes > self._permitted_bytes:  # a body may have no declared length
             self._store.files.require_room(len(chunk))
             self._store.assets.require_quota(self._owner, self._received_bytes)
             self._permitted_bytes = self._received_bytes + STEP
@@ -103,7 +103,7 @@ class Intake(ABC, Generic[Record]):
         self._file.write(chunk)
 
     def finish(self, declared_digest: str | None) -> Record | None:
-        """Call once after the last byte.
+        """Finish after the last byte: check the digest and the file, and store it.
 
         Args:
             promised: the sha256 in hex that the client said, if it did.
@@ -122,7 +122,7 @@ class Intake(ABC, Generic[Record]):
         return self._find_same(digest)
 
     def check(self, limits: SandboxLimits) -> CheckedUpload:
-        """Read the whole draft in a process of its own.
+        """Check the whole draft in a child process.
 
         Raises:
             InvalidInput, ProcessDied, ServiceUnavailable: as `check` has it.
@@ -135,7 +135,7 @@ class Intake(ABC, Generic[Record]):
         return CheckedUpload(self._draft, self._kind, digest, report.suffix, report.counts, report.warnings)
 
     def _files_beside(self) -> tuple[Path, ...]:
-        """Files that it is checked beside."""
+        """Files that are needed for the check."""
         return ()
 
     @abstractmethod
@@ -143,7 +143,7 @@ class Intake(ABC, Generic[Record]):
 
     @abstractmethod
     def keep(self, upload: CheckedUpload) -> tuple[Record, bool]:
-        """Make of it what it is for; whether its owner did not have it before.
+        """Store the checked file; return True if its owner did not have it before.
 
         Raises:
             OverQuota: it would be more than the owner may store.
@@ -159,12 +159,12 @@ class AssetIntake(Intake[AssetRecord]):
         return record if record is not None and record.kind == self._kind and record.whole else None
 
     def keep(self, upload: CheckedUpload) -> tuple[AssetRecord, bool]:
-        """Make an asset of it."""
+        """Store it as an asset."""
         return self._store.assets.add(self._owner, upload)
 
 
 class LiftIntake(Intake[LiftRecord]):
-    """The upload of a lift that was made elsewhere: its splats and cameras are here, under their digests.
+    """Upload of a lift that was made elsewhere. Its splats and cameras must be here, under their digests.
 
     Args:
         cameras: an asset that has the lift's cameras, in place of that digest: of a folder there is no such file.
@@ -184,7 +184,7 @@ class LiftIntake(Intake[LiftRecord]):
         return record if record is not None and is_whole(record.path, record.bytes) else None
 
     def keep(self, upload: CheckedUpload) -> tuple[LiftRecord, bool]:
-        """Make a lift of it."""
+        """Store it as a lift."""
         counts, assets = upload.counts, self._store.assets
         order = order_of(counts["metadata"])
         order = order if self._cameras is None else replace(order, cameras=self._cameras)
@@ -205,15 +205,15 @@ class LiftIntake(Intake[LiftRecord]):
 
 @dataclass(frozen=True)
 class Report:
-    """What a check found in a valid file."""
+    """Description of a valid file."""
 
     suffix: str  # of the stored file, such as .ply
     counts: dict[str, Any]
     warnings: list[str]
 
 
-def check(kind: UploadKind, path: Path, scratch: Path, limits: SandboxLimits, *others: Path) -> Report:
-    """Read a whole file in a process of its own, which unpacks into ``scratch`` and ends with this process.
+def check(kind: UploadKind, path: Path, scratch: Path, limits: SandboxLimits, *files_beside: Path) -> Report:
+    """Check a whole file in a child process, which writes to ``scratch`` and ends with this process.
 
     Args:
         beside: of a lift, cameras that must see what its own saw.
@@ -223,8 +223,8 @@ def check(kind: UploadKind, path: Path, scratch: Path, limits: SandboxLimits, *o
         ProcessDied: the process did not get as far as opening the file.
         ServiceUnavailable: as `run_sandboxed` has it.
     """
-    memory = min(limits.memory_bytes, CHECK_BASE_BYTES + CHECK_FACTOR * sum(map(_size, (path, *others))))
-    arguments = [kind, str(path), *map(str, others)]
+    memory = min(limits.memory_bytes, CHECK_BASE_BYTES + CHECK_FACTOR * sum(map(_size, (path, *files_beside))))
+    arguments = [kind, str(path), *map(str, files_beside)]
     result = run_sandboxed("service.tasks.check", arguments, scratch, replace(limits, memory_bytes=memory))
     if result is None:
         raise too_slow(kind, limits)
@@ -234,7 +234,7 @@ def check(kind: UploadKind, path: Path, scratch: Path, limits: SandboxLimits, *o
         raise error_of(result.last["fault"])
     log.error("the check of %s ended with %s: %s", kind, result.returncode, result.trace)
     if result.last["event"] == "ready":
-        # It had started to read: whatever ended it, this file did.
+        # It had begun to read, so the file is to blame.
         raise INVALID[kind](
             kind, expected="a file that its reader can take", got=f"one that ended it with {result.returncode}",
             hint="it may be broken, or need more memory than an upload may take",
@@ -243,7 +243,7 @@ def check(kind: UploadKind, path: Path, scratch: Path, limits: SandboxLimits, *o
 
 
 def too_slow(kind: UploadKind, limits: SandboxLimits) -> InvalidInput:
-    """What to say of a file that takes longer to read than it may."""
+    """Return the error for a file that takes too long to read."""
     return INVALID[kind](
         kind, expected=f"a file that is read within {limits.seconds:g} s", got="one that takes longer"
     )

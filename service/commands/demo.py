@@ -188,8 +188,8 @@ class Finding:
     """Result of one phrase."""
 
     phrase: str
-    there: bool | None  # True if the scene has it; None: unknown or uncertain
-    why: str  # the total weight for `there`
+    is_there: bool | None  # True if the scene has it; None: unknown or uncertain
+    reason: str  # how that is known
     object: str | None  # name of the object that the masks show most, if names are known
     splats: int  # selected
     score: float  # the best cosine
@@ -301,8 +301,8 @@ def _find(client: Client, lift: str, kind: str, phrase: str, subject: DemoScene,
     Image.fromarray(overlay).save(out / names["found"])
     return Finding(
         phrase=phrase,
-        there=answer["present"],
-        why=answer["why"],
+        is_there=answer["present"],
+        reason=answer["why"],
         object=truth.name_of(masks) if truth else None,
         splats=answer["count"],
         score=best[0]["score"] if best else float("nan"),
@@ -323,8 +323,8 @@ def _pixels(png: bytes) -> np.ndarray:
 
 def _lines(finding: Finding) -> list[str]:
     noun = f"the {finding.object}" if finding.object else "something"
-    if finding.there is False:
-        return [f'  "{finding.phrase}" finds nothing', f"      {finding.why}"]
+    if finding.is_there is False:
+        return [f'  "{finding.phrase}" finds nothing', f"      {finding.reason}"]
     bar = "no threshold" if finding.threshold is None else f"threshold {finding.threshold:.2f}"
     iou = "" if finding.iou is None else f", IoU {finding.iou:.2f} against the truth of views that were not lifted"
     lines = [
@@ -332,8 +332,8 @@ def _lines(finding: Finding) -> list[str]:
         f"      {finding.splats:,} splats, best score {finding.score:.2f}, {bar}, "
         f"{finding.query_ms:.0f} ms (mask {finding.mask_ms:.0f} ms){iou}",
     ]
-    if finding.there is None:
-        lines.append(f"      {finding.why}")
+    if finding.is_there is None:
+        lines.append(f"      {finding.reason}")
     for number, item in enumerate(finding.objects, 1):
         place = ", ".join(f"{value:.2f}" for value in item["centre"])
         lines.append(f"      object {number}: {item['splats']:,} splats around ({place})")
@@ -355,12 +355,14 @@ class Truth:
 
     names: tuple[str, ...]  # object names
     masks: Mapping[str, np.ndarray]  # view -> [H, W] integers, rows of names; -1 = none
-    meant: Mapping[str, tuple[str, ...]]  # phrase, no article -> names of its objects; empty if the scene has none
-    asked: tuple[str, ...]  # phrases to query
+    objects_of_phrases: Mapping[
+        str, tuple[str, ...]
+    ]  # phrase, no article -> names of its objects; empty if the scene has none
+    phrases: tuple[str, ...]  # phrases to query
 
     def mask_of(self, phrase: str, view: str) -> np.ndarray | None:
         """[H, W] bool, where the phrase's objects are; None when the phrase or the view has no truth."""
-        names = self.meant.get(_bare(phrase))
+        names = self.objects_of_phrases.get(_bare(phrase))
         if names is None or view not in self.masks:
             return None
         rows = [self.names.index(name) for name in names]
@@ -453,7 +455,7 @@ def find_scene(folder: Path, phrases: Sequence[str], scratch: Path, pack: Path |
         other_packs=tuple(path.name for path in packs if not path.exists() or path.resolve() != features.resolve()),
         encoder=f"table:{table}" if table.is_file() else _ENCODERS.get(text_space, next(iter(BUILT_IN))),
         text_space=text_space,
-        phrases=tuple(phrases) or (truth.asked if truth and askable and text_space != NO_WORDS else ()),
+        phrases=tuple(phrases) or (truth.phrases if truth and askable and text_space != NO_WORDS else ()),
         views=tuple(truth.masks) if truth else _some_views(cameras),
         truth=truth,
     )
@@ -510,9 +512,9 @@ def _read_truth(folder: Path) -> Truth | None:
     return Truth(
         names=names,
         masks={view: masks[view] for view in document.get("held_out_views", masks)},
-        meant=synonyms
+        objects_of_phrases=synonyms
         | {_bare(phrase): tuple(item_names) for phrase, item_names in document.get("phrases", {}).items()},
-        asked=tuple(document.get("ask", [f"the {name}" for name in _in_view(names, masks, document)])),
+        phrases=tuple(document.get("ask", [f"the {name}" for name in _in_view(names, masks, document)])),
     )
 
 

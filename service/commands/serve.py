@@ -66,9 +66,7 @@ class AnnouncingServer(uvicorn.Server):
         self._idle_since: dict[tuple[Any, Any], float] = {}
 
     async def on_tick(self, counter: int) -> bool:
-        """Close the connections that are idle the longest if there is no room for the next one. uvicorn calls this
-        ten times a second.
-        """
+        """Close the longest idle connections if there is no room for a new one; called ten times a second."""
         now, connections = time.monotonic(), self.server_state.connections
         requests = ((each, getattr(each, "cycle", None)) for each in connections)
         self._idle_since = {

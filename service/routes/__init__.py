@@ -1,1 +1,1 @@
-"""The routes: parse, call, shape the reply."""
+"""Routes: parse the request, call the library or the store, shape the reply."""

@@ -22,12 +22,12 @@ from service.store.files import require_whole
 from service.uploads import AssetIntake, Intake, Record, require_size, too_slow
 
 T = TypeVar("T")
-BATCH = 1 << 20  # bytes gathered before a thread writes them
-HEADER_LENGTH_BYTES = 8  # that a safetensors file begins with
-MAX_DIGITS = 20  # of a Content-Length: h11 takes no more
+BATCH = 1 << 20  # bytes that are collected before a thread writes them
+HEADER_LENGTH_BYTES = 8  # length field at the begin of a safetensors file
+MAX_DIGITS = 20  # of a Content-Length: h11 accepts no more
 
 router = APIRouter(prefix="/assets", tags=["assets"], route_class=JsonRoute)
-# By the name of the other routes' part: to OpenAPI, two templates that match the same paths are one path twice.
+# OpenAPI takes two templates of the same paths as one path given twice, so the parameter has one name.
 AssetKind = Annotated[models.AssetKind, Path(alias="asset", description="what it is")]
 KindParameter = Annotated[models.AssetKind, Query(description="what it is")]
 AssetId = Annotated[str, Path(description="sha256: and the digest of the bytes, in hex")]
@@ -45,7 +45,7 @@ RAW_BODY: dict[str, Any] = {
 
 @router.put("/{asset}", response_model=models.Asset, status_code=201, responses=KNOWN_ALREADY, openapi_extra=RAW_BODY)
 async def put_asset(kind: AssetKind, request: Request, deps: Deps, sha256: Sha256 = None) -> Response:
-    """Upload a file. It is checked whole.
+    """Upload a file. The service checks it whole.
 
     It is splats (any format but checkpoints), cameras (JSON, or a zip of a COLMAP model or of several files), a
     feature pack, masks, a text table, or photos (a zip of JPEG and PNG files that are named like the views).
@@ -63,10 +63,10 @@ async def create_asset(kind: KindParameter, request: Request, deps: Deps, sha256
 async def receive_upload(
     into: Callable[..., Intake[Record]], kind: models.UploadKind, request: Request, deps: AppState, sha256: str | None
 ) -> tuple[Record, bool]:
-    """Take the body of an upload in, check it whole and keep it; whether its owner did not have it before."""
+    """Receive, check and store an upload; return True if its owner did not have it before."""
     require_file(request.headers)
     limit = deps.settings.max_upload_bytes(kind)
-    require_size(kind, _declared_size(request), limit)  # before a byte of it is asked for with 100 Continue
+    require_size(kind, _declared_size(request), limit)  # before 100 Continue invites the body
     intake = into(deps.store, deps.owner, kind, limit)
 
     async def write(step: Callable[..., T], *arguments: Any) -> T:
@@ -81,12 +81,12 @@ async def receive_upload(
         upload = await anyio.to_thread.run_sync(intake.check, deps.check_limits, limiter=deps.checks)
         return await write(intake.keep, upload)
     finally:
-        with anyio.CancelScope(shield=True):  # removing gigabytes takes its time
+        with anyio.CancelScope(shield=True):  # removing gigabytes takes long
             await write(intake.close)
 
 
 def _declared_size(request: Request) -> int:
-    """The bytes that a body is said to have, 0 when nothing is said."""
+    """Return the declared length of a body in bytes; 0 if there is none."""
     length = request.headers.get("content-length", "")
     return int(length[:MAX_DIGITS]) if length.isascii() and length.isdigit() else 0
 
@@ -103,19 +103,19 @@ async def _receive(request: Request, feed: Callable[[bytes], Any]) -> None:
 
 @router.get("", response_model=models.Assets)
 def list_assets(deps: Deps, limit: Limit = models.PAGE, cursor: Cursor = None) -> Response:
-    """The assets, newest first, in pages. Lists of names and words are told with each asset alone."""
+    """List the assets, newest first, in pages. Lists of names and words are given with each single asset."""
     return page_response("assets", partial(deps.store.assets.page, deps.owner), shape, limit=limit, cursor=cursor)
 
 
 @router.get("/{asset}", response_model=models.Asset)
 def get_asset(asset: AssetId, deps: Deps) -> Response:
-    """One asset. Where its names or words are very many, they are at ``links.names`` alone."""
+    """Get one asset. Long lists of names or words are at ``links.names`` alone."""
     return _reply(deps.store.assets.get(deps.owner, asset, limit=SHOWN_CHARACTERS), 200)
 
 
 @router.get("/{asset}/names", response_model=models.Names)
 def get_asset_names(asset: AssetId, deps: Deps, limit: Limit = models.PAGE, cursor: NamesCursor = 0) -> models.Names:
-    """The names of views, or the words, that an asset holds, in pages: of long ones a page may have fewer."""
+    """List the names of views, or the words, that an asset holds, in pages: pages of long names may have fewer."""
     names = deps.store.assets.names(deps.owner, asset, cursor, limit + 1)
     count = max(1, sum(total <= models.PAGE_CHARACTERS for total in accumulate(map(len, names[:limit]))))
     return models.Names(names=names[:count], next=cursor + count if len(names) > count else None)
@@ -123,7 +123,7 @@ def get_asset_names(asset: AssetId, deps: Deps, limit: Limit = models.PAGE, curs
 
 @router.get("/{asset}/content", response_class=Response, responses=FILE)
 def get_asset_content(asset: AssetId, request: Request, deps: Deps) -> Response:
-    """The bytes of an asset, or a range of them."""
+    """Download an asset, or a range of its bytes."""
     record = deps.store.assets.get(deps.owner, asset)
     digest = record.id.removeprefix("sha256:")
     return file_answer(request, record.path, record.bytes, digest, record.file_name)
@@ -131,7 +131,7 @@ def get_asset_content(asset: AssetId, request: Request, deps: Deps) -> Response:
 
 @router.patch("/{asset}", response_model=models.Asset, status_code=201, responses=KNOWN_ALREADY)
 async def change_pack(asset: AssetId, change: models.PackChange, deps: Deps) -> Response:
-    """Name the encoder or the text space of a feature pack: the same features under these names, as another asset."""
+    """Set the encoder or the text space of a feature pack: returns a new asset with the same features."""
     record, new = await anyio.to_thread.run_sync(_retagged, asset, change, deps, limiter=deps.checks)
     return _reply(record, 201 if new else 200)
 
@@ -167,12 +167,12 @@ def _retagged(asset: str, change: models.PackChange, deps: AppState) -> tuple[As
 
 @router.delete("/{asset}", status_code=204)
 def delete_asset(asset: AssetId, deps: Deps) -> None:
-    """Forget an asset. It is refused (409) while a job or a lift refers to it."""
+    """Delete an asset. Refused (409) while a job or a lift refers to it."""
     deps.store.assets.delete(deps.owner, asset)
 
 
 def shape(asset: AssetRecord) -> models.Asset:
-    """An asset as clients get it."""
+    """Return an asset as clients get it."""
     path = f"/assets/{asset.id}"
     links = {"self": path, "content": f"{path}/content"}
     links |= {} if asset.kind is models.AssetKind.SPLATS else {"names": f"{path}/names"}

@@ -27,7 +27,7 @@ from service.state import AppState, Deps
 from service.store.assets import ALL, AssetRecord, kernel_of
 from service.store.jobs import Event, EventKind, JobOrder, JobRecord, fingerprint, labels_of
 
-FLOAT_BYTES = 2  # at least: of float16, which features are unless told otherwise
+FLOAT_BYTES = 2  # at least: of float16, the default of features
 router = APIRouter(route_class=JsonRoute)
 
 Key = Annotated[
@@ -71,11 +71,11 @@ REPEATED_ORDER: dict[int | str, dict[str, Any]] = {
     "/lift", response_model=models.Job, status_code=202, responses=REPEATED_ORDER, tags=["jobs"],
 )  # fmt: skip
 async def order_lift(order: models.LiftRequest, deps: Deps, key: Key = None) -> Response:
-    """Lift features onto splats. The job is on the disk before this answers."""
+    """Lift features onto splats. The job is on the disk before the reply."""
     return await anyio.to_thread.run_sync(_lift, order, deps, key, limiter=deps.ordering)
 
 
-# The document tells of it beside the upload of a lift file, in `service.routes.lifts`: to OpenAPI they are one.
+# OpenAPI has one operation for this and the upload of a lift file, in `service.routes.lifts`.
 router.add_api_route(
     "/lifts", order_lift, methods=["POST"], route_class_override=OrderRoute, include_in_schema=False, status_code=202
 )
@@ -83,7 +83,7 @@ router.add_api_route(
 
 @router.post("/lift/plan", response_model=models.Plan, tags=["jobs"])
 async def plan_lift(order: models.LiftRequest, deps: Deps) -> models.Plan:
-    """What a lift would do and need, without doing it: the views that it takes, and the memory."""
+    """Plan a lift without running it: the views that it would use, and the memory."""
     return await anyio.to_thread.run_sync(_planned, order, deps, limiter=deps.planning)
 
 
@@ -91,16 +91,16 @@ async def plan_lift(order: models.LiftRequest, deps: Deps) -> models.Plan:
     "/tradeoff", response_model=models.Job, status_code=202, responses=REPEATED_ORDER, tags=["trade-offs"],
 )  # fmt: skip
 async def order_tradeoff(order: models.TradeoffRequest, deps: Deps, key: Key = None) -> Response:
-    """Compare the dial and the presets on a scene within a budget. The job is on the disk before this answers."""
+    """Compare quality levels and presets on a scene within a budget. The job is on the disk before the reply."""
     return await anyio.to_thread.run_sync(_compare, order, deps, key, limiter=deps.ordering)
 
 
 def _lift(order: models.LiftRequest, deps: AppState, key: str | None) -> Response:
     settings = LiftSettings.of_json(order.settings).model_dump(mode="json")
-    # An order without words reads as before there were any.
+    # leave out fields that earlier releases did not have, so that equal orders have equal digests
     document = order.model_dump(mode="json", exclude=None if order.table else {"table"})
     parameters = {} if order.table is None else {"table": order.table}
-    return _take(order, deps, key, sent=document, settings=settings, parameters=parameters)
+    return _take(order, deps, key, order_json=document, settings=settings, parameters=parameters)
 
 
 def _planned(order: models.LiftRequest, deps: AppState) -> models.Plan:
@@ -136,28 +136,28 @@ def _compare(order: models.TradeoffRequest, deps: AppState, key: str | None) -> 
     if order.budget_s > deps.settings.tradeoff_seconds:
         limit = f"at most {deps.settings.tradeoff_seconds:g} s, as the operator allows"
         raise InvalidRequest("budget_s", expected=limit, got=f"{order.budget_s:g}")
-    document = order.model_dump(
-        mode="json", exclude_none=True
-    )  # an order without labels reads as before there were any
+    document = order.model_dump(mode="json", exclude_none=True)  # likewise
     parameters = {name: document[name] for name in ("budget_s", "labels") if name in document}
     return _take(
         order,
         deps,
         key,
-        sent=document,
+        order_json=document,
         settings=order.settings,
         kind=models.JobKind.TRADEOFF,
         parameters=parameters,
     )
 
 
-def _take(order: models.LiftInputs, deps: AppState, key: str | None, *, sent: dict[str, Any], **of: Any) -> Response:
-    """Return the answer to an order: its new job, or that of the same order before, by the JSON ``sent``."""
+def _take(
+    order: models.LiftInputs, deps: AppState, key: str | None, *, order_json: dict[str, Any], **of: Any
+) -> Response:
+    """Return the answer to an order: its new job, or the job of the same order before, found by ``order_json``."""
     job_order = JobOrder(
         splats=order.splats, cameras=order.cameras, features=tuple(order.features),
-        key=key, fingerprint=None if key is None else fingerprint(sent), request_id=current_id(), **of,
+        key=key, fingerprint=None if key is None else fingerprint(order_json), request_id=current_id(), **of,
     )  # fmt: skip
-    job, new = deps.store.jobs.repeated(deps.owner, job_order), False
+    job, new = deps.store.jobs.find_repeated(deps.owner, job_order), False
     if job is None:
         _require_fit(job_order, deps)
         deps.queries.require_device(job_order.settings.get("device", "auto"))
@@ -167,8 +167,8 @@ def _take(order: models.LiftInputs, deps: AppState, key: str | None, *, sent: di
 
 
 def _require_fit(order: JobOrder, deps: AppState) -> None:
-    """Refuse an order that cannot be lifted, or that there is no room for."""
-    get = partial(deps.store.assets.get, deps.owner, limit=ALL)  # names are compared with names
+    """Refuse an order that cannot be lifted, or for which there is no space."""
+    get = partial(deps.store.assets.get, deps.owner, limit=ALL)  # names must be complete: they are compared
     cameras = get(order.cameras, models.AssetKind.CAMERAS)
     packs = [get(pack, models.AssetKind.FEATURES) for pack in order.features]
     splats = get(order.splats, models.AssetKind.SPLATS)
@@ -186,19 +186,19 @@ def _require_fit(order: JobOrder, deps: AppState) -> None:
 
 @router.get("/jobs", response_model=models.Jobs, tags=["jobs"])
 def list_jobs(deps: Deps, limit: Limit = models.PAGE, cursor: Cursor = None) -> Response:
-    """The jobs, newest first, in pages."""
+    """List the jobs, newest first, in pages."""
     return page_response("jobs", partial(deps.store.jobs.page, deps.owner), shape, limit=limit, cursor=cursor)
 
 
 @router.get("/jobs/{job}", response_model=models.Job, tags=["jobs"])
 def get_job(job: str, deps: Deps) -> models.Job:
-    """One job: its state, its progress, and what came of it."""
+    """Get one job: its state, its progress and its result."""
     return shape(deps.store.jobs.get(deps.owner, job))
 
 
 @router.get("/jobs/{job}/events", response_class=Response, responses=EVENTS, tags=["jobs"])
 async def follow_job(job: str, deps: Deps, last_event: LastEvent = 0) -> Response:
-    """What happens to a job, as it happens: its states, plan, latest progress and log. Ends after the last state."""
+    """Stream the events of a job: its states, plan, latest progress and log. Ends after the last state."""
     read_events = partial(deps.store.jobs.events, deps.owner, job)
     state = await anyio.to_thread.run_sync(deps.store.jobs.state, deps.owner, job)
     if not await anyio.to_thread.run_sync(read_events, last_event) and state in models.ENDED:
@@ -214,8 +214,9 @@ async def follow_job(job: str, deps: Deps, last_event: LastEvent = 0) -> Respons
     tags=["jobs"],
 )
 def cancel_job(job: str, deps: Deps) -> Response:
-    """End a job. It is ``canceling`` until its processes are gone (within 5 s), then ``canceled``; asking twice does
-    no harm. A job that has succeeded or failed is refused (409).
+    """Cancel a job. It is ``canceling`` until its processes have ended (within 5 s), then ``canceled``.
+
+    A second request does no harm. A job that has succeeded or failed is refused (409).
     """
     deps.store.jobs.cancel(deps.owner, job)
     record = deps.store.jobs.get(deps.owner, job)
@@ -229,13 +230,13 @@ def delete_job(
     with_lift: Annotated[bool, Query(description="its lift goes too; without this a job with a lift stays")] = False,
     with_tradeoff: Annotated[bool, Query(description="its trade-off goes too, likewise")] = False,
 ) -> None:
-    """Forget a job. It is refused (409) before it has ended."""
+    """Delete a job. Refused (409) before it has ended."""
     choices = {models.JobKind.LIFT: with_lift, models.JobKind.TRADEOFF: with_tradeoff}
     deps.store.jobs.delete(deps.owner, job, given_up=[kind for kind, is_given_up in choices.items() if is_given_up])
 
 
 def event_data(event: Event) -> str:
-    """An event's data as clients get it."""
+    """Return an event's data as clients get it."""
     if event.kind is EventKind.STATE:
         step = event.data | {"problem": _problem(event.data["problem"])}
         return models.JobStep.model_validate(step).model_dump_json()
@@ -243,7 +244,7 @@ def event_data(event: Event) -> str:
 
 
 def shape(job: JobRecord) -> models.Job:
-    """A job as clients get it."""
+    """Return a job as clients get it."""
     links = {"self": f"/jobs/{job.id}", "events": f"/jobs/{job.id}/events"}
     if job.state not in models.ENDED:
         links["cancel"] = f"/jobs/{job.id}/cancel"
@@ -260,11 +261,11 @@ def _reply(job: JobRecord, status: int) -> Response:
     return JSONResponse(shape(job).model_dump(mode="json"), status, headers={"Location": f"/jobs/{job.id}"})
 
 
-# Whether assets belong together, from what their checks found: said at once rather than by a failed job
+# Checks that assets fit together, from the counts of their checks: an early error rather than a failed job
 
 
 def check_fit(cameras: AssetRecord, features: Sequence[AssetRecord]) -> None:
-    """Refuse features that cannot make a lift with these cameras.
+    """Refuse features that cannot be lifted with these cameras.
 
     Raises:
         InvalidFeatures: a view is in two packs, packs differ in channels, or no view has a camera.
@@ -284,12 +285,12 @@ def check_fit(cameras: AssetRecord, features: Sequence[AssetRecord]) -> None:
 
 
 def check_settings(settings: LiftSettings, features: Sequence[AssetRecord], *, in_blocks: bool) -> None:
-    """Refuse settings that need masks where no pack has any, and what an engine cannot work on in blocks.
+    """Refuse settings that need masks if no pack has any, and settings that an engine cannot do in blocks.
 
     Raises:
         InvalidSettings: as `LiftSettings` has it.
     """
-    masks = any(pack.counts.get("region_maps", 1) for pack in features)  # where nothing was counted the job tells
+    masks = any(pack.counts.get("region_maps", 1) for pack in features)  # without a count the job decides
     settings.finds_objects(masks)
     settings.asks_consensus(masks)
     if in_blocks:
@@ -297,7 +298,7 @@ def check_settings(settings: LiftSettings, features: Sequence[AssetRecord], *, i
 
 
 def check_kernel(splats: AssetRecord, settings: Mapping[str, Any]) -> None:
-    """Refuse a kernel that the splats lack a property of, and what the kernel has no meaning for.
+    """Refuse a kernel for which the splats lack a property, and settings that have no meaning for it.
 
     Raises:
         InvalidSettings: ``kernel`` or ``antialiased`` does not fit the file, of which the header is read.
@@ -320,7 +321,7 @@ def check_kernel(splats: AssetRecord, settings: Mapping[str, Any]) -> None:
 def check_labels(
     order: JobOrder, cameras: AssetRecord, features: Sequence[AssetRecord], masks: AssetRecord, table: AssetRecord
 ) -> None:
-    """Refuse labels that cannot judge lifts of these features.
+    """Refuse labels that cannot evaluate lifts of these features.
 
     Raises:
         InvalidRequest: a class that the table lacks or that is named twice, too few classes, a table of other
@@ -358,7 +359,7 @@ def check_labels(
 
 
 def check_channels(argument: str, table: AssetRecord, features: Sequence[AssetRecord]) -> None:
-    """Refuse a table of words that are no vectors of the features' space.
+    """Refuse a table of words whose vectors are not of the features' space.
 
     Raises:
         InvalidRequest: it has other channels.
@@ -370,12 +371,12 @@ def check_channels(argument: str, table: AssetRecord, features: Sequence[AssetRe
 
 
 def scratch_bytes(kind: models.JobKind, splats: AssetRecord, features: Sequence[AssetRecord]) -> int:
-    """What a job writes to the disk at least while it runs: a trade-off keeps the features of its exact run."""
+    """Return the least bytes that a job writes to the disk: a trade-off keeps the features of its exact run."""
     if kind is not models.JobKind.TRADEOFF:
         return 0
     return splats.counts.get("splats", 0) * (1 + features[0].counts["channels"]) * FLOAT_BYTES
 
 
 def _first_names(names: Sequence[str]) -> str:
-    """The first few names, for an error."""
+    """Return the first few names, for an error."""
     return ", ".join(map(repr, sorted(names)[:3]))

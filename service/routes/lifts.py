@@ -38,7 +38,7 @@ from service.store.lifts import LiftRecord, TradeoffRecord
 from service.store.owners import Scope
 from service.uploads import LIFT, LiftIntake
 
-MOST_SHARES = 100  # of a lift that are valid
+MOST_SHARES = 100  # valid keys of one lift
 MARKDOWN_TYPE = "text/markdown; charset=utf-8"
 MARKDOWN: dict[int | str, dict[str, Any]] = {200: {"content": {MARKDOWN_TYPE: {"schema": {"type": "string"}}}}}
 
@@ -78,7 +78,7 @@ router = APIRouter(route_class=JsonRoute)
 
 @router.get("/lifts", response_model=models.Lifts, tags=["lifts"])
 def list_lifts(deps: Deps, limit: Limit = models.PAGE, cursor: Cursor = None) -> Response:
-    """The lifts, newest first, in pages."""
+    """List the lifts, newest first, in pages."""
     return page_response("lifts", partial(deps.store.lifts.page, deps.owner), shape_lift, limit=limit, cursor=cursor)
 
 
@@ -99,7 +99,7 @@ def list_lifts(deps: Deps, limit: Limit = models.PAGE, cursor: Cursor = None) ->
 async def create_lift(
     request: Request, deps: Deps, sha256: Sha256 = None, cameras: LiftCameras = None, key: Key = None
 ) -> Response:
-    """Order a lift with a body of JSON, as POST /lift does; or bring a lift file of the command line.
+    """Order a lift with a JSON body, as POST /lift does; or upload a lift file of the command line.
 
     The Content-Type tells which of the two it is: application/json is an order, any other a file. ``Idempotency-Key``
     is of orders; ``sha256`` and ``cameras`` are of files.
@@ -115,13 +115,13 @@ async def create_lift(
 
 @router.patch("/lifts/{lift}", response_model=models.LiftResult, tags=["lifts"])
 def change_lift(lift: str, change: models.LiftChange, deps: Deps) -> models.LiftResult:
-    """Give a lift a name, photos of its views, or what is known of its frame; what is left out stays."""
+    """Set a lift's name, the photos of its views, or its world frame; absent fields stay."""
     return shape_lift(deps.store.lifts.change(deps.owner, lift, change.model_dump(exclude_unset=True)))
 
 
 @router.delete("/lifts/{lift}", status_code=204, tags=["lifts"])
 def delete_lift(lift: str, deps: Deps) -> Response:
-    """Forget a lift, its selections and its job; what it was made of stays."""
+    """Delete a lift, its selections and its job; the assets stay."""
     record = deps.store.lifts.get(deps.owner, lift)
     deps.store.jobs.delete(deps.owner, record.id, given_up=(models.JobKind.LIFT,))
     return Response(status_code=204)
@@ -129,13 +129,13 @@ def delete_lift(lift: str, deps: Deps) -> Response:
 
 @router.get("/lifts/{lift}", response_model=models.LiftResult, tags=["lifts"])
 def get_lift(lift: str, deps: Deps) -> models.LiftResult:
-    """One lift: its settings, certificate and timings."""
+    """Get one lift: its settings, diagnostics and timings."""
     return shape_lift(deps.store.lifts.get(deps.owner, lift))
 
 
 @router.get("/lifts/{lift}/features", response_class=Response, responses=FILE, tags=["lifts"])
 def get_lift_features(lift: str, request: Request, deps: Deps) -> Response:
-    """The lift file (safetensors), or a range of it; it has the ``world`` that a PATCH gave the lift."""
+    """Download the lift file (safetensors), or a range of it, with the ``world`` that a PATCH set."""
     record = deps.store.lifts.get(deps.owner, lift)
     name, header = f"lift-{record.id}.safetensors", record.changed_header()
     return file_answer(request, record.path, record.bytes, record.sha256, name, header)
@@ -143,13 +143,13 @@ def get_lift_features(lift: str, request: Request, deps: Deps) -> Response:
 
 @router.get("/tradeoffs/{tradeoff}", response_model=models.Tradeoff, tags=["trade-offs"])
 def get_tradeoff(tradeoff: str, deps: Deps) -> models.Tradeoff:
-    """What was found: the runs, and which to take."""
+    """Get a trade-off: the runs, and the recommended ones."""
     return shape_tradeoff(deps.store.tradeoffs.get(deps.owner, tradeoff))
 
 
 @router.get("/tradeoffs/{tradeoff}/chart", response_class=Response, responses=PNG | TAGGED, tags=["trade-offs"])
 def get_tradeoff_chart(tradeoff: str, request: Request, deps: Deps) -> Response:
-    """Accuracy over time, and how near the dial stays to the exact lift, as a picture."""
+    """Draw accuracy over time, and how near each quality level is to the exact lift, as a picture."""
     record = deps.store.tradeoffs.get(deps.owner, tradeoff)
     etag = f'"{record.sha256}"'
     return unchanged(request, etag) or Response(record.chart, media_type="image/png", headers=cache_headers(etag))
@@ -157,16 +157,16 @@ def get_tradeoff_chart(tradeoff: str, request: Request, deps: Deps) -> Response:
 
 @router.get("/tradeoffs/{tradeoff}/table", response_class=Response, responses=MARKDOWN, tags=["trade-offs"])
 def get_tradeoff_table(tradeoff: str, deps: Deps) -> Response:
-    """The runs as a table, with what it says and how it was made."""
+    """Get the runs as a table, with a summary and the protocol."""
     return Response(deps.store.tradeoffs.get(deps.owner, tradeoff).page, headers={"Content-Type": MARKDOWN_TYPE})
 
 
-# Keys that others read a lift with
+# Keys shared for one lift
 
 
 @router.get("/key", response_model=models.OwnKey, tags=["keys"])
 def get_key(deps: Deps) -> models.OwnKey:
-    """What the key of this request may do, and whose it is."""
+    """Get the scopes and the owner of this request's key."""
     key = deps.caller.record
     if key is None:
         return models.OwnKey(name=None, scopes=[Scope.ADMIN], lifts=[], expires=None)
@@ -175,14 +175,14 @@ def get_key(deps: Deps) -> models.OwnKey:
 
 @router.get("/lifts/{lift}/shares", response_model=models.Shares, tags=["keys"])
 def list_shares(lift: str, deps: Deps) -> models.Shares:
-    """The keys that the lift was given to and that are valid, newest first, without their secrets."""
+    """List the valid keys shared for the lift, newest first, without their secrets."""
     record = deps.store.lifts.get(deps.owner, lift)
     return models.Shares(shares=[shape_share(key, record.id) for key in deps.store.keys.of_lift(record.id)])
 
 
 @router.post("/lifts/{lift}/shares", response_model=models.NewShare, status_code=201, tags=["keys"])
 def create_share(lift: str, asked: models.AskedShare, request: Request, deps: Deps) -> Response:
-    """Make a key that looks at this lift and asks it. It is shown this once, and in a link of the page."""
+    """Create a key that can read and query this lift. The secret is shown once, and in a link of the page."""
     record = deps.store.lifts.get(deps.owner, lift)
     if deps.caller.record is None:
         raise InvalidRequest(
@@ -196,7 +196,7 @@ def create_share(lift: str, asked: models.AskedShare, request: Request, deps: De
         maker=bearer(request.headers),
     )  # fmt: skip
     share = shape_share(key, record.id)
-    # After the #, which browsers send nobody: neither the log of a proxy nor another site comes to know it.
+    # After the #, which browsers do not send: it reaches neither the log of a proxy nor another site.
     links = share.links | {"page": f"/?lift={record.id}#key={secret}"}
     reply = models.NewShare(**share.model_dump(exclude={"links"}), links=links, key=secret)
     headers = {"Location": share.links["self"], "Cache-Control": "no-store"}
@@ -205,23 +205,23 @@ def create_share(lift: str, asked: models.AskedShare, request: Request, deps: De
 
 @router.delete("/lifts/{lift}/shares/{share}", status_code=204, tags=["keys"])
 def delete_share(lift: str, share: ShareId, deps: Deps) -> Response:
-    """Take the lift away from a key, from the next request on; a key that then has none ends."""
+    """Take the lift away from a key, from the next request on; a key without lifts is revoked."""
     deps.store.keys.take_away(share, deps.store.lifts.get(deps.owner, lift).id)
     return Response(status_code=204)
 
 
 def shape_share(key: KeyRecord, lift: str) -> models.Share:
-    """A key as the one who gave it a lift gets it, without its secret."""
+    """Return a shared key as its creator gets it, without its secret."""
     links = {"self": f"/lifts/{lift}/shares/{key.id}", "lift": f"/lifts/{lift}"}
     return models.Share(id=key.id, name=key.name, created=key.created, expires=key.expires, links=links)
 
 
-# What a viewer draws of a lift
+# Files for viewers of a lift
 
 
 @router.get("/lifts/{lift}/splats", responses=PLY | TAGGED, response_class=Response, tags=["lifts"])
 def get_lift_splats(lift: str, request: Request, deps: Deps, ask: Ask) -> Response:
-    """The scene for a web viewer: `.splat`, 32 bytes a splat, rows as in the lift.
+    """Download the scene for a web viewer: `.splat`, 32 bytes a splat, rows as in the lift.
 
     2DGS discs are thin Gaussians there, and DBS kernels the Gaussians of nearest size.
     """
@@ -231,14 +231,14 @@ def get_lift_splats(lift: str, request: Request, deps: Deps, ask: Ask) -> Respon
 
 @router.get("/lifts/{lift}/colours", responses=NPY | TAGGED, response_class=Response, tags=["lifts"])
 def get_lift_colours(lift: str, request: Request, deps: Deps, ask: Ask, what: Layer = "pca") -> Response:
-    """A colour for every splat: .npy, uint8 [P, 3], sRGB. Splats without a feature are grey."""
+    """Download a colour for every splat: .npy, uint8 [P, 3], sRGB. Splats without a feature are grey."""
     record = deps.store.lifts.get(deps.owner, lift)
     return tagged_answer(request, deps, scene_request("layer", record, deps) | {"what": what}, record, ask)
 
 
 @router.get("/lifts/{lift}/photo", responses=PHOTO | TAGGED, response_class=Response, tags=["lifts"])
 def get_photo(lift: str, view: View, request: Request, deps: Deps, ask: Ask) -> Response:
-    """The photo of a view, as it was uploaded.
+    """Download the photo of a view, as it was uploaded.
 
     Where its camera is of the stored pixels, an EXIF orientation becomes 1, so that no browser turns the photo.
     """
@@ -268,7 +268,7 @@ def _with_photo(deps: AppState, lift: LiftRecord, views: list[str]) -> set[str]:
 
 @router.get("/lifts/{lift}/views", response_model=models.Views, tags=["lifts"])
 def list_views(lift: str, deps: Deps, ask: Ask, limit: Limit = models.PAGE, cursor: ViewsCursor = 0) -> models.Views:
-    """The cameras of the scene with their poses, in pages; also those that were not lifted."""
+    """List the cameras of the scene with their poses, in pages; also those that were not lifted."""
     record = deps.store.lifts.get(deps.owner, lift)
     answer = ask(scene_request("views", record, deps) | {"first": cursor, "count": limit}).header
     names = [view["name"] for view in answer["views"]]
@@ -281,7 +281,7 @@ def list_views(lift: str, deps: Deps, ask: Ask, limit: Limit = models.PAGE, curs
 
 @router.get("/lifts/{lift}/regions", response_model=models.CoveringRegions, tags=["lifts"])
 def list_regions(lift: str, view: View, x: Pixel, y: Pixel, deps: Deps, ask: Ask) -> models.CoveringRegions:
-    """The regions of the lift's feature packs that cover a pixel of a view's photo: each is an example to ask by."""
+    """List the regions of the lift's feature packs at a pixel of a view's photo: each is an example for queries."""
     record = deps.store.lifts.get(deps.owner, lift)
     request = with_packs(scene_request("regions", record, deps), record, deps, "lift") | {
         "view": view,
@@ -295,7 +295,7 @@ def list_regions(lift: str, view: View, x: Pixel, y: Pixel, deps: Deps, ask: Ask
 def get_region_mask(
     lift: str, view: View, level: Level, region: Level, request: Request, deps: Deps, ask: Ask
 ) -> Response:
-    """The pixels of a view's photo that one region covers: a PNG, white where it is."""
+    """Draw the pixels of a view's photo that one region covers: a PNG, white inside."""
     record = deps.store.lifts.get(deps.owner, lift)
     worker_request = with_packs(scene_request("region_mask", record, deps), record, deps, "lift")
     worker_request |= {"view": view, "level": level, "region": region}
@@ -304,7 +304,7 @@ def get_region_mask(
 
 @router.get("/lifts/{lift}/objects", response_model=models.SceneObjects, tags=["lifts"])
 def list_objects(lift: str, deps: Deps, ask: Ask, asked: Annotated[models.AskedForSceneObjects, Query()]) -> Response:
-    """The things in the scene, found by masks alone when it was lifted; a vocabulary names them."""
+    """List the objects of the scene, found by masks when it was lifted; a vocabulary names them."""
     labels = list(deps.store.selections.things(deps.owner, deps.store.lifts.get(deps.owner, lift).id).items())
     fields = {"means": asked.features, "things": labels, "splat": asked.splat}
     return _nodes("catalogue", lift, deps, ask, asked, **fields)
@@ -312,7 +312,7 @@ def list_objects(lift: str, deps: Deps, ask: Ask, asked: Annotated[models.AskedF
 
 @router.get("/lifts/{lift}/tree", response_model=models.LiftTree, tags=["lifts"])
 def get_tree(lift: str, deps: Deps, ask: Ask, asked: Annotated[models.AskedForTree, Query()]) -> Response:
-    """The same things with their parts and groups of them, objects first; a node's splats are an object's.
+    """Get the objects with their parts and their groups, objects first; nodes have splats as objects have.
 
     With `relations`, how the objects lie to each other.
     """
@@ -331,14 +331,14 @@ def _nodes(operation: str, lift: str, deps: Deps, ask: Ask, asked: models.AskedF
 
 @router.get("/lifts/{lift}/objects/{thing}/splats", responses=PLY | TAGGED, response_class=Response, tags=["lifts"])
 def get_object_splats(lift: str, thing: ObjectId, request: Request, deps: Deps, ask: Ask) -> Response:
-    """The splats of one object and no others: a PLY of the dialect that was lifted."""
+    """Download the splats of one object: a PLY of the dialect that was lifted."""
     record = deps.store.lifts.get(deps.owner, lift)
     worker_request = scene_request("splats", record, deps) | {"what": f"object-{thing}", "object": thing}
     return tagged_answer(request, deps, worker_request, record, ask)
 
 
 def shape_lift(lift: LiftRecord) -> models.LiftResult:
-    """A lift as clients get it; paths of this machine stay here."""
+    """Return a lift as clients get it, without private paths."""
     path = f"/lifts/{lift.id}"
     links = {"self": path, "job": f"/jobs/{lift.id}", "features": f"{path}/features"}
     links |= {"views": f"{path}/views", "objects": f"{path}/objects", "tree": f"{path}/tree"}
@@ -356,7 +356,7 @@ def shape_lift(lift: LiftRecord) -> models.LiftResult:
 
 
 def shape_tradeoff(tradeoff: TradeoffRecord) -> models.Tradeoff:
-    """A trade-off as clients get it."""
+    """Return a trade-off as clients get it."""
     path = f"/tradeoffs/{tradeoff.id}"
     links = {"self": path, "job": f"/jobs/{tradeoff.id}", "chart": f"{path}/chart", "table": f"{path}/table"}
     names = ("id", "splats", "cameras", "features", "labels", "created")

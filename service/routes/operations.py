@@ -1,5 +1,4 @@
-"""How the service is: /healthz, /readyz, /version, /metrics; and what people and programs read of it: the page, the
-routes described, and their description."""
+"""Routes about the service itself (/healthz, /readyz, /version, /metrics), of the page and the API's documents."""
 
 from __future__ import annotations
 
@@ -25,9 +24,9 @@ from service.content import BINARY
 from service.state import CHECKS, Deps
 
 EXAMPLE = Path(__file__).parents[1] / "commands" / "tabletop"
-WEB = Path(__file__).parents[1] / "web" / "built"  # by `make web`
-SWAGGER = Path(str(files("fastapi_offline"))) / "static"  # shipped, as a robot's network may lead nowhere
-NO_PICTURE = "data:,"  # the page asks another host for one unless it is told
+WEB = Path(__file__).parents[1] / "web" / "built"  # built by `make web`
+SWAGGER = Path(str(files("fastapi_offline"))) / "static"  # shipped with the package: the machine may be offline
+NO_PICTURE = "data:,"  # else the page loads one from another host
 METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 METRICS: dict[int | str, dict[str, Any]] = {
     200: {"description": "The Prometheus text format", "content": {METRICS_TYPE: {"schema": {"type": "string"}}}}
@@ -35,7 +34,7 @@ METRICS: dict[int | str, dict[str, Any]] = {
 
 
 def _policy(scripts: str, styles: str, **sources: str) -> dict[str, str]:
-    """The header of a page that runs these scripts and no others, whatever comes to be in it."""
+    """Return the Content-Security-Policy of a page with these scripts, and no others."""
     rules = {
         "default-src": "'none'",
         "script-src": scripts,
@@ -49,24 +48,24 @@ def _policy(scripts: str, styles: str, **sources: str) -> dict[str, str]:
     return {"Content-Security-Policy": "; ".join(f"{name} {value}" for name, value in rules.items())}
 
 
-# The page asks this service, and sorts and unpacks splats, which is done by WebAssembly in workers.
+# The page calls this service, and sorts and unpacks splats in WebAssembly, in workers.
 PAGE_HEADERS = _policy("'self' 'wasm-unsafe-eval'", "'self'", worker_src="blob:", font_src="data:")
 PAGE_HEADERS |= {"Cache-Control": "no-cache"}
-IMMUTABLE = {"Cache-Control": "public, max-age=31536000, immutable"}  # the page asks for them by their digest
+IMMUTABLE = {"Cache-Control": "public, max-age=31536000, immutable"}  # their addresses contain their digest
 
 router = APIRouter(tags=["operations"])
 
 
-# These are async, and wait for no thread of the common pool: a sync route would queue behind every slow one.
+# Async, so that they need no thread: a sync route would queue behind every slow one.
 @router.get("/healthz", response_model=models.Health)
 async def healthz() -> models.Health:
-    """Whether the HTTP process answers."""
+    """Check that the HTTP process answers."""
     return models.Health(status="ok")
 
 
 @router.get("/readyz", response_model=models.Ready)
 async def readyz(deps: Deps) -> models.Ready:
-    """Whether the service can work: writes to its database, has disk to work with, and all its parts live. Else 503,
+    """Check that the service can work: its database is writable, the disk has space, and all parts live. Else 503,
     with the checks that failed; also while the service stops."""
     await deps.readiness.require()
     return models.Ready(status="ready", checks=list(CHECKS))
@@ -74,25 +73,25 @@ async def readyz(deps: Deps) -> models.Ready:
 
 @router.get("/version", response_model=models.Version)
 async def version(deps: Deps) -> models.Version:
-    """What runs here."""
+    """Get the versions of the service and its packages."""
     return deps.version
 
 
 @router.get("/metrics", response_class=Response, responses=METRICS)
 async def metrics(deps: Deps) -> Response:
-    """Counters and gauges for Prometheus."""
+    """Get counters and gauges for Prometheus."""
     text = await anyio.to_thread.run_sync(deps.metrics.text, limiter=deps.scrapes)
     return Response(text, headers={"Content-Type": METRICS_TYPE})
 
 
 @router.get("/", response_class=HTMLResponse, include_in_schema=False)
 def page() -> HTMLResponse:
-    """The page. It and its files need no key, before it can ask for one."""
+    """Get the page. It and its files need no key."""
     return HTMLResponse((WEB / "page.html").read_text(encoding="utf-8"), headers=PAGE_HEADERS)
 
 
 def with_summaries(document: dict[str, Any]) -> dict[str, Any]:
-    """An OpenAPI document whose operations have the first sentence of their description as their summary."""
+    """Return an OpenAPI document in which the first sentence of each description is the summary."""
     for operations in document["paths"].values():
         for operation in operations.values():
             summary, *rest = re.split(r"\.\s+", operation["description"].rstrip("."), maxsplit=1)
@@ -102,7 +101,7 @@ def with_summaries(document: dict[str, Any]) -> dict[str, Any]:
 
 
 class Documents:
-    """The routes as OpenAPI has them, without keys and with them: made once, as that takes half a second."""
+    """OpenAPI documents with and without keys: made once, as that takes half a second."""
 
     def __init__(self, app: FastAPI) -> None:
         self._app = app
@@ -110,7 +109,7 @@ class Documents:
         self._bodies: tuple[bytes, ...] = ()
 
     def get(self, *, keys: bool) -> bytes:
-        """The one of the two, as JSON."""
+        """Return one of the two as JSON."""
         with self._turn:
             if not self._bodies:
                 document = with_summaries(self._app.openapi())
@@ -120,14 +119,14 @@ class Documents:
 
 @router.get("/openapi.json", include_in_schema=False)
 def document(request: Request, deps: Deps) -> Response:
-    """The routes as OpenAPI has them, as things are now: with keys or without."""
+    """Get the OpenAPI document, with keys if the service needs them."""
     required = deps.store.keys.under(deps.settings.keys).required()
     return Response(request.app.state.documents.get(keys=required), media_type="application/json")
 
 
 @router.get("/docs", response_class=HTMLResponse, include_in_schema=False)
 def docs() -> HTMLResponse:
-    """The routes described for people: Swagger UI. Its addresses are relative: it works behind a proxy's prefix."""
+    """Get the API's documentation (Swagger UI). Its addresses are relative: it works behind a proxy's prefix."""
     page = get_swagger_ui_html(
         openapi_url="openapi.json",
         title="splatlift: routes",
@@ -139,14 +138,14 @@ def docs() -> HTMLResponse:
     inline = re.findall("<script>(.*?)</script>", html, re.DOTALL)
     digests = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in inline)
     scripts = " ".join(("'self'", *(f"'sha256-{digest}'" for digest in digests)))
-    policy = _policy(scripts, "'self' 'unsafe-inline'", form_action="'self'")  # it styles as it goes
+    policy = _policy(scripts, "'self' 'unsafe-inline'", form_action="'self'")  # Swagger UI sets styles while it runs
     return HTMLResponse(html, headers=policy)
 
 
 def _serve(
     path: str, content_of: Callable[[], bytes], media_type: str, headers: dict[str, str] | None = None
 ) -> None:
-    """Register a file that a page asks for, which is read at each request."""
+    """Register a file of the page, which is read at each request."""
 
     @router.get(path, include_in_schema=False)
     def content() -> Response:
@@ -154,7 +153,7 @@ def _serve(
 
 
 def _read_example(name: str) -> bytes:
-    """Read a file of the scene that ships, of which the page orders a lift, as of files that were brought."""
+    """Download a file of the example, with which the page orders a lift."""
     if (EXAMPLE / name).exists():
         return (EXAMPLE / name).read_bytes()
     return zstandard.ZstdDecompressor().decompress((EXAMPLE / f"{name}.zst").read_bytes())

@@ -1,1 +1,1 @@
-"""What the service remembers: SQLite for facts, files for bytes, all below one data directory."""
+"""The store: SQLite for records and files for bytes, all below one data directory."""

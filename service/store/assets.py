@@ -1,4 +1,4 @@
-"""Assets: uploaded files, known by the digest of their bytes."""
+"""Assets: uploaded files, identified by the digest of their bytes."""
 
 from __future__ import annotations
 
@@ -16,35 +16,35 @@ from service.errors import InUse
 from service.models import AssetKind, UploadKind
 from service.store.database import Database, Page, insert, page_of, record_of
 from service.store.files import DataDirectory, is_whole
-from service.store.owners import SEEN, SHOWN_ASSETS, Owner, require_quota
+from service.store.owners import OWNED, VISIBLE_ASSETS, Owner, require_quota
 
 
 @dataclass(frozen=True)
 class AssetRecord:
-    """An asset as the store knows it."""
+    """Record of an asset."""
 
     id: str  # sha256:...
     kind: AssetKind
     bytes: int
     path: Path
-    counts: dict[str, Any] = field(default_factory=dict)  # what its check found: splats, views, channels and so on
+    counts: dict[str, Any] = field(default_factory=dict)  # from its check: splats, views, channels and so on
     warnings: list[str] = field(default_factory=list)
     created: float = 0.0  # seconds since 1970
 
     @property
     def file_name(self) -> str:
-        """What its bytes are called where somebody saves them, and in lifts that are made of them."""
+        """File name for downloads, and for lifts that are made of the asset."""
         return f"{self.kind}-{self.id.removeprefix('sha256:')[:12]}{self.path.suffix}"
 
     @property
-    def whole(self) -> bool:
-        """Whether its bytes are here, all of them: somebody may have been at the data directory."""
+    def is_complete(self) -> bool:
+        """True if its file is complete: someone may have changed the data directory."""
         return is_whole(self.path, self.bytes)
 
 
 @dataclass(frozen=True)
 class CheckedUpload:
-    """A draft that is whole and valid, ready to become an asset."""
+    """A checked draft, ready to become an asset."""
 
     draft: Path
     kind: UploadKind
@@ -54,32 +54,32 @@ class CheckedUpload:
     warnings: list[str]
 
 
-# What several owners have is one file and one row; each has it since its own upload.
+# Several owners of the same bytes share one file and one row; each owner has it since its own upload.
 VISIBLE = (
     "SELECT assets.*, created FROM (SELECT asset, min(created) AS created"
-    f" FROM asset_owners WHERE {SEEN} GROUP BY asset) JOIN assets ON asset = id"
+    f" FROM asset_owners WHERE {OWNED} GROUP BY asset) JOIN assets ON asset = id"
 )
-ONE_ASSET = VISIBLE.replace(f"{SEEN} GROUP", f"{SHOWN_ASSETS} AND asset = :asset GROUP")
+ONE_ASSET = VISIBLE.replace(f"{OWNED} GROUP", f"{VISIBLE_ASSETS} AND asset = :asset GROUP")
 
 
-SHOWN_CHARACTERS = 256 << 10  # of counts; of more the names, or words, are told apart, in pages
+SHOWN_CHARACTERS = 256 << 10  # of counts; longer lists of names or words are given in pages
 ALL = sys.maxsize
 
 
 def _long(kind: UploadKind) -> str:
-    """Of counts: what there may be a hundred thousand of, and which has a table of its own."""
+    """Part of `counts` that may hold a hundred thousand names, and has a table of its own."""
     return "words" if kind is AssetKind.TABLE else "names"
 
 
 class AssetStore:
-    """Assets in the database, their bytes in blobs/. What an owner does not see is absent."""
+    """Assets in the database, with their bytes in blobs/. Assets of other owners count as absent."""
 
     def __init__(self, database: Database, files: DataDirectory) -> None:
         self._database = database
         self._files = files
 
     def add(self, owner: Owner, upload: CheckedUpload) -> tuple[AssetRecord, bool]:
-        """Keep a checked upload.
+        """Store a checked upload.
 
         Returns:
             The asset, and whether its owner did not have it before. That somebody else did, nobody learns: the bytes
@@ -97,12 +97,12 @@ class AssetStore:
                 require_quota(connection, owner, upload.draft.stat().st_size)
                 self._publish(connection, asset, upload)
                 add_owner(connection, asset, owner.key)
-            elif not self.get(owner, asset).whole:
+            elif not self.get(owner, asset).is_complete:
                 self._publish(connection, asset, upload)
         return self.get(owner, asset, limit=SHOWN_CHARACTERS), row is None
 
     def _publish(self, connection: sqlite3.Connection, asset: str, upload: CheckedUpload) -> None:
-        """The bytes and the row; both may be there, and then the bytes are replaced by equal ones."""
+        """Store the bytes and the row; if both are there, equal bytes replace the old ones."""
         row = connection.execute("SELECT file FROM assets WHERE id = ?", (asset,)).fetchone()
         path = self._files.blob(upload.sha256, upload.suffix) if row is None else self._files.root / row["file"]
         size, long = upload.draft.stat().st_size, _long(upload.kind)
@@ -123,7 +123,7 @@ class AssetStore:
         )
 
     def require_quota(self, owner: Owner, coming: int = 1) -> None:
-        """See that the owner may store more, before bytes are on their way.
+        """Require that the owner may store more, before bytes are sent.
 
         Raises:
             OverQuota: it may not.
@@ -132,8 +132,7 @@ class AssetStore:
             require_quota(connection, owner, coming)
 
     def find(self, owner: Owner, asset: str, *, limit: int = 0) -> AssetRecord | None:
-        """The asset of that id, None when there is none; its counts with names, or words, if they are of at most so
-        many characters."""
+        """Return the asset of that id, None if there is none; its counts have up to `limit` characters of names."""
         with self._database.read() as connection:
             row = connection.execute(ONE_ASSET, owner.terms(asset=asset)).fetchone()
             if row is None:
@@ -144,13 +143,13 @@ class AssetStore:
             return record
 
     def names(self, owner: Owner, asset: str, first: int, limit: int) -> list[str]:
-        """So many of the names, or words, that an asset holds, from the one of that number on."""
+        """Return names, or words, of an asset from that number on."""
         self.get(owner, asset)
         with self._database.read() as connection:
             return _names(connection, asset, first, limit)
 
     def get(self, owner: Owner, asset: str, kind: AssetKind | None = None, *, limit: int = 0) -> AssetRecord:
-        """The asset of that id, as `find` has it.
+        """Return the asset of that id, as `find` does.
 
         Raises:
             NotFound: there is none, or it is of another kind.
@@ -164,16 +163,16 @@ class AssetStore:
         return record
 
     def page(self, owner: Owner, limit: int, cursor: str | None = None) -> Page[AssetRecord]:
-        """So many assets after a cursor, newest first, without the names and words that they hold."""
+        """Return so many assets after a cursor, newest first, without their names and words."""
         with self._database.read() as connection:
             return page_of(connection, VISIBLE, owner.terms(), limit, cursor, self._record)
 
     def all(self, owner: Owner) -> list[AssetRecord]:
-        """Every asset, newest first, without the names and words that it holds."""
+        """Yield every asset, newest first, without its names and words."""
         return self.page(owner, sys.maxsize - 1).records
 
     def delete(self, owner: Owner, asset: str) -> None:
-        """Take an asset from its owner, or from everybody when it is an admin who asks. Its bytes go with the last.
+        """Remove an asset from its owner, or from all owners if an admin asks. The bytes go with the last owner.
 
         Raises:
             NotFound: there is none.
@@ -184,7 +183,7 @@ class AssetStore:
 
             def forget(connection: sqlite3.Connection) -> list[Path]:
                 users = connection.execute(
-                    f"SELECT id FROM jobs WHERE {SEEN} AND (splats = :asset OR cameras = :asset OR EXISTS"
+                    f"SELECT id FROM jobs WHERE {OWNED} AND (splats = :asset OR cameras = :asset OR EXISTS"
                     " (SELECT 1 FROM job_features WHERE job = id AND asset = :asset) OR EXISTS"
                     " (SELECT 1 FROM job_labels WHERE job = id AND asset = :asset) OR EXISTS"
                     " (SELECT 1 FROM lifts WHERE lifts.id = jobs.id AND photos = :asset)) LIMIT 4",
@@ -195,7 +194,7 @@ class AssetStore:
                         "asset", expected="an asset that no job and no lift refers to", got=asset,
                         hint=f"jobs that refer to it: {', '.join(row['id'] for row in users)}",
                     )  # fmt: skip
-                connection.execute(f"DELETE FROM asset_owners WHERE asset = :asset AND {SEEN}", terms)
+                connection.execute(f"DELETE FROM asset_owners WHERE asset = :asset AND {OWNED}", terms)
                 last = connection.execute(
                     "DELETE FROM assets WHERE id = :asset"
                     " AND NOT EXISTS (SELECT 1 FROM asset_owners WHERE asset = :asset) RETURNING id",
@@ -217,7 +216,7 @@ class AssetStore:
 
 
 def kernel_of(splats: AssetRecord, settings: Mapping[str, Any]) -> str:
-    """The kernel that a lift of those settings takes the splats for."""
+    """Return the kernel with which a lift of those settings interprets the splats."""
     kernel = settings.get("kernel", "auto")
     return splats.counts.get("kernel", "3dgs") if kernel == "auto" else kernel
 
@@ -230,5 +229,5 @@ def _names(connection: sqlite3.Connection, asset: str, first: int, limit: int) -
 
 
 def add_owner(connection: sqlite3.Connection, asset: str, owner: str) -> None:
-    """Within a write transaction: let an owner have an asset that is here."""
+    """Add an owner to an asset, within a write transaction."""
     insert(connection, "asset_owners", {"asset": asset, "owner": owner, "created": time.time()}, on_conflict="IGNORE")

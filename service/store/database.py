@@ -1,4 +1,4 @@
-"""The database: one connection that writes, a few that read; and the files that know a lost one from a new one."""
+"""The database: one connection for writes, a few for reads; and marker files that reveal a lost database."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ from service.errors import InvalidRequest, Misconfigured, StaleDatabase
 from service.store.files import remove, sync_directory
 
 VERSION = 15  # SQLite's user_version
-OF_0_4 = 13  # that of release 0.4, which takes databases of any version before to it
+OF_0_4 = 13  # of release 0.4; migrations start there
 MIGRATING_RELEASE = "0.4.0"
 TABLES_OF_0_4, SINCE_0_4 = (
     Path(__file__).with_name(f"{name}.sql").read_text(encoding="utf-8") for name in ("schema_of_0_4", "since_0_4")
 )
-# By the version of a database, what it lacks; a new one has version 0. No release had version 14.
+# Migrations by the version of the database; a new one has version 0. No release had version 14.
 STEPS = {0: TABLES_OF_0_4 + SINCE_0_4, OF_0_4: SINCE_0_4}
-DATABASE = "service.sqlite"  # in the data directory, beside two files that know an empty or older one from it:
-GENERATION = "generation"  # the number that the newest counted transaction had
-KEYS_REQUIRED = "keys.required"  # there when a key was ever made
-RESERVE = "reserve"  # room for the transaction of a deletion on a full disk
+DATABASE = "service.sqlite"  # in the data directory; the two files below reveal an empty or older database
+GENERATION = "generation"  # number of the newest counted transaction
+KEYS_REQUIRED = "keys.required"  # exists once a key was ever made
+RESERVE = "reserve"  # space for deletions on a full disk
 RESERVE_BYTES = 1 << 20
-BUSY_SECONDS = 10.0  # that a write waits for others, of this process and of others, and a read for other reads
-LOOK_SECONDS = 0.3  # that a look at the pages may take: of two hundred megabytes or so
-LOOK_STEPS = 1000  # of SQLite's machine, between two looks at the clock
-READERS = 4  # at once: more threads in SQLite and with what it gave only keep the event loop from its turn
-CURSOR = r"^[0-9]{1,20}(\.[0-9]{1,20})?(e[+-]?[0-9]{1,2})?~[0-9a-z:]{1,80}$"  # of a page's last one: when, and its id
+BUSY_SECONDS = 10.0  # that a write waits for other writes, of any process, and a read for other reads
+LOOK_SECONDS = 0.3  # for a check of the pages: enough for about 200 MB
+LOOK_STEPS = 1000  # of SQLite's virtual machine, between two checks of the time
+READERS = 4  # at once: more threads would only compete with the event loop
+CURSOR = r"^[0-9]{1,20}(\.[0-9]{1,20})?(e[+-]?[0-9]{1,2})?~[0-9a-z:]{1,80}$"  # time and id of a page's last record
 
 R = TypeVar("R")
 log = logging.getLogger(__name__)
 
 
 class Database:
-    """SQLite in WAL mode: an acknowledged write is on the disk (as far as the disk tells the truth).
+    """SQLite in WAL mode: a committed write is on the disk, if the disk reports the truth.
 
     Args:
         path: the file; made when it is not there.
@@ -57,15 +57,15 @@ class Database:
 
     def __init__(self, path: Path, *, rebuilding: bool = False) -> None:
         self._path = path
-        self._rebuilding = rebuilding  # until `catch_up`, and so long nothing counts
-        # Looked at before the database is: a server that runs may count on meanwhile, there first.
+        self._rebuilding = rebuilding  # no transaction counts until `catch_up`
+        # Read before the database: a running server may count further meanwhile.
         least = None if rebuilding else expected_generation(path.parent)
         if least is not None:
             require_database(path)
         self._write_lock = threading.Lock()
         self._readers: queue.LifoQueue[sqlite3.Connection | None] = queue.LifoQueue()
         for _ in range(READERS):
-            self._readers.put(None)  # opened by the first who needs it
+            self._readers.put(None)  # opened by the first reader
         self._writer = self._connect("rwc")
         self._identity = _identity(path)
         try:
@@ -75,7 +75,7 @@ class Database:
             raise
 
     def _connect(self, mode: str = "rw") -> sqlite3.Connection:
-        """A connection; only the first one may make the file: a later one would hide that it is gone."""
+        """Return a connection; only the first may create the file: later ones would hide that it is lost."""
         connection = sqlite3.connect(
             f"{self._path.absolute().as_uri()}?mode={mode}", uri=True,
             isolation_level=None, check_same_thread=False, timeout=BUSY_SECONDS,
@@ -87,7 +87,7 @@ class Database:
         return connection
 
     def _require_schema(self, least: int | None) -> None:
-        """See that the schema is this release's, and make it in an empty database."""
+        """Require the schema of this release; create it in an empty database."""
         with self.write() as connection:
             version = connection.execute("PRAGMA user_version").fetchone()[0]
             if version == 0 and least is not None:
@@ -111,7 +111,7 @@ class Database:
 
     @contextmanager
     def write(self, *, is_counted: bool = False) -> Iterator[sqlite3.Connection]:
-        """One write transaction: committed when the block ends, rolled back when it raises.
+        """Run one write transaction: committed at the end of the block, rolled back after an exception.
 
         Args:
             counted: a start must not go on without what it writes, so the data directory remembers its generation.
@@ -131,17 +131,17 @@ class Database:
                 yield self._writer
                 self._writer.execute("COMMIT")
             except BaseException:
-                if self._writer.in_transaction:  # on a full disk SQLite has rolled back by itself
+                if self._writer.in_transaction:  # on a full disk SQLite rolls back by itself
                     self._writer.execute("ROLLBACK")
                 raise
-            self.require_same_file()  # what is committed to a file that is gone is not kept
+            self.require_same_file()  # a commit to a removed file would be lost
             if generation is not None:
                 self._remember(generation)
         finally:
             self._write_lock.release()
 
     def write_freeing(self, work: Callable[[sqlite3.Connection], Iterable[Path]]) -> None:
-        """A counted write transaction that makes room: on a full disk the reserve is given up for it.
+        """Run a counted write transaction that frees space: on a full disk the reserve is given up for it.
 
         Args:
             work: deletes rows, and returns the files and folders that go after the commit. A crash between leaves
@@ -161,31 +161,31 @@ class Database:
         self.keep_reserve()
 
     def keep_reserve(self) -> None:
-        """See that there is a reserve, if the disk has room for it."""
+        """Create the reserve, if the disk has space for it."""
         path = self._path.parent / RESERVE
         if path.exists():
             return
         try:
             with whole_file(path) as handle:
-                handle.write(os.urandom(RESERVE_BYTES))  # which no file system stores in less
+                handle.write(os.urandom(RESERVE_BYTES))  # random bytes, which no file system compresses
         except OSError as error:
             log.warning("there is no room for %s, from which deletions on a full disk live: %s", path, error)
 
     def require_same_file(self) -> None:
-        """See that the database is the file that was opened: what is written to another one would be lost.
+        """Require that the database is the file that was opened: writes to another file would be lost.
 
         Raises:
             sqlite3.OperationalError: it is gone, or another.
         """
         try:
             is_same = _identity(self._path) == self._identity
-        except OSError as error:  # a disk that tells nothing tells of no other file
+        except OSError as error:  # an error of the disk does not prove another file
             is_same = not isinstance(error, FileNotFoundError)
         if not is_same:
             raise _error("another file, or none, is in the place of the database", "SQLITE_READONLY_DBMOVED")
 
     def _require_readable(self, seconds: float = 0.0) -> None:
-        """See that who comes anew finds a database, which an open connection does not notice.
+        """Require that a new connection would find a database, which an open connection does not notice.
 
         Args:
             seconds: how long its pages are looked through; 0 = not at all.
@@ -209,7 +209,7 @@ class Database:
         return self._writer.execute("UPDATE generation SET number = number + 1 RETURNING number").fetchone()[0]
 
     def _remember(self, generation: int) -> None:
-        """After the commit, which stands whatever happens here: a marker that lags only knows less of the past."""
+        """Update the marker after the commit, which stands in any case: an old marker only reveals less."""
         try:
             remember_generation(self._path.parent, generation)
         except (OSError, Misconfigured) as error:
@@ -217,7 +217,7 @@ class Database:
 
     @contextmanager
     def read(self) -> Iterator[sqlite3.Connection]:
-        """A connection to read with; readers never wait for the writer. A thread must not hold two.
+        """Yield a connection for reads; readers never wait for the writer. A thread must not hold two.
 
         Raises:
             sqlite3.OperationalError: others read for too long, or the file is no longer the one that was opened.
@@ -227,24 +227,24 @@ class Database:
         except queue.Empty:
             raise _error("others read it", "SQLITE_BUSY") from None
         try:
-            self.require_same_file()  # else the collector would find that no file belongs to anything
+            self.require_same_file()  # else garbage collection would find every file unreferenced
             connection = connection or self._connect()
             yield connection
         except sqlite3.Error:
-            self.require_same_file()  # what another file has to say is no news
+            self.require_same_file()  # results of another file do not count
             raise
         finally:
             self._readers.put(connection)
 
     def catch_up(self) -> None:
-        """Say that this is the newest database of its directory: what was lost of it was made again."""
+        """Declare this the newest database of its directory, after its records were rebuilt."""
         self._rebuilding = False
         with self.write(is_counted=True) as connection:
             expected = expected_generation(self._path.parent)
             connection.execute("UPDATE generation SET number = max(number, ?)", (expected or 0,))
 
     def prove_usable(self) -> None:
-        """See that the file is the one that was opened, can be read by who comes anew, and takes a write.
+        """Require that the file is the one that was opened, and that new connections can read and write it.
 
         Raises:
             sqlite3.Error, OSError: it is not so.
@@ -265,7 +265,7 @@ class Database:
 
 
 def expected_generation(data: Path) -> int | None:
-    """The least generation that the database of a data directory has; None when a new one does no harm.
+    """Return the least generation that the database of a data directory must have; None if a new one does no harm.
 
     Raises:
         Misconfigured: the marker is there and holds no number.
@@ -277,18 +277,18 @@ def expected_generation(data: Path) -> int | None:
 
 
 def remember_generation(data: Path, number: int) -> None:
-    """Keep the number of a transaction that is on the disk; a larger one, of another process, stays."""
+    """Store the number of a transaction that is on the disk; a larger one, of another process, stays."""
     if (_marker_version(data) or 0) < number:
         _write(data / GENERATION, f"{number}\n")
 
 
 def keys_were_made(data: Path) -> bool:
-    """Whether there ever was a key."""
+    """Return True if there was ever a key."""
     return (data / KEYS_REQUIRED).exists()
 
 
 def remember_keys(data: Path) -> None:
-    """Keep that there is a key."""
+    """Record that there is a key."""
     if not keys_were_made(data):
         _write(data / KEYS_REQUIRED, "A key was made for this data directory: without one nobody is let in.\n")
 
@@ -313,13 +313,13 @@ def _write(path: Path, text: str) -> None:
 
 
 def copy_database(source: Path, target: Path) -> None:
-    """Copy a database as it was last committed, whole or not at all, beside those who read and write it."""
+    """Copy a database as of its last commit, whole or not at all, while others use it."""
     draft = target.with_name(f".{target.name}.part")
     draft.unlink(missing_ok=True)
     try:
         with closing(open_to_read(source)) as original, closing(sqlite3.connect(draft)) as copy:
             original.backup(copy)
-            copy.execute("PRAGMA journal_mode = DELETE")  # so that it is one file
+            copy.execute("PRAGMA journal_mode = DELETE")  # to have one file
         with draft.open("rb") as handle:
             os.fsync(handle.fileno())
         draft.replace(target)
@@ -329,7 +329,7 @@ def copy_database(source: Path, target: Path) -> None:
 
 
 def require_database(path: Path) -> None:
-    """See that there is a database, or nothing that one belongs to; it is not opened.
+    """Require that there is a database, or nothing that one belongs to; it is not opened.
 
     Raises:
         StaleDatabase: it is gone.
@@ -339,7 +339,7 @@ def require_database(path: Path) -> None:
 
 
 def _error(message: str, name: str) -> sqlite3.OperationalError:
-    """What SQLite would say, said of what it does not see."""
+    """Return the error that SQLite would give for what it cannot see."""
     error = sqlite3.OperationalError(message)
     error.sqlite_errorcode, error.sqlite_errorname = getattr(sqlite3, name), name
     return error
@@ -351,12 +351,12 @@ def _identity(path: Path) -> tuple[int, int]:
 
 
 def open_to_read(path: Path) -> sqlite3.Connection:
-    """A connection to a database that somebody else may hold; nothing is made or changed."""
+    """Return a connection to a database that another process may hold; it creates and changes nothing."""
     return sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
 
 
 def unusable(path: Path, error: sqlite3.Error) -> Misconfigured:
-    """What to say of a file that SQLite does not work with: it is none of its files, or now is not the time."""
+    """Return the error for a file that SQLite cannot use: not a database, or locked."""
     if isinstance(error, sqlite3.OperationalError):
         hint = "see that the disk has room, that the file may be written and that nothing else holds it"
     else:
@@ -373,26 +373,26 @@ def insert(
         connection: of the transaction.
         table: that gets it.
         values: by column.
-        known: what to do with a row that is there already: ``ABORT`` or ``IGNORE``.
+        on_conflict: what to do with a row that is there already: ``ABORT`` or ``IGNORE``.
     """
     columns, places = ", ".join(values), ", ".join("?" * len(values))
     connection.execute(f"INSERT OR {on_conflict} INTO {table} ({columns}) VALUES ({places})", list(values.values()))
 
 
-def record_of(kind: type[R], row: sqlite3.Row, /, **made: Any) -> R:
-    """A row as a dataclass: its fields are columns of their names, or what was made of them."""
+def record_of(kind: type[R], row: sqlite3.Row, /, **values: Any) -> R:
+    """Return a row as a dataclass, whose fields are columns, or are given."""
     names = [field.name for field in fields(cast("Any", kind))]
-    return kind(**{name: made[name] if name in made else row[name] for name in names})
+    return kind(**{name: values[name] if name in values else row[name] for name in names})
 
 
 def parsed(text: str | None) -> Any:
-    """The JSON of a column that may be empty."""
+    """Return the parsed JSON of a column that may be NULL."""
     return None if text is None else json.loads(text)
 
 
 @dataclass(frozen=True)
 class Page(Generic[R]):
-    """Some records of a list, newest first, and where the next page begins; None when there is none."""
+    """Some records of a list, newest first, with the cursor of the next page; None after the last one."""
 
     records: list[R]
     cursor: str | None
@@ -406,7 +406,7 @@ def page_of(
     cursor: str | None,
     record: Callable[[sqlite3.Row], R],
 ) -> Page[R]:
-    """So many records after a cursor, newest first.
+    """Return so many records after a cursor, newest first.
 
     Args:
         connection: to read with.

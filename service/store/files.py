@@ -1,4 +1,4 @@
-"""The files of the service: drafts that nobody sees, and blobs and lifts that are whole."""
+"""The files of the service: private drafts, and complete blobs and lifts."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from typing import TextIO
 from liftcore.errors import NotFound
 from service.errors import Misconfigured, NoSpace
 
-LOCK_SECONDS = 0.5  # for another process to let go of the directory
+LOCK_SECONDS = 0.5  # that another process may take to release the directory
 FOLDERS = ("blobs", "lifts", "work")
-QUARANTINE_TIME = "%Y%m%dT%H%M%SZ"  # how a folder of the quarantine tells since when it is there
+QUARANTINE_TIME = "%Y%m%dT%H%M%SZ"  # the name of a folder in the quarantine: its time
 
 
 class DataDirectory:
-    """One directory, held by one server at a time.
+    """One data directory, held by one server at a time.
 
     ``blobs/ab/abcd....ply`` are assets by digest, ``lifts/ID.safetensors`` lifts by job, ``lifts/ID.json`` what was
     changed of one since, ``work/ID/`` what a job that was interrupted goes on from, ``tmp/`` drafts,
@@ -38,11 +38,11 @@ class DataDirectory:
     """
 
     def __init__(self, root: Path, *, floor_bytes: int = 0) -> None:
-        self.root = root.resolve()  # a path in an error is the one that was opened
+        self.root = root.resolve()  # resolved once, as it stands in errors
         self._floor = floor_bytes
-        # Held while a blob appears or goes, so that no delete removes the bytes of a new upload.
+        # Held while a blob is added or removed, so that no deletion removes the bytes of a new upload.
         self.blobs_changing = threading.Lock()
-        self._live: set[str] = set()  # names below tmp/ that are in use; adding and removing one is atomic
+        self._live: set[str] = set()  # names below tmp/ in use; adding and removing one is atomic
         keep_private(self.root)
         self.make_folders()
         self._lock = (self.root / "lock").open("w")
@@ -52,18 +52,18 @@ class DataDirectory:
                 "data", expected="a directory that no other server uses", got=str(root),
                 hint="stop the other server or name another directory with --data",
             )  # fmt: skip
-        # Nothing below tmp/ was ever acknowledged, and the server that wrote it is gone.
+        # Files below tmp/ were never acknowledged, and the server that wrote them has ended.
         shutil.rmtree(self.root / "tmp")
         (self.root / "tmp").mkdir()
 
     def make_folders(self) -> None:
-        """Make the folders of files and drafts that are missing: somebody may tidy up while the server runs."""
+        """Create the folders that are missing: someone may tidy up while the server runs."""
         for name in (*FOLDERS, "tmp"):
             (self.root / name).mkdir(exist_ok=True)
 
     @contextmanager
     def draft(self, suffix: str) -> Iterator[Path]:
-        """A path to write to; what is still there when the block ends is removed."""
+        """Yield a path to write to; a file that is still there after the block is removed."""
         self.make_folders()
         path = self.root / "tmp" / f"{secrets.token_hex(16)}{suffix}"
         self._live.add(path.name)
@@ -71,12 +71,12 @@ class DataDirectory:
             yield path
         finally:
             self._live.discard(path.name)
-            for remnant in path.parent.glob(f"*{path.name}*"):  # with the drafts that writers keep beside it
+            for remnant in path.parent.glob(f"*{path.name}*"):  # and the drafts that writers keep beside it
                 remnant.unlink(missing_ok=True)
 
     @contextmanager
     def scratch(self) -> Iterator[Path]:
-        """A folder for what a child process unpacks; nothing of it is left, however the child ends."""
+        """Yield a folder for a child process; it is removed with its content, however the child ends."""
         self.make_folders()
         folder = self.root / "tmp" / secrets.token_hex(16)
         self._live.add(folder.name)
@@ -88,21 +88,21 @@ class DataDirectory:
             shutil.rmtree(folder, ignore_errors=True)
 
     def left_over(self) -> list[Path]:
-        """What lies below tmp/ and belongs to no draft and no scratch folder that is still open."""
+        """Return the paths below tmp/ that belong to no open draft or scratch folder."""
         live = set(self._live)
         return [path for path in (self.root / "tmp").iterdir() if not any(name in path.name for name in live)]
 
     @property
     def floor_bytes(self) -> int:
-        """Free disk that new work must leave."""
+        """Return the free disk space that new work must leave."""
         return self._floor
 
     def free_bytes(self) -> int:
-        """Free disk that is ours to use."""
+        """Return the free disk space that may be used."""
         return shutil.disk_usage(self.root).free
 
     def require_room(self, coming: int = 0) -> None:
-        """See that there is room for new work.
+        """Require space for new work.
 
         Args:
             coming: bytes that are known to come.
@@ -118,7 +118,7 @@ class DataDirectory:
             )  # fmt: skip
 
     def work(self, job: str) -> Path:
-        """The folder of what a job has done so far; its child makes it."""
+        """Return the folder for a job's checkpoint; its child creates it."""
         return self.root / "work" / job
 
     def forget_work(self, job: str) -> None:
@@ -126,28 +126,28 @@ class DataDirectory:
         remove(self.work(job))
 
     def blob(self, digest: str, suffix: str) -> Path:
-        """Where an asset of that digest lies."""
+        """Return the path of the asset with that digest."""
         return self.root / "blobs" / digest[:2] / f"{digest}{suffix}"
 
     def lift(self, job: str) -> Path:
-        """Where the lift of a job lies."""
+        """Return the path of a job's lift."""
         return self.root / "lifts" / f"{job}.safetensors"
 
     def lift_changes(self, job: str) -> Path:
-        """The path of a lift's changes, if there are any."""
+        """Return the path of a lift's changes, if there are any."""
         return self.lift(job).with_suffix(".json")
 
     def relative(self, path: Path) -> str:
-        """The path as the database keeps it."""
+        """Return the path as the database stores it."""
         return str(path.relative_to(self.root))
 
     def quarantine(self, paths: Iterable[Path]) -> list[Path]:
-        """Move files and folders away from where they are seen, to be removed after a time or moved back.
+        """Move files and folders to quarantine, to be removed after a time or moved back.
 
         Returns:
             What was moved, where it was.
         """
-        # A folder for each time that something is moved, so that nothing replaces what is there.
+        # A folder for each call, so that nothing is replaced.
         now = datetime.now(UTC).strftime(QUARANTINE_TIME)
         folder = self.root / "quarantine" / f"{now}-{secrets.token_hex(4)}"
         sources = []
@@ -156,13 +156,13 @@ class DataDirectory:
             target.parent.mkdir(parents=True, exist_ok=True)
             try:
                 path.rename(target)
-            except FileNotFoundError:  # its owner was quicker
+            except FileNotFoundError:  # its owner removed it
                 continue
             sources.append(path)
         return sources
 
     def quarantined(self) -> list[tuple[Path, float]]:
-        """The folders of the quarantine, and since when each is there; those with other names are nobody's."""
+        """Return the folders of the quarantine with their times; folders with other names are ignored."""
         folders = []
         for folder in (self.root / "quarantine").glob("*-*"):
             try:
@@ -173,14 +173,14 @@ class DataDirectory:
         return folders
 
     def begin_anew(self, database: str, marker: str) -> None:
-        """Move all that is here to quarantine, with the database and what is remembered of its generation."""
+        """Move all files to quarantine, with the database and its markers."""
         names = (*FOLDERS, *(f"{database}{part}" for part in ("", "-wal", "-shm")))
-        # The marker last: as long as it is here, a start that was cut off is refused and not half done.
+        # The marker last: while it is here, an interrupted call cannot leave half a directory in use.
         self.quarantine(path for name in (*names, marker) if (path := self.root / name).exists())
         self.make_folders()
 
     def publish(self, draft: Path, path: Path) -> None:
-        """Make a draft the file at ``path``: on the disk first, then there at once or not at all.
+        """Move a draft to ``path``: first to the disk, then atomically.
 
         A file that is its own draft is there.
         """
@@ -194,21 +194,21 @@ class DataDirectory:
             sync_directory(directory)
 
     def close(self) -> None:
-        """Let another server have the directory."""
+        """Release the directory to other servers."""
         self._lock.close()
 
 
 def keep_private(root: Path) -> None:
-    """Make a data directory, if need be, and keep it from other users: what is made in it from now on, too."""
-    os.umask(0o077)  # of this process and of its children, which work in nothing else
+    """Create a data directory if needed, and protect it and all future files from other users."""
+    os.umask(0o077)  # of this process and its children, which work in nothing else
     root.mkdir(parents=True, exist_ok=True)
     root.chmod(0o700)
-    for path in root.glob("*.sqlite*"):  # of a release that left them open
+    for path in root.glob("*.sqlite*"):  # of a release that left them readable
         path.chmod(0o600)
 
 
 def remove(path: Path) -> None:
-    """Remove a file, or a folder with all that is in it; what cannot go now is garbage for the collector."""
+    """Remove a file, or a folder with its content; garbage collection removes what cannot be removed now."""
     try:
         path.unlink()
     except OSError:
@@ -216,13 +216,13 @@ def remove(path: Path) -> None:
 
 
 def sha256_of(path: Path) -> str:
-    """The digest of a file's bytes, in hex."""
+    """Return the sha256 of a file's bytes, in hex."""
     with path.open("rb") as handle:
         return hashlib.file_digest(handle, "sha256").hexdigest()
 
 
 def is_whole(path: Path, size: int) -> bool:
-    """Whether a regular file still has the bytes that it was stored with; a pipe in its place would be waited for."""
+    """Return True if a regular file still has its stored size; a pipe in its place would block."""
     try:
         require_whole(path, size)
     except NotFound:
@@ -231,7 +231,7 @@ def is_whole(path: Path, size: int) -> bool:
 
 
 def require_whole(path: Path, size: int) -> os.stat_result:
-    """What the system says of such a file.
+    """Return the system's error for such a file.
 
     Raises:
         NotFound: it is not there, or no longer what was stored.
@@ -248,7 +248,7 @@ def require_whole(path: Path, size: int) -> os.stat_result:
 
 
 def _locked(lock: TextIO) -> bool:
-    """Take the lock; whoever only looks whether a server holds it has it for a moment too."""
+    """Take the lock; a process that only checks for a server holds it for a moment too."""
     deadline = time.monotonic() + LOCK_SECONDS
     while True:
         try:
@@ -262,7 +262,7 @@ def _locked(lock: TextIO) -> bool:
 
 
 def sync_directory(path: Path) -> None:
-    """See that what was renamed in a directory is on the disk."""
+    """Flush a directory, so that a renamed file is on the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -1,4 +1,4 @@
-"""Jobs: what was acknowledged, what became of it, and what happened on the way.
+"""Jobs: acknowledged orders, their states, and their events.
 
 An attempt at a job is a claim with a number. Every note of it names its number, and changes nothing once the job has
 moved on: an attempt that was given up, however alive its process still is, can end nothing and publish nothing.
@@ -25,40 +25,48 @@ from service.models import ENDED, AssetKind, JobKind, JobState
 from service.store.assets import add_owner
 from service.store.database import Database, Page, insert, page_of, parsed, record_of
 from service.store.files import DataDirectory
-from service.store.owners import ENDED_KEYS, QUEUE_RETRY_SECONDS, SEEN, SHOWN_JOBS, Owner, require_quota, require_turn
+from service.store.owners import (
+    INVALID_KEYS,
+    OWNED,
+    QUEUE_RETRY_SECONDS,
+    VISIBLE_JOBS,
+    Owner,
+    require_quota,
+    require_turn,
+)
 
-LOG_LINES = 200  # a job; older ones go
+LOG_LINES = 200  # a job; older ones are deleted
 LINE_CHARACTERS = 500
-FORGOTTEN_AT_ONCE = 500  # jobs a transaction: others write, too
-MAX_ATTEMPTS = 3  # that give no answer, and that the job itself is to blame for
-# An attempt may act while this holds; ids and numbers are bound by name.
+FORGOTTEN_AT_ONCE = 500  # jobs a transaction, so that others can write
+MAX_ATTEMPTS = 3  # without an answer that count against the job
+# Condition under which an attempt may act; ids and numbers are bound by name.
 OWNS = "id = :job AND attempt = :attempt AND state IN ('running', 'canceling')"
-RESULTS = {JobKind.LIFT: "lifts", JobKind.TRADEOFF: "tradeoffs"}  # the tables of what jobs make, by their ids
+RESULTS = {JobKind.LIFT: "lifts", JobKind.TRADEOFF: "tradeoffs"}  # tables of results, by kind of job
 
 
 @dataclass(frozen=True)
 class JobOrder:
-    """What a client wants to have done."""
+    """Order of a client."""
 
     splats: str
     cameras: str
     features: tuple[str, ...]
-    settings: dict[str, Any] = field(default_factory=dict)  # all of them, with defaults filled in
+    settings: dict[str, Any] = field(default_factory=dict)  # complete, with defaults
     key: str | None = None  # Idempotency-Key
-    fingerprint: str | None = None  # of the order as it was sent, with a key
+    fingerprint: str | None = None  # of the order as it was sent, if it has a key
     request_id: str | None = None  # of the request that brings it
     kind: JobKind = JobKind.LIFT
-    parameters: dict[str, Any] = field(default_factory=dict)  # what its kind takes beside settings
+    parameters: dict[str, Any] = field(default_factory=dict)  # of its kind, beside settings
 
     def assets(self) -> list[tuple[str, AssetKind]]:
-        """What it needs: ids, and the kind that each must be."""
+        """Return the ids that it needs, with the kind that each must have."""
         inputs = [(self.splats, AssetKind.SPLATS), (self.cameras, AssetKind.CAMERAS)]
         return [*inputs, *((asset, AssetKind.FEATURES) for asset in self.features), *labels_of(self.parameters)]
 
 
 @dataclass(frozen=True)
 class JobRecord:
-    """A job as the store knows it."""
+    """Record of a job."""
 
     id: str
     state: JobState
@@ -79,7 +87,7 @@ class JobRecord:
 
 
 class EventKind(StrEnum):
-    """What an event tells of."""
+    """Kind of an event."""
 
     STATE = "state"
     PLAN = "plan"
@@ -89,7 +97,7 @@ class EventKind(StrEnum):
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened to a job."""
+    """Event of a job."""
 
     number: int  # ascending in a job
     kind: EventKind
@@ -97,7 +105,7 @@ class Event:
 
 
 def labels_of(parameters: Mapping[str, Any]) -> list[tuple[str, AssetKind]]:
-    """The assets that a job's parameters name, with their kinds: what a trade-off is judged by, or a lift's words."""
+    """Return the assets in a job's parameters, with their kinds: the labels of a trade-off, or a lift's words."""
     labels = parameters.get("labels")
     if labels is not None:
         return [(labels[str(kind)], kind) for kind in (AssetKind.MASKS, AssetKind.TABLE)]
@@ -105,12 +113,12 @@ def labels_of(parameters: Mapping[str, Any]) -> list[tuple[str, AssetKind]]:
 
 
 def fingerprint(order: dict[str, Any]) -> str:
-    """The digest of an order, by which a repeated one is known."""
+    """Return the digest of an order, which identifies a repeated one."""
     return hashlib.sha256(json.dumps(order, sort_keys=True).encode()).hexdigest()
 
 
 class JobStore:
-    """The line of jobs and their history. What an owner does not see is absent; attempts serve all owners alike."""
+    """The queue of jobs and their history. Jobs of other owners count as absent; attempts serve all owners alike."""
 
     def __init__(self, database: Database, files: DataDirectory) -> None:
         self._database = database
@@ -118,7 +126,7 @@ class JobStore:
         self._claims: list[str] = []  # owners of claimed jobs, each once, the latest last
 
     def submit(self, owner: Owner, order: JobOrder, *, max_queued: int = 1_000_000) -> tuple[str, bool]:
-        """Put a job in line; it is on the disk when this returns.
+        """Queue a job; it is on the disk when this returns.
 
         Returns:
             The id, and whether the job is new: an order with the key of an earlier one is that one.
@@ -164,8 +172,8 @@ class JobStore:
             note(connection, job, EventKind.STATE, {"state": JobState.QUEUED, "attempt": 0, "problem": None})
         return job, True
 
-    def repeated(self, owner: Owner, order: JobOrder) -> str | None:
-        """The job that an earlier order of this owner with this Idempotency-Key made, None when there is none.
+    def find_repeated(self, owner: Owner, order: JobOrder) -> str | None:
+        """Return the job of an earlier order of this owner with this Idempotency-Key; None if there is none.
 
         Raises:
             KeyReused: the key came with another order before.
@@ -174,7 +182,7 @@ class JobStore:
             return _of_key(connection, order, owner)
 
     def get(self, owner: Owner, job: str) -> JobRecord:
-        """The job of that id.
+        """Return the job of that id.
 
         Raises:
             NotFound: there is none.
@@ -183,29 +191,29 @@ class JobStore:
             return record(connection, row_of(connection, job, owner))
 
     def count_by_state(self) -> dict[JobState, int]:
-        """How many jobs there are in each state that has any."""
+        """Return the number of jobs in each state that has any."""
         with self._database.read() as connection:
             rows = connection.execute("SELECT state, count(*) FROM jobs GROUP BY state").fetchall()
         return {JobState(state): count for state, count in rows}
 
     def page(self, owner: Owner, limit: int, cursor: str | None = None) -> Page[JobRecord]:
-        """So many jobs after a cursor, newest first."""
+        """Return so many jobs after a cursor, newest first."""
         with self._database.read() as connection:
-            select = f"SELECT * FROM jobs WHERE {SEEN}"
+            select = f"SELECT * FROM jobs WHERE {OWNED}"
             return page_of(connection, select, owner.terms(), limit, cursor, lambda row: record(connection, row))
 
     def all(self, owner: Owner) -> list[JobRecord]:
-        """Every job, newest first."""
+        """Yield every job, newest first."""
         return self.page(owner, sys.maxsize - 1).records
 
     def state(self, owner: Owner, job: str) -> JobState | None:
-        """Where a job is; None when there is none."""
+        """Return the state of a job; None if there is none."""
         with self._database.read() as connection:
             row = find(connection, job, owner)
         return None if row is None else JobState(row["state"])
 
     def cancel(self, owner: Owner, job: str) -> bool:
-        """Ask for the end of a job. One in line is canceled at once; a running one when its processes are gone.
+        """Cancel a job. A queued one is canceled at once, a running one when its processes have ended.
 
         Returns:
             Whether something changed; a job that is canceled, or is being, may be canceled again.
@@ -225,14 +233,14 @@ class JobStore:
             return True
 
     def events(self, owner: Owner, job: str, number: int) -> list[Event]:
-        """The events of a job beyond a number, in order.
+        """Return the events of a job after a number, in order.
 
         Raises:
             NotFound: there is no such job, or the key that follows it is no longer valid.
         """
         with self._database.read() as connection:
             visible = connection.execute(
-                f"SELECT 1 FROM jobs WHERE id = :job AND {SEEN} AND :owner NOT IN ({ENDED_KEYS})",
+                f"SELECT 1 FROM jobs WHERE id = :job AND {OWNED} AND :owner NOT IN ({INVALID_KEYS})",
                 owner.terms(job=job, now=time.time()),
             )
             if visible.fetchone() is None:
@@ -244,7 +252,7 @@ class JobStore:
         return [Event(row["number"], EventKind(row["kind"]), json.loads(row["data"])) for row in rows]
 
     def delete(self, owner: Owner, job: str, *, given_up: Collection[JobKind] = ()) -> None:
-        """Forget a job that has ended, its events and its result.
+        """Delete a job that has ended, with its events and its result.
 
         Args:
             job: its id.
@@ -275,7 +283,7 @@ class JobStore:
         self._database.write_freeing(forget)
 
     def forget_ended(self, before: float, limit: int) -> int:
-        """Forget jobs that have ended without a result, or whose result was deleted; lifts and trade-offs stay.
+        """Delete jobs that have ended without a result, or whose result was deleted; lifts and trade-offs stay.
 
         Args:
             before: seconds since 1970; those that ended earlier go.
@@ -306,7 +314,7 @@ class JobStore:
                 return count
 
     def claim(self) -> JobRecord | None:
-        """Take a queued job and make it running, as a new attempt.
+        """Claim a queued job: start a new attempt.
 
         Owners take turns: it is the oldest job of the one that has the fewest running, and of these of the one whose
         last turn is longest ago.
@@ -334,15 +342,15 @@ class JobStore:
         return job
 
     def advance(self, job: str, attempt: int, progress: Mapping[str, Any]) -> None:
-        """Note how far an attempt is."""
+        """Record the progress of an attempt."""
         self._note_latest(job, attempt, EventKind.PROGRESS, progress)
 
     def plan(self, job: str, attempt: int, plan: Mapping[str, Any]) -> None:
-        """Note what an attempt is about to do. It stays with the job until the next attempt has planned."""
+        """Record the plan of an attempt. It stays with the job until the next attempt has planned."""
         self._note_latest(job, attempt, EventKind.PLAN, plan)
 
     def _note_latest(self, job: str, attempt: int, kind: EventKind, data: Mapping[str, Any]) -> None:
-        """Keep what there is one of: in the job's column of that name, and as an event."""
+        """Store a single value: in the job's column of that name, and as an event."""
         with self._database.write() as connection:
             update = connection.execute(
                 f"UPDATE jobs SET {kind} = :data WHERE {OWNS}",
@@ -358,7 +366,7 @@ class JobStore:
                 note(connection, job, EventKind.LOG, log_line(text))
 
     def fail(self, job: str, attempt: int, error: Mapping[str, str]) -> None:
-        """End an attempt, and its job, with a problem; a job that was to be canceled is canceled."""
+        """End an attempt and its job with a problem; a job that is being canceled is canceled."""
         with self._database.write() as connection:
             row = _owned_row(connection, job, attempt)
             if row is not None and row["state"] == JobState.CANCELING:
@@ -367,7 +375,7 @@ class JobStore:
                 move(connection, row, JobState.FAILED, error)
 
     def lose(self, job: str, attempt: int, reason: str, error: Mapping[str, str] | None = None) -> None:
-        """End an attempt that gave no answer: the job goes back in line, or fails after its last attempt.
+        """End an attempt without an answer: the job is requeued, or fails after its last attempt.
 
         Args:
             job: its id.
@@ -386,27 +394,27 @@ class JobStore:
                 move(connection, row, _without_answer(row))
 
     def release(self, job: str, attempt: int, reason: str) -> None:
-        """Put the job of an attempt that the server ended or could not keep up back in line: it counts as none."""
+        """Requeue the job of an attempt that the server ended or failed: it does not count."""
         with self._database.write() as connection:
             row = _owned_row(connection, job, attempt)
             if row is not None:
                 _release(connection, row, reason)
 
     def release_all(self, reason: str) -> None:
-        """At start-up: put all of these back in line. A server's death is no job's fault."""
+        """At start-up: requeue all of these. The end of the server is not the job's fault."""
         with self._database.write() as connection:
             for row in connection.execute("SELECT * FROM jobs WHERE state IN ('running', 'canceling')").fetchall():
                 _release(connection, row, reason)
 
 
 def find(connection: sqlite3.Connection, job: str, owner: Owner) -> sqlite3.Row | None:
-    """The row of a job that an owner sees."""
-    select = f"SELECT * FROM jobs WHERE id = :job AND {SHOWN_JOBS}"
+    """Return the row of a job that an owner may see."""
+    select = f"SELECT * FROM jobs WHERE id = :job AND {VISIBLE_JOBS}"
     return connection.execute(select, owner.terms(job=job)).fetchone()
 
 
 def row_of(connection: sqlite3.Connection, job: str, owner: Owner) -> sqlite3.Row:
-    """`find`, where there must be one.
+    """Return the job as `find` does; raise NotFound if there is none.
 
     Raises:
         NotFound: there is no such job, or the owner does not see it.
@@ -418,7 +426,7 @@ def row_of(connection: sqlite3.Connection, job: str, owner: Owner) -> sqlite3.Ro
 
 
 def record(connection: sqlite3.Connection, row: sqlite3.Row) -> JobRecord:
-    """A row of the table as a record."""
+    """Return a row of the table as a record."""
     features = connection.execute("SELECT asset FROM job_features WHERE job = ? ORDER BY place", (row["id"],))
     return record_of(
         JobRecord,
@@ -454,10 +462,10 @@ def _require_place(connection: sqlite3.Connection, kind: JobKind, max_queued: in
 
 
 def _take_assets(connection: sqlite3.Connection, order: JobOrder, owner: Owner) -> None:
-    """See that the assets are there; what the job of an admin needs of others, the admin has from now on."""
+    """Require that the assets are there; an admin becomes an owner of those that its job needs."""
     for asset, kind in order.assets():
         visible = connection.execute(
-            f"SELECT 1 FROM assets JOIN asset_owners ON asset = id WHERE id = :asset AND kind = :kind AND {SEEN}",
+            f"SELECT 1 FROM assets JOIN asset_owners ON asset = id WHERE id = :asset AND kind = :kind AND {OWNED}",
             owner.terms(asset=asset, kind=kind),
         )
         if visible.fetchone() is None:
@@ -482,12 +490,12 @@ def note(connection: sqlite3.Connection, job: str, kind: EventKind, data: Mappin
 
 
 def log_line(text: str) -> dict[str, Any]:
-    """A line of the log as the data of an event."""
+    """Return a line of the log as the data of an event."""
     return {"line": text[:LINE_CHARACTERS], "time": round(time.time(), 3)}
 
 
 def record_state(connection: sqlite3.Connection, row: sqlite3.Row) -> None:
-    """Note the state of a row that was just changed."""
+    """Record the state of a row that was just changed."""
     data = {"state": row["state"], "attempt": row["attempt"], "problem": parsed(row["problem"])}
     note(connection, row["id"], EventKind.STATE, data)
 
@@ -495,7 +503,7 @@ def record_state(connection: sqlite3.Connection, row: sqlite3.Row) -> None:
 def move(
     connection: sqlite3.Connection, row: sqlite3.Row, state: JobState, problem: Mapping[str, str] | None = None
 ) -> None:
-    """Within a write transaction: bring a job to a state, and note it."""
+    """Set a job's state, within a write transaction, and record it."""
     after = connection.execute(
         "UPDATE jobs SET state = :state, problem = :problem,"
         " ended = CASE WHEN :ended THEN :now ELSE NULL END,"
@@ -513,7 +521,7 @@ def move(
 
 
 def succeed(connection: sqlite3.Connection, job: str, attempt: int) -> bool:
-    """Within the transaction that keeps its result: end an attempt well.
+    """End an attempt with success, within the transaction that stores its result.
 
     Returns:
         False when it is no longer the job's running one, or is to be canceled; then nothing changes.
@@ -526,9 +534,11 @@ def succeed(connection: sqlite3.Connection, job: str, attempt: int) -> bool:
 
 
 def stop_waiting(connection: sqlite3.Connection) -> None:
-    """Within a write transaction: cancel the queued jobs of keys that are no longer valid."""
+    """Cancel the queued jobs of keys that are no longer valid, within a write transaction."""
     now = time.time()
-    rows = connection.execute(f"SELECT * FROM jobs WHERE state = 'queued' AND owner IN ({ENDED_KEYS})", {"now": now})
+    rows = connection.execute(
+        f"SELECT * FROM jobs WHERE state = 'queued' AND owner IN ({INVALID_KEYS})", {"now": now}
+    )
     for row in rows.fetchall():
         error = Unauthorized("key", expected="a key that is valid when its job begins", got="one that no longer is")
         move(connection, row, JobState.CANCELED, fault_of(error))

@@ -1,4 +1,4 @@
-"""Keys: who may come in. Only their digests are here; the secrets are with those whom they were given to."""
+"""Keys of callers. Only digests of their secrets are stored."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from liftcore.errors import NotFound
 from service.errors import InvalidRequest, Unauthorized
 from service.store.database import Database, insert, keys_were_made, open_to_read, remember_keys, unusable
 from service.store.jobs import stop_waiting
-from service.store.owners import ENDED_KEYS, Scope, parse_scopes
+from service.store.owners import INVALID_KEYS, Scope, parse_scopes
 
-PREFIX = "splatlift_"  # by which people, and scanners for leaked secrets, know what it is
+PREFIX = "splatlift_"  # identifies a key, for people and for scanners of leaked secrets
 SECRET_BYTES = 32
 
-Rule = Literal["required", "none"]  # what the operator says of keys; not said = required once one was made
+Rule = Literal["required", "none"]  # the operator's rule; unset = required once a key was made
 
 
 @dataclass(frozen=True)
 class Quota:
-    """What one key may fill; None = as the server's settings have it."""
+    """Limits of one key; None = those of the server's settings."""
 
     max_bytes: int | None = None  # of assets and results together
     max_queued: int | None = None  # jobs in line
@@ -36,7 +36,7 @@ class Quota:
 
 @dataclass(frozen=True)
 class KeyRecord:
-    """A key as the store knows it."""
+    """Record of a key."""
 
     id: str
     name: str
@@ -45,16 +45,16 @@ class KeyRecord:
     created: float  # seconds since 1970
     revoked: float | None = None
     expires: float | None = None
-    lifts: tuple[str, ...] = ()  # of the scope `shared`: what it was given
-    maker: str | None = None  # the id of the key that shared them, with which it ends
+    lifts: tuple[str, ...] = ()  # of the scope `shared`: the shared lifts
+    maker: str | None = None  # the id of the key that shared them; this key ends with it
 
 
-# With what each is given
+# With the lifts of each key
 KEYS = "SELECT keys.*, (SELECT json_group_array(lift) FROM key_lifts WHERE key = keys.id) AS lifts FROM keys"
 
 
 class KeyStore:
-    """Keys in the database. Every look is a look at the disk's truth: what another process did counts at once.
+    """Keys in the database. Every call reads the database: changes of other processes count at once.
 
     Args:
         database: that holds them.
@@ -68,7 +68,7 @@ class KeyStore:
         self._data = data
 
     def under(self, rule: Rule | None) -> Self:
-        """The same keys under the operator's word on whether requests need one."""
+        """Return the same keys under the operator's rule."""
         store = copy.copy(self)
         store._rule = rule
         return store
@@ -83,7 +83,7 @@ class KeyStore:
         lifts: Sequence[str] = (),
         maker: str | None = None,
     ) -> tuple[KeyRecord, str]:
-        """Make a key, which is valid until it is revoked or expires (seconds since 1970).
+        """Create a key, which is valid until it is revoked or expires (seconds since 1970).
 
         Args:
             name: for people.
@@ -104,10 +104,10 @@ class KeyStore:
             got = f"{', '.join(sorted(scopes))} and {len(lifts)} lifts"
             raise InvalidRequest("scopes", expected="shared alone, with the lifts that the key is given", got=got)
         secret = _new_secret()
-        remember_keys(self._data)  # first: a key whose database is lost must not leave the door open
+        remember_keys(self._data)  # first: if the database is lost, the service must still require keys
         with self._database.write(is_counted=True) as connection:
             sharer = None if maker is None else _key_of(connection, maker)
-            if maker is not None and sharer is None:  # a rotation ends what the secret before has made, and no more
+            if maker is not None and sharer is None:  # a rotation ends the keys that the old secret made
                 raise Unauthorized(
                     "Authorization", expected="Bearer and a key of this service", got="one that ended a moment ago",
                     headers={"WWW-Authenticate": 'Bearer realm="splatlift", error="invalid_token"'},
@@ -142,7 +142,7 @@ class KeyStore:
     def rotate(
         self, name: str, *, grace: float = 0.0, keep_shares: bool = False
     ) -> tuple[KeyRecord, str, list[KeyRecord]]:
-        """Give a key a new secret; what it made stays its own.
+        """Give a key a new secret; its assets and lifts stay its own.
 
         Args:
             named: its id, or its name where no other valid key has it.
@@ -160,7 +160,7 @@ class KeyStore:
         secret, now = _new_secret(), time.time()
         with self._database.write(is_counted=True) as connection:
             rows = connection.execute(
-                f"{KEYS} WHERE (id = :named OR name = :named) AND id NOT IN ({ENDED_KEYS})",
+                f"{KEYS} WHERE (id = :named OR name = :named) AND id NOT IN ({INVALID_KEYS})",
                 {"named": name, "now": now},
             ).fetchall()
             if not rows:
@@ -170,7 +170,7 @@ class KeyStore:
                 raise InvalidRequest("key", expected="a name that one key has", got=name, hint=f"name one of {ids}")
             key, old_until = _record(rows[0]), rows[0]["old_until"]
             shares = [] if keep_shares else _shares_of(connection, key, now)
-            for share in shares:  # what ends as the secret before, or sooner, may have been made with it
+            for share in shares:  # a key that expires with the old secret, or sooner, may have been made with it
                 is_older = old_until is not None and share.expires is not None and share.expires <= old_until
                 end = now if is_older else earliest(share.expires, now + grace)
                 connection.execute("UPDATE keys SET expires = ? WHERE id = ?", (end, share.id))
@@ -181,7 +181,7 @@ class KeyStore:
         return key, secret, shares
 
     def revoke(self, key: str) -> tuple[KeyRecord, list[KeyRecord]]:
-        """End a key for good, and those that it shared lifts with; again does no harm.
+        """Revoke a key, and the keys that it made to share lifts; repeating it does no harm.
 
         What it made stays, for admins; its jobs in line are canceled.
 
@@ -205,21 +205,21 @@ class KeyStore:
         return _record(row), shares
 
     def all(self) -> list[KeyRecord]:
-        """Every key, oldest first, with those that were revoked."""
+        """Return every key, oldest first, with revoked ones."""
         with self._database.read() as connection:
             rows = connection.execute(f"{KEYS} ORDER BY created, id").fetchall()
         return [_record(row) for row in rows]
 
     def of_lift(self, lift: str) -> list[KeyRecord]:
-        """The keys that a lift was given to and that are valid, newest first."""
+        """Return the valid keys with which a lift is shared, newest first."""
         holders, terms = "SELECT key FROM key_lifts WHERE lift = :lift", {"lift": lift, "now": time.time()}
-        select = f"{KEYS} WHERE id IN ({holders}) AND id NOT IN ({ENDED_KEYS}) ORDER BY created DESC, id"
+        select = f"{KEYS} WHERE id IN ({holders}) AND id NOT IN ({INVALID_KEYS}) ORDER BY created DESC, id"
         with self._database.read() as connection:
             rows = connection.execute(select, terms).fetchall()
         return [_record(row) for row in rows]
 
     def take_away(self, key: str, lift: str) -> None:
-        """Take a lift away from a key that it was given to; a key that then has none is revoked.
+        """Stop sharing a lift with a key; a key without lifts is revoked.
 
         Raises:
             NotFound: it was not given to that key.
@@ -235,12 +235,12 @@ class KeyStore:
             )
 
     def required(self) -> bool:
-        """Whether requests need a key: from the first one that was ever made, revoked, lost or not."""
+        """Return True if requests need a key: from the first key on, even if it is revoked or lost."""
         with self._database.read() as connection:
             return self._required(connection)
 
     def admit(self, secret: str | None) -> tuple[bool, KeyRecord | None]:
-        """Whether requests need a key, and the valid key of that secret, which ends when the secret does."""
+        """Return whether requests need a key, and the valid key of that secret, which ends with the secret."""
         with self._database.read() as connection:
             if secret is None:
                 return self._required(connection), None
@@ -254,11 +254,11 @@ class KeyStore:
 
 
 def _key_of(connection: sqlite3.Connection, secret: str) -> KeyRecord | None:
-    """The valid key of a secret, which ends when the secret does; None when there is none."""
+    """Return the valid key of a secret, which ends with the secret; None if there is none."""
     digest = digest_of(secret)
     row = connection.execute(
         f"{KEYS} WHERE (digest = :digest OR (old_digest = :digest AND old_until > :now))"
-        f" AND id NOT IN ({ENDED_KEYS})",
+        f" AND id NOT IN ({INVALID_KEYS})",
         {"digest": digest, "now": time.time()},
     ).fetchone()
     if row is None:
@@ -272,14 +272,12 @@ def _new_secret() -> str:
 
 
 def digest_of(secret: str) -> str:
-    """What is kept and compared of a secret. It has 256 random bits: neither the digest nor the time that it takes to
-    compare two gives anything to guess.
-    """
+    """Return the digest of a secret. A secret has 256 random bits: neither digest nor timing helps to guess it."""
     return hashlib.sha256(secret.encode()).hexdigest()
 
 
 def any_key(database: Path) -> bool:
-    """Whether a database that nobody has opened yet holds a key; it is left as it is.
+    """Return True if a database that is not open holds a key; the database is not changed.
 
     Raises:
         Misconfigured: the file is no database.
@@ -301,13 +299,13 @@ def _any(connection: sqlite3.Connection) -> bool:
 
 
 def earliest(*moments: float | None) -> float | None:
-    """The first of moments, of which None is never."""
+    """Return the earliest of times, where None means never."""
     return min((moment for moment in moments if moment is not None), default=None)
 
 
 def _shares_of(connection: sqlite3.Connection, maker: KeyRecord, now: float) -> list[KeyRecord]:
-    """The keys that are valid so far and that a key shared lifts with, oldest first."""
-    select = f"{KEYS} WHERE maker = :maker AND id NOT IN ({ENDED_KEYS}) ORDER BY created, id"
+    """Return the valid keys that a key made to share lifts, oldest first."""
+    select = f"{KEYS} WHERE maker = :maker AND id NOT IN ({INVALID_KEYS}) ORDER BY created, id"
     return [_record(row) for row in connection.execute(select, {"maker": maker.id, "now": now})]
 
 

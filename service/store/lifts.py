@@ -1,4 +1,4 @@
-"""What jobs make: lifts, which are files, and trade-offs, which are small and lie in the database whole."""
+"""Results of jobs: lifts, which are files, and trade-offs, which are stored in the database whole."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from service.store.assets import add_owner
 from service.store.database import Database, Page, insert, page_of, parsed, record_of
 from service.store.files import DataDirectory, sync_directory
 from service.store.jobs import JobOrder, record_state, succeed
-from service.store.owners import SEEN, SHOWN_JOBS, Owner, require_quota
+from service.store.owners import OWNED, VISIBLE_JOBS, Owner, require_quota
 
-BY_HAND = "set by hand"  # of the rendering that a lift's plan tells: the setting was not auto
-WORLD_CHANGED = "world_changed"  # of a lift's metadata in the database: its file has another world
+BY_HAND = "set by hand"  # reason of the rendering in a lift's plan: the setting was not auto
+WORLD_CHANGED = "world_changed"  # in a lift's metadata in the database: its file has another world
 SET_WORLD = f"""
     UPDATE lifts SET metadata = json_set(metadata, '$.world', json(?), '$.{WORLD_CHANGED}', json('true')) WHERE id = ?
 """
@@ -34,7 +34,7 @@ SET_WORLD = f"""
 
 @dataclass(frozen=True)
 class FinishedLift:
-    """What a job's process made: a draft and what it says about it."""
+    """Result of a lift job: a draft and its description."""
 
     draft: Path
     sha256: str
@@ -45,7 +45,7 @@ class FinishedLift:
 
 @dataclass(frozen=True)
 class LiftRecord:
-    """A lift as the store knows it."""
+    """Record of a lift."""
 
     id: str  # the id of its job
     bytes: int
@@ -53,8 +53,8 @@ class LiftRecord:
     path: Path
     count: int
     channels: int
-    name: str | None  # that somebody gave it
-    metadata: dict[str, Any]  # without the names of views and the words where these are very many
+    name: str | None  # given by a user
+    metadata: dict[str, Any]  # without long lists of views and words
     view_count: int
     first_view: str | None
     created: float
@@ -64,7 +64,7 @@ class LiftRecord:
     photos: str | None  # of its views
 
     def changed_header(self) -> bytes | None:
-        """What the lift's file begins with, its length and header, with the ``world`` of now; None: with its own.
+        """Return the length and the header of the lift's file with the present ``world``; None if the file has it.
 
         Raises:
             NotFound: the file is not there, or no longer a lift.
@@ -94,16 +94,16 @@ class LiftRecord:
 
 @dataclass(frozen=True)
 class FinishedTradeoff:
-    """What a job's process found."""
+    """Result of a trade-off job."""
 
-    document: dict[str, Any]  # as liftcore.evaluate.tradeoff.compare gives it
+    document: dict[str, Any]  # from liftcore.evaluate.tradeoff.compare
     page: str  # Markdown
     chart: bytes  # PNG
 
 
 @dataclass(frozen=True)
 class TradeoffRecord:
-    """A trade-off as the store knows it."""
+    """Record of a trade-off."""
 
     id: str  # the id of its job
     document: dict[str, Any]
@@ -117,22 +117,22 @@ class TradeoffRecord:
     labels: dict[str, Any] | None  # of the order
 
 
-# A result belongs to whom its job does. One statement, so that none is without its job.
+# A result belongs to its job's owner: one statement, so that no result is without its job.
 FEATURES = "(SELECT json_group_array(asset) FROM (SELECT asset FROM job_features WHERE job = jobs.id ORDER BY place))"
 NAMES_OF_VIEWS = ("views_without_camera", "views_without_splats")  # in a certificate
-SHOWN_BYTES = 64 << 10  # of metadata; of more the names of views are told apart, in pages
-LONG = ("views", "words")  # what metadata leave out then
+SHOWN_BYTES = 64 << 10  # of metadata; longer lists of views are given in pages
+LONG = ("views", "words")  # left out of long metadata
 VISIBLE = (
-    f"SELECT lifts.*, splats, cameras, {FEATURES} AS features FROM lifts JOIN jobs USING (id) WHERE {SHOWN_JOBS}"
+    f"SELECT lifts.*, splats, cameras, {FEATURES} AS features FROM lifts JOIN jobs USING (id) WHERE {VISIBLE_JOBS}"
 )
 VISIBLE_TRADEOFFS = (
     "SELECT tradeoffs.*, splats, cameras, json_extract(parameters, '$.labels') AS labels,"
-    f" {FEATURES} AS features FROM tradeoffs JOIN jobs USING (id) WHERE {SEEN}"
+    f" {FEATURES} AS features FROM tradeoffs JOIN jobs USING (id) WHERE {OWNED}"
 )
 
 
 def order_of(metadata: Mapping[str, Any]) -> JobOrder:
-    """What a lift was made of, as its file remembers it: the order of its job.
+    """Return the order that a lift's file records: what it was made of.
 
     Raises:
         KeyError, TypeError: these are no metadata of a lift.
@@ -142,19 +142,19 @@ def order_of(metadata: Mapping[str, Any]) -> JobOrder:
     settings, certificate = dict(metadata["settings"]), metadata.get("certificate")
     plan = certificate.get("plan") if isinstance(certificate, Mapping) else None
     if isinstance(plan, Mapping) and BY_HAND not in str(plan.get("rendering", BY_HAND)):
-        settings["antialiased"] = "auto"  # a lift remembers what that came to
+        settings["antialiased"] = "auto"  # the lift records the resolved value
     return JobOrder(splats, cameras, tuple(features), settings)
 
 
 class LiftStore:
-    """Lifts in the database, their bytes in lifts/. What an owner does not see is absent."""
+    """Lifts in the database, with their bytes in lifts/. Lifts of other owners count as absent."""
 
     def __init__(self, database: Database, files: DataDirectory) -> None:
         self._database = database
         self._files = files
 
     def finish(self, job: str, attempt: int, result: FinishedLift) -> bool:
-        """End an attempt with its lift: the file, the lift and the job's last state become true together.
+        """End an attempt with its lift: the file, the lift and the job's last state are stored together.
 
         Returns:
             False when the attempt may not (`succeed`); then nothing changes.
@@ -168,14 +168,14 @@ class LiftStore:
                 published = True
                 self._insert(connection, job, result, size, time.time())
         except BaseException:
-            if published:  # but not recorded: whoever tries again finds the draft where it was
+            if published:  # the next attempt finds the draft again
                 with contextlib.suppress(OSError):
                     path.replace(result.draft)
             raise
         return True
 
     def take(self, owner: Owner, order: JobOrder, result: FinishedLift) -> LiftRecord:
-        """Keep a lift that was made elsewhere, as the result of a job that nobody waited for.
+        """Store an uploaded lift, as the result of a job that never ran.
 
         Args:
             owner: whose it is.
@@ -194,7 +194,7 @@ class LiftStore:
         return self.get(owner, job)
 
     def adopt(self, owner: Owner, job: str, order: JobOrder, result: FinishedLift) -> None:
-        """Keep a lift that has no row, and perhaps no job, from a draft or from where it belongs.
+        """Store a lift without a row, and perhaps without a job, from a draft or from its own place.
 
         Args:
             owner: of the job, if there is none.
@@ -229,13 +229,13 @@ class LiftStore:
                 self._files.publish(result.draft, path)
 
     def change(self, owner: Owner, lift: str, changes: Mapping[str, Any]) -> LiftRecord:
-        """Give a lift another ``name``, other ``photos``, an asset that is here, or ``world``; None takes them away.
+        """Set a lift's ``name``, ``photos`` (an asset) or ``world``; None removes them.
 
         Raises:
             NotFound: there is no such lift, or there are no such photos.
         """
         with self._database.write(is_counted=True) as connection:
-            self.get(owner, lift)  # here, where nobody deletes it
+            self.get(owner, lift)  # within the transaction, where nobody can delete it
             photos = changes.get("photos")
             if photos is not None:
                 self._own_photos(connection, owner, lift, photos)
@@ -247,7 +247,7 @@ class LiftStore:
         return self.get(owner, lift)
 
     def _write_changes(self, connection: sqlite3.Connection, lift: str) -> None:
-        """Within a write transaction: keep what was changed of a lift beside its file, which never changes itself."""
+        """Store the changes of a lift beside its file, which never changes, within a write transaction."""
         row = connection.execute("SELECT name, photos, metadata FROM lifts WHERE id = ?", (lift,)).fetchone()
         metadata, path = json.loads(row["metadata"]), self._files.lift_changes(lift)
         world = {"world": metadata["world"]} if metadata.get(WORLD_CHANGED) else {}
@@ -256,9 +256,10 @@ class LiftStore:
         sync_directory(path.parent)
 
     def _own_photos(self, connection: sqlite3.Connection, owner: Owner, lift: str, photos: str) -> None:
-        """Within a write transaction: let the lift's owner have them, whoever of those who see them it is."""
+        """Add the lift's owner to assets, within a write transaction, whoever requested it."""
         row = connection.execute(
-            f"SELECT 1 FROM assets JOIN asset_owners ON asset = id WHERE id = :photos AND kind = 'photos' AND {SEEN}",
+            "SELECT 1 FROM assets JOIN asset_owners ON asset = id"
+            f" WHERE id = :photos AND kind = 'photos' AND {OWNED}",
             owner.terms(photos=photos),
         ).fetchone()
         if row is None:
@@ -269,7 +270,7 @@ class LiftStore:
         )
 
     def of_file(self, owner: Owner, sha256: str) -> LiftRecord | None:
-        """The lift of a file with that digest, None when there is none."""
+        """Return the lift of a file with that digest; None if there is none."""
         with self._database.read() as connection:
             terms = owner.terms(sha256=sha256)
             row = connection.execute(f"{VISIBLE} AND sha256 = :sha256 LIMIT 1", terms).fetchone()
@@ -298,13 +299,13 @@ class LiftStore:
         connection.executemany("INSERT OR IGNORE INTO lifted_views VALUES (?, ?)", ((job, view) for view in views))
 
     def find(self, owner: Owner, lift: str) -> LiftRecord | None:
-        """The lift of that id, None when there is none."""
+        """Return the lift of that id; None if there is none."""
         with self._database.read() as connection:
             row = connection.execute(f"{VISIBLE} AND id = :lift", owner.terms(lift=lift)).fetchone()
         return None if row is None else self._record(row)
 
     def get(self, owner: Owner, lift: str) -> LiftRecord:
-        """The lift of that id.
+        """Return the lift of that id.
 
         Raises:
             NotFound: there is none.
@@ -317,13 +318,13 @@ class LiftStore:
         return record
 
     def lifted(self, owner: Owner, lift: str, names: list[str]) -> set[str]:
-        """Which of these views were lifted."""
+        """Return the set of these views that were lifted."""
         select, ident = "SELECT 1 FROM lifted_views WHERE lift = ? AND name = ?", self.get(owner, lift).id
         with self._database.read() as connection:
             return {name for name in names if connection.execute(select, (ident, name)).fetchone()}
 
     def only(self, owner: Owner) -> LiftRecord:
-        """The one lift that is here.
+        """Return the only lift.
 
         Raises:
             NotFound: there is none at all.
@@ -340,12 +341,12 @@ class LiftStore:
         return self._record(rows[0])
 
     def page(self, owner: Owner, limit: int, cursor: str | None = None) -> Page[LiftRecord]:
-        """So many lifts after a cursor, newest first."""
+        """Return so many lifts after a cursor, newest first."""
         with self._database.read() as connection:
             return page_of(connection, VISIBLE, owner.terms(), limit, cursor, self._record)
 
     def all(self, owner: Owner) -> list[LiftRecord]:
-        """Every lift, newest first."""
+        """Yield every lift, newest first."""
         return self.page(owner, sys.maxsize - 1).records
 
     def _record(self, row: sqlite3.Row) -> LiftRecord:
@@ -363,13 +364,13 @@ def _without(values: dict[str, Any], *names: str) -> dict[str, Any]:
 
 
 class TradeoffStore:
-    """Trade-offs in the database. What an owner does not see is absent."""
+    """Trade-offs in the database. Those of other owners count as absent."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def finish(self, job: str, attempt: int, result: FinishedTradeoff) -> bool:
-        """End an attempt with its trade-off: it and the job's last state become true together.
+        """End an attempt with its trade-off: it and the job's last state are stored together.
 
         Returns:
             False when the attempt may not (`succeed`); then nothing changes.
@@ -391,7 +392,7 @@ class TradeoffStore:
         return True
 
     def get(self, owner: Owner, tradeoff: str) -> TradeoffRecord:
-        """The trade-off of that id.
+        """Return the trade-off of that id.
 
         Raises:
             NotFound: there is none.

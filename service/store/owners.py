@@ -1,4 +1,4 @@
-"""Whose things are whose, what one owner may do, and what they may fill."""
+"""Owners of records, their rights and their quotas."""
 
 from __future__ import annotations
 
@@ -10,36 +10,37 @@ from typing import Any
 
 from service.errors import InvalidRequest, KeyLimitReached, OverQuota
 
-# For WHERE clauses over a table with a column `owner`; its names are bound by `Owner.terms`.
-SEEN = "(:sees_all OR owner = :owner)"
-# The same to look only, over jobs and over owners of assets: also what a key was given (`service.auth` is its gate).
-GIVEN = "SELECT lift FROM key_lifts WHERE key = :owner"
-GIVEN_ASSETS = (
-    f"SELECT splats FROM jobs WHERE id IN ({GIVEN}) UNION SELECT cameras FROM jobs WHERE id IN ({GIVEN})"
-    f" UNION SELECT asset FROM job_features WHERE job IN ({GIVEN})"
-    f" UNION SELECT photos FROM lifts WHERE id IN ({GIVEN})"
-    f" UNION SELECT json_extract(parameters, '$.table') FROM jobs WHERE id IN ({GIVEN})"
+# For WHERE clauses over a table with a column `owner`; `Owner.terms` binds its names.
+OWNED = "(:sees_all OR owner = :owner)"
+# The same for reads of jobs and of owners of assets: includes shared lifts (`service.auth` limits the routes).
+SHARED_LIFTS = "SELECT lift FROM key_lifts WHERE key = :owner"
+SHARED_ASSETS = (
+    f"SELECT splats FROM jobs WHERE id IN ({SHARED_LIFTS})"
+    f" UNION SELECT cameras FROM jobs WHERE id IN ({SHARED_LIFTS})"
+    f" UNION SELECT asset FROM job_features WHERE job IN ({SHARED_LIFTS})"
+    f" UNION SELECT photos FROM lifts WHERE id IN ({SHARED_LIFTS})"
+    f" UNION SELECT json_extract(parameters, '$.table') FROM jobs WHERE id IN ({SHARED_LIFTS})"
 )
-SHOWN_JOBS = f"(:sees_all OR owner = :owner OR jobs.id IN ({GIVEN}))"
-SHOWN_ASSETS = f"(:sees_all OR owner = :owner OR asset IN ({GIVEN_ASSETS}))"
-# Keys that nobody comes in with any more; `:now` in seconds since 1970. A NULL is no end.
-_ENDED = "SELECT id FROM keys WHERE revoked IS NOT NULL OR expires <= :now"
-ENDED_KEYS = f"{_ENDED} OR maker IN ({_ENDED})"
-QUEUE_RETRY_SECONDS = 30  # a lift takes seconds to minutes, and one must end before the line is shorter
+VISIBLE_JOBS = f"(:sees_all OR owner = :owner OR jobs.id IN ({SHARED_LIFTS}))"
+VISIBLE_ASSETS = f"(:sees_all OR owner = :owner OR asset IN ({SHARED_ASSETS}))"
+# Keys that are no longer valid; `:now` in seconds since 1970. NULL means no end.
+_INVALID_KEYS = "SELECT id FROM keys WHERE revoked IS NOT NULL OR expires <= :now"
+INVALID_KEYS = f"{_INVALID_KEYS} OR maker IN ({_INVALID_KEYS})"
+QUEUE_RETRY_SECONDS = 30  # a lift takes seconds to minutes, and one must end before the queue is shorter
 
 
 class Scope(StrEnum):
-    """A kind of request that a key allows."""
+    """Kind of request that a key allows."""
 
-    READ = "read"  # look: assets, jobs, results, queries, pictures
+    READ = "read"  # read assets, jobs, results, queries, pictures
     WRITE = "write"  # upload, order, cancel, delete
-    SHARED = "shared"  # look at and ask the lifts that the key was given
+    SHARED = "shared"  # read and query the lifts shared with the key
     METRICS = "metrics"  # /metrics, which tells of everybody's work together, and nothing else
-    ADMIN = "admin"  # all of these, on everybody's things
+    ADMIN = "admin"  # all of these, on the records of all owners
 
 
 def parse_scopes(names: Iterable[str]) -> frozenset[Scope]:
-    """Scopes by their names.
+    """Return scopes by their names.
 
     Raises:
         InvalidRequest: there is none, or one is unknown.
@@ -53,25 +54,25 @@ def parse_scopes(names: Iterable[str]) -> frozenset[Scope]:
 
 @dataclass(frozen=True)
 class Owner:
-    """Who looks at the store, and what they may fill of it. What another owner made is absent: it is not found."""
+    """Owner of records, with quotas. Records of other owners count as absent."""
 
-    key: str  # the id of a key: what is made belongs to it
+    key: str  # the id of a key: new records belong to it
     sees_all: bool
     max_bytes: int | None = None  # of assets and results together; None = no limit
     max_queued: int | None = None  # jobs in line
 
-    def terms(self, **more: Any) -> dict[str, Any]:
-        """Values for SEEN, and more."""
-        return {"sees_all": self.sees_all, "owner": self.key, **more}
+    def terms(self, **others: Any) -> dict[str, Any]:
+        """Return values for OWNED, and others."""
+        return {"sees_all": self.sees_all, "owner": self.key, **others}
 
 
-# The service itself, and everybody while there are no keys; what it makes belongs to admins once there are keys.
+# The service itself, and every caller while there are no keys; its records belong to admins once there are keys.
 SERVICE = Owner("", sees_all=True)
-NOBODY = Owner("-", sees_all=False)  # the id of no key, so nothing is theirs
+NOBODY = Owner("-", sees_all=False)  # the id of no key: it owns nothing
 
 
 def stored_bytes(connection: sqlite3.Connection, owner: Owner) -> int:
-    """What an owner's assets and results, selections too, take; bytes that several have count for each of them."""
+    """Return the bytes of an owner's assets, results and selections; shared bytes count for each owner."""
     assets = "SELECT total(bytes) FROM assets JOIN asset_owners ON asset = id WHERE owner = :owner"
     lifts = "SELECT total(lifts.bytes) FROM lifts JOIN jobs USING (id) WHERE owner = :owner"
     tradeoffs = "SELECT total(tradeoffs.bytes) FROM tradeoffs JOIN jobs USING (id) WHERE owner = :owner"
@@ -85,7 +86,7 @@ def stored_bytes(connection: sqlite3.Connection, owner: Owner) -> int:
 
 
 def require_quota(connection: sqlite3.Connection, owner: Owner, coming: int) -> None:
-    """See that an owner may store so many bytes more, within the transaction that will store them or before it.
+    """Require that an owner may store so many more bytes, within the transaction that stores them or before it.
 
     Raises:
         OverQuota: it would be more than the owner may store.
@@ -102,7 +103,7 @@ def require_quota(connection: sqlite3.Connection, owner: Owner, coming: int) -> 
 
 
 def require_turn(connection: sqlite3.Connection, kind: str, owner: Owner) -> None:
-    """See that an owner may put another job, of that kind, in line.
+    """Require that an owner may queue another job of that kind.
 
     Raises:
         KeyLimitReached: as many are in line as may be.

@@ -1,4 +1,4 @@
-"""Backups of a data directory, beside a server that runs, and rows for files whose database is lost.
+"""Backups of a data directory, also of a running server, and rows for files whose database is lost.
 
 A backup is laid out as a data directory, without work and drafts: the database and every file that it knows, whole or
 absent. Files never change once they are stored, so they are linked where the file system can, and copied where it
@@ -36,12 +36,12 @@ from service.store.owners import SERVICE
 from service.store.store import Store
 from service.uploads import LIFT, Report, check
 
-TRIES = 10  # of a database whose files all are here; each DELETE meanwhile may cost one
+TRIES = 10  # for a database with all of its files; each deletion meanwhile may cost one
 CHUNK = 1 << 20
 
 
 def back_up(data: Path, target: Path) -> int:
-    """Copy a data directory, whether a server holds it or not; how many files there are beside the database.
+    """Copy a data directory, also while a server holds it; return the number of files beside the database.
 
     Raises:
         NotFound: there is no database.
@@ -50,7 +50,7 @@ def back_up(data: Path, target: Path) -> int:
     _require_database(data)
     files, missing = set[str](), list[str]()
     with _made_whole(target) as folder:
-        for _ in range(TRIES):  # the database first: what is deleted after it is missed, and looked for anew
+        for _ in range(TRIES):  # the database first: files deleted after it are missing, and it is copied again
             copy_database(data / DATABASE, folder / DATABASE)
             files = {file for file, _, _ in _files(folder)}
             missing = [file for file in sorted(files) if not _linked(data / file, folder / file)]
@@ -63,7 +63,7 @@ def back_up(data: Path, target: Path) -> int:
                 hint="splatlift store verify tells which; delete what they belong to, then back up again",
             )  # fmt: skip
         for path in [path for name in ("blobs", "lifts") for path in (folder / name).rglob("*") if path.is_file()]:
-            if str(path.relative_to(folder)) not in files:  # deleted while we tried
+            if str(path.relative_to(folder)) not in files:  # deleted meanwhile
                 path.unlink()
         for path in data.glob("lifts/*.json"):
             if str(path.relative_to(data).with_suffix(".safetensors")) in files:
@@ -75,7 +75,7 @@ def back_up(data: Path, target: Path) -> int:
 
 
 def restore(backup: Path, data: Path) -> int:
-    """Make a data directory of a backup; how many files there are beside the database.
+    """Restore a data directory from a backup; return the number of files beside the database.
 
     Raises:
         NotFound: it is no backup.
@@ -90,7 +90,7 @@ def restore(backup: Path, data: Path) -> int:
 
 
 def verify(data: Path) -> list[str]:
-    """What is wrong with a data directory or a backup, a line each: files that are lost or not as they were stored.
+    """Return the damage of a data directory or a backup, a line each: files that are lost or changed.
 
     Raises:
         NotFound: there is no database.
@@ -105,7 +105,7 @@ def verify(data: Path) -> list[str]:
     damage += [f"trade-off {job}: another chart" for job in damaged]
     for file, size, digest in _files(data):
         reason = _damage_of(data / file, size, digest)
-        if reason is not None and (file, size, digest) in _files(data):  # else it was deleted while we looked
+        if reason is not None and (file, size, digest) in _files(data):  # else it was deleted meanwhile
             damage.append(f"{file}: {reason}")
     return damage
 
@@ -125,7 +125,7 @@ def _damage_of(path: Path, size: int, digest: str) -> str | None:
 
 
 def _files(data: Path) -> list[tuple[str, int, str]]:
-    """Path below the directory, bytes and sha256 of every file that the database knows."""
+    """Yield path below the directory, bytes and sha256 of every file in the database."""
     with closing(open_to_read(data / DATABASE)) as connection:
         return connection.execute(
             "SELECT file, bytes, substr(id, 8) FROM assets UNION SELECT file, bytes, sha256 FROM lifts"
@@ -138,7 +138,7 @@ def _generation(data: Path) -> int:
 
 
 def _linked(source: Path, target: Path) -> bool:
-    """Whether a regular file, that is there, is there too."""
+    """Return True if a regular file of one directory is also in the other."""
     if not source.is_file():
         return False
     if target.exists():
@@ -148,7 +148,7 @@ def _linked(source: Path, target: Path) -> bool:
         os.link(source, target)
     except FileNotFoundError:
         return False
-    except OSError:  # another file system, or one without links
+    except OSError:  # another file system, or one without hard links
         try:
             with source.open("rb") as original, target.open("wb") as copy:
                 shutil.copyfileobj(original, copy, CHUNK)
@@ -161,7 +161,7 @@ def _linked(source: Path, target: Path) -> bool:
 
 @contextmanager
 def _made_whole(target: Path) -> Iterator[Path]:
-    """A folder beside the target, which becomes the target at the end and is removed after an error."""
+    """Yield a folder beside the target, which replaces the target at the end and is removed after an error."""
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise Misconfigured(
             "directory", expected="one that is not there yet, or empty", got=str(target), hint="move it away first"
@@ -185,11 +185,11 @@ def _require_database(data: Path) -> None:
         raise NotFound("data", expected=f"a directory with a {DATABASE}", got=str(data), hint="name it with --data")
 
 
-# Rows for files whose database is gone or older than they are
+# Rows for files whose database is lost or older than they are
 
 
 def rebuild(store: Store, settings: ServiceSettings) -> dict[str, Any]:
-    """Give rows to the files that have none, and let the database be the newest one of its directory.
+    """Add rows for files without one, and declare the database the newest of its directory.
 
     Returns:
         ``assets`` by kind and ``lifts``: how many were added; ``left``: files that could not be, and why.
@@ -197,7 +197,7 @@ def rebuild(store: Store, settings: ServiceSettings) -> dict[str, Any]:
     root, failures, counts = store.files.root, list[dict[str, str]](), Counter[UploadKind]()
     recorded = {record.path for record in (*store.assets.all(SERVICE), *store.lifts.all(SERVICE))}
     changes = {path for path in root.glob("lifts/*.json") if store.files.lift(path.stem).exists()}
-    for add, pattern in ((_add_asset, "blobs/*/*"), (_add_lift, "lifts/*")):  # lifts are of assets
+    for add, pattern in ((_add_asset, "blobs/*/*"), (_add_lift, "lifts/*")):  # lifts refer to assets
         for path in sorted(set(root.glob(pattern)) - recorded - changes):
             try:
                 counts[add(store, settings, path)] += 1
@@ -214,7 +214,7 @@ def rebuild(store: Store, settings: ServiceSettings) -> dict[str, Any]:
 
 
 def _add_asset(store: Store, settings: ServiceSettings, path: Path) -> AssetKind:
-    """A blob is whole when its name is its digest; what it holds is read by the check of uploads."""
+    """Check a blob: its name must be its digest, and its content is checked like an upload."""
     if not path.is_file():
         raise NotFound("asset", expected="a regular file", got="something else")
     digest = sha256_of(path)
@@ -222,13 +222,13 @@ def _add_asset(store: Store, settings: ServiceSettings, path: Path) -> AssetKind
         raise NotFound("asset", expected="a file named after its sha256", got=f"one whose sha256 is {digest}")
     kind = _kind_of(path)
     report = check_file(store, settings, kind, path)
-    # The file is its own draft: it stays where it is.
+    # The file is its own draft: it stays in place.
     store.assets.add(SERVICE, CheckedUpload(path, kind, digest, path.suffix, report.counts, report.warnings))
     return kind
 
 
 def check_file(store: Store, settings: ServiceSettings, kind: UploadKind, *paths: Path) -> Report:
-    """What the check of an upload finds in a file, beside others."""
+    """Return the result of the upload check of a file, with the files that it needs."""
     limits = SandboxLimits(settings.check_seconds, settings.check_memory_bytes, threading.Event())
     with store.files.scratch() as scratch:
         return check(kind, paths[0], scratch, limits, *paths[1:])
@@ -242,7 +242,7 @@ def _kind_of(path: Path) -> AssetKind:
 
 
 def _add_lift(store: Store, settings: ServiceSettings, path: Path) -> UploadKind:
-    """A lift remembers the settings and the digests of what it was made of: that is its job's order.
+    """Return the order of a lift's job from its file, which records the settings and the digests of its inputs.
 
     One that was brought may have been made with a folder of cameras: then those of its poses are looked for.
     """
@@ -258,15 +258,15 @@ def _add_lift(store: Store, settings: ServiceSettings, path: Path) -> UploadKind
     if document.get("poses") and store.assets.find(SERVICE, order.cameras) is None:
         order = replace(order, cameras=_cameras_of(store, settings, path) or order.cameras)
     packs = tuple(pack for pack in order.features if store.assets.find(SERVICE, pack) is not None)
-    order = replace(order, features=packs)  # lifts may be brought without their packs
+    order = replace(order, features=packs)  # an uploaded lift may have no packs here
     for asset, kind in order.assets():
-        store.assets.get(SERVICE, asset, kind)  # a lift without what it was made of can be shown to nobody
+        store.assets.get(SERVICE, asset, kind)  # a lift without its splats and cameras cannot be shown
     store.lifts.adopt(SERVICE, path.stem, order, FinishedLift(path, sha256_of(path), count, channels, document))
     return LIFT
 
 
 def _change_lift(store: Store, path: Path) -> None:
-    """Give a lift again what was changed of it, but for photos that are gone."""
+    """Restore the changes of a lift, except photos that are lost."""
     try:
         changes = LiftChange.model_validate_json(path.read_bytes()).model_dump(exclude_unset=True)
     except (OSError, ValueError) as error:
@@ -288,7 +288,7 @@ def _cameras_of(store: Store, settings: ServiceSettings, lift: Path) -> str | No
 
 
 def header_of(path: Path) -> tuple[set[str], dict[str, str], list[int]]:
-    """Names of tensors, metadata and the shape of ``features``, of a safetensors file."""
+    """Return the names of tensors, the metadata and the shape of ``features`` of a safetensors file."""
     try:
         handle: Any
         with safe_open(str(path), framework="np") as handle:

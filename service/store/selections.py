@@ -1,4 +1,4 @@
-"""Sets of splats that somebody corrects by hand, each with its history; and what people call the things of a lift."""
+"""Selections of splats with their history, and labels of a lift's objects, both edited by users."""
 
 from __future__ import annotations
 
@@ -16,45 +16,48 @@ from liftcore.errors import NotFound
 from service.errors import InvalidRequest, OverLimit, VersionMismatch
 from service.store.database import Database, insert, parsed, record_of
 from service.store.files import DataDirectory
-from service.store.owners import SHOWN_JOBS, Owner, require_quota
+from service.store.owners import VISIBLE_JOBS, Owner, require_quota
 
-MOST = 200  # selections of a lift
+MAX_SELECTIONS = 200  # selections of a lift
 HISTORY = 100  # steps that a selection can go back
-MOST_BYTES, BYTES_A_SPLAT = 64 << 20, 64  # of all steps of a lift's selections, compressed: so much, and a splat more
+MAX_BYTES, BYTES_A_SPLAT = (
+    64 << 20,
+    64,
+)  # of all steps of a lift's selections, compressed, and in addition for each splat
 NO_USE = "delete one that is of no use any more"
-MOST_THINGS = 10_000  # of a lift, that have a name or are hidden
+MAX_LABELS = 10_000  # of a lift, with a name or hidden
 
-SHOWN = (
+COLUMNS = (
     "selections.*, (SELECT min(number) FROM selection_steps WHERE selection = selections.id) AS first,"
     " (SELECT max(number) FROM selection_steps WHERE selection = selections.id) AS last, steps.count, steps.box"
 )
 VISIBLE = (
-    f"SELECT {SHOWN} FROM selections JOIN jobs ON jobs.id = lift"
+    f"SELECT {COLUMNS} FROM selections JOIN jobs ON jobs.id = lift"
     " JOIN selection_steps AS steps ON selection = selections.id AND number = step"
-    f" WHERE lift = :lift AND {SHOWN_JOBS}"
+    f" WHERE lift = :lift AND {VISIBLE_JOBS}"
 )
 
 
 @dataclass(frozen=True)
 class SplatSet:
-    """Splats, and what made them of those before."""
+    """Splats of a selection after an edit, and the edit."""
 
     edit: dict[str, Any]
     count: int
     box: dict[str, Any] | None
-    bits: bytes  # a bit a splat, the first the lowest of its byte
+    bits: bytes  # a bit for each splat, the lowest bit of a byte first
 
 
 @dataclass(frozen=True)
 class SelectionRecord:
-    """A selection as the store knows it."""
+    """Record of a selection."""
 
     id: str
     lift: str
     name: str
-    version: int  # grows with each change
-    step: int  # where in its history it is
-    first: int  # the steps that there are
+    version: int  # increases with each change
+    step: int  # the current step of its history
+    first: int  # the oldest step in the history
     last: int
     count: int  # splats
     box: dict[str, Any] | None
@@ -63,14 +66,14 @@ class SelectionRecord:
 
 
 class SelectionStore:
-    """Selections in the database: they belong to whom their lift does. What an owner does not see is absent."""
+    """Selections in the database; each belongs to its lift's owner. Selections of other owners count as absent."""
 
     def __init__(self, database: Database, files: DataDirectory) -> None:
         self._database = database
         self._files = files
 
     def create(self, owner: Owner, lift: str, name: str, splats: SplatSet) -> SelectionRecord:
-        """Keep a new selection; the lift is one that the owner sees.
+        """Store a new selection of a lift that the owner may see.
 
         Raises:
             NotFound: the lift was deleted meanwhile.
@@ -80,8 +83,8 @@ class SelectionStore:
         selection, now = secrets.token_hex(8), time.time()
         with _lift_there(lift), self._database.write(is_counted=True) as connection:
             number = connection.execute("SELECT count(*) FROM selections WHERE lift = ?", (lift,)).fetchone()[0]
-            if number >= MOST:
-                raise OverLimit("selection", expected=f"at most {MOST} of a lift", got="more", hint=NO_USE)
+            if number >= MAX_SELECTIONS:
+                raise OverLimit("selection", expected=f"at most {MAX_SELECTIONS} of a lift", got="more", hint=NO_USE)
             row = {"id": selection, "lift": lift, "name": name, "version": 1, "step": 0}
             insert(connection, "selections", row | {"created": now, "changed": now})
             self._keep(connection, owner, selection, 0, splats)
@@ -90,7 +93,7 @@ class SelectionStore:
     def extend(
         self, owner: Owner, lift: str, selection: str, splats: SplatSet, versions: frozenset[int]
     ) -> SelectionRecord:
-        """Take a step from the version that it had; steps that were undone are forgotten, and the oldest.
+        """Add a step to the history; the steps that were undone are deleted, and the oldest ones over the limit.
 
         Raises:
             NotFound: there is no such selection.
@@ -111,7 +114,7 @@ class SelectionStore:
     def change(
         self, owner: Owner, lift: str, selection: str, changes: dict[str, Any], versions: frozenset[int] | None
     ) -> SelectionRecord:
-        """Give it another ``name``, or go to another ``step`` of its history.
+        """Set the ``name``, or go to another ``step`` of the history.
 
         Raises:
             NotFound: there is no such selection.
@@ -129,7 +132,7 @@ class SelectionStore:
         return self.get(owner, lift, selection)
 
     def delete(self, owner: Owner, lift: str, selection: str, versions: frozenset[int] | None) -> None:
-        """Forget it and its history.
+        """Delete a selection and its history.
 
         Raises:
             NotFound: there is no such selection.
@@ -140,7 +143,7 @@ class SelectionStore:
             connection.execute("DELETE FROM selections WHERE id = ?", (selection,))
 
     def get(self, owner: Owner, lift: str, selection: str, versions: frozenset[int] | None = None) -> SelectionRecord:
-        """The selection of that id.
+        """Return the selection of that id.
 
         Raises:
             NotFound: the lift has none.
@@ -150,7 +153,7 @@ class SelectionStore:
             return _expected(connection, owner, lift, selection, versions)
 
     def all(self, owner: Owner, lift: str) -> list[SelectionRecord]:
-        """Those of a lift, newest first."""
+        """Return the selections of a lift, newest first."""
         with self._database.read() as connection:
             rows = connection.execute(
                 f"{VISIBLE} ORDER BY selections.created DESC, selections.id", owner.terms(lift=lift)
@@ -158,7 +161,7 @@ class SelectionStore:
             return [_record(row) for row in rows]
 
     def history(self, selection: SelectionRecord) -> list[dict[str, Any]]:
-        """The ``number``, ``edit`` and ``count`` of each of its steps, also of those that were undone."""
+        """Return the ``number``, ``edit`` and ``count`` of each step, also of those that were undone."""
         with self._database.read() as connection:
             rows = connection.execute(
                 "SELECT number, edit, count FROM selection_steps WHERE selection = ? ORDER BY number", (selection.id,)
@@ -166,7 +169,7 @@ class SelectionStore:
         return [{**dict(row), "edit": json.loads(row["edit"])} for row in rows]
 
     def bits(self, selection: SelectionRecord) -> bytes:
-        """Its splats at its step; NotFound where that is gone."""
+        """Return the splats at the current step; NotFound if it is gone."""
         with self._database.read() as connection:
             row = connection.execute(
                 "SELECT splats FROM selection_steps WHERE selection = ? AND number = ?",
@@ -177,16 +180,17 @@ class SelectionStore:
         return zlib.decompress(row["splats"])
 
     def things(self, owner: Owner, lift: str) -> dict[int, tuple[str | None, bool]]:
-        """Of the lift's objects that somebody named or hid: their names, and whether they are hidden."""
+        """Return the labels of the lift's objects: their names, and whether they are hidden."""
         select = (
-            f"SELECT thing, name, hidden FROM things JOIN jobs ON jobs.id = lift WHERE lift = :lift AND {SHOWN_JOBS}"
+            "SELECT thing, name, hidden FROM things JOIN jobs ON jobs.id = lift"
+            f" WHERE lift = :lift AND {VISIBLE_JOBS}"
         )
         with self._database.read() as connection:
             rows = connection.execute(select, owner.terms(lift=lift)).fetchall()
         return {row["thing"]: (row["name"], bool(row["hidden"])) for row in rows}
 
     def change_thing(self, lift: str, thing: int, changes: dict[str, Any]) -> None:
-        """Give an object of a lift, which the owner sees, another ``name``, None for its own, or have it ``hidden``.
+        """Set the ``name`` of an object (None: its own), or ``hidden``; the owner must be able to see the lift.
 
         Raises:
             NotFound: the lift was deleted meanwhile.
@@ -195,8 +199,8 @@ class SelectionStore:
         with _lift_there(lift), self._database.write(is_counted=True) as connection:
             select = "SELECT count(*) FROM things WHERE lift = ? AND thing != ?"
             number = connection.execute(select, (lift, thing)).fetchone()[0]
-            if number >= MOST_THINGS:
-                raise OverLimit("thing", expected=f"at most {MOST_THINGS} changed objects of a lift", got="more")
+            if number >= MAX_LABELS:
+                raise OverLimit("thing", expected=f"at most {MAX_LABELS} changed objects of a lift", got="more")
             insert(connection, "things", {"lift": lift, "thing": thing, "hidden": 0}, on_conflict="IGNORE")
             for column in changes.keys() & {"name", "hidden"}:
                 connection.execute(
@@ -212,7 +216,7 @@ class SelectionStore:
         select = "SELECT total(length(splats) + length(edit)) FROM selection_steps JOIN selections ON id = selection"
         lift = "(SELECT lift FROM selections WHERE id = ?)"
         (stored,) = connection.execute(f"{select} WHERE lift = {lift}", (selection,)).fetchone()
-        limit = MOST_BYTES + BYTES_A_SPLAT * 8 * len(splats.bits)
+        limit = MAX_BYTES + BYTES_A_SPLAT * 8 * len(splats.bits)
         if stored + coming > limit:
             expected = f"at most {limit} bytes of all selections of a lift"
             raise OverLimit("selection", expected=expected, got="more", hint=NO_USE)
@@ -232,7 +236,7 @@ class SelectionStore:
 
 @contextmanager
 def _lift_there(lift: str) -> Iterator[None]:
-    """Say of rows that reference no lift that it is not there."""
+    """Raise NotFound for rows that refer to no lift."""
     try:
         yield
     except sqlite3.IntegrityError as error:

@@ -1,4 +1,4 @@
-"""The store: everything below one data directory; and garbage, files that nothing in the database reaches and no
+"""The store: everything below one data directory; and garbage collection of files that no record refers to and no
 running work needs."""
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from service.store.selections import SelectionStore
 
 @dataclass(frozen=True)
 class Store:
-    """The files and the database of a data directory. Who asks for assets, jobs or results says for which owner."""
+    """The files and the database of a data directory. Callers name the owner for assets, jobs and results."""
 
     files: DataDirectory
     database: Database
@@ -51,7 +51,7 @@ class Store:
 
     @classmethod
     def open(cls, root: Path, *, floor_bytes: int = 0, new: bool = False, rebuilding: bool = False) -> Self:
-        """Open or make the data directory.
+        """Open or create the data directory.
 
         Args:
             root: the directory.
@@ -86,14 +86,14 @@ class Store:
         )
 
     def close(self) -> None:
-        """Close the database and let the directory go."""
+        """Close the database and release the directory."""
         self.database.close()
         self.files.close()
 
 
 def _database(files: DataDirectory, *, new: bool, rebuilding: bool) -> Database:
     path = files.root / DATABASE
-    if rebuilding:  # until `Database.catch_up` it is not the one that belongs here
+    if rebuilding:  # until `Database.catch_up` it is not the directory's database
         remember_generation(files.root, (expected_generation(files.root) or 0) + 1)
     existed = path.exists()
     try:
@@ -107,7 +107,7 @@ def _database(files: DataDirectory, *, new: bool, rebuilding: bool) -> Database:
     except StaleDatabase:
         if not new:
             raise
-        if any_key(path):  # of a release that did not remember it
+        if any_key(path):  # keys of a release without the marker
             remember_keys(files.root)
         files.begin_anew(DATABASE, GENERATION)
         database = Database(path)
@@ -122,10 +122,10 @@ log = logging.getLogger(__name__)
 
 
 def collect(store: Store, older_than: float) -> list[Path]:
-    """Clear away what crashes left behind: blobs and lifts without a row, drafts without a writer, unused work.
+    """Remove the remains of crashes: blobs and lifts without a row, drafts without a writer, unused work.
 
-    What the database does not know goes to quarantine: it may be that the database is wrong. Drafts, which nobody was
-    told of, and the work of jobs that it says have ended are removed.
+    Files without a record go to quarantine, as the database may be wrong. Drafts, which were never acknowledged, and
+    the work of jobs that have ended are removed.
 
     Args:
         store: whose files are looked through.
@@ -136,10 +136,13 @@ def collect(store: Store, older_than: float) -> list[Path]:
     """
     files, quarantined = store.files, []
     files.make_folders()
-    with files.blobs_changing, store.database.read() as connection:  # so no upload is between its blob and its row
+    with (
+        files.blobs_changing,
+        store.database.read() as connection,
+    ):  # so that no upload is between its blob and its row
         recorded = {row["file"] for row in connection.execute("SELECT file FROM assets")}
         quarantined += _lost_paths(files, (files.root / "blobs").glob("*/*"), recorded, older_than)
-    with store.database.write() as connection:  # so no lift is between its file and its row
+    with store.database.write() as connection:  # so that no lift is between its file and its row
         rows = connection.execute("SELECT id, file FROM lifts").fetchall()
         recorded = {file for row in rows for file in (row["file"], files.relative(files.lift_changes(row["id"])))}
         quarantined += _lost_paths(files, (files.root / "lifts").iterdir(), recorded, older_than)
@@ -160,7 +163,7 @@ def _lost_paths(
 
 
 def empty_quarantine(files: DataDirectory, since_before: float) -> list[Path]:
-    """Remove what was moved to quarantine long ago.
+    """Remove files that were moved to quarantine long ago.
 
     Args:
         files: whose quarantine it is.
@@ -176,7 +179,7 @@ def empty_quarantine(files: DataDirectory, since_before: float) -> list[Path]:
 
 
 def _unused_work(store: Store) -> tuple[list[Path], list[Path]]:
-    """Folders of jobs that have ended, which never run again, and of jobs that the database does not know."""
+    """Return the folders of jobs that have ended, and of unknown jobs."""
     states = {folder: store.jobs.state(SERVICE, folder.name) for folder in (store.files.root / "work").iterdir()}
     finished = [folder for folder, state in states.items() if state in ENDED]
     return finished, [folder for folder, state in states.items() if state is None]
@@ -185,12 +188,12 @@ def _unused_work(store: Store) -> tuple[list[Path], list[Path]]:
 def _changed_at(path: Path) -> float:
     try:
         return path.stat().st_mtime
-    except FileNotFoundError:  # its owner was quicker
+    except FileNotFoundError:  # its owner removed it
         return float("inf")
 
 
 class Collector:
-    """A thread that collects at start-up and now and then."""
+    """Thread that collects garbage at start-up and periodically."""
 
     def __init__(self, store: Store, settings: ServiceSettings) -> None:
         self._store = store
@@ -199,11 +202,11 @@ class Collector:
         self._thread = threading.Thread(target=self._loop, name="collector", daemon=True)
 
     def start(self) -> None:
-        """Begin."""
+        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> None:
-        """End; returns when the thread has."""
+        """End the thread; return when it has ended."""
         self._stopping.set()
         self._thread.join()
 
@@ -211,7 +214,7 @@ class Collector:
         while True:
             try:
                 self._collect()
-            except Exception:  # a full disk today must not stop the collection of tomorrow
+            except Exception:  # an error of today must not stop later collections
                 log.exception("the collection of garbage stumbled")
             if self._stopping.wait(self._settings.garbage_seconds):
                 return

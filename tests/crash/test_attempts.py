@@ -389,7 +389,7 @@ def test_long_answer_is_heard_in_time_that_grows_with_its_length() -> None:
     heard: list[dict[str, Any]] = []
     begun = time.process_time()
     with JobProcess([sys.executable, "-S", "-c", said], {}, "0" * 32) as process:
-        while not (ended := process.ended()) or not heard:
+        while not (ended := process.has_ended()) or not heard:
             heard += process.listen(0 if ended else 0.2)
         heard += process.listen(0)
     assert [len(message["said"]) for message in heard] == [48 << 20]  # the half line at its end is none

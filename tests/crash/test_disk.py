@@ -181,7 +181,7 @@ def test_another_database_in_its_place_costs_no_file(tmp_path: Path) -> None:
     for look in (lambda: collect(store, time.time() + 1), lambda: store.assets.all(SERVICE)):
         with pytest.raises(sqlite3.OperationalError, match="in the place of the database"):
             look()
-    assert asset.whole
+    assert asset.is_complete
     store.close()
 
 

@@ -144,7 +144,7 @@ def test_marker_on_a_full_disk_fails_no_upload(data: Path, monkeypatch: pytest.M
     store = Store.open(data)
     monkeypatch.setattr("service.store.database.remember_generation", full)
     asset = asset_of(store, AssetKind.CAMERAS, {})
-    assert store.assets.get(SERVICE, asset).whole
+    assert store.assets.get(SERVICE, asset).is_complete
     store.close()
 
 
@@ -191,7 +191,7 @@ def test_folder_that_somebody_removed_is_made_again(data: Path) -> None:
     collect(store, older_than=0)
     asset = asset_of(store, AssetKind.CAMERAS, {})
     with store.files.scratch() as folder:
-        assert folder.is_dir() and store.assets.get(SERVICE, asset).whole
+        assert folder.is_dir() and store.assets.get(SERVICE, asset).is_complete
     store.close()
 
 
