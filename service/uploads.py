@@ -156,7 +156,7 @@ class AssetIntake(Intake[AssetRecord]):
 
     def _find_same(self, digest: str) -> AssetRecord | None:
         record = self._store.assets.find(self._owner, f"sha256:{digest}", limit=SHOWN_CHARACTERS)
-        return record if record is not None and record.kind == self._kind and record.whole else None
+        return record if record is not None and record.kind == self._kind and record.is_complete else None
 
     def keep(self, upload: CheckedUpload) -> tuple[AssetRecord, bool]:
         """Store it as an asset."""

@@ -441,7 +441,7 @@ function keyed(event, built) {
 
 // What is on the screen, with a legend below it: words by their colours, a layer by its name.
 async function shot() {
-  const parts = look.mode !== "view" && viewer ? [await viewer.whole()] : [at("render"), at("over"), at("mask"), at("outline")].filter(part => !part.hidden);
+  const parts = look.mode !== "view" && viewer ? [await viewer.is_complete()] : [at("render"), at("over"), at("mask"), at("outline")].filter(part => !part.hidden);
   const [wide, high] = [parts[0].naturalWidth ?? parts[0].width, parts[0].naturalHeight ?? parts[0].height];
   const legend = [...ask.painted().map(({ question }) => [label(question), question.colour]), ...names.entries(), ...(look.what === "rgb" ? [] : [[look.title, null]])];
   const canvas = document.createElement("canvas");
