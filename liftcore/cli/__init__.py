@@ -1,9 +1,9 @@
 """Public: ``splatlift``, the command line.
 
-Each command is a file, here or in the service's package: ``add_arguments`` and ``run``.
+Each command is a module with ``add_arguments`` and ``run``, here or in the service's package.
 
-Exit status: 0; 2 for input that is the user's to mend, with one line on stderr that says what; 1 for our own
-fault. With ``--json`` stdout holds one JSON object and nothing else.
+Exit status: 0 for success; 2 for invalid input, with one line on stderr; 1 for an internal error. With ``--json``
+stdout has exactly one JSON object.
 """
 
 import argparse
@@ -15,91 +15,91 @@ from importlib import import_module
 from typing import Any
 
 from liftcore import __version__, load_plugin
-from liftcore.cli.options import BAD_INPUT, Elsewhere, Parser, misplaced, place, shared_options, whole
+from liftcore.cli.options import BAD_INPUT, Parser, RemoteUrl, place, shared_options, whole_number, wrong_kind_error
 from liftcore.errors import SplatliftError
 from liftcore.files import local_path
 
-__all__ = ["Parser", "build_parser", "main", "place", "whole"]  # what commands of other packages are made of
+__all__ = ["Parser", "build_parser", "main", "place", "whole_number"]  # for commands of other packages
 COMMANDS = {
-    "check": "do splats, cameras, photos and features belong together",
+    "check": "check that splats, cameras, photos and features match",
     "lift": "lift features onto splats",
-    "refine": "a finished lift with smooth features",
-    "transfer": "a finished lift on an edited copy of its splats",
-    "plan": "what a lift would do and need",
+    "refine": "smooth the features of a lift",
+    "transfer": "transfer a lift to an edited copy of its splats",
+    "plan": "plan a lift: views, memory and time",
     "query": "find words and examples in a lift",
-    "segment": "name every splat of a lift by the best of many words",
-    "objects": "the things in a lift, found without a word",
-    "export": "a lifted scene with its labels, for other programs",
-    "render": "a picture of a lift from any camera",
-    "pack": "make a feature pack of the field's formats",
-    "encode": "make a feature pack of images",
-    "inspect": "what is in a file, and what is wrong",
-    "evaluate": "lifts against the field's labels",
-    "bench": "how fast this machine lifts",
-    "tradeoff": "speed against accuracy on your scene",
+    "segment": "label every splat of a lift with the best of many words",
+    "objects": "list the objects in a lift",
+    "export": "export a lifted scene with its labels",
+    "render": "render a lift from any camera",
+    "pack": "convert features or masks to a feature pack",
+    "encode": "encode images as a feature pack",
+    "inspect": "describe a file and its problems",
+    "evaluate": "evaluate lifts on labelled datasets",
+    "bench": "measure the speed of lifts on this machine",
+    "tradeoff": "compare speed and accuracy on a scene",
 }
-SERVICE_COMMANDS = {  # files of another package, which are entry points in splatlift.commands
-    "demo": "the whole job, through the real service",
+SERVICE_COMMANDS = {  # modules of another package, which are entry points in splatlift.commands
+    "demo": "run a complete example through the HTTP service",
     "serve": "run the HTTP service",
-    "view": "one lift on the service's page, until Ctrl-C",
-    "keys": "who may use the HTTP service",
-    "store": "mend the HTTP service's data directory",
+    "view": "show a lift on the service's page, until Ctrl-C",
+    "keys": "manage the API keys of the HTTP service",
+    "store": "repair the HTTP service's data directory",
 }
 WITH_ACTIONS = ("keys", "pack", "store")  # whose actions take the shared options
-OUR_FAULT = 1
+INTERNAL_ERROR = 1
 INTERRUPTED = 130
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; the exit status."""
+    """Run a command, and return the exit status."""
     try:
         options = build_parser().parse_args(argv)
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else 0
     try:
-        bring(options)
+        download_inputs(options)
         status = _module(options.command).run(options)
         sys.stdout.flush()
         return status
     except SplatliftError as error:
-        print(f"splatlift: {misplaced(options) or error}", file=sys.stderr)
+        print(f"splatlift: {wrong_kind_error(options) or error}", file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:
         print("splatlift: interrupted", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
-        # Whoever read the answer has seen enough; what is still buffered goes nowhere, without a complaint.
+        # The reader of stdout closed it; the rest of the buffer is discarded without an error.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return OUR_FAULT
+        return INTERNAL_ERROR
     except Exception as error:
         if options.debug:
             raise
-        what = " ".join(f"{type(error).__name__}: {error}".split())[:400]
-        print(f"splatlift: our fault: {what} (--debug shows where)", file=sys.stderr)
-        return OUR_FAULT
+        message = " ".join(f"{type(error).__name__}: {error}".split())[:400]
+        print(f"splatlift: internal error: {message} (--debug shows the traceback)", file=sys.stderr)
+        return INTERNAL_ERROR
 
 
-def bring(options: argparse.Namespace) -> None:
-    """Put paths of this machine in the place of inputs that lie elsewhere, whose options ``elsewhere`` names."""
-    options.elsewhere = [name for name, value in vars(options).items() if isinstance(value, Elsewhere)]
+def download_inputs(options: argparse.Namespace) -> None:
+    """Download remote inputs, and replace their URLs by local paths; ``remote_options`` are the options of URLs."""
+    options.remote_options = [name for name, value in vars(options).items() if isinstance(value, RemoteUrl)]
     for name, value in vars(options).items():
         if name == "output":
             continue
-        if isinstance(value, Elsewhere):
+        if isinstance(value, RemoteUrl):
             setattr(options, name, local_path(value))
         elif isinstance(value, list):
-            setattr(options, name, [local_path(one) if isinstance(one, Elsewhere) else one for one in value])
+            setattr(options, name, [local_path(item) if isinstance(item, RemoteUrl) else item for item in value])
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """All commands; one's options are added when it is parsed, and what it needs is loaded when it runs."""
+    """Build the parser of all commands. Options of a command are added, and its modules imported, only if it runs."""
     parser = Parser(prog="splatlift", description="Lift 2D features onto trained splats and query them in words.")
     parser.add_argument("--version", action="version", version=f"splatlift {__version__}")
     shared = shared_options()
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
-    for name, said in (SERVICE_COMMANDS | COMMANDS).items():
-        own = commands.add_parser(name, parents=[] if name in WITH_ACTIONS else [shared], help=said)
-        own.fill = partial(_add_options, name, own, [shared] if name in WITH_ACTIONS else [])
+    for name, description in (SERVICE_COMMANDS | COMMANDS).items():
+        command = commands.add_parser(name, parents=[] if name in WITH_ACTIONS else [shared], help=description)
+        command.fill = partial(_add_options, name, command, [shared] if name in WITH_ACTIONS else [])
     return parser
 
 
@@ -111,7 +111,7 @@ def _add_options(name: str, parser: Parser, shared: list[Parser]) -> None:
 
 
 def _module(name: str) -> Any:
-    """The file of a command.
+    """Import the module of a command.
 
     Raises:
         Unavailable: its package is not installed.

@@ -8,9 +8,9 @@ from liftcore.cli import main
 
 
 def run() -> NoReturn:
-    """Run a command as the whole of a process, and end it."""
-    # A command lives for seconds, and torch makes many objects: to look through them for cycles at each 700 new ones
-    # takes .2 s, and once more at the end .3 s.
+    """Run a command, and exit with its status."""
+    # A command runs for seconds, and torch creates many objects. To collect cycles after every 700 new objects takes
+    # 0.2 s, and at exit 0.3 s.
     gc.set_threshold(50_000)
     status = main()
     gc.freeze()

@@ -1,4 +1,4 @@
-"""``splatlift check``: do splats, cameras, photos and features belong together?"""
+"""``splatlift check``: check that splats, cameras, photos and features match."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ if TYPE_CHECKING:
 
 
 CHECKS = """\
-Twelve views are compared. The exit status is 2, and the fault is named, unless
-- photos have the shape of their cameras, in any size. Others are crops, or lie
-  on their side, and are compared no further;
-- rays meet splats, and the render of a view is more like its own photo than
-  like others. Causes that are recognised: photos that are turned, mirrored,
-  shifted (a wrong principal point) or of another exposure, and camera positions
-  in another scale;
+Twelve views are compared. The exit status is 2, with the problem, unless
+- photos have the aspect ratio of their cameras, in any size. Otherwise they are
+  cropped or rotated, and are not compared further;
+- rays hit splats, and the render of a view is more similar to its own photo
+  than to others. Detected causes: photos that are rotated, mirrored, shifted (a
+  wrong principal point) or of another exposure, and camera positions in another
+  scale;
 - masks follow the edges in the photos better than when mirrored, and
-  neighbouring cells of grids are more alike than with the axes in another order;
+  neighbouring cells of grids are more similar than with another order of axes;
 - views agree on the splats that they share at least a fifth as much as their
-  most similar regions would allow, and no better with the camera positions at
-  another scale.
-Photos without a camera and cameras without a photo are named, too.
+  most similar regions allow, and not better with another scale of the camera
+  positions.
+Photos without a camera and cameras without a photo are listed too.
 """
 
 
 def add_arguments(parser: Parser) -> None:
-    """The options of the command."""
+    """Add the options of the command."""
     parser.add_argument("splats", type=place, help="trained splats")
     parser.add_argument("cameras", type=place, help="COLMAP folder or .zip, transforms.json or cameras.json")
     parser.add_argument("others", type=place, nargs="*", help="folders of photos, and feature packs (.safetensors)")
@@ -48,7 +48,7 @@ def add_arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Look, and say what is wrong; the exit status is 2 if something is."""
+    """Check the scene, and print the problems; the exit status is 2 if there are any."""
     from liftcore import LiftSettings
     from liftcore.evaluate import check_scene
     from liftcore.files import check_output, writing
@@ -59,38 +59,37 @@ def run(options: argparse.Namespace) -> int:
     packs = [path for path in options.others if path.suffix == ".safetensors"]
     photos = [path for path in options.others if path not in packs]
     begin = time.perf_counter()
-    found = check_scene(options.splats, options.cameras, photos, packs or None, True, settings)
-    document = {name: value for name, value in asdict(found).items() if name != "worst"}
+    report = check_scene(options.splats, options.cameras, photos, packs or None, True, settings)
+    document = {name: value for name, value in asdict(report).items() if name != "worst"}
     for view in document["views"]:
-        view["others"] = view["other_psnr"]  # the older key stays
-    document |= {"healthy": not found.wrong, "seconds": time.perf_counter() - begin}
-    if options.worst and found.worst is not None:
+        view["others"] = view["other_psnr"]  # the key of earlier releases
+    document |= {"healthy": not report.wrong, "seconds": time.perf_counter() - begin}
+    if options.worst and report.worst is not None:
         with writing(options.worst):
-            options.worst.write_bytes(found.worst)
+            options.worst.write_bytes(report.worst)
         document["worst"] = str(options.worst)
-    reply(document, as_json=options.json, lines=_lines(found, document, options.verbose))
-    return BAD_INPUT if found.wrong else 0
+    reply(document, as_json=options.json, lines=_lines(report, document, options.verbose))
+    return BAD_INPUT if report.wrong else 0
 
 
-def _lines(found: CheckReport, document: dict, verbose: bool) -> Iterable[str]:
+def _lines(report: CheckReport, document: dict, verbose: bool) -> Iterable[str]:
     if verbose:
-        for view in found.views:
-            compared = "" if view.psnr is None else f", {view.psnr:.1f} dB to its photo"
-            control = "" if view.other_psnr is None else f" and {view.other_psnr:.1f} to others"
-            yield f"  {view.view}: row sums {view.row_sum:.3f}{compared}{control}"
-        yield f"  {found.in_view:.1%} of the splats are in some view"
-        yield from (f"  features, {name.replace('_', ' ')}: {value:.3f}" for name, value in found.features.items())
-    compared = [view for view in found.views if view.psnr is not None]
-    if compared:
-        worst = min(compared, key=lambda view: view.psnr or 0.0)
-        typical = median(view.psnr for view in compared if view.psnr is not None)
+        for view in report.views:
+            photo_match = "" if view.psnr is None else f", {view.psnr:.1f} dB to its photo"
+            other_match = "" if view.other_psnr is None else f" and {view.other_psnr:.1f} to others"
+            yield f"  {view.view}: row sums {view.row_sum:.3f}{photo_match}{other_match}"
+        yield f"  {report.in_view:.1%} of the splats are in some view"
+        yield from (f"  features, {name.replace('_', ' ')}: {value:.3f}" for name, value in report.features.items())
+    photo_match = [view for view in report.views if view.psnr is not None]
+    if photo_match:
+        worst = min(photo_match, key=lambda view: view.psnr or 0.0)
+        typical = median(view.psnr for view in photo_match if view.psnr is not None)
         yield f"renders are {typical:.1f} dB from their photos in the median, {worst.psnr:.1f} in {worst.view}"
-    yield from (f"note: {text}" for text in found.notes)
-    yield from (f"wrong: {text}" for text in found.wrong)
+    yield from (f"note: {text}" for text in report.notes)
+    yield from (f"wrong: {text}" for text in report.wrong)
     if "worst" in document:
         yield f"  worst: {document['worst']}"
-    if found.wrong:
-        yield "not healthy: mend what is wrong before you lift"
+    if report.wrong:
+        yield "not healthy: fix the problems before you lift"
     else:
-        took = f"{document['seconds']:.0f} s"
-        yield f"healthy: nothing contradicts anything that was given ({took}); splatlift lift is next"
+        yield f"healthy: no contradictions between the inputs ({document['seconds']:.0f} s); next: splatlift lift"

@@ -1,11 +1,11 @@
-"""``splatlift evaluate``: lifts against the labels of LeRF-OVS and 3D-OVS, in the protocols of the field."""
+"""``splatlift evaluate``: evaluate lifts on LeRF-OVS and 3D-OVS, by the protocols of published methods."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from liftcore.cli.options import Parser, add_encoder, renamed
+from liftcore.cli.options import Parser, add_encoder, option_errors
 from liftcore.cli.reply import reply
 
 NAMES = {
@@ -17,33 +17,35 @@ NAMES = {
 
 
 def add_arguments(parser: Parser) -> None:
-    """The options of the command."""
+    """Add the options of the command."""
     from liftcore.models import METHODS
 
-    parser.add_argument("dataset", choices=("lerf-ovs", "3d-ovs"), help="whose labels")
+    parser.add_argument("dataset", choices=("lerf-ovs", "3d-ovs"), help="dataset of the labels")
     parser.add_argument(
         "lifts", nargs="+", metavar="LIFT", help="SCENE=LIFT, SCENE.lift.safetensors, or a folder of those"
     )
     parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="the dataset, or its labels")
     add_encoder(parser)
-    parser.add_argument("--protocol", nargs="+", choices=("P1", "P2", "P3", "own"), help="else all")
+    parser.add_argument("--protocol", nargs="+", choices=("P1", "P2", "P3", "own"), help="default: all")
     parser.add_argument(
         "--threshold", default="auto", metavar="T", help=f"of P2, P3 and own: {', '.join(METHODS)} or a number"
     )
-    competitors = "texts to compete with: all up to the next option; may be given several times"
+    competitors = "negative texts: all words up to the next option; may be repeated"
     parser.add_argument("--negative", nargs="+", action="extend", default=[], metavar="WORD", help=competitors)
-    parser.add_argument("--held-out", type=Path, metavar="FILE", help="the only frames to judge, a name a line")
+    parser.add_argument(
+        "--held-out", type=Path, metavar="FILE", help="file of the frames to evaluate, one name a line"
+    )
 
 
 def run(options: argparse.Namespace) -> int:
-    """Judge every lift whose scene is labelled, and print what was measured beside what was published."""
+    """Evaluate every lift of a labelled scene, and print the results with published ones."""
     from liftcore.evaluate import evaluate_lifts
 
     try:
         threshold = float(options.threshold)
     except ValueError:
         threshold = options.threshold
-    with renamed(NAMES):
+    with option_errors(NAMES):
         evaluation = evaluate_lifts(
             options.dataset,
             options.lifts,

@@ -1,4 +1,4 @@
-"""``splatlift export``: a lifted scene with its labels, for other programs; the name of the file says the format."""
+"""``splatlift export``: export a lifted scene with its labels; the suffix of the file is the format."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.cli.objects import named_tree
-from liftcore.cli.options import Parser, add_encoder, add_lift, add_world, opened_lift, text_encoder, whole
-from liftcore.cli.query import made_from
+from liftcore.cli.options import Parser, add_encoder, add_lift, add_world, open_lift, text_encoder, whole_number
+from liftcore.cli.query import source_files
 from liftcore.cli.reply import reply, write_files
 from liftcore.cli.segment import encoder_and_words
 from liftcore.errors import InvalidInput
@@ -18,72 +18,74 @@ if TYPE_CHECKING:
     from liftcore import Answer, Catalogue, Scene, Segmentation
     from liftcore.models import SceneTree
 
-WHAT = {".json": "masks", ".jsonl": "lines"}  # by the suffix; all others are splats with labels
+CONTENT_BY_SUFFIX = {".json": "masks", ".jsonl": "lines"}  # other suffixes: splats with labels
 
 
 def add_arguments(parser: Parser) -> None:
-    """The options of the command."""
+    """Add the options of the command."""
     add_lift(parser)
-    made = ".glb, .usdz, .ply or .spz: splats with labels; .json: COCO masks in the views; .jsonl: objects"
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=made)
+    formats = ".glb, .usdz, .ply or .spz: splats with labels; .json: COCO masks in the views; .jsonl: objects"
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=formats)
     source = parser.add_mutually_exclusive_group()
-    source.add_argument("--text", action="append", default=[], metavar="TEXT", help="label what these words find")
-    source.add_argument("--words", type=Path, metavar="FILE", help="label every splat by the best of these words")
-    source.add_argument("--all-words", action="store_true", help="label every splat by the best word of the encoder")
-    source.add_argument("--object", type=whole, metavar="ID", help="one object of the lift, and no other splat")
-    only = "with --text: the splats that were found, and no others"
-    parted = "of a .usdc or .usdz: a prim an object, in place of a subset of one prim"
-    parser.add_argument("--prims", action="store_true", help=parted)
-    parser.add_argument("--only", action="store_true", help=only)
-    names = "without the options above: name the lift's objects by these words, a file of one a line"
-    parser.add_argument("--vocabulary", type=Path, metavar="FILE", help=names)
+    source.add_argument(
+        "--text", action="append", default=[], metavar="TEXT", help="label the splats selected by these words"
+    )
+    source.add_argument("--words", type=Path, metavar="FILE", help="label every splat with the best of these words")
+    source.add_argument("--all-words", action="store_true", help="label every splat with the encoder's best word")
+    source.add_argument("--object", type=whole_number, metavar="ID", help="only one object of the lift")
+    only_help = "with --text: only the selected splats"
+    prims_help = "for .usdc or .usdz: one prim for each object instead of subsets of one prim"
+    parser.add_argument("--prims", action="store_true", help=prims_help)
+    parser.add_argument("--only", action="store_true", help=only_help)
+    vocabulary_help = "without the options above: label the lift's objects with these words, a file with one a line"
+    parser.add_argument("--vocabulary", type=Path, metavar="FILE", help=vocabulary_help)
     add_encoder(parser)
     add_world(parser)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write the scene, and say what is in the file."""
+    """Write the scene, and describe the file."""
     from liftcore.files import check_output
 
     suffix = options.output.suffix.lower()
-    what = WHAT.get(suffix, "labelled")
-    kind = {"masks": "json", "lines": "jsonl"}.get(what, "splats")
-    given = [path for path in (options.lift, options.table, options.words, options.vocabulary) if path]
-    check_output(options.output, given, kind)
+    content = CONTENT_BY_SUFFIX.get(suffix, "labelled")
+    kind = {"masks": "json", "lines": "jsonl"}.get(content, "splats")
+    inputs = [path for path in (options.lift, options.table, options.words, options.vocabulary) if path]
+    check_output(options.output, inputs, kind)
     if options.only and not options.text:
         raise InvalidInput(
-            "--only", expected="--text beside it", got="--only alone", hint="--object ID is one object"
+            "--only", expected="--text as well", got="no --text", hint="use --object ID for one object"
         )
-    scene = opened_lift(options)
-    check_output(options.output, made_from(scene), kind)
+    scene = open_lift(options)
+    check_output(options.output, source_files(scene), kind)
     source = _source(options, scene)
     if isinstance(source, int) or options.only:
-        what = "object"
+        content = "object"
     elif suffix == ".splat" or source is None:
-        what, source = "splats", None
+        content, source = "splats", None
     if options.prims:
-        if what != "labelled" or suffix not in (".usdc", ".usdz"):
+        if content != "labelled" or suffix not in (".usdc", ".usdz"):
             is_usd = suffix in (".usdc", ".usdz")
             got = "splats without labels" if is_usd else f"an output that ends in {suffix or 'no suffix'}"
             raise InvalidInput("--prims", expected="an output of labels that ends in .usdc or .usdz", got=got)
-        what = "prims"
-    files, exports = {"output": options.output}, {"output": partial(scene.export, source=source, what=what)}
-    if what == "labelled" and suffix == ".ply":
+        content = "prims"
+    files, exports = {"output": options.output}, {"output": partial(scene.export, source=source, what=content)}
+    if content == "labelled" and suffix == ".ply":
         names = options.output.with_name(f"{options.output.name}.json")
-        files["names"] = Path(check_output(names, [*given, *made_from(scene)], "json"))
+        files["names"] = Path(check_output(names, [*inputs, *source_files(scene)], "json"))
         exports["names"] = partial(scene.export, source=source, what="names")
     files = write_files(files, exports)
     splats = int(scene.members(source).sum()) if isinstance(source, int) else len(scene.features)
-    document: dict[str, Any] = {"files": files, "splats": splats, "what": what}
+    document: dict[str, Any] = {"files": files, "splats": splats, "what": content}
     document["world"] = scene.world.model_dump(mode="json")
-    if source is not None and not isinstance(source, int) and what != "object":
+    if source is not None and not isinstance(source, int) and content != "object":
         labels = scene.labels(source)
         document |= {
             name: len(labels.document[name]) for name in ("classes", "instances", "nodes") if name in labels.document
         }
-    if suffix != ".ply" and what not in WHAT.values() and scene.splats.kernel != "3dgs":
+    if suffix != ".ply" and content not in CONTENT_BY_SUFFIX.values() and scene.splats.kernel != "3dgs":
         document["warnings"] = [
-            f"{scene.splats.kernel} splats are written as the nearest Gaussians, all that the format has"
+            f"{scene.splats.kernel} splats are written as the nearest Gaussians, the only kernel of this format"
         ]
     reply(document, as_json=options.json)
     return 0

@@ -1,4 +1,4 @@
-"""``splatlift inspect``: what is in this file, and what is wrong with it."""
+"""``splatlift inspect``: describe a file and its problems."""
 
 from __future__ import annotations
 
@@ -10,18 +10,19 @@ from liftcore.cli.reply import reply
 CAMERAS = """\
 how cameras are read
 - Of several COLMAP models (sparse/0, sparse/1, ...) the one with cameras for
-  most views of the features is read, else the largest, and a warning names the
-  others. Between a distorted and an undistorted model you must choose.
-- A transforms.json without w and h takes each photo's size from the photo at
-  file_path, with or without a suffix. Of a folder transforms_train.json is read
-  if there is no transforms.json, and a warning names the views of test and val.
-- ns-export cameras writes poses alone, in the frame of the exported splats. Put
-  the transforms.json of the data beside its list, for the intrinsics by the
+  most views of the features is read, or else the largest, and a warning lists
+  the others. Choose one if there are a distorted and an undistorted model.
+- If transforms.json has no w and h, the size of each photo is read from the
+  photo at file_path, with or without a suffix. In a folder without
+  transforms.json, transforms_train.json is read, and a warning lists the views
+  of test and val.
+- ns-export cameras writes only poses, in the frame of the exported splats. Put
+  the transforms.json of the data next to its list, for the intrinsics by the
   photo's name.
-- A camera with a broken pose is skipped, with a warning.
+- A camera with an invalid pose is skipped, with a warning.
 - Lenses: COLMAP's SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV, OPENCV_FISHEYE,
   SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, SIMPLE_FISHEYE and FISHEYE, and
-  nerfstudio's k1 to k4, p1, p2. Others are refused.
+  nerfstudio's k1 to k4, p1, p2. Others are errors.
 - A panorama P (EQUIRECTANGULAR of both) becomes six cameras, the faces of a
   cube: P@front, P@right, P@back, P@left, P@up and P@down. All six read the
   features of the photo P.
@@ -29,7 +30,7 @@ how cameras are read
 
 
 def add_arguments(parser: Parser) -> None:
-    """The options of the command."""
+    """Add the options of the command."""
     parser.appendix = lambda: CAMERAS
     parser.add_argument("file", type=place, help="splats, cameras, features, a lift, masks or a text table")
 

@@ -1,4 +1,4 @@
-"""``splatlift lift``: features on splats, from three kinds of files to one."""
+"""``splatlift lift``: lift features onto splats."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liftcore.cli.options import Parser, add_settings, add_sources, add_verbose, add_world, count, place, world_of
-from liftcore.cli.reply import reply, shown, smoothing_line
+from liftcore.cli.reply import reply, short_text, smoothing_line
 from liftcore.errors import InvalidInput, InvalidSettings
 
-FEW_VIEWS = 26  # of masks: smooth features gain there, and hardly with 52 (docs/results.md)
-FILLED = 0.9  # of a ray, in a scene that was trained with its background
+FEW_VIEWS = 26  # of masks, where smoothing improves features; with 52 it hardly does (docs/results.md)
+CLOSED_SCENE_ROW_SUM = 0.9  # least mean row sum of a scene that was trained with its background
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -22,24 +22,24 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: Parser) -> None:
-    """The options of the command."""
+    """Add the options of the command."""
     add_sources(parser)
     parser.add_argument("-o", "--output", type=place, required=True, metavar="LIFT", help="the lift to write")
     add_settings(parser)
     add_world(parser)
-    parser.add_argument("--explain", action="store_true", help="print the plan before the work")
+    parser.add_argument("--explain", action="store_true", help="print the plan before the lift")
     add_verbose(parser)
-    goes_on = "a killed lift goes on from there, and one of the same regions with other features walks none again"
-    parser.add_argument("--checkpoint", type=Path, metavar="DIR", help=f"keep walked views there: {goes_on}")
-    parser.add_argument("--threads", type=count, metavar="N", help="else as many as there are cores")
-    blocks = "lift in blocks, whose memory is bounded: local, in this process; ray, by the workers of a Ray cluster"
-    shards = "X.shards as LIFT is a folder of shards"
-    parser.add_argument("--engine", metavar="NAME", help=f"{blocks}; {shards}")
-    parser.add_argument("--address", metavar="HOST:PORT", help="of the Ray cluster, or auto; else of this machine")
+    checkpoint_help = "an interrupted lift resumes, and a lift of the same regions with other features reuses them"
+    parser.add_argument("--checkpoint", type=Path, metavar="DIR", help=f"store rasterized views: {checkpoint_help}")
+    parser.add_argument("--threads", type=count, metavar="N", help="default: the number of cores")
+    engine_help = "lift in blocks of bounded memory: local, in this process; ray, by the workers of a Ray cluster"
+    shards = "LIFT as X.shards is a folder of shards"
+    parser.add_argument("--engine", metavar="NAME", help=f"{engine_help}; {shards}")
+    parser.add_argument("--address", metavar="HOST:PORT", help="of the Ray cluster, or auto; default: this machine")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Lift, write the lift whole or not at all, and say what came of it."""
+    """Lift, write the lift completely or not at all, and print a summary."""
     settings, world = settings_of(options), world_of(options)
     from liftcore import lift_files, open_engine
     from liftcore.files import check_output, writing
@@ -51,10 +51,10 @@ def run(options: argparse.Namespace) -> int:
 
     plans: list[Plan] = []
 
-    def take(plan: Plan) -> None:
+    def add_plan(plan: Plan) -> None:
         plans.append(plan)
         if not options.json:
-            print(*(plan.lines() if options.explain else in_short(plan)), sep="\n", flush=True)
+            print(*(plan.lines() if options.explain else plan_lines(plan)), sep="\n", flush=True)
 
     result = lift_files(
         options.splats,
@@ -63,7 +63,7 @@ def run(options: argparse.Namespace) -> int:
         settings,
         threads=options.threads,
         progress=True,
-        on_plan=take,
+        on_plan=add_plan,
         checkpoint=options.checkpoint or None,
         engine=engine,
     ).with_world(world)
@@ -72,15 +72,19 @@ def run(options: argparse.Namespace) -> int:
     (plan,) = plans
     warnings = result.metadata.certificate["warnings"]
     document = {"out": str(options.output), **_summary(result), "warnings": [*plan.warnings, *warnings]}
-    new = [warning for warning in warnings if warning not in plan.told]  # the others were printed with the plan
+    lift_warnings = [
+        warning for warning in warnings if warning not in plan.told
+    ]  # the others were printed with the plan
     reply(
-        document, as_json=options.json, lines=_lines(document | {"warnings": new}, options.cameras, options.verbose)
+        document,
+        as_json=options.json,
+        lines=_lines(document | {"warnings": lift_warnings}, options.cameras, options.verbose),
     )
     return 0
 
 
 def example_in(views: Sequence[str], cameras: Path) -> str:
-    """The pixel in the middle of the first of the lifted views, as an example of what to look for."""
+    """Return the middle pixel of the first of the lifted views, as an example of a query."""
     from liftcore import read_cameras
 
     width, height = read_cameras(cameras, choosing=False, views=views)[views[0]].photo_size
@@ -88,10 +92,10 @@ def example_in(views: Sequence[str], cameras: Path) -> str:
 
 
 def require_folder(folder: Path) -> None:
-    """See that a checkpoint can be kept in a folder, which is made if need be: a lift itself would go on without one.
+    """Check that checkpoints can be written to a folder, created if missing; the lift itself would only warn.
 
     Raises:
-        InvalidInput: it is no folder, or nothing can be written there.
+        InvalidInput: it is not a folder, or not writable.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -110,16 +114,16 @@ def settings_of(options: argparse.Namespace) -> LiftSettings:
     """
     from liftcore import LiftSettings
 
-    named = {"preset": options.preset, "speed": options.speed, "device": options.device}
+    options_by_name = {"preset": options.preset, "speed": options.speed, "device": options.device}
     values = pairs_of(options.set)
-    for name, value in named.items():
+    for name, value in options_by_name.items():
         if value is not None and values.setdefault(name, value) != value:
             raise _contradiction(name, f"--{name} {value}", f"--set {name}={values[name]}")
     return LiftSettings.of(**values)
 
 
 def pairs_of(pairs: Sequence[str]) -> dict[str, Any]:
-    """Names and values of ``key=value``; a value is JSON, or else a word.
+    """Parse names and values of ``key=value``; a value is JSON, or else a text.
 
     Raises:
         InvalidSettings: a pair without ``=``, an unknown name or one with two values.
@@ -148,22 +152,22 @@ def _value(text: str) -> Any:
         return text
 
 
-def _contradiction(name: str, one: str, other: str) -> InvalidSettings:
-    hint = "leave one of them out"
-    return InvalidSettings(name, expected="one value", got=f"{one} and {other}"[:200], hint=hint)
+def _contradiction(name: str, first: str, second: str) -> InvalidSettings:
+    hint = "remove one of them"
+    return InvalidSettings(name, expected="one value", got=f"{first} and {second}"[:200], hint=hint)
 
 
-def in_short(plan: Plan) -> Iterable[str]:
-    """The plan in a few lines, with its verdict."""
+def plan_lines(plan: Plan) -> Iterable[str]:
+    """Yield the plan in a few lines, with its verdict."""
     head, *rest = plan.summary()
     yield f"plan: {head}"
     yield from (f"  {line}" for line in rest)
     if plan.seconds is not None:
-        yield f"  about {max(plan.seconds, 1):.0f} s to look through the views on this machine"
+        yield f"  about {max(plan.seconds, 1):.0f} s to rasterize the views on this machine"
     warnings = (*plan.warnings, *plan.told)
     yield from (f"warning: {warning}" for warning in warnings)
     if not warnings:
-        yield "  healthy: nothing contradicts anything that was given"
+        yield "  healthy: no contradictions between the inputs"
 
 
 def _summary(result: LiftResult) -> dict[str, Any]:
@@ -194,31 +198,31 @@ def _lines(document: dict[str, Any], cameras: Path, verbose: bool) -> Iterable[s
     if not verbose:
         return
     for key, value in document["certificate"].items():
-        if key not in ("plan", "warnings"):  # the plan in full is what --explain prints
-            yield f"  {key}: {smoothing_line(value) if key == 'smoothing' else shown(value)}"
+        if key not in ("plan", "warnings"):  # --explain prints the whole plan
+            yield f"  {key}: {smoothing_line(value) if key == 'smoothing' else short_text(value)}"
     yield "timings:"
     yield from (f"  {stage}: {seconds:.3f} s" for stage, seconds in document["timings"].items())
 
 
 def _verdict(document: dict[str, Any], cameras: Path) -> Iterable[str]:
-    """What is healthy, what to look at, and what to do."""
+    """Yield the verdict: coverage of rays, smoothing, warnings, and the next command."""
     from liftcore.text import NO_WORDS
 
     certificate = document["certificate"]
-    filled = certificate["row_sum_mean"]
-    if filled is not None:
-        usual = "as of a scene without holes" if filled >= FILLED else "the rest of a ray meets nothing"
-        yield f"splats fill {filled:.1%} of a ray, {usual}"
+    row_sum = certificate["row_sum_mean"]
+    if row_sum is not None:
+        note = "as in a scene without holes" if row_sum >= CLOSED_SCENE_ROW_SUM else "so parts of rays hit no splat"
+        yield f"splats fill {row_sum:.1%} of a ray on average, {note}"
     if "candidates" in certificate.get("smoothing", {}):
         yield smoothing_line(certificate["smoothing"])
     masks = certificate.get("reweighting", {}).get("masks")
     if masks is not None and not document["settings"]["smoothness"] and (not masks or document["views"] <= FEW_VIEWS):
         of = f"{document['views']} views of masks" if masks else "maps without masks"
-        yield f"of {of}: --set smoothness=auto would draw neighbours together as far as halves of views gain by it"
+        yield f"for {of}: --set smoothness=auto smooths as far as it helps halves of the views to predict each other"
     if certificate["warnings"]:
-        yield "look at the warnings: splatlift check says whether photos, cameras and splats belong together"
+        yield "see the warnings: splatlift check tests whether photos, cameras and splats match"
     space = document["text_space"]
     if not space:
-        yield "the packs' text space is not named: splatlift pack retag names it, or ask with --table FILE"
-    how = "WORD" if space not in ("", NO_WORDS) else f"--like {example_in(document['lifted'], cameras)}"
-    yield f"next: splatlift query {document['out']} {how}  (--verbose shows all figures)"
+        yield "the packs have no text space: set it with splatlift pack retag, or query with --table FILE"
+    example = "WORD" if space not in ("", NO_WORDS) else f"--like {example_in(document['lifted'], cameras)}"
+    yield f"next: splatlift query {document['out']} {example}  (--verbose shows all figures)"

@@ -1,4 +1,4 @@
-"""``splatlift pack``: the field's feature formats become feature packs."""
+"""``splatlift pack``: convert features and masks of common formats to feature packs."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import Parser, renamed
-from liftcore.cli.reply import reply, shown, told_folders
+from liftcore.cli.options import Parser, option_errors
+from liftcore.cli.reply import list_folders, reply, short_text
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -16,111 +16,120 @@ if TYPE_CHECKING:
 OPTIONS = (
     "layout", "unlabelled", "encoder", "photos", "device", "names", "folders", "unannotated", "encoder_name",
     "text_space", "normalised",
-)  # options that `pack_folder` takes  # fmt: skip
+)  # options of `pack_folder`  # fmt: skip
 NAMES = {
     "normalised": "--no-normalised",
     **{name: f"--{name}" for name in ("device", "encoder", "names", "photos", "unlabelled")},
 }  # of arguments
 LARGEST_GREY = 65_535  # of a picture of 16 bits
 MASK_LAYOUTS = """\
-layouts of FOLDER: vectors IMG.npy [M, F] of each image, unless --encoder makes
-them, with one of
+layouts of FOLDER: vectors IMG.npy [M, F] of each image, unless --encoder
+computes them, with one of
   IMG.json              SAM's generator with output_mode uncompressed_rle or
                         coco_rle, SA-1B's files, or polygons
   IMG_masks.npy (.npz)  booleans [M, H, W] or [M, 1, H, W], or ids [H, W] or
                         [L, H, W] with -1 for none
-  IMG.png               a label picture of 8 or 16 bits or a palette: value v has
-                        row v - 1, and 0 means none; with --unlabelled 255 (or
-                        another value) that one means none, and v has row v
+  IMG.png               a label picture of 8 or 16 bits or a palette: value v is
+                        row v - 1, and 0 means no mask; with --unlabelled 255
+                        (or another value) 255 means no mask, and v is row v
 
-Masks may overlap: the largest come first, each on the first level with its
-pixels free; more than 32 levels are refused. Hidden files, Thumbs.db and the
-like are left out.
+Masks may overlap: the largest come first, each on the first level where its
+pixels are free, on at most 32 levels. Hidden files, Thumbs.db and similar ones
+are skipped.
 """
 ARRAY_LAYOUTS = """\
 layouts of FOLDER: maps IMG.npy or IMG.jpg.npy, also .npz of one array and .pt of
-one tensor, read as tensors only, so no code runs. feature-3dgs'
-IMG_fmap_CxHxW.pt has its channels first. Hidden files, Thumbs.db and the like
-are left out.
+one tensor, read as tensors only, so no code runs. IMG_fmap_CxHxW.pt of
+feature-3dgs has channels first. Hidden files, Thumbs.db and similar ones are
+skipped.
 """
 PROMPT_LAYOUTS = """\
-layouts of FOLDER, with sub-folders where views have some:
+layouts of FOLDER, with sub-folders if names of views have some:
   PHRASE/VIEW.png       binary pictures, or arrays [h, w] in .npy or .npz; with
                         --folders views VIEW/PHRASE.png. _ is a space
   *.json of COCO        images, annotations and categories (CVAT, Label Studio,
                         Roboflow), LVIS, SA-Co's text_input, YouTube-VIS
   *.json, one an image  records with a phrase, label or class_name and run
                         lengths, polygons or pictures: Grounded SAM 2, LabelMe,
-                        ISAT, Supervisely, Darwin. The view is that of its
-                        image_path, else of its own name
+                        ISAT, Supervisely, Darwin. The view is that of the
+                        image_path, or else of the file's name
   json_data, mask_data  the tracking of Grounded SAM 2: pictures of ids and
                         their class names; also DEVA, COCO's panoptic pictures
-  VIEW.png (.npy)       label pictures. Those of 'segment --labels' bring their
-                        names; else --names FILE: JSON from values to names or
-                        back (id2label, COCO's categories), .csv or .tsv of
-                        values and names, a name a line (a first "background"
-                        is 0), "1 name" or "1,name" a line, CVAT's labelmap.txt
+  VIEW.png (.npy)       label pictures. Those of 'segment --labels' contain
+                        their names; for others --names FILE: JSON from values
+                        to names or from names to values (id2label, COCO's
+                        categories), .csv or .tsv of values and names, one name
+                        a line (a first "background" is 0), "1 name" or "1,name"
+                        a line, CVAT's labelmap.txt
 
 Masks of one phrase in a view are merged. Polygons are filled within a pixel of
-pycocotools, on the image's width and height. In a view with a file, pixels
-without a mask count as none of the phrases, but have no label where SA-Co or
-LVIS say that the image was not searched for every phrase. Annotations with
-boxes alone are counted in a warning, and their inside has no label.
+pycocotools, at the image's width and height. In a view with a file, pixels
+outside of all masks show none of the phrases. If SA-Co or LVIS say that the
+image was not searched for every phrase, they have no label. Annotations with
+only a box are counted in a warning, and their pixels have no label.
 """
 
 
 def add_arguments(parser: Parser, shared: Parser) -> None:
-    """The options of the command."""
+    """Add the options of the command."""
     formats = parser.add_subparsers(dest="format", required=True, metavar="FORMAT", parser_class=Parser)
     langsplat = formats.add_parser("langsplat", parents=[shared], help="IMG_s.npy and IMG_f.npy")
-    arrays = formats.add_parser("npy", parents=[shared], help="IMG.npy (.npz, .pt), a dense map a view")
-    by = "the order of the axes, [h, w, F] or [F, h, w]; axes of length 1 before them are taken off"
-    arrays.add_argument("--layout", choices=("hwc", "chw"), default="hwc", help=by)
+    arrays = formats.add_parser("npy", parents=[shared], help="IMG.npy (.npz, .pt), one dense map a view")
+    axes_help = "the order of the axes, [h, w, F] or [F, h, w]; leading axes of length 1 are removed"
+    arrays.add_argument("--layout", choices=("hwc", "chw"), default="hwc", help=axes_help)
     masks = formats.add_parser(
-        "masks", parents=[shared], help="IMG.npy, a vector a mask, with IMG.json (SAM's), IMG_masks.npy or IMG.png"
+        "masks", parents=[shared], help="IMG.npy, one vector a mask, with IMG.json (SAM), IMG_masks.npy or IMG.png"
     )
     masks.add_argument(
         "--unlabelled",
         type=_grey,
         default=0,
         metavar="VALUE",
-        help="of label pictures, the value that means no mask: 0, and value 1 is of the first vector; with another "
-        "(255) value 0 is of the first",
+        help="value of pixels without a mask in label pictures: with 0, value 1 is the first vector; with another "
+        "(255), value 0 is the first",
     )
-    by = "make the vectors: of each mask's crop of its photo, open_clip:MODEL/TAG or open_clip:MODEL@FILE"
-    masks.add_argument("--encoder", metavar="SPEC", help=by)
-    masks.add_argument("--photos", type=Path, nargs="+", metavar="PATH", help="of --encoder, or their folders")
-    masks.add_argument("--device", default="cpu", metavar="NAME", help="where the model runs, as torch names it")
+    encoder_help = (
+        "compute the vectors from each mask's crop of its photo: open_clip:MODEL/TAG or open_clip:MODEL@FILE"
+    )
+    masks.add_argument("--encoder", metavar="SPEC", help=encoder_help)
+    masks.add_argument(
+        "--photos", type=Path, nargs="+", metavar="PATH", help="photos for --encoder, or their folders"
+    )
+    masks.add_argument("--device", default="cpu", metavar="NAME", help="device of the model, as torch names it")
     prompts = formats.add_parser(
         "prompts",
         parents=[shared],
-        help="masks by phrase: PHRASE/VIEW.png, JSON (COCO's, Grounded SAM 2's), or named label pictures",
+        help="masks by phrase: PHRASE/VIEW.png, JSON (COCO, Grounded SAM 2), or label pictures with names",
     )
     prompts.add_argument(
-        "--names", type=Path, metavar="FILE", help="of label pictures, JSON from values to names, or a name a line"
+        "--names",
+        type=Path,
+        metavar="FILE",
+        help="names of label pictures, JSON from values to names, or one name a line",
     )
-    by = "what folders of binary PNGs are named by: phrases (PHRASE/VIEW.png) or views (VIEW/PHRASE.png)"
-    prompts.add_argument("--folders", choices=("phrases", "views"), default="phrases", help=by)
-    by = "of pictures, the value of pixels of which nobody decided what they show (255), which get no label"
-    prompts.add_argument("--unlabelled", type=_grey, metavar="VALUE", help=by)
-    by = "COCO's images without an annotation are left out (skip), or show none of the phrases (negative)"
-    prompts.add_argument("--unannotated", choices=("skip", "negative"), default="skip", help=by)
+    folders_help = "names of folders of binary PNGs: phrases (PHRASE/VIEW.png) or views (VIEW/PHRASE.png)"
+    prompts.add_argument("--folders", choices=("phrases", "views"), default="phrases", help=folders_help)
+    unlabelled_help = "value of unlabelled pixels in pictures (255), which get no label"
+    prompts.add_argument("--unlabelled", type=_grey, metavar="VALUE", help=unlabelled_help)
+    unannotated_help = (
+        "COCO's images without an annotation are omitted (skip), or show none of the phrases (negative)"
+    )
+    prompts.add_argument("--unannotated", choices=("skip", "negative"), default="skip", help=unannotated_help)
     for command, layouts in ((arrays, ARRAY_LAYOUTS), (masks, MASK_LAYOUTS), (prompts, PROMPT_LAYOUTS)):
         command.appendix = partial(str, layouts)
-    retag = formats.add_parser("retag", parents=[shared], help="a pack under other names of its encoder or space")
+    retag = formats.add_parser("retag", parents=[shared], help="a pack with other names of its encoder or text space")
     space = (
-        "the text encoder whose words lie in the space of the features, as query's --encoder names it "
-        "(open_clip:ViT-B-32/openai): query opens it where no encoder is given, and a service takes the one that it "
-        "has under that name; 'none': no text encoder shares it, so a lift is asked by example. Packs of one lift "
-        "must agree"
+        "the text encoder that shares the space of the features, as for query's --encoder "
+        "(open_clip:ViT-B-32/openai), which is the default encoder of queries here and in a service; 'none': no text "
+        "encoder shares it, so a lift is queried by example. All packs of a lift must have the same"
     )
-    unit = "say that the vectors are unit vectors, or are not; this changes none of them"
+    unit = "record that the vectors are unit vectors, or are not; this does not change them"
     for command in (langsplat, arrays, masks, prompts):
         command.add_argument("folder", type=Path, help="the folder of the files")
-    retag.add_argument("pack", type=Path, help="the pack as it is")
+    retag.add_argument("pack", type=Path, help="the pack to copy")
     for command in (langsplat, arrays, masks, prompts, retag):
         command.add_argument("-o", "--output", type=Path, required=True, metavar="PACK", help="the pack to write")
-        command.add_argument("--encoder-name", metavar="NAME", help="what made the features or masks")
+        command.add_argument("--encoder-name", metavar="NAME", help="name of the encoder of the features or masks")
     for command in (langsplat, arrays, masks, retag):
         command.add_argument("--text-space", metavar="NAME", help=space)
     for command in (langsplat, arrays, masks):
@@ -135,36 +144,36 @@ def _grey(text: str) -> int:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write the pack whole or not at all, and say what is in it."""
+    """Write the pack, completely or not at all, and describe it."""
     if options.format == "retag":
         return _retag(options)
     from liftcore import pack_folder
     from liftcore.evaluate import inspect_file
 
     values = {name: value for name, value in vars(options).items() if name in OPTIONS}
-    with renamed(NAMES):
+    with option_errors(NAMES):
         facts = pack_folder(options.folder, options.output, options.format, **values, progress=True)
-    described = inspect_file(options.output, "features")
+    description = inspect_file(options.output, "features")
     names = ("bytes", "views", "channels", "encoder", "text_space", "normalised")
     document = {
         "out": str(options.output),
-        **{name: described[name] for name in names},
+        **{name: description[name] for name in names},
         "folders": facts["folders"],
-        "sizes": described["sizes"],
+        "sizes": description["sizes"],
         "renamed": facts["renamed"],
         "words": facts["words"],
-        "warnings": [*facts["warnings"], *described["warnings"]],
+        "warnings": [*facts["warnings"], *description["warnings"]],
     }
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
 
 
 def _retag(options: argparse.Namespace) -> int:
-    """Write the pack under its new names, and say them."""
+    """Write the pack with its new names, and print them."""
     from liftcore import read_features, retag_pack
 
     names = {"encoder": options.encoder_name, "text_space": options.text_space}
-    with renamed({"names": "--text-space or --encoder-name"}):
+    with option_errors({"names": "--text-space or --encoder-name"}):
         retag_pack(options.pack, options.output, {name: value for name, value in names.items() if value})
     packs = read_features(options.output)
     document = {"out": str(options.output), "encoder": packs.encoder, "text_space": packs.text_space}
@@ -175,10 +184,10 @@ def _retag(options: argparse.Namespace) -> int:
 
 def _lines(document: dict[str, Any]) -> Iterator[str]:
     yield f"{document['out']}: {document['views']} views, {document['channels']} channels, {document['bytes']} bytes"
-    yield f"  {shown(document['sizes'])}"
+    yield f"  {short_text(document['sizes'])}"
     if document["words"]:
-        yield f"  {len(document['words'])} words: {shown(document['words'])}"
-    yield from told_folders(document["folders"])
+        yield f"  {len(document['words'])} words: {short_text(document['words'])}"
+    yield from list_folders(document["folders"])
     for name, view in list(document["renamed"].items())[:1]:
-        yield f"  views are named without the suffix of their images, as cameras are: {name} is {view!r}"
+        yield f"  names of views have no suffix of an image, like those of cameras: {name} is {view!r}"
     yield from (f"warning: {warning}" for warning in document["warnings"])

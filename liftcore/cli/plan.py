@@ -1,29 +1,31 @@
-"""``splatlift plan``: what a lift would do and need, without doing it; without features, what to encode first."""
+"""``splatlift plan``: plan a lift; without features, plan which photos to encode first."""
 
 from __future__ import annotations
 
 import argparse
 from typing import TYPE_CHECKING
 
-from liftcore.cli.lift import in_short, settings_of
+from liftcore.cli.lift import plan_lines, settings_of
 from liftcore.cli.options import Parser, add_settings, add_sources, add_verbose, count
 from liftcore.cli.reply import reply
 
 if TYPE_CHECKING:
     from liftcore import LiftSettings
 
-NO_LOOK = (
-    "smoothness adds no look: these shares are of what photos show, and splats that none of them sees take their "
-    "neighbours' features, still counted as unseen"
+SMOOTHNESS_NOTE = (
+    "smoothness does not change these shares: splats that no photo shows get the features of their neighbours, and "
+    "still count as unseen"
 )
 
 
 def add_arguments(parser: Parser) -> None:
-    """The options of the command."""
-    add_sources(parser, "*", "; none: which photos to encode first, and what fewer would show")
+    """Add the options of the command."""
+    add_sources(parser, "*", "; none: plan which photos to encode first")
     add_settings(parser)
     add_verbose(parser)
-    parser.add_argument("--threads", type=count, metavar="N", help="of the lift; else as many as there are cores")
+    parser.add_argument(
+        "--threads", type=count, metavar="N", help="threads of the lift; default: the number of cores"
+    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -43,7 +45,7 @@ def run(options: argparse.Namespace) -> int:
         "views": views,
         "warnings": [*plan.warnings, *plan.told],
     }
-    reply(document, as_json=options.json, lines=plan.lines() if options.verbose else in_short(plan))
+    reply(document, as_json=options.json, lines=plan.lines() if options.verbose else plan_lines(plan))
     return 0
 
 
@@ -55,6 +57,6 @@ def _photos(options: argparse.Namespace, settings: LiftSettings) -> int:
     plan = plan_photos(splats, read_cameras(options.cameras), settings, threads=options.threads, progress=True)
     lines = [*plan.lines(verbose=options.verbose)]
     if settings.smoothness:
-        lines.append(NO_LOOK)
+        lines.append(SMOOTHNESS_NOTE)
     reply(plan.facts(), as_json=options.json, lines=lines)
     return 0

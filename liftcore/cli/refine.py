@@ -1,4 +1,4 @@
-"""``splatlift refine``: a finished lift with smooth features, without lifting again."""
+"""``splatlift refine``: smooth the features of a lift, without lifting again."""
 
 from __future__ import annotations
 
@@ -11,22 +11,24 @@ from liftcore.errors import InvalidInput
 
 
 def add_arguments(parser: Parser) -> None:
-    """The options of the command."""
+    """Add the options of the command."""
     parser.add_argument("lift", type=place, help="a lift (.safetensors or .shards)")
-    strength = "lambda of the term that draws splats near in place and colour together, above 0; try 1"
-    parser.add_argument("--smoothness", type=float, required=True, metavar="L", help=strength)
-    named = "the lift to write; else the name of LIFT with .smooth before its suffix"
-    parser.add_argument("-o", "--output", type=place, metavar="OUT", help=named)
+    smoothness_help = (
+        "weight lambda of the smoothness term between splats near in position and colour, above 0; try 1"
+    )
+    parser.add_argument("--smoothness", type=float, required=True, metavar="L", help=smoothness_help)
+    output_help = "the lift to write; default: LIFT with .smooth before its suffix"
+    parser.add_argument("-o", "--output", type=place, metavar="OUT", help=output_help)
     add_splats(parser)
-    parser.add_argument("--threads", type=count, metavar="N", help="else as many as there are cores")
+    parser.add_argument("--threads", type=count, metavar="N", help="default: the number of cores")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Smooth the lift's features, write it whole or not at all, and say how much they moved."""
+    """Smooth the lift's features, write it completely or not at all, and print how much they changed."""
     out = options.output
     if out is None:
-        if "lift" in options.elsewhere:
-            raise InvalidInput("output", expected="-o OUT", got="none, of a lift that lies elsewhere")
+        if "lift" in options.remote_options:
+            raise InvalidInput("output", expected="-o OUT", got="none, for a remote lift")
         out = options.lift.with_name(f"{options.lift.stem}.smooth{options.lift.suffix}")
     from liftcore import Scene, load_lift
     from liftcore.files import check_output, writing

@@ -1,4 +1,4 @@
-"""``splatlift render``: a lifted scene from any camera, in its colours, features, clusters or confidence."""
+"""``splatlift render``: render a lifted scene from any camera: colours, features, clusters or confidence."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import argparse
 from functools import partial
 from pathlib import Path
 
-from liftcore.cli.options import Parser, add_fields, add_lift, add_view, opened_lift, view_of
-from liftcore.cli.query import made_from
-from liftcore.cli.reply import free_outputs, reply, write_files
+from liftcore.cli.options import Parser, add_fields, add_lift, add_view, open_lift, view_of
+from liftcore.cli.query import source_files
+from liftcore.cli.reply import check_outputs, reply, write_files
 from liftcore.errors import InvalidQuery
 
 
 def add_arguments(parser: Parser) -> None:
-    """The options of the command."""
+    """Add the options of the command."""
     from liftcore import Picture
 
     add_lift(parser)
@@ -23,13 +23,13 @@ def add_arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Draw it, and say what was written."""
+    """Render the picture, and print its path."""
     view, files = view_of(options), {"output": options.output}
     if view is None:
-        raise InvalidQuery("--view", expected="a view to see it from", got="no --view and no --camera")
-    free_outputs(files, [path for path in (options.lift, options.camera) if path])
-    scene = opened_lift(options)
-    free_outputs(files, made_from(scene))
-    written = write_files(files, {"output": partial(scene.export, what=options.what, view=view)})
-    reply({"what": options.what, "out": written["output"]}, as_json=options.json, lines=[written["output"]])
+        raise InvalidQuery("--view", expected="a view to render", got="no --view and no --camera")
+    check_outputs(files, [path for path in (options.lift, options.camera) if path])
+    scene = open_lift(options)
+    check_outputs(files, source_files(scene))
+    paths = write_files(files, {"output": partial(scene.export, what=options.what, view=view)})
+    reply({"what": options.what, "out": paths["output"]}, as_json=options.json, lines=[paths["output"]])
     return 0

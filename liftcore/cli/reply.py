@@ -1,4 +1,4 @@
-"""How commands answer: one JSON object, or lines for people; and bars on stderr for somebody who watches."""
+"""Replies of commands: one JSON object, or lines of text; and the files that they write."""
 
 import json
 import math
@@ -8,14 +8,14 @@ from typing import Any
 
 from liftcore.errors import InvalidInput
 
-SHOWN_ITEMS = 6  # of a list, for people
-SHOWN_FOLDERS = 8
-LARGE = 1e4  # from here on numbers show about three decimals: places in map coordinates begin alike
-MOST_DIGITS = 15
+MAX_ITEMS = 6  # of a list, in text
+MAX_FOLDERS = 8
+LARGE = 1e4  # from here on numbers have about three decimals, as map coordinates share their first digits
+MAX_DIGITS = 15
 
 
 def reply(document: Mapping[str, Any], *, as_json: bool, lines: Iterable[str] | None = None) -> None:
-    """Print one JSON object, or else ``lines``, or else the document's entries, a line each."""
+    """Print one JSON object, or else ``lines``, or else the document's entries, one a line."""
     if as_json:
         from liftcore.files import finite
 
@@ -28,26 +28,26 @@ def reply(document: Mapping[str, Any], *, as_json: bool, lines: Iterable[str] | 
 OUTPUTS = {
     "object": "splats", "coloured": "ply", "labelled": "ply", "names": "json", "scores": "npy", "splat_labels": "npy",
     "csv": "csv", **dict.fromkeys(("mask", "attention", "overlay", "labels", "picture", "output"), "png"),
-}  # what options that name files write  # fmt: skip
+}  # kind of file of each option  # fmt: skip
 
 
-def free_outputs(files: Mapping[str, Path], inputs: Sequence[Path]) -> None:
-    """Several outputs, by the options that name them.
+def check_outputs(files: Mapping[str, Path], inputs: Sequence[Path]) -> None:
+    """Check output files by the options that name them.
 
     Raises:
-        InvalidInput: one of them cannot be written (`check_output`), or two are one file.
+        InvalidInput: a file cannot be written (`check_output`), or two are the same file.
     """
     from liftcore.files import check_output
 
     if len({path.absolute() for path in files.values()}) < len(files):
-        named = " and ".join(f"--{name.replace('_', '-')}" for name in files)
-        raise InvalidInput(named, expected="a file each", got="the same file twice")
+        option_names = " and ".join(f"--{name.replace('_', '-')}" for name in files)
+        raise InvalidInput(option_names, expected="different files", got="the same file twice")
     for name, path in files.items():
         check_output(path, inputs, OUTPUTS[name])
 
 
 def write_files(files: Mapping[str, Path], exports: Mapping[str, Callable[[Path], None]]) -> dict[str, str]:
-    """Write each file, in their order: what cannot be made leaves no file, and none after it."""
+    """Write the files in order, each completely or not at all; after an error, no further files are written."""
     from liftcore.files import writing
 
     for kind, path in files.items():
@@ -62,62 +62,62 @@ def _entries(document: Mapping[str, Any]) -> Iterable[str]:
         if key == "warnings":
             yield from (f"warning: {warning}" for warning in value)
         else:
-            yield f"{str(key).replace('_', ' '):<{width}}  {shown(value)}"
+            yield f"{str(key).replace('_', ' '):<{width}}  {short_text(value)}"
 
 
-def shown(value: Any) -> str:
-    """A value in short, for people."""
+def short_text(value: Any) -> str:
+    """Format a value as short text."""
     if isinstance(value, float):
         is_large = LARGE <= abs(value) < math.inf
-        return f"{value:.{min(MOST_DIGITS, 4 + int(math.log10(abs(value)))) if is_large else 6}g}"
+        return f"{value:.{min(MAX_DIGITS, 4 + int(math.log10(abs(value)))) if is_large else 6}g}"
     if isinstance(value, Mapping):
         return ", ".join(f"{key} {_nested(item)}" for key, item in value.items()) or "-"
     if isinstance(value, list | tuple):
-        more = [f"... ({len(value)})"] if len(value) > SHOWN_ITEMS else []
-        return ", ".join([*map(_nested, value[:SHOWN_ITEMS]), *more]) or "-"
+        ellipsis = [f"... ({len(value)})"] if len(value) > MAX_ITEMS else []
+        return ", ".join([*map(_nested, value[:MAX_ITEMS]), *ellipsis]) or "-"
     return "-" if value is None or value == "" else str(value)
 
 
 def _nested(value: Any) -> str:
-    return f"({shown(value)})" if isinstance(value, Mapping | list | tuple) else shown(value)
+    return f"({short_text(value)})" if isinstance(value, Mapping | list | tuple) else short_text(value)
 
 
 def place_of(point: tuple[float, ...]) -> str:
-    """A point for people, with four digits; of map coordinates, which all begin alike, with about three decimals."""
+    """Format a point with four digits, or with about three decimals for large map coordinates."""
     reach = max(map(abs, point))
     digits = 4 if reach < LARGE else 4 + int(math.log10(reach))
     return f"({', '.join(f'{value:.{digits}g}' for value in point)})"
 
 
 def smoothing_line(facts: Mapping[str, Any]) -> str:
-    """What smoothing did (``diagnostics["smoothing"]``), as a sentence for people."""
+    """Describe the smoothing of a lift (``diagnostics["smoothing"]``) in a sentence."""
     reason = _choice_reason(facts["smoothness"], facts["candidates"]) if "candidates" in facts else ""
     if not facts["smoothness"]:
         return f"smoothness 0{reason}"
-    moved = "not at all" if facts["moved"] is None else f"by {facts['moved']:.1%} of their length"
-    by = "place and colour" if facts["colours"] else "place alone, as the splats have no colours"
-    parted = facts.get("parted", 0.0)
-    by += f", but where masks part them ({parted:.1%} of affinity)" if parted else ""
+    shift = "not at all" if facts["moved"] is None else f"by {facts['moved']:.1%} of their length"
+    neighbourhood = "position and colour" if facts["colours"] else "position only, as the splats have no colours"
+    cut_share = facts.get("parted", 0.0)
+    neighbourhood += f", except between masks ({cut_share:.1%} of affinity)" if cut_share else ""
     return (
-        f"smoothness {facts['smoothness']:g}{reason}: features moved {moved} towards their neighbours' in {by}; "
-        f"{facts['filled']} splats without weight took their neighbours' "
-        f"({facts['steps']} steps, {facts['residual']:.1g} of the gradient left)"
+        f"smoothness {facts['smoothness']:g}{reason}: features moved {shift} towards their neighbours' in "
+        f"{neighbourhood}; {facts['filled']} splats without weight took their neighbours' "
+        f"({facts['steps']} steps, {facts['residual']:.1g} of the gradient remaining)"
     )
 
 
-def _choice_reason(chosen: float, candidates: Sequence[Mapping[str, float]]) -> str:
-    """Why auto chose its lambda, as a clause."""
+def _choice_reason(smoothness: float, candidates: Sequence[Mapping[str, float]]) -> str:
+    """Describe the reason for the lambda that auto selected, as a clause."""
     if not candidates:
-        return ", as there are no two halves of the views to tell what the scene gains by more"
-    bits = {one["smoothness"]: one["information"] for one in candidates}
-    if not chosen:
-        return f", as half of the views tells no more of the other half with it ({bits[0]:.3f} bits a splat without)"
+        return ", as the views cannot be split into halves to compare values"
+    bits = {candidate["smoothness"]: candidate["information"] for candidate in candidates}
+    if not smoothness:
+        return f", as smoothing does not help to predict half of the views ({bits[0]:.3f} bits a splat)"
     return (
-        f", by which half of the views tells {bits[chosen]:.3f} bits a splat of the other half, {bits[0]:.3f} without"
+        f", which predicts {bits[smoothness]:.3f} bits a splat of the other half of the views, {bits[0]:.3f} without"
     )
 
 
-def told_folders(folders: Sequence[str]) -> list[str]:
-    """A line about them, if there are any."""
-    shown = ", ".join(folders[:SHOWN_FOLDERS]) + (" ..." if len(folders) > SHOWN_FOLDERS else "")
-    return [f"  of sub-folders, whose names are part of their views': {shown}"] if folders else []
+def list_folders(folders: Sequence[str]) -> list[str]:
+    """Return a line about the folders of views, if there are any."""
+    names = ", ".join(folders[:MAX_FOLDERS]) + (" ..." if len(folders) > MAX_FOLDERS else "")
+    return [f"  names of views include their sub-folders: {names}"] if folders else []

@@ -1,4 +1,4 @@
-"""``splatlift tradeoff``: speed against accuracy on one's own scene, as a chart, a table and JSON."""
+"""``splatlift tradeoff``: compare speed and accuracy on a scene, as a chart, a table and JSON."""
 
 from __future__ import annotations
 
@@ -7,22 +7,24 @@ import shlex
 from pathlib import Path
 
 from liftcore.cli.lift import pairs_of
-from liftcore.cli.options import Parser, add_sources, count, renamed
+from liftcore.cli.options import Parser, add_sources, count, option_errors
 from liftcore.cli.reply import reply
 
 
 def add_arguments(parser: Parser) -> None:
-    """The options of the command."""
+    """Add the options of the command."""
     add_sources(parser)
-    parser.add_argument("--budget", type=_seconds, default=600.0, metavar="SECONDS", help="what it may take; 600")
-    parser.add_argument("-o", "--out", type=Path, default=Path("tradeoff"), metavar="DIR", help="of chart and table")
+    parser.add_argument("--budget", type=_seconds, default=600.0, metavar="SECONDS", help="time limit; default 600")
+    parser.add_argument(
+        "-o", "--out", type=Path, default=Path("tradeoff"), metavar="DIR", help="folder of the output"
+    )
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of all runs; preset: of the dial's"
     )
-    parser.add_argument("--labels", type=Path, metavar="MASKS", help="VIEW/mask [h, w], numbers of classes")
+    parser.add_argument("--labels", type=Path, metavar="MASKS", help="VIEW/mask [h, w], class numbers")
     parser.add_argument("--table", type=Path, metavar="FILE", help="text embeddings of the classes")
     parser.add_argument("--classes", nargs="+", default=[], metavar="WORD", help="the classes, from number 0 on")
-    parser.add_argument("--threads", type=count, metavar="N", help="else as many as there are cores")
+    parser.add_argument("--threads", type=count, metavar="N", help="default: the number of cores")
 
 
 def _seconds(text: str) -> float:
@@ -36,14 +38,14 @@ def _seconds(text: str) -> float:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Compare, write the chart, the table and the JSON, and say what to take."""
+    """Compare, write the chart, the table and the JSON, and print the recommendation."""
     settings = pairs_of(options.set)
     from liftcore.evaluate import SceneFiles, compare_speeds
     from liftcore.files import check_output, writing
 
     check_output(options.out / "tradeoff.json", [], "json")
     sources = options.splats, options.cameras, tuple(options.features)
-    with renamed({"settings": "--set"}):
+    with option_errors({"settings": "--set"}):
         comparison = compare_speeds(
             SceneFiles(*sources, options.labels, options.table, tuple(options.classes)),
             budget=options.budget,
@@ -61,7 +63,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _command(options: argparse.Namespace) -> str:
-    """The command that makes this comparison again."""
+    """Return the command of this comparison."""
     parts = ["splatlift", "tradeoff", str(options.splats), str(options.cameras), *map(str, options.features)]
     parts += ["--budget", f"{options.budget:g}"]
     for pair in options.set:

@@ -1,4 +1,4 @@
-"""``splatlift transfer``: a lift on an edited, compressed or retrained copy of its splats, without lifting again."""
+"""``splatlift transfer``: transfer a lift to an edited, compressed or retrained copy of its splats."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ NUMBERS = (12, 16)  # of a matrix
 
 
 def add_arguments(parser: Parser) -> None:
-    """The options of the command."""
+    """Add the options of the command."""
     parser.add_argument("lift", type=place, help="a lift (.safetensors or .shards)")
     parser.add_argument("edited", type=place, help="other splats of its scene, of any format")
     parser.add_argument("-o", "--output", type=place, required=True, metavar="NEW", help="the lift to write")
-    moved = "how the scene was moved, a text file of 3 or 4 rows of 4 numbers; else it is found, if it was"
-    parser.add_argument("--matrix", type=Path, metavar="FILE", help=moved)
+    matrix_help = "transform of the scene, a text file of 3 or 4 rows of 4 numbers; default: estimated"
+    parser.add_argument("--matrix", type=Path, metavar="FILE", help=matrix_help)
     add_splats(parser)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write the lift of the other splats, and say what became of the rows."""
+    """Write the lift of the other splats, and print the origin of their features."""
     from liftcore import Scene, load_lift
     from liftcore.files import check_output, writing
 
@@ -36,8 +36,10 @@ def run(options: argparse.Namespace) -> int:
         result.save(options.output, progress=True)
     facts = result.diagnostics["transfer"]
     document: dict[str, Any] = {"out": str(options.output), "splats": len(result), **facts, "warnings": []}
-    if lost := facts["without_partner"]:
-        document["warnings"] = [f"{lost} of {len(result)} splats overlap with none of the lift, and have no feature"]
+    if unmatched := facts["without_partner"]:
+        document["warnings"] = [
+            f"{unmatched} of {len(result)} splats overlap with no splat of the lift, and have no feature"
+        ]
     reply(document, as_json=options.json, lines=_lines(document))
     return 0
 
@@ -53,10 +55,10 @@ def _matrix(path: Path) -> list[list[float]]:
 
 
 def _lines(document: dict[str, Any]) -> list[str]:
-    moved = document["moved"]
+    transform = document["moved"]
     lines = [
         f"{document['out']}: {document['splats']} splats, {document['rows']} of them rows of the lift, "
-        f"{document['mixed']} mixed of those that they overlap with, {document['without_partner']} without a partner"
+        f"{document['mixed']} mixtures of overlapping splats, {document['without_partner']} without a match"
     ]
-    lines += [] if moved is None else [f"  the scene was moved: {moved['scale']:.6g} times as large"]
+    lines += [] if transform is None else [f"  the scene was transformed, with scale {transform['scale']:.6g}"]
     return lines + [f"warning: {warning}" for warning in document["warnings"]]

@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from liftcore.cli import Parser, whole
+from liftcore.cli import Parser, whole_number
 from liftcore.errors import NotFound
 from service.commands.serve import data_directory_errors
 from service.errors import InvalidRequest
@@ -43,7 +43,7 @@ def add_arguments(parser: Parser, shared: Parser) -> None:
     create.add_argument("--expires", metavar="WHEN", help="after 30d, 12h or 90m, or at a date (UTC); else never")
     for name, limit in QUOTAS.items():
         option = f"--{name.replace('_', '-')}"
-        create.add_argument(option, type=whole, metavar="N", help=f"{limit}; else as the server is set")
+        create.add_argument(option, type=whole_number, metavar="N", help=f"{limit}; else as the server is set")
     listing = actions.add_parser("list", parents=[shared], help="all keys, without their secrets")
     rotate = actions.add_parser("rotate", parents=[shared], help="give a key another secret and show it, once")
     rotate.add_argument("key", metavar="NAME", help="its name, or its id as keys list shows it")

@@ -212,7 +212,7 @@ def test_settings_of_the_service_that_are_told_exist_and_have_that_default() -> 
 def _commands() -> dict[str, argparse.ArgumentParser]:
     actions = build_parser()._actions
     choices = next(action.choices for action in actions if isinstance(action, argparse._SubParsersAction))
-    return {name: parser.filled() for name, parser in choices.items()}
+    return {name: parser.add_options() for name, parser in choices.items()}
 
 
 def _actions(parser: argparse.ArgumentParser) -> list[argparse.Action]:

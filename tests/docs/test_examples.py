@@ -232,7 +232,7 @@ def test_questions_of_the_guide_are_answered(scene_folder: Path, capsys: pytest.
     assert [command[0] for command in commands] == ["query"] * 4 + ["segment"] * 2 + ["objects", "export", "objects"]
     assert [main(command) for command in commands] == [0] * len(commands)
     told = capsys.readouterr().out
-    assert "3 of 3 words are there" in told and "middle:6,12: apple " in told
+    assert "3 of 3 words found" in told and "middle:6,12: apple " in told
     assert all((scene_folder / name).is_file() for name in ("like.png", "words.png", "seen.png", "scores.ply"))
 
 

@@ -74,7 +74,7 @@ def test_scene_is_lifted_inspected_and_queried(scene: Path, capsys: pytest.Captu
     assert "'left': 1 of 2 splats" in out and "object" not in out
     status, out, err = run(capsys, *question, "--objects", "--top", 2)
     assert re.search(r"  splat 0: score \S+ at \(\S+, \S+, \S+\)\n  splat 1: ", out)
-    assert "\n  object 1: 1 splats, 100.0% of what is selected, score 0.9" in out and "strays" not in out
+    assert "\n  object 1: 1 splats, 100.0% of the selection, score 0.9" in out and "in no object" not in out
     status, out, err = run(capsys, *question, "--objects", "--json")
     (thing,) = json.loads(out)["objects"]
     assert thing["splats"] == 1 and thing["box"] == [thing["centre"]] * 2 and json.loads(out)["strays"] == 0

@@ -120,7 +120,7 @@ def test_masks_get_vectors_of_their_crops(
     assert all(torch.equal(again[view].codebook, packs[view].codebook) for view in ("left", "right"))
     for more, message in (
         (asked, "--photos"),
-        ([*asked, "--photos", photos / "right.png"], "photo of each view"),
+        ([*asked, "--photos", photos / "right.png"], "a photo with the name of each view"),
         ([*asked[:-2], "--photos", photos], "--encoder"),
         ([*asked, "--photos", photos, "--no-normalised"], "--no-normalised"),
         ([*asked[:-1], "timm:resnet18", "--photos", photos], "open_clip:MODEL/TAG"),
@@ -140,7 +140,7 @@ def test_backbones_without_words_say_so(photos: Path, tmp_path: Path, capsys: py
     options = ["--encoder", f"timm:test_resnet@{weights}", "--no-normalised"]
     status, out, err = run(capsys, "encode", photos / "left.png", "-o", pack, *options)
     assert (status, err) == (0, "")
-    assert "1 views, 96 channels" in out and "no words" in out
+    assert "1 views, 96 channels" in out and "no text space" in out
     packs = read_features(pack)
     assert (packs.text_space, packs.normalised, packs.encoder) == ("none", False, "timm:test_resnet")
 
@@ -152,7 +152,7 @@ def test_backbones_without_words_say_so(photos: Path, tmp_path: Path, capsys: py
         (["--encoder", "magic"], "one of maskclip"),
         (["--encoder", "timm:resnet18", "--size", "0"], "--size"),
         (["--encoder", "timm:resnet18", "--device", "abacus"], "--device"),
-        (["--encoder", "maskclip:ViT-B-32@a.pt", "--weights", "b.pt"], "names no weights itself"),
+        (["--encoder", "maskclip:ViT-B-32@a.pt", "--weights", "b.pt"], "without weights in its name"),
         (["--encoder", "timm:resnet18", "-o", "{photos}/left.png"], "another file than the inputs"),
         ([], "--encoder"),
     ],

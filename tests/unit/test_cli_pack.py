@@ -58,7 +58,7 @@ def test_masks_and_their_vectors_are_packed_and_no_input_is_written_over(
     status, out, err = run(capsys, *arguments, "-o", pack)
     assert (status, err) == (0, "")
     assert "2 views, 5 channels" in out and "1 levels of 2x2" in out and "camA/a.jpg.npy is 'camA/a'" in out
-    assert "of sub-folders, whose names are part of their views': camA, camB" in out
+    assert "sub-folders: camA, camB" in out
     regions = read_features(pack)["camA/a"]
     assert isinstance(regions, Regions)
     assert regions.labels.tolist() == [[[-1, 0], [1, 1]]]

@@ -56,7 +56,7 @@ def test_the_text_of_a_query_stands_before_between_or_after_options(arguments: l
         (["L", "red", "mug"], "arguments: mug; a text of several words is one, in quotes"),
         (["L", "--view", "v", "red", "mug"], "arguments: mug; a text of several words is one, in quotes"),
         (["L", "--vieuw", "v", "mug"], "arguments: --vieuw v"),
-        (["L", "--negative", "cat", "mug"], "expected what to look for, before --negative, got --negative cat mug"),
+        (["L", "--negative", "cat", "mug"], "before --negative, got only --negative cat mug"),
         (["L", "cat", "--mask", "m.png"], "no --view"),
     ],
 )
@@ -222,7 +222,7 @@ def test_a_suffix_that_is_not_written_is_refused_before_the_work(
         (["segment", "--words", "nowhere.txt"], "--words: expected a file of words"),
         (["export", "--words", "nowhere.txt", "-o", "x.ply"], "--words: expected a file of words"),
         (["export", "--prims", "-o", "x.glb"], "ends in .usdc or .usdz, got an output that ends in .glb"),
-        (["objects", "--distance", *"0001002", "--metres-per-unit", "2"], "it or --metres-per-unit, not both"),
+        (["objects", "--distance", *"0001002", "--metres-per-unit", "2"], "one of --distance and --metres-per-unit"),
     ],
 )
 def test_what_does_not_fit_is_said_in_the_words_of_the_options_and_before_an_encoder_opens(
