@@ -300,7 +300,7 @@ def test_lift_of_few_views_tells_of_smoothness(
     out = tmp_path / "scene.lift.safetensors"
     status, text, _ = run(capsys, "lift", *files, "-o", out, "--set", f"smoothness={smoothness}")
     assert status == 0
-    assert ("3 views of masks: --set smoothness=auto would" in text) == (smoothness == "0")
+    assert ("3 views of masks: --set smoothness=auto smooths" in text) == (smoothness == "0")
 
 
 def test_command_refines_a_lift_that_is_there(
