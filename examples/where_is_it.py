@@ -24,7 +24,7 @@ def main() -> None:
     scene = lc.Scene(options.lift)
     answer = scene.ask(lc.Query(text=[options.word]), encoder=options.table and f"table:{options.table}")
     if answer.present is False or not answer.count:  # None: unknown, as there are too few other words
-        raise SystemExit(f"{options.word}: not here ({answer.why})")
+        raise SystemExit(f"{options.word}: not here ({answer.reason})")
     camera = scene.camera(options.view)
     world_to_camera = np.asarray(camera.viewmat, dtype=np.float64)
     for item in scene.objects(answer).objects:

@@ -34,12 +34,12 @@ from liftcore.query.catalogue import Catalogue as Catalogue
 from liftcore.query.directions import read_example as read_example
 from liftcore.query.question import Answer as Answer
 from liftcore.query.question import CoveringRegion as CoveringRegion
-from liftcore.query.question import FoundObject as FoundObject
 from liftcore.query.question import NamedSplats as NamedSplats
 from liftcore.query.question import Objects as Objects
 from liftcore.query.question import Picture as Picture
 from liftcore.query.question import Query as Query
 from liftcore.query.question import SceneObject as SceneObject
+from liftcore.query.question import SelectedObject as SelectedObject
 from liftcore.query.render import ViewMask as ViewMask
 from liftcore.query.result import LiftResult as LiftResult
 from liftcore.query.result import load_lift as load_lift

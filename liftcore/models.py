@@ -3,21 +3,26 @@
 from liftcore.query.edits import Edit
 from liftcore.query.question import (
     METHODS,
-    AskableWords,
     BestWords,
     Box,
-    Found,
-    FoundWords,
+    LabelSummary,
     ListedObjects,
     Notation,
     OwnCamera,
     SceneTree,
-    Seen,
+    SelectionSummary,
+    SuggestedWords,
+    Viewpoint,
 )
 from liftcore.query.terms import NOTATIONS
+from liftcore.runtime.aliases import deprecated_classes
 from liftcore.runtime.fields import Body, NoBoolean, takes
 
 __all__ = [
-    "METHODS", "NOTATIONS", "AskableWords", "BestWords", "Body", "Box", "Edit", "Found", "FoundWords",
-    "ListedObjects", "NoBoolean", "Notation", "OwnCamera", "SceneTree", "Seen", "takes",
+    "METHODS", "NOTATIONS", "BestWords", "Body", "Box", "Edit", "LabelSummary", "ListedObjects", "NoBoolean",
+    "Notation", "OwnCamera", "SceneTree", "SelectionSummary", "SuggestedWords", "Viewpoint", "takes",
 ]  # fmt: skip
+
+__getattr__ = deprecated_classes(
+    __name__, AskableWords="SuggestedWords", Found="SelectionSummary", FoundWords="LabelSummary", Seen="Viewpoint"
+)

@@ -24,18 +24,18 @@ from pydantic_core import CoreSchema, PydanticCustomError
 from liftcore import Answer, CoveringRegion, LiftSettings, Objects, Picture, Query, SceneObject, WorldFrame
 from liftcore.models import (
     NOTATIONS,
-    AskableWords,
     BestWords,
     Body,
     Box,
     Edit,
-    Found,
-    FoundWords,
+    LabelSummary,
     ListedObjects,
     NoBoolean,
     Notation,
     SceneTree,
-    Seen,
+    SelectionSummary,
+    SuggestedWords,
+    Viewpoint,
     takes,
 )
 
@@ -532,7 +532,7 @@ class Words(LiftQuestion, Body):
     )
 
 
-class AskedToSegment(Words, Seen):
+class SegmentRequest(Words, Viewpoint):
     """Every splat's best word."""
 
     model_config = BUILT
@@ -548,11 +548,14 @@ class NamedQuestion(Question):
     name: SelectionName | None = Field(None, description="else its words")
 
 
-class AskedToExport(Words):
-    """What to take: the answers of questions, every splat's best word, or the things of the lift."""
+class ExportRequest(Words):
+    """The content of a ZIP: the answers of questions, every splat's best word, or the objects of the lift."""
 
     model_config = BUILT
-    of: Literal["questions", "words", "things"] = Field("things", description="what the labels are")
+    of: Annotated[
+        Literal["questions", "words", "objects"],
+        BeforeValidator(lambda of: "objects" if of == "things" else of),  # the old name
+    ] = Field("objects", description="what the labels are")
     questions: Annotated[list[NamedQuestion], Field(max_length=QUESTIONS, fail_fast=True)] = Field(
         [], description="of `questions`: each is a class of the labels"
     )
@@ -561,7 +564,7 @@ class AskedToExport(Words):
     )
 
 
-class AskedWhat(Words):
+class NearestWordsRequest(Words):
     """What is this?"""
 
     model_config = BUILT
@@ -569,7 +572,7 @@ class AskedWhat(Words):
     top: Annotated[int, Field(ge=1, le=1000), NoBoolean] = Field(5, description="how many words")
 
 
-class AskedForWords(LiftQuestion):
+class SuggestedWordsRequest(LiftQuestion):
     """What is being typed."""
 
     model_config = BUILT
@@ -577,7 +580,7 @@ class AskedForWords(LiftQuestion):
     limit: int = Field(8, ge=1, le=100, description="how many words at most")
 
 
-class AskedToRender(Picture):
+class RenderRequest(Picture):
     """A picture of a lift's scene."""
 
     model_config = BUILT
@@ -591,19 +594,19 @@ class OfLift(BaseModel):
     lift: JobId
 
 
-class SegmentAnswer(FoundWords, OfLift):
+class SegmentAnswer(LabelSummary, OfLift):
     """What is there, of many words."""
 
     encoder: str = Field(description="the text encoder that was asked, without its file")
 
 
-class WhatAnswer(BestWords, OfLift):
+class NearestWordsAnswer(BestWords, OfLift):
     """The words that something is most like."""
 
     encoder: str
 
 
-class WordsAnswer(AskableWords, OfLift):
+class WordsAnswer(SuggestedWords, OfLift):
     """What a lift can be asked."""
 
 
@@ -616,7 +619,7 @@ class QueryAnswer(Answer, OfLift):
     links: dict[str, str]
 
 
-class ObjectsAnswer(Found, Objects, OfLift):
+class ObjectsAnswer(SelectionSummary, Objects, OfLift):
     """The things that were found."""
 
 
@@ -627,7 +630,7 @@ class CoveringRegions(OfLift):
     regions: list[CoveringRegion] = Field(description="one a level at most, the smallest first")
 
 
-class AskedEdit(Edit):
+class EditRequest(Edit):
     """One change of a selection."""
 
     model_config = BUILT
@@ -640,7 +643,7 @@ class NewSelection(Body):
 
     model_config = BUILT
     name: SelectionName = Field(description="for people")
-    edit: AskedEdit | None = Field(None, description="how, of no splats, it begins; left out, it has none")
+    edit: EditRequest | None = Field(None, description="how, of no splats, it begins; left out, it has none")
 
 
 class SelectionChange(Body):
@@ -653,16 +656,16 @@ class SelectionChange(Body):
     )
 
 
-class ThingChange(Body):
-    """What to change of a thing; what is left out stays."""
+class ObjectLabelChange(Body):
+    """Changes of an object's label; fields that are left out stay."""
 
     model_config = BUILT
     name: SelectionName | None = Field(None, description="of your own; null for the nearest word again")
     hidden: bool = Field(False, description="whether lists leave it out")
 
 
-class Thing(BaseModel):
-    """What somebody calls a thing of a lift."""
+class ObjectLabel(BaseModel):
+    """The name that a user gave an object of a lift, and whether it is hidden."""
 
     id: int
     name: str | None = Field(description="null where it has none of its own")
@@ -687,11 +690,22 @@ class ListedSelection(OfLift):
     links: dict[str, str]
 
 
+def _with_both_names(edit: dict[str, Any]) -> dict[str, Any]:
+    """Return an edit with its old field names beside the new ones, whichever it was stored with."""
+    old_names = {"how": "operation", "weigh": "weight_by"}
+    fields = {old_names.get(name, name): value for name, value in edit.items()}
+    if "query" in fields:
+        fields["query"] = _with_both_names(fields["query"])
+    return fields | {old: fields[new] for old, new in old_names.items() if new in fields}
+
+
 class SelectionStep(BaseModel):
     """A step of a selection's history."""
 
     number: int
-    edit: dict[str, Any] = Field(description="what made it of the step before, without bits")
+    edit: Annotated[dict[str, Any], BeforeValidator(_with_both_names)] = Field(
+        description="the edit of the step before, without bits; `how` is the old name of `operation`"
+    )
     count: int = Field(description="splats after it")
 
 
@@ -718,7 +732,7 @@ class OwnKey(BaseModel):
     expires_at = iso_of("expires", optional=True)
 
 
-class AskedShare(Body):
+class ShareRequest(Body):
     """A key to make for somebody."""
 
     model_config = BUILT
@@ -752,7 +766,7 @@ class Shares(BaseModel):
     shares: list[Share]
 
 
-class AskedForNodes(BaseModel):
+class NodesRequest(BaseModel):
     """Which nodes of a lift's tree to list, and what names them."""
 
     table: AssetId | None = Field(None, description="an uploaded text table: they are named by its words")
@@ -769,7 +783,7 @@ NUMBER = r"[+-]?(\d{1,20}(\.\d{0,20})?|\.\d{1,20})([eE][+-]?\d{1,3})?"
 UP = rf"^(cameras|{NUMBER},{NUMBER},{NUMBER})$"
 
 
-class AskedForTree(AskedForNodes):
+class TreeRequest(NodesRequest):
     """Which nodes to list, and whether to say how objects lie to each other."""
 
     relations: bool = Field(False, description="how the objects lie to each other, with numbers")
@@ -781,7 +795,7 @@ class AskedForTree(AskedForNodes):
     )
 
 
-class AskedForSceneObjects(AskedForNodes):
+class SceneObjectsRequest(NodesRequest):
     """Which objects to list, and what names them."""
 
     features: Annotated[bool, Field(description="with the mean feature of each")] = False

@@ -202,9 +202,9 @@ def refusal(request: Request, error: RequestValidationError) -> errors.ServiceEr
     if place == ["body"] and isinstance(first.get("input"), bytes):
         return _not_json(request.headers.get("content-type"))
     got = "nothing" if kind == "missing" else _short(first.get("input"))
-    if kind == "unknown_field":  # reported for the object that holds it, `service.models.Body`
+    if "field" in context:  # reported for the object that holds it (`liftcore.runtime.fields`)
         place.append(context["field"])
-        got = repr(context["field"])
+        got = repr(context["field"]) if kind == "unknown_field" else context["got"]
     return errors.InvalidRequest(
         ".".join(place[1:]) or place[0],
         expected="a JSON object" if place == ["body"] else _expected(first),

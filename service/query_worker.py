@@ -44,7 +44,7 @@ from liftcore import (
 )
 from liftcore.errors import InvalidQuery
 from liftcore.files import cameras_of_views
-from liftcore.models import Edit, Found, OwnCamera, SceneTree, Seen
+from liftcore.models import Edit, OwnCamera, SceneTree, SelectionSummary, Viewpoint
 from liftcore.text import OWN_WORDS
 from service.child import end_with_parent, fault_of
 from service.errors import NoSpace
@@ -206,7 +206,7 @@ class Answers:
 
         def make() -> ViewMask:
             scene, view = self._scene(request), view_of(request)
-            return scene.look(answer, view, find_objects=lambda: self._grouped(request))
+            return scene.view_mask(answer, view, find_objects=lambda: self._grouped(request))
 
         seen_from = json.dumps(request.get("camera", request.get("view")))
         return self._cached(ViewMask, (_key(request), "view", seen_from), make)
@@ -223,12 +223,13 @@ class Answers:
         return Frame(scene.locate(answer, request["top"]).model_dump(mode="json"))
 
     def _objects(self, request: dict[str, Any]) -> Frame:
-        document = self._answer(request).model_dump(mode="json", include=set(Found.model_fields))
+        document = self._answer(request).model_dump(mode="json", include=set(SelectionSummary.model_fields))
         return Frame(document | self._grouped(request).model_dump(mode="json"))
 
     def _file(self, request: dict[str, Any]) -> Frame:
         """Return a file of an answer, of named splats, of an object or of the scene."""
-        scene, operation, kind_asked = self._scene(request), request["operation"], request.get("what", "")
+        scene, operation = self._scene(request), request["operation"]
+        kind_asked = request.get("what", request.get("channel", ""))
         view = view_of(request) if "view" in request or "camera" in request else None
         if operation == "layer":
             blocks = scene.blocks_of(scene.colours(kind_asked))
@@ -282,11 +283,11 @@ class Answers:
 
     def _segment(self, request: dict[str, Any]) -> Frame:
         document = self._segmentation(request).summary.model_dump(mode="json")
-        return _json(request, document, "found", document.pop("found"))
+        return _json(request, document, "named_words", document.pop("named_words"))
 
     def _nearest_words(self, request: dict[str, Any]) -> Frame:
         words, encoder = self._words(request)
-        best = self._scene(request).what(request["example"], words, top=request["top"], encoder=encoder)
+        best = self._scene(request).nearest_words(request["example"], words, top=request["top"], encoder=encoder)
         return Frame({"words": [word.model_dump(mode="json") for word in best]})
 
     def _askable(self, request: dict[str, Any]) -> Frame:
@@ -301,7 +302,9 @@ class Answers:
         first, last = request["first"], request["first"] + request["count"]
         if request["splat"] is not None:
             first, last = self._object_of(request)
-        labels = {number: {"name": name, "hidden": is_hidden} for number, (name, is_hidden) in request["things"]}
+        labels = {
+            number: {"name": name, "hidden": is_hidden} for number, (name, is_hidden) in request["object_labels"]
+        }
         objects = (
             item.model_dump(mode="json") | {"hidden": False} | _object_label(labels.get(item.id))
             for item in catalogue.iterate_objects(first, last, features=request["means"])
@@ -380,7 +383,7 @@ class Answers:
 
     def _labelled_objects(self, request: dict[str, Any]) -> Catalogue | SceneTree:
         """Return the named objects of a lift by their names, with their parts."""
-        labels = {number: {"name": name} for number, (name, _) in request["things"] if name is not None}
+        labels = {number: {"name": name} for number, (name, _) in request["object_labels"] if name is not None}
         if self._scene(request).node is None:
             catalogue = self._named_objects(request)
             return replace(
@@ -408,7 +411,7 @@ class Answers:
 def _selected(scene: Scene, name: str, bits: str) -> Any:
     """Return a selection of these splats; drop the history of a selection with the same name."""
     scene.selections.pop(name, None)
-    return scene.select(name).edit(Edit(how="set", bits=bits))
+    return scene.select(name).edit(Edit(operation="set", bits=bits))
 
 
 def _direction(up: str | None) -> tuple[float, float, float] | Literal["cameras"] | None:
@@ -491,7 +494,7 @@ def view_of(request: dict[str, Any]) -> str | Camera:
     Raises:
         InvalidCameras: what came is none.
     """
-    return Seen(view=request.get("view"), camera=request.get("camera")).seen_from()
+    return Viewpoint(view=request.get("view"), camera=request.get("camera")).seen_from()
 
 
 def open_scene(request: dict[str, Any]) -> Scene:

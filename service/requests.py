@@ -32,7 +32,7 @@ from service.errors import (
 from service.problems import CLOSE, refusal
 
 NAME_CHARACTERS = 80  # of a name or a value of a request, in an answer
-M = TypeVar("M", bound=BaseModel)
+M = TypeVar("M", bound=models.Body)
 F = TypeVar("F", bound=Callable[..., Any])
 BODY = "in the body of the request"
 JSON = re.compile(r"\s*application/([^;\s]+\+)?json\s*(;|$)", re.IGNORECASE)  # as the framework has it
@@ -50,11 +50,12 @@ async def _known_only(request: Request) -> None:
     documented = (route.openapi_extra or {}).get("parameters", ())
     by_name = {parameter["name"]: parameter for parameter in documented if parameter["in"] == "query"}
     names = [*_names(route), *by_name]
+    listed_names = [name for name in names if not by_name.get(name, {}).get("deprecated")]
     lists = {name for name, parameter in by_name.items() if parameter["schema"].get("type") == "array"}
     for name in parameters:
         if name not in names:
             raise InvalidRequest(
-                name[:NAME_CHARACTERS], expected=f"one of {', '.join(names)}" if names else "no parameters",
+                name[:NAME_CHARACTERS], expected=f"one of {', '.join(listed_names)}" if names else "no parameters",
                 got=repr(name[:NAME_CHARACTERS]), hint="in the query of the request",
             )  # fmt: skip
         if len(values := parameters.getlist(name)) > 1 and name not in lists:  # the framework would take the last one
@@ -220,7 +221,7 @@ class Parameters(Generic[M]):
         query, fields = request.query_params, self.schema["properties"]
         values = {
             name: query.getlist(name) if fields[name].get("type") == "array" else query[name]
-            for name in self.names
+            for name in self._names()
             if name in query
         }
         try:
@@ -238,16 +239,21 @@ class Parameters(Generic[M]):
         """The fields as JSON schema."""
         return self.model.model_json_schema()
 
+    def _names(self) -> list[str]:
+        """Return the names of the parameters, and old names of these, which the schema says are deprecated."""
+        return [*self.names, *(old for old, new in self.model.old_names.items() if new in self.names)]
+
     def openapi_schema(self) -> dict[str, Any]:
         """The parameters as OpenAPI describes them."""
         parameters = []
-        for name in self.names:
+        for name in self._names():
             schema = {key: value for key, value in self.schema["properties"][name].items() if key != "description"}
             if "anyOf" in schema.get("items", {}):  # the part of an example that a URL can hold
                 schema["items"] = next(part for part in schema["items"]["anyOf"] if part["type"] == "string")
             about = self.schema["properties"][name].get("description", "")
             parameter = {"name": name, "in": "query", "required": name in self.needs, "schema": schema}
-            parameters.append(parameter | {"description": about})
+            deprecated = {"deprecated": True} if schema.pop("deprecated", False) else {}
+            parameters.append(parameter | {"description": about} | deprecated)
         return {"parameters": parameters}
 
 

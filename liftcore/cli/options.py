@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+import sys
 import textwrap
 from contextlib import contextmanager
 from functools import partial
@@ -18,9 +19,8 @@ from liftcore.files import is_remote
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
-    from pydantic import BaseModel
-
     from liftcore import Scene, TextEncoder, WorldFrame
+    from liftcore.models import Body
 
 BAD_INPUT = 2
 ROLES = {  # kind of file of each argument
@@ -170,7 +170,7 @@ def add_device(parser: argparse.ArgumentParser) -> None:
 
 def add_fields(
     parser: argparse.ArgumentParser,
-    model: type[BaseModel],
+    model: type[Body],
     names: Iterable[str],
     overrides: Mapping[str, dict[str, Any]],
 ) -> None:
@@ -196,7 +196,42 @@ def add_fields(
         keywords |= overrides.get(name, {})
         flag = keywords.pop("flag", f"--{name.replace('_', '-')}")
         keywords |= {"dest": name} if flag.startswith("-") else {}
-        parser.add_argument(flag, **keywords)
+        old_flags = [f"--{old.replace('_', '-')}" for old, new in model.old_names.items() if new == name]
+        add_renamed(parser, flag, old_flags, **keywords)
+
+
+def add_renamed(parser: argparse.ArgumentParser, flag: str, old_flags: Sequence[str], **options: Any) -> None:
+    """Add an option that can also be given by its old names, which help does not show.
+
+    Args:
+        flag: its name now. old_flags: its old names. options: of `add_argument`.
+    """
+    if not old_flags:
+        parser.add_argument(flag, **options)
+        return
+    options.setdefault("action", OneValue)
+    dest = parser.add_argument(flag, **options).dest
+    for old in old_flags:
+        action = parser.add_argument(old, **{**options, "dest": dest, "help": argparse.SUPPRESS})
+        if isinstance(action, OneValue):
+            action.renamed_to = flag
+
+
+class OneValue(argparse.Action):
+    """Store the value of an option; by the old name and the new one, two values are bad input."""
+
+    renamed_to = ""  # the option's name now, of an old one
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option: str | None = None
+    ) -> None:
+        flag, value = vars(namespace).setdefault(f"spelling of {self.dest}", (option, values))
+        if flag != option and value != values:
+            parser.error(f"{flag}: expected one of {flag} and {option}, got both, with different values")
+        if self.renamed_to:
+            note = f"splatlift: {option} is now {self.renamed_to}; the old name goes with the next release"
+            print(note, file=sys.stderr)
+        setattr(namespace, self.dest, values)
 
 
 def add_encoder(parser: argparse.ArgumentParser) -> None:

@@ -84,7 +84,7 @@ def run(options: argparse.Namespace) -> int:
     hint = "or query by example, with --like"
     encoder = text_encoder(options, scene, hint, stand_in=True) if query.texts else None
     answer = scene.ask(query, encoder=encoder, places=options.top > 0)
-    view_mask = None if view is None else scene.look(answer, view)
+    view_mask = None if view is None else scene.view_mask(answer, view)
     objects = scene.objects(answer) if options.objects else None
     document = _document(answer, objects, view_mask, encoder)
     photo = None if view_mask is None else _picture(options.photo, view_mask.mask.shape[::-1])
@@ -136,12 +136,16 @@ def _deprecated_keys(answer: Answer, objects: Objects | None) -> dict[str, Any]:
         "threshold": answer.threshold.value,
         "threshold_method": answer.threshold.method,
         "explanation": answer.threshold.explanation,
-        **{name: getattr(answer, name) for name in ("clear", "present", "presence", "why", "statistics")},
+        "why": answer.reason,
+        **{name: getattr(answer, name) for name in ("clear", "present", "presence", "statistics")},
     }
     if answer.top:
         document |= {"top": [vars(splat) for splat in answer.top], "box": answer.box}
     if objects is not None:
-        document |= {"objects": [vars(scene_object) for scene_object in objects.objects], "strays": objects.strays}
+        document |= {
+            "objects": [vars(scene_object) for scene_object in objects.objects],
+            "strays": objects.unassigned_splats,
+        }
     return document
 
 
@@ -160,7 +164,7 @@ def _lines(document: dict[str, Any]) -> Iterable[str]:
     query_text = ", ".join(map(repr, document["query"]))
     yield from (f"{entry['text']!r} is queried as {entry['word']!r}" for entry in document["answer"]["wording"])
     if document["present"] is not None or document["encoder"]:
-        yield document["why"]
+        yield document["answer"]["reason"]
     if document["threshold"] < math.inf:
         selection = f"{document['selected']} of {document['splats']} splats at or above {document['threshold']:.4g}"
         yield f"{query_text}: {selection} ({document['explanation']})"
@@ -185,8 +189,8 @@ def _lines(document: dict[str, Any]) -> Iterable[str]:
             f"{entry['score']:.4g}, at {place_of(entry['centre'])}, from {place_of(low)} to {place_of(high)}, "
             f"{sides_of(entry['size'], document['answer']['unit'])}"
         )
-    if document.get("strays"):
-        yield f"  {document['strays']} selected splats are in no object: single splats or small groups"
+    if count := document["answer"].get("unassigned_splats"):
+        yield f"  {count} selected splats are in no object: single splats or small groups"
     yield from (f"  {kind}: {path}" for kind, path in document["files"].items())
     if "origin" in document:
         yield f"  positions in the file are relative to the origin {place_of(document['origin'])}"

@@ -18,7 +18,7 @@ def add_arguments(parser: Parser) -> None:
 
     add_lift(parser)
     add_view(parser)
-    add_fields(parser, Picture, ["what"], {})
+    add_fields(parser, Picture, ["channel"], {})
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="PNG", help="the picture to write")
 
 
@@ -30,6 +30,7 @@ def run(options: argparse.Namespace) -> int:
     check_outputs(files, [path for path in (options.lift, options.camera) if path])
     scene = open_lift(options)
     check_outputs(files, source_files(scene))
-    paths = write_files(files, {"output": partial(scene.export, what=options.what, view=view)})
-    reply({"what": options.what, "out": paths["output"]}, as_json=options.json, lines=[paths["output"]])
+    paths = write_files(files, {"output": partial(scene.export, what=options.channel, view=view)})
+    document = {"channel": options.channel, "what": options.channel, "out": paths["output"]}  # what: deprecated
+    reply(document, as_json=options.json, lines=[paths["output"]])
     return 0

@@ -7,7 +7,17 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from liftcore.cli.options import Parser, add_encoder, add_lift, add_view, count, open_lift, text_encoder, view_of
+from liftcore.cli.options import (
+    Parser,
+    add_encoder,
+    add_lift,
+    add_renamed,
+    add_view,
+    count,
+    open_lift,
+    text_encoder,
+    view_of,
+)
 from liftcore.cli.query import source_files
 from liftcore.cli.reply import check_outputs, place_of, reply, write_files
 from liftcore.errors import InvalidQuery
@@ -27,9 +37,9 @@ def add_arguments(parser: Parser) -> None:
         "--words", type=Path, metavar="FILE", help="the words, one a line; default: all words of the table"
     )
     add_encoder(parser)
-    what_help = "list the best words for an example, as of 'query --like'; may be repeated"
-    parser.add_argument("--what", action="append", default=[], metavar="EXAMPLE", help=what_help)
-    parser.add_argument("--top", type=count, default=5, metavar="N", help="words for each --what; default 5")
+    example_help = "list the best words for an example, as of 'query --like'; may be repeated"
+    add_renamed(parser, "--example", ["--what"], action="append", default=[], metavar="EXAMPLE", help=example_help)
+    parser.add_argument("--top", type=count, default=5, metavar="N", help="words for each --example; default 5")
     add_view(parser)
     parser.add_argument(
         "--labels", type=Path, metavar="PNG", help="write the numbers of the words of the view's pixels"
@@ -61,18 +71,21 @@ def run(options: argparse.Namespace) -> int:
         check_outputs(files, source_files(scene))
     encoder, words = encoder_and_words(options, scene, options.words)
     document: dict[str, Any] = {"encoder": encoder.name, "words": len(words)}
-    if options.what:
-        examples = [(notation, read_example(notation, "--what")) for notation in options.what]
-        best = {text: scene.what(example, words, top=options.top, encoder=encoder) for text, example in examples}
+    if options.example:
+        examples = [(notation, read_example(notation, "--example")) for notation in options.example]
+        best = {
+            text: scene.nearest_words(example, words, top=options.top, encoder=encoder) for text, example in examples
+        }
         document["examples"] = [
             BestWords(example=text, words=nearest).model_dump(mode="json") for text, nearest in best.items()
         ]
         document["what"] = {text: [vars(word) for word in nearest] for text, nearest in best.items()}  # deprecated
-    if files or not options.what:
+    if files or not options.example:
         segmentation = scene.segment(words, encoder=encoder, progress=True)
         document["answer"] = segmentation.summary.model_dump(mode="json")
         # Deprecated keys, which the next release removes.
-        document |= vars(segmentation.summary) | {"found": [vars(examples) for examples in segmentation.found]}
+        document |= {"splats": len(segmentation.labels), "none": segmentation.summary.none}
+        document["found"] = [vars(word) for word in segmentation.named_words]
         exports = {kind: partial(scene.export, source=segmentation, what=kind, view=view) for kind in files}
         document["files"] = write_files(files, exports)
     reply(document, as_json=options.json, lines=_lines(document))

@@ -30,7 +30,6 @@ from liftcore.query.presence import (
 )
 from liftcore.query.question import (
     Answer,
-    AskedAs,
     Box,
     Candidate,
     Objects,
@@ -39,6 +38,7 @@ from liftcore.query.question import (
     Query,
     Threshold,
     TopSplat,
+    WordMatch,
 )
 from liftcore.query.scores import LEAST_LIKENESS, LOWEST_COSINE, combine, cosines, cosines_about
 from liftcore.query.selection import (
@@ -55,6 +55,7 @@ from liftcore.query.selection import (
 from liftcore.query.selections import set_members
 from liftcore.query.terms import Vector
 from liftcore.query.threshold import explain_no_selection, find_threshold
+from liftcore.runtime.aliases import deprecated_names
 from liftcore.runtime.cores import cores
 from liftcore.runtime.one_thread import one_thread
 from liftcore.text import TextEncoder, check_texts
@@ -68,7 +69,7 @@ MOST_RIVALS = 3  # words that are named as nearer than what was asked
 MOST_OF_IT = 0.5  # the same where an answer is clear
 LEAST_RIVAL = 0.1  # of what is looked at, by total weight, to which such a word is the nearest
 WHOLE = 0.9  # of a thing's splats, from which what is found of it is no part
-_OF_ANSWER = ("rivals", "candidates", "threshold", "clear", "statistics", "present", "presence", "why")
+_OF_ANSWER = ("rivals", "candidates", "threshold", "clear", "statistics", "present", "presence", "reason")
 _QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 
 
@@ -96,6 +97,7 @@ class PartQuestion:
     part: Question
 
 
+@deprecated_names(why="reason")
 @dataclass(frozen=True)
 class VectorAnswer:
     """How a lift answers vectors (`query_vectors`); tensors lie on the CPU, where questions are answered."""
@@ -114,7 +116,7 @@ class VectorAnswer:
     """whether it is there; None: not known, or not sure"""
     presence: float | None
     """in 0..1, present from 0.5 on"""
-    why: str
+    reason: str
     """one sentence on how that is known"""
     objects: Objects | None
     """the things that they make up, with boxes; None where no splats were given"""
@@ -128,9 +130,9 @@ def ask(scene: OpenedLift, query: Query | str, encoder: TextEncoder | None = Non
     """Score every splat for a query and choose those that answer it.
 
     A splat counts in the histogram by its total weight: what hardly a ray met scores by the chance of a few pixels.
-    It is still selected by its score. With ``weigh`` its confidence counts too. The threshold `auto` is held to other
-    words, and things of the region graph may be taken whole (`liftcore.query.selection`); any other selects by the
-    score alone. Scores that are all equal or zero select nothing. A word for what is not there
+    It is still selected by its score. With ``weight_by`` its confidence counts too. The threshold `auto` is held to
+    other words, and things of the region graph may be taken whole (`liftcore.query.selection`); any other selects by
+    the score alone. Scores that are all equal or zero select nothing. A word for what is not there
     (`liftcore.query.presence`) is left out of the scores, and where no other positive is left nothing is selected,
     unless the query keeps what is absent. Negatives and examples are not questioned.
 
@@ -193,7 +195,7 @@ def query_vectors(
     answer = answers(scene, [Question(query, rows, np.ones(len(rows), np.bool_), others, asked_as, pack)])[0]
     scores, selected = map(torch.from_numpy, (answer.scores, answer.selected))
     found = objects(scene, answer) if grouped else None
-    cut, known = answer.threshold, (answer.present, answer.presence, answer.why)
+    cut, known = answer.threshold, (answer.present, answer.presence, answer.reason)
     return VectorAnswer(scores, selected, cut.value, cut.explanation, answer.clear, *known, found)
 
 
@@ -221,7 +223,9 @@ def question(scene: OpenedLift, query: Query, encoder: TextEncoder | None, names
     phrase = part_phrase(scene, query, encoder)
     if phrase is None:
         return replace(_question(scene, query, encoder, names), unknown_part=unknown_part(scene, query, encoder))
-    thing = _question(scene, Query(text=[phrase.object_phrase], weigh=query.weigh, absent=query.absent), encoder)
+    thing = _question(
+        scene, Query(text=[phrase.object_phrase], weight_by=query.weight_by, absent=query.absent), encoder
+    )
     asked = _question(scene, query, encoder, names) if not phrase.sure else replace(thing, query=query)
     return replace(asked, part=PartQuestion(phrase, thing, _question(scene, query, encoder, names, phrase)))
 
@@ -244,7 +248,7 @@ def _question(
     rows = directions(scene, query, encoder, names, asked_as)
     if phrase is not None:
         asked_as = asked_as | {0: Wording(query.text[0], str(phrase), "part")}
-    scene.splat_weights(query.weigh)
+    scene.splat_weights(query.weight_by)
     encoder = encoder or scene.table
     if encoder is None or not words[: len(query.positives)].any():
         return Question(query, rows, words, "", asked_as, candidates=candidates(scene, query))
@@ -275,7 +279,7 @@ def _part_answer(scene: OpenedLift, asked: Question) -> Answer:
         inside = add_objects(scene, thing.selected)
         (found,) = answers(scene.within(inside), [part])
         nothing = "" if found.count or found.present is False else " Nothing stands out there."
-        told = f"{asked.part.phrase.object_phrase!r} has {thing.count:,} splats. Within it: {found.why}{nothing}"
+        told = f"{asked.part.phrase.object_phrase!r} has {thing.count:,} splats. Within it: {found.reason}{nothing}"
         if found.count >= WHOLE * inside.sum() and asked.query.absent == "drop":
             told = (
                 f"{asked.part.phrase.object_phrase!r} is there, but {part.query.text[0]!r} tells no part of it from "
@@ -288,13 +292,13 @@ def _part_answer(scene: OpenedLift, asked: Question) -> Answer:
             thing,
             "it" if thing.present is False else f"{asked.part.phrase.object_phrase!r} is not found, and",
         )
-        told = f"{thing.why} So {nothing} has no parts."
+        told = f"{thing.reason} So {nothing} has no parts."
     if not found.count and not sure:
         return answers(scene, [replace(asked, part=None)])[0]
-    fields = {name: getattr(found, name) for name in _OF_ANSWER} | {"why": told}
+    fields = {name: getattr(found, name) for name in _OF_ANSWER} | {"reason": told}
     if thing.present is False:
         fields |= {"present": False, "presence": thing.presence}
-    wording = tuple(AskedAs(**word._asdict()) for word in part.asked_as.values() if word.how)
+    wording = tuple(WordMatch(**word._asdict()) for word in part.asked_as.values() if word.match)
     return Answer.of(asked.query, found.scores, found.seen, found.selected, **fields, wording=wording)
 
 
@@ -352,21 +356,21 @@ def _answer(scene: OpenedLift, asked: Question, similarities: np.ndarray) -> Ans
     known = scores if scene.all_seen else scores[seen]
     if presence.present is False and query.absent == "drop":
         method = query.threshold if isinstance(query.threshold, str) else "fixed"
-        found = Threshold(value=math.inf, method=method, explanation=presence.why, clear=False)
+        found = Threshold(value=math.inf, method=method, explanation=presence.reason, clear=False)
         selected = np.zeros_like(seen)
     else:
-        found, selected = _selected(scene, asked, kept, scores, scene.splat_weights(query.weigh))
+        found, selected = _selected(scene, asked, kept, scores, scene.splat_weights(query.weight_by))
     clear = found.clear and presence.present is not False and bool(selected.any())
     least = MOST_OF_IT if clear and presence.present is not None else LEAST_RIVAL
     competitors = _nearer_words(scene, asked, scores, selected, least)
     meant = asked.candidates
     if asked.unknown_part is not None and selected.any():
         meant = parts_of(scene, objects_within(scene, selected))
-        thing = presence.why.replace(
+        thing = presence.reason.replace(
             repr(query.text[0]), repr(asked.unknown_part.object_phrase)
         )  # what is there is the thing
-        presence = presence.model_copy(update={"why": f"{thing} {_without_word(asked.unknown_part, len(meant))}"})
-    wording = tuple(AskedAs(**word._asdict()) for word in asked.asked_as.values() if word.how)
+        presence = presence.model_copy(update={"reason": f"{thing} {_without_word(asked.unknown_part, len(meant))}"})
+    wording = tuple(WordMatch(**word._asdict()) for word in asked.asked_as.values() if word.match)
     return Answer.of(
         query, scores, seen, selected, wording=wording, rivals=competitors,
         candidates=meant, threshold=found, clear=clear, statistics=finite(_statistics(known)),
@@ -414,7 +418,7 @@ def _set_answer(scene: OpenedLift, query: Query) -> Answer:
         members |= set_members(scene, one)
     named, count, scores = ", ".join(query.sets), int(members.sum()), members.astype(np.float32)
     found = Threshold(value=0.5, method="set", explanation=f"the splats of {named}, as they are", clear=count > 0)
-    here = Presence(present=count > 0, presence=float(count > 0), why=f"{named} has {count} splats.")
+    here = Presence(present=count > 0, presence=float(count > 0), reason=f"{named} has {count} splats.")
     return Answer.of(
         query, scores, np.ones_like(members), members,
         threshold=found, clear=count > 0, statistics=finite(_statistics(scores)), **dict(here),
@@ -438,8 +442,8 @@ def _selected(
         return found, np.zeros_like(scene.seen)
     in_words = (asked.plain & kept)[:positives]
     least = -math.inf if in_words.any() else LEAST_LIKENESS
-    counted = "total weight" if query.weigh == "evidence" else "total weight times confidence"
-    alone = scene.weights if query.weigh == "evidence" else scene.weights_with_feature(weights)
+    counted = "total weight" if query.weight_by == "evidence" else "total weight times confidence"
+    alone = scene.weights if query.weight_by == "evidence" else scene.weights_with_feature(weights)
     found = find_threshold(known, query.threshold, alone, least, counted)
     selected = scene.seen & (scores >= np.float32(found.value))
     competitors = _rivals(asked, asked.rows[:positives][in_words])
@@ -487,7 +491,7 @@ def _presence(scene: OpenedLift, asked: Question, similarities: np.ndarray) -> t
     if not words:
         return NOT_IN_WORDS, kept
     if isinstance(asked.references, str):
-        return Presence(present=None, presence=None, why=asked.references), kept
+        return Presence(present=None, presence=None, reason=asked.references), kept
     names = [repr(term) if isinstance(term, str) else str(term) for term in asked.query.positives]
     presences = [
         estimate_presence(scene, names[k], asked.rows[k], similarities[:, k], asked.references) for k in words

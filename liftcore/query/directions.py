@@ -15,7 +15,7 @@ from liftcore.errors import InvalidQuery, NotFound
 from liftcore.query.areas import area_feature
 from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.presence import references_of
-from liftcore.query.question import AskableWord, AskableWords, Query
+from liftcore.query.question import Query, SuggestedWord, SuggestedWords
 from liftcore.query.regions import codebook_row, regions_of
 from liftcore.query.selections import set_members
 from liftcore.query.terms import Area, Example, Region, SplatSet, SplatTerm, Term, Vector, parse_example
@@ -79,16 +79,16 @@ def unknown_part(scene: OpenedLift, query: Query, encoder: TextEncoder | None) -
     return source.vocabulary.unknown_part(query.text[0])
 
 
-def askable_words(scene: OpenedLift, encoder: TextEncoder, text: str, count: int) -> AskableWords:
+def askable_words(scene: OpenedLift, encoder: TextEncoder, text: str, count: int) -> SuggestedWords:
     """Suggest words to query a lift by (`Scene.askable`)."""
     source = table_of(encoder)
     if source is not None:
         scene_words = object_words(scene, source.words, source.embeddings)
-        words = tuple(AskableWord(**suggestion._asdict()) for suggestion in source.vocabulary.complete(text, count))
-        return AskableWords(any_text=False, words=words, here=scene_words)
+        words = tuple(SuggestedWord(**suggestion._asdict()) for suggestion in source.vocabulary.complete(text, count))
+        return SuggestedWords(open_vocabulary=False, words=words, scene_words=scene_words)
     references = references_of(encoder, scene.metadata.text_space)
     scene_words = () if isinstance(references, str) else object_words(scene, references.words, references.vectors)
-    return AskableWords(any_text=True, words=(), here=scene_words)
+    return SuggestedWords(open_vocabulary=True, words=(), scene_words=scene_words)
 
 
 def object_words(scene: OpenedLift, words: Sequence[str], vectors: np.ndarray) -> tuple[str, ...]:

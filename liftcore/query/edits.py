@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
@@ -30,8 +31,9 @@ class Edit(Body):
 
     model_config = ConfigDict(frozen=True)
     error_type: ClassVar = InvalidQuery
+    old_names: ClassVar[Mapping[str, str]] = {"how": "operation"}
 
-    how: Literal["set", "add", "remove", "grow", "shrink"] = Field(description="what changes")
+    operation: Literal["set", "add", "remove", "grow", "shrink"] = Field(description="the kind of change")
     query: Query | None = Field(default=None, description="a question: the splats that answer it")
     area: Annotated[str, Field(min_length=1, max_length=MOST_CHARACTERS, description=AREAS)] | None = Field(
         default=None, description="of a view's image: the splats whose centres are seen there"
@@ -55,10 +57,11 @@ class Edit(Body):
     @model_validator(mode="after")
     def _one_source(self) -> Self:
         sources = [name for name in SOURCES if getattr(self, name) is not None]
-        most, least = (0, 0) if self.how in ("grow", "shrink") else (1, int(self.how != "set"))
+        most, least = (0, 0) if self.operation in ("grow", "shrink") else (1, int(self.operation != "set"))
         if not least <= len(sources) <= most:
             expected = "no source" if not most else f"one of {', '.join(SOURCES)}"
-            raise InvalidQuery("how", expected=f"{expected} with {self.how}", got=" and ".join(sources) or "none")
+            got = " and ".join(sources) or "none"
+            raise InvalidQuery("operation", expected=f"{expected} with {self.operation}", got=got)
         if self.area is not None:
             self.parsed_area()
         return self
@@ -71,9 +74,11 @@ class Edit(Body):
         return area
 
     def described(self) -> dict[str, Any]:
-        """What a history says of it, as JSON: all but the bits, and of a vector its length."""
-        told = self.model_dump(mode="json", exclude_defaults=True, exclude={"bits", "camera"})
-        query = told.get("query", {})
+        """Return the edit as a history has it, JSON: all but the bits, and of a vector its length."""
+        document = self.model_dump(mode="json", exclude_defaults=True, exclude={"bits", "camera"})
+        query = document.get("query", {})
         for name in query.keys() & {"like", "unlike"}:
-            query[name] = [one if isinstance(one, str) else str(Vector(tuple(one))) for one in query[name]]
-        return told
+            query[name] = [
+                example if isinstance(example, str) else str(Vector(tuple(example))) for example in query[name]
+            ]
+        return document

@@ -180,7 +180,7 @@ def object_splats(scene: OpenedLift, answer: Answer, suffix: str = ".ply") -> It
 
     if answer.dropped:
         hint = "absent=keep selects the most similar splats; or ask in other words or by example"
-        raise InvalidQuery("object", expected="an object in the scene", got=answer.why.rstrip("."), hint=hint)
+        raise InvalidQuery("object", expected="an object in the scene", got=answer.reason.rstrip("."), hint=hint)
     if answer.count == 0:
         raise InvalidQuery(
             "object",

@@ -76,7 +76,7 @@ def _name(answer: Answer) -> str:
 def _of_words(scene: OpenedLift, segmentation: Segmentation) -> Labels:
     values, colours = segmentation.values, segmentation.colours.tolist()
     instances, entries = np.zeros(len(values), np.int32), list[dict[str, Any]]()
-    for value, label in enumerate(segmentation.found, 1):
+    for value, label in enumerate(segmentation.named_words, 1):
         rows = np.flatnonzero(values == value)
         weights = _weights(scene, rows)
         groups = touching(scene.splats, rows)
@@ -96,7 +96,7 @@ def _of_words(scene: OpenedLift, segmentation: Segmentation) -> Labels:
             "margin": label.margin,
             "box": {"low": label.box[0], "high": label.box[1]},
         }
-        for value, label in enumerate(segmentation.found, 1)
+        for value, label in enumerate(segmentation.named_words, 1)
     ]
     return _labels(scene, values, instances, segmentation.score, classes, entries)
 
@@ -105,7 +105,7 @@ def _of_answers(scene: OpenedLift, answers: Mapping[str, Answer]) -> Labels:
     selections = {name: (a, objects(scene, a)) for name, a in answers.items() if a.count and not a.dropped}
     if not selections:
         first = next(iter(answers.values()))
-        got = first.why.rstrip(".") if first.dropped else "none above the threshold"
+        got = first.reason.rstrip(".") if first.dropped else "none above the threshold"
         raise InvalidQuery("source", expected="an answer with selected splats", got=got, hint="ask in other words")
     count = len(scene.features)
     class_ids, best = np.zeros(count, np.int32), np.full(count, -np.inf)

@@ -7,7 +7,7 @@ import numpy as np
 
 from liftcore.errors import InvalidQuery
 from liftcore.query.opened import OpenedLift
-from liftcore.query.question import Answer, Box, FoundObject, Objects, Point
+from liftcore.query.question import Answer, Box, Objects, Point, SelectedObject
 from liftcore.query.selection import MOSTLY_SELECTED, PARTLY_SELECTED
 from liftcore.query.terms import SplatSet
 from liftcore.scene.touching import touching
@@ -46,7 +46,7 @@ def objects(scene: OpenedLift, answer: Answer) -> Objects:
     numbers = np.full(len(answer.scores), -1, np.int32)
     if not len(rows):
         return Objects.of((), numbers, 0, scene.world)
-    weights = scene.splat_weights(answer.query.weigh)[rows].astype(np.float64)
+    weights = scene.splat_weights(answer.query.weight_by)[rows].astype(np.float64)
     weights = weights if weights.any() else np.ones(len(rows))
     groups = _set_numbers(scene, sets)[rows] if sets else touching(scene.splats, rows)
     sums = np.bincount(groups, weights)
@@ -71,7 +71,7 @@ def objects(scene: OpenedLift, answer: Answer) -> Objects:
             else trimmed_box(scene.splats.positions(members), member_weights)
         )
         summaries.append(
-            FoundObject(
+            SelectedObject(
                 splats=int(inside.sum()),
                 share=float(weights[inside].sum() / weights.sum()),
                 score=float(np.average(answer.scores[members], weights=member_weights)),

@@ -233,17 +233,17 @@ class OpenedLift:
         """How much each seen splat counts in a histogram, its total weight; None when none has total weight."""
         return self.weights_with_feature(self.total_weight)
 
-    def splat_weights(self, weigh: str) -> np.ndarray:
+    def splat_weights(self, weight_by: str) -> np.ndarray:
         """[P] f32, how much each splat counts: by its total weight, or by that times its confidence.
 
         Raises:
             InvalidQuery: the lift has no confidence.
         """
-        if weigh == "evidence":
+        if weight_by == "evidence":
             return self.total_weight
         if self.confidence is None:
             hint, got = "lift again with the preset default, or with robust_steps", "a lift that was not reweighted"
-            raise InvalidQuery("weigh", expected="a lift with confidence", got=got, hint=hint)
+            raise InvalidQuery("weight_by", expected="a lift with confidence", got=got, hint=hint)
         return self.total_weight * self.confidence
 
     def weights_with_feature(self, weights: np.ndarray) -> np.ndarray | None:

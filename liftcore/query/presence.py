@@ -119,7 +119,7 @@ def estimate_presence(
     """
     best, weights = best_splats(scene, scores)
     if not len(best):
-        return Presence(present=False, presence=0.0, why=f"{name} is not there: no splat has a feature.")
+        return Presence(present=False, presence=0.0, reason=f"{name} is not there: no splat has a feature.")
     reference_rows, limit = references.against(direction)
     rows, norms, count = scene.features[best], scene.norms[best], len(references.words)
     nearer, contrast = nearer_counts(
@@ -129,7 +129,7 @@ def estimate_presence(
     presence = min(shares)
     if presence >= 0.5:
         facts = f"at {presence:.0%} of its best splats at most {limit} of {count} reference words are nearer"
-        return Presence(present=True, presence=presence, why=f"{name} is there: {facts}.")
+        return Presence(present=True, presence=presence, reason=f"{name} is there: {facts}.")
     order = np.argsort(nearer, kind="stable")
     middle = int(nearer[order[np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2)]])
     near = weights @ products(rows, norms, direction[None], references.vectors[reference_rows])[1]
@@ -137,12 +137,14 @@ def estimate_presence(
     facts = f"its best splats are nearer to {middle} of {count} reference words, first of all to {nearest!r}"
     first = float(weights[contrast == 0].sum() / weights.sum())
     if shares[0] < 0.5 and first < 0.5:
-        return Presence(present=False, presence=presence, why=f"{name} is not there: {facts}.")
+        return Presence(present=False, presence=presence, reason=f"{name} is not there: {facts}.")
     if shares[0] < 0.5:
         yet = "but to what sets them apart from the rest of the scene it is the nearest"
-        return Presence(present=None, presence=presence, why=f"Whether {name} is there is not sure: {facts}, {yet}.")
+        return Presence(
+            present=None, presence=presence, reason=f"Whether {name} is there is not sure: {facts}, {yet}."
+        )
     facts = "hardly a reference word is nearer to its best splats, but many are to what sets them apart from the rest"
-    return Presence(present=None, presence=presence, why=f"Whether {name} is there is not sure: {facts}.")
+    return Presence(present=None, presence=presence, reason=f"Whether {name} is there is not sure: {facts}.")
 
 
 def nearer_counts(
@@ -181,14 +183,14 @@ def products(
 
 
 NOT_IN_WORDS = Presence(
-    present=None, presence=None, why="Nothing was asked in words: what an example shows is not questioned."
+    present=None, presence=None, reason="Nothing was asked in words: what an example shows is not questioned."
 )
 
 
 def any_present(words: Sequence[Presence]) -> Presence:
     """Combine the presences of one or more words: present if one of them is."""
     first = max(words, key=lambda word: (word.present is not False, word.present is True, word.presence or 0.0))
-    return Presence(present=first.present, presence=first.presence, why=" ".join(word.why for word in words))
+    return Presence(present=first.present, presence=first.presence, reason=" ".join(word.reason for word in words))
 
 
 def best_splats(scene: OpenedLift, scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -27,7 +27,7 @@ from pydantic_core import CoreSchema, core_schema
 
 from liftcore.errors import InvalidQuery
 from liftcore.query.terms import NOTATIONS, SETS, Example, SplatSet, Term, Vector, parse_example, parse_set
-from liftcore.runtime.fields import Body, NoBoolean, Shown, takes
+from liftcore.runtime.fields import Body, NoBoolean, Shown, old_field, takes
 from liftcore.scene.compositing import MAX_SIDE
 from liftcore.scene.world import WorldFrame
 
@@ -126,7 +126,7 @@ class OwnCamera(Body):
         return Camera.pinhole(self.name, self.width, self.height, self.fx, fy, cx, cy, self.viewmat)
 
 
-class Seen(Body):
+class Viewpoint(Body):
     """Where a picture is seen from."""
 
     view: ViewName | None = Field(
@@ -148,17 +148,18 @@ class Seen(Body):
         return self.camera.camera() if self.camera is not None else str(self.view)
 
 
-class Picture(Seen):
+class Picture(Viewpoint):
     """A picture of the scene."""
 
-    what: Rendered = Field(
+    old_names: ClassVar[Mapping[str, str]] = {"what": "channel"}
+    channel: Rendered = Field(
         default="rgb",
         description="the splats' colours, expected depth, three principal components of features, clusters, or how "
         "far views agree",
     )
 
 
-class Query(Seen):
+class Query(Viewpoint):
     """What is looked for, and how to find it: words and examples, for and against, make one query.
 
     Texts need an encoder of the lift's text space, examples need none. The scores are defined in
@@ -170,6 +171,7 @@ class Query(Seen):
 
     model_config = ConfigDict(frozen=True)
     error_type: ClassVar = InvalidQuery
+    old_names: ClassVar[Mapping[str, str]] = {"weigh": "weight_by"}
 
     text: Texts = Field(default=[], description="what to look for; may be given several times")
     like: Examples = Field(
@@ -200,9 +202,10 @@ class Query(Seen):
     absent: Literal["drop", "keep"] = Field(
         default="drop", description="words for what is not there: select nothing for them, or what is most like them"
     )
-    weigh: Literal["evidence", "confidence"] = Field(
+    weight_by: Literal["evidence", "confidence"] = Field(
         default="evidence",
-        description="what splats count by in the threshold's histogram and in objects; confidence: times it",
+        description="the weight of a splat in the threshold's histogram and in objects: its evidence, or that times "
+        "its confidence",
     )
     top: Annotated[int, Field(ge=0, le=1000), NoBoolean] = Field(
         default=10, description="how many of the best splats to list"
@@ -238,7 +241,7 @@ class Query(Seen):
     @classmethod
     def deciding(cls) -> list[str]:
         """The fields that decide what is found; the others say what is listed of it, and where from."""
-        return [name for name in cls.model_fields if name not in {*Seen.model_fields, "top"}]
+        return [name for name in cls.model_fields if name not in {*Viewpoint.model_fields, "top"}]
 
     @cached_property
     def positives(self) -> tuple[Term, ...]:
@@ -342,12 +345,14 @@ class Threshold(Value):
 class Presence(Value):
     """Whether what was asked for is there."""
 
+    old_names: ClassVar[Mapping[str, str]] = {"why": "reason"}
     present: bool | None = Field(description="whether it is there; null when not known or not sure")
     presence: float | None = Field(description="how sure that is, in 0..1: there from 0.5 on; null when not known")
-    why: str = Field(description="one sentence on how it is known whether it is there, or why it is not")
+    reason: str = Field(description="one sentence on how it is known whether it is there, or why it is not")
+    why = old_field("reason", str)
 
 
-class Found(Presence):
+class SelectionSummary(Presence):
     """How much was found."""
 
     threshold: Threshold
@@ -377,38 +382,43 @@ class TopSplat(Value):
     position: Point = Field(description="x y z, world frame")
 
 
-class AskedAs(Value):
+class WordMatch(Value):
     """A text that the encoder's table lacks, and the word of it that stands for the text."""
 
+    old_names: ClassVar[Mapping[str, str]] = {"how": "match"}
     text: str
     word: str = Field(description="of a part: the part of the thing that it is looked for within")
-    how: Literal["spelling", "qualifier", "synonym", "number", "head", "part"] = Field(
-        description="what makes them one: letters, a word that says which is meant, meaning, one or several, the "
+    match: Literal["spelling", "qualifier", "synonym", "number", "head", "part"] = Field(
+        description="the kind of match: letters, a word that says which is meant, meaning, one or several, the "
         "head of a phrase, or a part that it names"
     )
+    how = old_field("match", str)
 
 
-class AskableWord(Value):
+class SuggestedWord(Value):
     """A word that can be asked."""
 
     word: str
     typed: str = Field(description="what begins as the text does: the word itself, or a synonym of it")
 
 
-class AskableWords(Value):
+class SuggestedWords(Value):
     """What a lift can be asked."""
 
-    any_text: bool = Field(description="any text can be asked, not the words of a table alone")
-    words: tuple[AskableWord, ...] = Field(description="those that a text may become, the likeliest first")
-    here: tuple[str, ...] = Field(description="words for the things that the lift found by masks alone")
+    old_names: ClassVar[Mapping[str, str]] = {"any_text": "open_vocabulary", "here": "scene_words"}
+    open_vocabulary: bool = Field(description="true if any text can be queried, not the words of a table alone")
+    any_text = old_field("open_vocabulary", bool)
+    words: tuple[SuggestedWord, ...] = Field(description="those that a text may become, the likeliest first")
+    scene_words: tuple[str, ...] = Field(description="words for the objects that the lift found by masks alone")
+    here = old_field("scene_words", tuple[str, ...])
 
 
-class Answer(Found):
+class Answer(SelectionSummary):
     """Where in a scene is what was asked for."""
 
     text: list[str]
     like: list[str] = Field(description="the examples, in their notation; vectors by their length")
-    wording: tuple[AskedAs, ...] = Field(
+    wording: tuple[WordMatch, ...] = Field(
         default=(), description="texts that were asked as another word; one that the table has is asked as it is"
     )
     rivals: tuple[str, ...] = Field(
@@ -464,7 +474,7 @@ class Answer(Found):
         return self.present is False and self.query.absent == "drop"
 
 
-class Measured(Value):
+class WithUnits(Value):
     """What tells sizes and distances: in metres where it is known how long a scene unit is."""
 
     world: WorldFrame = Field(description="which way is up and how long a scene unit is, as far as somebody said it")
@@ -473,40 +483,39 @@ class Measured(Value):
     )
 
 
-class FoundObject(Value):
+class SelectedObject(Value):
     """Selected splats that hang together."""
 
     splats: int = Field(description="how many")
-    share: float = Field(description="of the total weight of all selected splats, or of what `weigh` says")
+    share: float = Field(description="of the total weight of all selected splats, or of the weights of `weight_by`")
     score: float = Field(description="the mean of its splats' scores, by the same")
     centre: Point = Field(description="the middle of its box: x y z, world frame")
     box: Box = Field(description="of its splats' centres, but for a thousandth of the total weight at each end")
     size: Point = Field(description="the sides of its box, in `unit`")
 
 
-class Objects(Measured):
+class Objects(WithUnits):
     """What an answer found, thing by thing."""
 
-    objects: tuple[FoundObject, ...] = Field(description="those with the largest total weight first")
-    strays: int = Field(description="selected splats in none of them")
+    old_names: ClassVar[Mapping[str, str]] = {"strays": "unassigned_splats", "found": "objects"}
+    objects: tuple[SelectedObject, ...] = Field(description="those with the largest total weight first")
+    unassigned_splats: int = Field(description="the number of selected splats in none of them")
+    strays = old_field("unassigned_splats", int)
     _numbers: np.ndarray = PrivateAttr()
 
     @classmethod
-    def of(cls, objects: Iterable[FoundObject], numbers: np.ndarray, strays: int, world: WorldFrame) -> Self:
-        """Objects with the number of each splat's, which JSON leaves out."""
-        made = cls(objects=tuple(objects), strays=strays, world=world, unit=world.unit)
-        made._numbers = numbers
-        return made
+    def of(
+        cls, objects: Iterable[SelectedObject], numbers: np.ndarray, unassigned_splats: int, world: WorldFrame
+    ) -> Self:
+        """Return objects with the index of each splat's object, which JSON leaves out."""
+        groups = cls(objects=tuple(objects), unassigned_splats=unassigned_splats, world=world, unit=world.unit)
+        groups._numbers = numbers
+        return groups
 
     @property
     def numbers(self) -> np.ndarray:
         """[P] i32, the place in ``objects`` of each splat's object; -1 for none."""
         return self._numbers
-
-    @property
-    def found(self) -> tuple[FoundObject, ...]:
-        """The objects."""
-        return self.objects
 
 
 class NamedSplats(Value):
@@ -524,13 +533,18 @@ class NamedSplats(Value):
     box: Box = Field(description="of its splats' centres, but for a thousandth of the total weight at each end")
 
 
-class FoundWords(Value):
-    """Which of many words are there."""
+class LabelSummary(Value):
+    """The words of a vocabulary that are in the scene."""
 
-    words: int = Field(description="how many were asked")
+    old_names: ClassVar[Mapping[str, str]] = {"words": "word_count", "found": "named_words"}
+    word_count: int = Field(description="the number of words of the query")
+    words = old_field("word_count", int)
     splats: int = Field(description="P")
-    none: int = Field(description="splats that none of the words names")
-    found: tuple[NamedSplats, ...] = Field(description="those that are there, with the largest total weight first")
+    none: int = Field(description="the number of splats without a word")
+    named_words: tuple[NamedSplats, ...] = Field(
+        description="the words that are there, those with the largest total weight first"
+    )
+    found = old_field("named_words", tuple[NamedSplats, ...])
 
 
 class BestWord(Value):
@@ -564,7 +578,7 @@ class SceneObject(Value):
     )
 
 
-class ListedObjects(Measured):
+class ListedObjects(WithUnits):
     """The things in a scene, or some of them, those with the largest total weight first."""
 
     explanation: str = Field(description="why there are so many; or why there are none")
@@ -592,7 +606,7 @@ class Relation(Value):
     overlap: float | None = Field(description="0 to 1, of what it comes from; null of touching")
 
 
-class SceneTree(Measured):
+class SceneTree(WithUnits):
     """Objects, their parts and groups of them, or some of these; the first are the objects."""
 
     explanation: str = Field(description="why there are so many; or why there are none")

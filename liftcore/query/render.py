@@ -90,7 +90,7 @@ def view_mask(
         members, subject = answer.selected, f"all {answer.count} selected splats, too many to group into objects"
     else:
         groups = group(scene, answer)
-        members, count = groups.numbers >= 0, len(groups.found)
+        members, count = groups.numbers >= 0, len(groups.objects)
         subject = f"the {count} object{'s' * (count != 1)} that {'were' if count != 1 else 'was'} found"
     # A splat without a feature has a score of -1, which would lower the attention of its neighbours: it counts as 0.
     scores = np.where(answer.seen & (not answer.dropped), answer.scores, np.float32(0.0))
@@ -111,7 +111,7 @@ def attention_png(in_view: ViewMask) -> bytes:
     return _png(heat_colours(in_view.attention, in_view.row_sums > 0))
 
 
-def render_png(scene: OpenedLift, view: str | Camera, what: str = "rgb") -> bytes:
+def render_png(scene: OpenedLift, view: str | Camera, channel: str = "rgb") -> bytes:
     """Render the scene from a camera as a PNG, RGB [H, W, 3] on black: colours, features (``pca``) or clusters.
 
     ``depth`` is one 8-bit channel [H, W], near bright; the PNG has its range as text (`ShownDepth`).
@@ -119,13 +119,13 @@ def render_png(scene: OpenedLift, view: str | Camera, what: str = "rgb") -> byte
     Raises:
         NotFound, InvalidQuery, InvalidLift: as `render` does.
     """
-    if what == "depth":
+    if channel == "depth":
         depth = shown_depth(scene, view)
         return _png(depth.levels, depth.text())
-    return _png(render(scene, view, what))
+    return _png(render(scene, view, channel))
 
 
-def render(scene: OpenedLift, view: str | Camera, what: str = "rgb") -> np.ndarray:
+def render(scene: OpenedLift, view: str | Camera, channel: str = "rgb") -> np.ndarray:
     """Render the colours of a view, [H, W, 3] u8 sRGB on black, with the opacities as trained.
 
     ``rgb`` takes the splats' colours, ``pca`` the first three principal components of their features, and ``cluster``
@@ -138,11 +138,11 @@ def render(scene: OpenedLift, view: str | Camera, what: str = "rgb") -> np.ndarr
         InvalidQuery: the lift has no clusters, or no confidence; or the image is larger than pictures may be.
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """
-    if what == "cluster":
+    if channel == "cluster":
         return _render_clusters(scene, view)
-    if what == "confidence":
+    if channel == "confidence":
         return _render_confidence(scene, view)
-    colours = scene.principal if what == "pca" else view_colours(scene.splats, scene.camera(view))
+    colours = scene.principal if channel == "pca" else view_colours(scene.splats, scene.camera(view))
     levels = scene.image(view, lambda camera: scene.raster.render(camera, colours, _as_trained(scene))).numpy()
     np.clip(levels, 0.0, 1.0, out=levels)  # in place: an image of floats is large
     levels *= 255
@@ -152,7 +152,7 @@ def render(scene: OpenedLift, view: str | Camera, what: str = "rgb") -> np.ndarr
 def _render_clusters(scene: OpenedLift, view: str | Camera) -> np.ndarray:
     if scene.cluster is None or scene.cluster_features is None:
         hint = "lift again with the setting aggregation=true"
-        raise InvalidQuery("what", expected="a lift with clusters", got="a lift without aggregation", hint=hint)
+        raise InvalidQuery("channel", expected="a lift with clusters", got="a lift without aggregation", hint=hint)
     clusters = torch.from_numpy(scene.cluster)
     labels = scene.image(view, lambda camera: scene.raster.strongest_labels(camera, clusters, scene.compositing))
     picture = cluster_colours(len(scene.cluster_features))[labels.numpy()]  # the last colour is that of label -1
@@ -164,7 +164,9 @@ def _render_clusters(scene: OpenedLift, view: str | Camera) -> np.ndarray:
 def _render_confidence(scene: OpenedLift, view: str | Camera) -> np.ndarray:
     if scene.confidence is None:
         hint = "lift again with the preset default, or with robust_steps"
-        raise InvalidQuery("what", expected="a lift with confidence", got="a lift that was not reweighted", hint=hint)
+        raise InvalidQuery(
+            "channel", expected="a lift with confidence", got="a lift that was not reweighted", hint=hint
+        )
     values = torch.from_numpy(np.stack([scene.confidence, np.ones_like(scene.confidence)], axis=1))
     image = scene.image(view, lambda camera: scene.raster.render(camera, values, scene.compositing)).numpy()
     sums = image[..., 1]

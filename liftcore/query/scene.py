@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from liftcore.errors import InvalidLift
 from liftcore.query.opened import OpenedLift
+from liftcore.runtime.aliases import deprecated_keywords, deprecated_names
 from liftcore.runtime.progress import Progress, shown_progress
 
 if TYPE_CHECKING:  # these load torch
@@ -20,12 +21,12 @@ if TYPE_CHECKING:  # these load torch
     from liftcore.query.catalogue import Catalogue
     from liftcore.query.question import (
         Answer,
-        AskableWords,
         BestWord,
         CoveringRegion,
         Objects,
         Query,
         SceneTree,
+        SuggestedWords,
     )
     from liftcore.query.render import ViewMask
     from liftcore.query.segment import Segmentation
@@ -40,6 +41,7 @@ Source: TypeAlias = (  # of a file
 )
 
 
+@deprecated_names(look="view_mask", what="nearest_words")
 class Scene(OpenedLift):
     """A lift opened for questions, with the splats and cameras of its scene.
 
@@ -114,7 +116,7 @@ class Scene(OpenedLift):
 
         return located(self, answer, count)
 
-    def look(
+    def view_mask(
         self,
         query: Query | str | Answer,
         view: str | Camera | None = None,
@@ -122,7 +124,7 @@ class Scene(OpenedLift):
         encoder: TextEncoder | str | Path | None = None,
         find_objects: Callable[[], Objects] | None = None,
     ) -> ViewMask:
-        """See an answer from a camera: its attention, and a mask of the objects that were found.
+        """Render an answer from a camera: its attention, and a mask of the objects that were found.
 
         Args:
             query: as in `ask`, or the answer to it. view: the name of a camera of the scene, or any camera in the
@@ -145,8 +147,8 @@ class Scene(OpenedLift):
         *,
         encoder: TextEncoder | str | Path | None = None,
     ) -> np.ndarray:
-        """[H, W] bool, the pixels of a view that are mostly of what was found; arguments as in `look`."""
-        return self.look(query, view, encoder=encoder).mask
+        """[H, W] bool, the pixels of a view that are mostly of what was found; arguments as in `view_mask`."""
+        return self.view_mask(query, view, encoder=encoder).mask
 
     def attention(
         self,
@@ -155,8 +157,8 @@ class Scene(OpenedLift):
         *,
         encoder: TextEncoder | str | Path | None = None,
     ) -> np.ndarray:
-        """[H, W] f32, the scores as a view shows them; arguments as in `look`."""
-        return self.look(query, view, encoder=encoder).attention
+        """[H, W] f32, the scores as a view shows them; arguments as in `view_mask`."""
+        return self.view_mask(query, view, encoder=encoder).attention
 
     def select(self, name: str, source: Answer | Query | str | np.ndarray | int | None = None) -> Selection:
         """A selection by its name, made where there is none: splats that `Selection.edit` corrects.
@@ -180,7 +182,8 @@ class Scene(OpenedLift):
         self.selections[name] = found
         return found
 
-    def render(self, view: str | Camera, what: str = "rgb") -> np.ndarray:
+    @deprecated_keywords(what="channel")
+    def render(self, view: str | Camera, channel: str = "rgb") -> np.ndarray:
         """A view: [H, W, 3] u8 sRGB of ``rgb``, ``pca``, ``cluster`` or ``confidence``; [H, W] f32 of ``depth``.
 
         Depths are expected ones, in scene units, 0 where no splat is.
@@ -190,7 +193,7 @@ class Scene(OpenedLift):
         """
         from liftcore.query.render import expected_depth, render
 
-        return expected_depth(self, view)[0] if what == "depth" else render(self, view, what)
+        return expected_depth(self, view)[0] if channel == "depth" else render(self, view, channel)
 
     def objects(self, query: Query | str | Answer, *, encoder: TextEncoder | str | Path | None = None) -> Objects:
         """The things that a question finds: splats that touch, each with its box (`liftcore.query.objects`)."""
@@ -261,7 +264,7 @@ class Scene(OpenedLift):
             references = references_of(reader, self.metadata.text_space)
             return segment(self, words, reader.encode(words), reporter, references)
 
-    def what(
+    def nearest_words(
         self,
         example: Example | str | Sequence[float],
         words: Sequence[str] | None = None,
@@ -294,7 +297,7 @@ class Scene(OpenedLift):
 
     def askable(
         self, text: str = "", count: int = 8, *, encoder: TextEncoder | str | Path | None = None
-    ) -> AskableWords:
+    ) -> SuggestedWords:
         """What can be asked: at most so many words that a text which is being typed may become, and what is here.
 
         Raises:
@@ -382,7 +385,7 @@ class Scene(OpenedLift):
                 `render` draws, or splats; of an array npy, or mask of booleans [H, W]. Empty: the first of these; of
                 a segmentation or a catalogue as a .glb, .spz or .usdz labelled (a catalogue as a .ply, too), .json
                 masks, .jsonl lines; as a .zip the bundle.
-            view: of pictures, as in `look`. suffix: of its name, where there are several formats.
+            view: of pictures, as in `view_mask`. suffix: of its name, where there are several formats.
             seen: the answer as the view shows it, where that is known. photo: of the view, for an overlay.
 
         Raises:

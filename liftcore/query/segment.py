@@ -28,11 +28,12 @@ from liftcore.query.directions import directions
 from liftcore.query.objects import trimmed_box
 from liftcore.query.opened import OpenedLift, as_numpy
 from liftcore.query.presence import LEAST_WORDS, References, estimate_presence, references_of_space
-from liftcore.query.question import BestWord, FoundWords, NamedSplats, Query
+from liftcore.query.question import BestWord, LabelSummary, NamedSplats, Query
 from liftcore.query.scores import cosines, norms_of
 from liftcore.query.selection import levels_disagree, parts_of_words
 from liftcore.query.terms import Example
 from liftcore.query.threshold import find_threshold
+from liftcore.runtime.aliases import deprecated_names
 from liftcore.runtime.one_line import one_line
 from liftcore.runtime.one_thread import one_thread
 from liftcore.runtime.progress import Progress, silent
@@ -49,6 +50,7 @@ AT_ONCE = 16  # words whose cosines are held at a time: [P, AT_ONCE] f32
 SHOWN = 20  # words of a drawn legend
 
 
+@deprecated_names(found="named_words")
 @dataclass(frozen=True)
 class Segmentation:
     """What every splat is, of some words."""
@@ -61,30 +63,34 @@ class Segmentation:
     """[P] f32, the cosine to its word; 0 where it has none"""
     margin: np.ndarray
     """[P] f32, the cosine to its word less that to the nearest other; 0 where it has none"""
-    found: tuple[NamedSplats, ...]
-    """those that are there, with the largest total weight first"""
+    named_words: tuple[NamedSplats, ...]
+    """the words that are there, those with the largest total weight first"""
 
     def __repr__(self) -> str:
-        found = ", ".join(f"{one.word!r}: {one.splats}" for one in self.found)
-        return one_line(self, f"{len(self.labels)} splats", f"{len(self.found)} of {len(self.words)} words: {found}")
+        found = ", ".join(f"{one.word!r}: {one.splats}" for one in self.named_words)
+        return one_line(
+            self, f"{len(self.labels)} splats", f"{len(self.named_words)} of {len(self.words)} words: {found}"
+        )
 
     @property
     def values(self) -> np.ndarray:
-        """[P] i32, the place of each splat's word in ``found``, from 1; 0 for none."""
+        """[P] i32, the place of each splat's word in ``named_words``, from 1; 0 for none."""
         places = np.zeros(len(self.words) + 1, np.int32)  # the last is of -1
-        places[[named.row for named in self.found]] = np.arange(1, len(self.found) + 1)
+        places[[named.row for named in self.named_words]] = np.arange(1, len(self.named_words) + 1)
         return places[self.labels]
 
     @property
     def colours(self) -> np.ndarray:
-        """[len(found) + 1, 3] u8 sRGB, by ``values``: grey, then a colour a word."""
-        return _palette(len(self.found))
+        """[len(named_words) + 1, 3] u8 sRGB, by ``values``: grey, then a colour a word."""
+        return _palette(len(self.named_words))
 
     @property
-    def summary(self) -> FoundWords:
+    def summary(self) -> LabelSummary:
         """What is there, and what has no name."""
         none = int((self.labels < 0).sum())
-        return FoundWords(words=len(self.words), splats=len(self.labels), none=none, found=self.found)
+        return LabelSummary(
+            word_count=len(self.words), splats=len(self.labels), none=none, named_words=self.named_words
+        )
 
 
 def _palette(words: int) -> np.ndarray:
@@ -307,7 +313,7 @@ def map_png(values: np.ndarray, segmentation: Segmentation) -> bytes:
 
     More than 255 words make a grey picture of 16 bits.
     """
-    return palette_png(values, [named.word for named in segmentation.found], segmentation.colours)
+    return palette_png(values, [named.word for named in segmentation.named_words], segmentation.colours)
 
 
 def palette_png(values: np.ndarray, names: Sequence[str], colours: np.ndarray) -> bytes:
@@ -338,7 +344,7 @@ def picture_png(image: np.ndarray, values: np.ndarray, segmentation: Segmentatio
     shown = [place for place in np.argsort(-pixels, kind="stable").tolist() if place and pixels[place]][:SHOWN]
     size = max(12, image.shape[0] // 30)
     font = ImageFont.load_default(size)
-    words = [segmentation.found[place - 1].word for place in shown] or ["no word is here"]
+    words = [segmentation.named_words[place - 1].word for place in shown] or ["no word is here"]
     width = int(max(font.getlength(word) for word in words)) + 3 * size
     canvas = Image.new("RGB", (image.shape[1] + width, max(image.shape[0], (2 * len(words) + 1) * size)), "white")
     canvas.paste(Image.fromarray(tinted), (0, 0))

@@ -17,6 +17,7 @@ from liftcore.query.objects import MOST_SPLATS, object_box, objects
 from liftcore.query.opened import MOST_PIXELS, OpenedLift
 from liftcore.query.question import Answer, Box, Query
 from liftcore.query.terms import PixelBox, SplatSet, Stroke
+from liftcore.runtime.aliases import deprecated_keywords
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.touching import REACH, spreads_along, touching_pairs
 
@@ -58,7 +59,7 @@ class Selection:
     def __init__(self, scene: Scene, name: str, splats: np.ndarray | None = None) -> None:
         self._scene, self.name = scene, name
         start = np.zeros(len(scene.features), np.bool_) if splats is None else _booleans(scene, splats)
-        self._steps, self._place = [Step.of({"how": "set"}, start)], 0
+        self._steps, self._place = [Step.of({"operation": "set"}, start)], 0
 
     def __repr__(self) -> str:
         return one_line(self, repr(self.name), f"{int(self.splats.sum())} splats", f"step {self._place}")
@@ -84,13 +85,14 @@ class Selection:
         """The edits up to the present state, in their order, without undone ones."""
         return tuple(step.edit for step in self._steps[1 : self._place + 1])
 
+    @deprecated_keywords(how="operation")
     def edit(
-        self, how: str | Edit, source: Answer | Query | str | np.ndarray | int | None = None, **fields: Any
+        self, operation: str | Edit, source: Answer | Query | str | np.ndarray | int | None = None, **fields: Any
     ) -> Self:
         """Edit the selection; edits that were undone before are dropped from the history.
 
         Args:
-            how: set, add, remove, grow or shrink; or an `Edit`, with the answer to its query if that is known.
+            operation: set, add, remove, grow or shrink; or an `Edit`, with the answer to its query if that is known.
             source: of the splats: an answer, a query or a text, [P] bool, or the number of an object.
             fields: of `Edit`, such as ``area="0001:stroke:40,30,90,30", radius=12`` or ``steps=2``.
 
@@ -99,7 +101,7 @@ class Selection:
             NotFound: no such view, object or selection.
             InvalidLift: the splats or cameras moved or changed since the lift.
         """
-        edit, answer = _edit_of(self._scene, how, source, fields)
+        edit, answer = _edit_of(self._scene, operation, source, fields)
         if edit.query is not None and answer is None:
             answer = self._scene.ask(edit.query, places=False)
         splats = apply_edit(self._scene, self.splats, edit, answer)
@@ -118,17 +120,17 @@ class Selection:
         return self
 
 
-def _edit_of(scene: Scene, how: str | Edit, source: Any, fields: dict[str, Any]) -> tuple[Edit, Answer | None]:
+def _edit_of(scene: Scene, operation: str | Edit, source: Any, fields: dict[str, Any]) -> tuple[Edit, Answer | None]:
     """Return an edit from Python's arguments, and the answer that is its source."""
     answer = source if isinstance(source, Answer) else None
-    if isinstance(how, Edit):
-        return how, answer
+    if isinstance(operation, Edit):
+        return operation, answer
     if isinstance(source, np.ndarray):
         fields["bits"] = base64.b64encode(Step.of({}, _booleans(scene, source)).bits).decode()
     elif source is not None:
         query = answer.query if answer else Query(sets=[f"object:{source}"]) if isinstance(source, int) else source
         fields["query"] = Query.of(query) if isinstance(query, str) else query
-    return Edit.model_validate({"how": how, **fields}), answer
+    return Edit.model_validate({"operation": operation, **fields}), answer
 
 
 def splats_of_bits(bits: bytes, count: int) -> np.ndarray:
@@ -145,10 +147,12 @@ def apply_edit(scene: OpenedLift, splats: np.ndarray, edit: Edit, answer: Answer
     Raises:
         InvalidQuery, NotFound, InvalidLift, Unavailable: as `Selection.edit`.
     """
-    if edit.how in ("grow", "shrink"):
-        return _grow(scene, splats, edit.steps) if edit.how == "grow" else ~_grow(scene, ~splats, edit.steps, splats)
+    if edit.operation == "grow":
+        return _grow(scene, splats, edit.steps)
+    if edit.operation == "shrink":
+        return ~_grow(scene, ~splats, edit.steps, splats)
     source = _source(scene, edit, answer)
-    return source if edit.how == "set" else splats | source if edit.how == "add" else splats & ~source
+    return source if edit.operation == "set" else splats | source if edit.operation == "add" else splats & ~source
 
 
 def set_members(scene: OpenedLift, members: SplatSet) -> np.ndarray:

@@ -6,15 +6,17 @@ old and a new name with different values are an error, as either could be the on
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Callable, Mapping
 from functools import wraps
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from liftcore.errors import InvalidInput, SplatliftError
 
 T = TypeVar("T")
 C = TypeVar("C", bound=type)
+F = TypeVar("F", bound=Callable[..., Any])
 VALUE_CHARACTERS = 60  # characters of a value in an error
 
 
@@ -59,7 +61,7 @@ def deprecated_names(**aliases: str) -> Callable[[C], C]:
         @wraps(initialise)
         def initialise_by_names(self: Any, *args: Any, **keywords: Any) -> None:
             for old in aliases.keys() & keywords.keys():
-                _warn(cls, old, aliases[old])
+                _warn(cls.__name__, old, aliases[old])
             initialise(self, *args, **current_names(keywords, aliases))
 
         cls.__init__ = initialise_by_names
@@ -71,16 +73,63 @@ def deprecated_names(**aliases: str) -> Callable[[C], C]:
 def add_deprecated_properties(cls: type, aliases: Mapping[str, str]) -> None:
     """Let instances of a class be read by old names, each with a `DeprecationWarning`."""
     for old, new in aliases.items():
-
-        def read_new(self: Any, old: str = old, new: str = new) -> Any:
-            _warn(type(self), old, new)
-            return getattr(self, new)
-
-        setattr(cls, old, property(read_new, doc=f"Deprecated: `{new}`."))
+        setattr(cls, old, property(deprecated_getter(new, old), doc=f"Deprecated: `{new}`."))
 
 
-def _warn(cls: type, old: str, new: str) -> None:
-    warnings.warn(f"{cls.__name__}.{old} is now {new}", DeprecationWarning, stacklevel=3)
+def deprecated_getter(new: str, old: str = "", readers: tuple[str, ...] = ()) -> Callable[[Any], Any]:
+    """Return a getter of an attribute by its old name, which warns.
+
+    Args:
+        new: the attribute. old: its old name, for the warning. readers: packages that read it without a warning.
+    """
+
+    def read_new(self: Any) -> Any:
+        caller = sys._getframe(1).f_globals.get("__name__", "")
+        if caller.partition(".")[0] not in readers:
+            _warn(type(self).__name__, old, new)
+        return getattr(self, new)
+
+    return read_new
+
+
+def deprecated_keywords(**aliases: str) -> Callable[[F], F]:
+    """Let a function take keyword arguments by their old names, each with a `DeprecationWarning`.
+
+    Args:
+        aliases: new names by old ones.
+    """
+
+    def decorate(function: F) -> F:
+        @wraps(function)
+        def call_by_names(*args: Any, **keywords: Any) -> Any:
+            for old in aliases.keys() & keywords.keys():
+                _warn(function.__qualname__, old, aliases[old])
+            return function(*args, **current_names(keywords, aliases))
+
+        return cast("F", call_by_names)
+
+    return decorate
+
+
+def deprecated_classes(module: str, **aliases: str) -> Callable[[str], Any]:
+    """Return a ``__getattr__`` of a module that has classes by their old names, each with a `DeprecationWarning`.
+
+    Args:
+        module: its name. aliases: new names by old ones.
+    """
+
+    def get(name: str) -> Any:
+        if name not in aliases:
+            raise AttributeError(f"module {module!r} has no attribute {name!r}")
+        _warn(module, name, aliases[name])
+        return getattr(sys.modules[module], aliases[name])
+
+    return get
+
+
+def _warn(owner: str, old: str, new: str) -> None:
+    name = f"{owner}.{old}" if old else f"an old name in {owner}"
+    warnings.warn(f"{name} is now {new}", DeprecationWarning, stacklevel=3)
 
 
 def _equal(a: Any, b: Any) -> bool:

@@ -10,6 +10,7 @@ from pydantic import (
     BaseModel,
     BeforeValidator,
     ConfigDict,
+    GetJsonSchemaHandler,
     ModelWrapValidatorHandler,
     ValidationError,
     ValidatorFunctionWrapHandler,
@@ -17,10 +18,11 @@ from pydantic import (
     computed_field,
     model_validator,
 )
-from pydantic_core import PydanticCustomError
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, PydanticCustomError
 
 from liftcore.errors import InvalidInput, SplatliftError
-from liftcore.runtime.aliases import add_deprecated_properties, current_names
+from liftcore.runtime.aliases import add_deprecated_properties, current_names, deprecated_getter
 from liftcore.runtime.arguments import one_of
 from liftcore.runtime.one_line import one_line, value_text
 
@@ -56,6 +58,7 @@ class AliasedModel(BaseModel):
 
     @classmethod
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
+        cls.old_names = {old: new for base in reversed(cls.__mro__) for old, new in _old_names(base).items()}
         add_deprecated_properties(cls, {old: new for old, new in cls.old_names.items() if not hasattr(cls, old)})
 
     @model_validator(mode="before")
@@ -72,11 +75,27 @@ class AliasedModel(BaseModel):
         """
         return current_names(values, cls.old_names, cls.error_type or InvalidInput) if cls.old_names else values
 
+    @classmethod
+    def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        """Return the model's schema; of what is read, old names are deprecated properties."""
+        document = handler(schema)
+        properties = handler.resolve_ref_schema(document).get("properties", {})
+        for old, new in cls.old_names.items() if handler.mode == "validation" else ():
+            if new in properties:
+                properties[old] = {**properties[new], "description": f"the old name of {new}", "deprecated": True}
+        return document
+
+
+def _old_names(model: type) -> Mapping[str, str]:
+    return vars(model).get("old_names", {})
+
 
 def old_field(new: str, annotation: Any) -> Any:
     """Return a field that a reply has beside the one of the new name, with the same value, marked as deprecated."""
-    field = property(lambda self: getattr(self, new), doc=f"`{new}`, by its old name")
-    return computed_field(return_type=annotation, json_schema_extra={"deprecated": True})(field)
+    description = f"the old name of {new}"
+    field = property(deprecated_getter(new, readers=("pydantic",)), doc=f"Deprecated: `{new}`.")
+    decorate = computed_field(return_type=annotation, description=description, json_schema_extra={"deprecated": True})
+    return decorate(field)
 
 
 class Shown(AliasedModel):

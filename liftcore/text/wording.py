@@ -70,7 +70,7 @@ class Wording(NamedTuple):
 
     text: str
     word: str
-    how: str  # "" for the word itself, else "spelling", "qualifier", "synonym", "number", "head" or "part"
+    match: str  # "" for the word itself, else "spelling", "qualifier", "synonym", "number", "head" or "part"
 
 
 class PartPhrase(NamedTuple):
@@ -191,8 +191,8 @@ class Vocabulary:
             part_match = self.find(phrase.part)
             if object_match is None or part_match is None:
                 continue
-            head = None if object_match.how != "head" or " of " in text else self._head(text)
-            if phrase.sure or (part_match.how != "head" and (head is None or head[0] == phrase.part)):
+            head = None if object_match.match != "head" or " of " in text else self._head(text)
+            if phrase.sure or (part_match.match != "head" and (head is None or head[0] == phrase.part)):
                 return PartPhrase(object_match.word, part_match.word, phrase.sure)
         return None
 

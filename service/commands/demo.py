@@ -302,7 +302,7 @@ def _find(client: Client, lift: str, kind: str, phrase: str, subject: DemoScene,
     return Finding(
         phrase=phrase,
         is_there=answer["present"],
-        reason=answer["why"],
+        reason=answer["reason"],
         object=truth.name_of(masks) if truth else None,
         splats=answer["count"],
         score=best[0]["score"] if best else float("nan"),

@@ -57,7 +57,7 @@ View = Annotated[str, Query(min_length=1, max_length=models.VIEW_CHARACTERS, des
 ViewsCursor = Annotated[int, Query(ge=0, le=10**9, description="the `next` of the page before")]
 Pixel = Annotated[int, Query(ge=0, le=10**9, description="of the photo: x from the left, y from the top")]
 Level = Annotated[int, Query(ge=0, le=10**9, description="as GET /lifts/{lift}/regions tells it")]
-ObjectId = Annotated[int, Path(ge=0, le=10**9, description="the id of an object of the lift")]
+ObjectId = Annotated[int, Path(alias="object", ge=0, le=10**9, description="the id of an object of the lift")]
 ShareId = Annotated[str, Path(pattern=r"^[0-9a-f]{12}$", description="the id of a share of the lift")]
 Layer = Annotated[
     Literal["pca", "cluster", "evidence", "agreement", "confidence"],
@@ -181,7 +181,7 @@ def list_shares(lift: str, deps: Deps) -> models.Shares:
 
 
 @router.post("/lifts/{lift}/shares", response_model=models.NewShare, status_code=201, tags=["keys"])
-def create_share(lift: str, asked: models.AskedShare, request: Request, deps: Deps) -> Response:
+def create_share(lift: str, asked: models.ShareRequest, request: Request, deps: Deps) -> Response:
     """Create a key that can read and query this lift. The secret is shown once, and in a link of the page."""
     record = deps.store.lifts.get(deps.owner, lift)
     if deps.caller.record is None:
@@ -303,15 +303,15 @@ def get_region_mask(
 
 
 @router.get("/lifts/{lift}/objects", response_model=models.SceneObjects, tags=["lifts"])
-def list_objects(lift: str, deps: Deps, ask: Ask, asked: Annotated[models.AskedForSceneObjects, Query()]) -> Response:
+def list_objects(lift: str, deps: Deps, ask: Ask, asked: Annotated[models.SceneObjectsRequest, Query()]) -> Response:
     """List the objects of the scene, found by masks when it was lifted; a vocabulary names them."""
-    labels = list(deps.store.selections.things(deps.owner, deps.store.lifts.get(deps.owner, lift).id).items())
-    fields = {"means": asked.features, "things": labels, "splat": asked.splat}
+    labels = list(deps.store.selections.object_labels(deps.owner, deps.store.lifts.get(deps.owner, lift).id).items())
+    fields = {"means": asked.features, "object_labels": labels, "splat": asked.splat}
     return _nodes("catalogue", lift, deps, ask, asked, **fields)
 
 
 @router.get("/lifts/{lift}/tree", response_model=models.LiftTree, tags=["lifts"])
-def get_tree(lift: str, deps: Deps, ask: Ask, asked: Annotated[models.AskedForTree, Query()]) -> Response:
+def get_tree(lift: str, deps: Deps, ask: Ask, asked: Annotated[models.TreeRequest, Query()]) -> Response:
     """Get the objects with their parts and their groups, objects first; nodes have splats as objects have.
 
     With `relations`, how the objects lie to each other.
@@ -319,7 +319,7 @@ def get_tree(lift: str, deps: Deps, ask: Ask, asked: Annotated[models.AskedForTr
     return _nodes("tree", lift, deps, ask, asked, relations=asked.relations or asked.up is not None, up=asked.up)
 
 
-def _nodes(operation: str, lift: str, deps: Deps, ask: Ask, asked: models.AskedForNodes, **options: Any) -> Response:
+def _nodes(operation: str, lift: str, deps: Deps, ask: Ask, asked: models.NodesRequest, **options: Any) -> Response:
     record = deps.store.lifts.get(deps.owner, lift)
     request: dict[str, Any] = scene_request(operation, record, deps) | NO_ENCODER | {"words": None}
     if asked.table is not None or asked.encoder is not None:
@@ -329,11 +329,11 @@ def _nodes(operation: str, lift: str, deps: Deps, ask: Ask, asked: models.AskedF
     return binary_response(deps, request | {"head": {"lift": record.id, "encoder": encoder}}, record, ask, {})
 
 
-@router.get("/lifts/{lift}/objects/{thing}/splats", responses=PLY | TAGGED, response_class=Response, tags=["lifts"])
-def get_object_splats(lift: str, thing: ObjectId, request: Request, deps: Deps, ask: Ask) -> Response:
+@router.get("/lifts/{lift}/objects/{object}/splats", responses=PLY | TAGGED, response_class=Response, tags=["lifts"])
+def get_object_splats(lift: str, object_id: ObjectId, request: Request, deps: Deps, ask: Ask) -> Response:
     """Download the splats of one object: a PLY of the dialect that was lifted."""
     record = deps.store.lifts.get(deps.owner, lift)
-    worker_request = scene_request("splats", record, deps) | {"what": f"object-{thing}", "object": thing}
+    worker_request = scene_request("splats", record, deps) | {"what": f"object-{object_id}", "object": object_id}
     return tagged_answer(request, deps, worker_request, record, ask)
 
 

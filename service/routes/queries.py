@@ -21,17 +21,17 @@ from service import models
 from service.content import BINARY, Draft, cache_headers, unchanged
 from service.errors import InvalidRequest
 from service.models import (
-    AskedForWords,
-    AskedToExport,
-    AskedToRender,
-    AskedToSegment,
-    AskedWhat,
+    ExportRequest,
     LiftQuestion,
+    NearestWordsAnswer,
+    NearestWordsRequest,
     ObjectsAnswer,
     QueryAnswer,
     Question,
+    RenderRequest,
     SegmentAnswer,
-    WhatAnswer,
+    SegmentRequest,
+    SuggestedWordsRequest,
     Words,
     WordsAnswer,
 )
@@ -180,7 +180,7 @@ def bits_of(bits: bytes) -> str:
     return base64.b64encode(bits).decode()
 
 
-def seen_from(asked: models.Seen) -> dict[str, Any]:
+def seen_from(asked: models.Viewpoint) -> dict[str, Any]:
     """The camera of a picture: a view of the lift, or one of the client's own.
 
     Raises:
@@ -212,7 +212,7 @@ def _with_packs_here(request: dict[str, Any], lift: LiftRecord, deps: AppState) 
 
 
 def with_encoder(
-    request: dict[str, Any], asked: models.LiftQuestion | models.AskedForNodes, lift: LiftRecord, deps: AppState
+    request: dict[str, Any], asked: models.LiftQuestion | models.NodesRequest, lift: LiftRecord, deps: AppState
 ) -> dict[str, Any]:
     """The request with the encoder of its words: an uploaded table, the lift's, or one of the operator.
 
@@ -253,7 +253,7 @@ PNG, NPY, PLY = bytes_of(PNG_TYPE), bytes_of(NPY_TYPE), bytes_of(BINARY)
 TERMS = (*LiftQuestion.model_fields, *Query.deciding())
 ASKED, WHERE = Parameters(Question, TERMS), Parameters(Question, (*TERMS, "view", "top"))
 IN_VIEW = Parameters(Question, (*TERMS, "view"), needs=("view",))
-PICTURE = Parameters(AskedToRender, ("lift", "view", "what"), needs=("view",))
+PICTURE = Parameters(RenderRequest, ("lift", "view", "channel"), needs=("view",))
 
 
 @get_and_post(router, "/query", WHERE, response_model=QueryAnswer)
@@ -277,7 +277,7 @@ def query(asked: Question, deps: Deps, ask: Ask) -> dict[str, Any]:
 
 
 @router.get("/query/words", response_model=WordsAnswer)
-def query_words(asked: Annotated[AskedForWords, Parameter()], deps: Deps, ask: Ask) -> WordsAnswer:
+def query_words(asked: Annotated[SuggestedWordsRequest, Parameter()], deps: Deps, ask: Ask) -> WordsAnswer:
     """What can be asked: words that a text which is being typed may become, and words for what is here."""
     lift = find_lift(asked.lift, deps)
     request = with_encoder(scene_request("askable", lift, deps), asked, lift, deps)
@@ -326,7 +326,7 @@ def query_splats(asked: Question, request: Request, deps: Deps, ask: Ask, what: 
 
 
 @get_and_post(router, "/render", PICTURE, responses=PNG, response_class=Response)
-def render(asked: AskedToRender, request: Request, deps: Deps, ask: Ask) -> Response:
+def render(asked: RenderRequest, request: Request, deps: Deps, ask: Ask) -> Response:
     """The splats from a view, in their colours or in those of their features or clusters, or their depth: a PNG.
 
     Depths are those of the splats' centres along the camera's axis, weighted as the colours are. They are grey, near
@@ -335,7 +335,7 @@ def render(asked: AskedToRender, request: Request, deps: Deps, ask: Ask) -> Resp
     is. In a body a camera of your own may stand in place of the view.
     """
     lift = find_lift(asked.lift, deps)
-    worker_request = scene_request("render", lift, deps) | seen_from(asked) | {"what": asked.what}
+    worker_request = scene_request("render", lift, deps) | seen_from(asked) | {"channel": asked.channel}
     return tagged_answer(request, deps, worker_request, lift, ask)
 
 
@@ -382,7 +382,7 @@ def _link(path: str, asked: Question, **more: str) -> str:
 
 
 @router.post("/query/segment", response_model=SegmentAnswer)
-def segment(asked: AskedToSegment, deps: Deps, ask: Ask) -> Response:
+def segment(asked: SegmentRequest, deps: Deps, ask: Ask) -> Response:
     """Which of many words are there, and where: to every splat the word that it is most like, or none."""
     lift = find_lift(asked.lift, deps)
     request = _word_request("segment", asked, lift, deps)
@@ -391,28 +391,28 @@ def segment(asked: AskedToSegment, deps: Deps, ask: Ask) -> Response:
 
 
 @router.post("/query/segment/labels", responses=NPY, response_class=Response)
-def segment_labels(asked: AskedToSegment, deps: Deps, ask: Ask) -> Response:
+def segment_labels(asked: SegmentRequest, deps: Deps, ask: Ask) -> Response:
     """The value of every splat's word, 0 for none: .npy, int32 [P]."""
     lift = find_lift(asked.lift, deps)
     return binary_response(deps, _word_request("word_labels", asked, lift, deps), lift, ask, {})
 
 
 @router.post("/query/segment/map", responses=PNG, response_class=Response)
-def segment_map(asked: AskedToSegment, deps: Deps, ask: Ask) -> Response:
+def segment_map(asked: SegmentRequest, deps: Deps, ask: Ask) -> Response:
     """The values of a view's pixels in colours, with a palette: a PNG whose text `legend` has the words by value."""
     lift = find_lift(asked.lift, deps)
     return binary_response(deps, _word_request("word_map", asked, lift, deps) | seen_from(asked), lift, ask, {})
 
 
 @router.post("/query/segment/picture", responses=PNG, response_class=Response)
-def segment_picture(asked: AskedToSegment, deps: Deps, ask: Ask) -> Response:
+def segment_picture(asked: SegmentRequest, deps: Deps, ask: Ask) -> Response:
     """A view tinted with the colours of its words, beside a drawn legend: a PNG."""
     lift = find_lift(asked.lift, deps)
     return binary_response(deps, _word_request("word_picture", asked, lift, deps) | seen_from(asked), lift, ask, {})
 
 
 @router.post("/query/export", responses=bytes_of("application/zip"), response_class=Response)
-def export(asked: AskedToExport, deps: Deps, ask: Ask) -> Response:
+def export(asked: ExportRequest, deps: Deps, ask: Ask) -> Response:
     """All of it in one ZIP: splats with labels, names, colours, boxes and counts, and masks of the views.
 
     It holds `labels.ply`, `labels.json`, `instances.csv`, `legend.png`, `masks/VIEW.png`, `masks.json` (COCO) and
@@ -433,8 +433,8 @@ def export(asked: AskedToExport, deps: Deps, ask: Ask) -> Response:
     elif asked.of == "words" or asked.encoder is not None or asked.table is not None:
         request = _word_request("export", asked, lift, deps)
     name = "-".join(re.findall(r"[A-Za-z0-9]+", " ".join(title)))[:80]
-    labels = list(deps.store.selections.things(deps.owner, lift.id).items())
-    request |= {"of": asked.of, "of_view": asked.view, "name": name, "things": labels}
+    labels = list(deps.store.selections.object_labels(deps.owner, lift.id).items())
+    request |= {"of": asked.of, "of_view": asked.view, "name": name, "object_labels": labels}
     return binary_response(deps, request, lift, ask, {})
 
 
@@ -451,12 +451,12 @@ def _by_name(questions: list[models.NamedQuestion]) -> dict[str, models.NamedQue
     return by_name
 
 
-@router.post("/query/what", response_model=WhatAnswer)
-def name_example(asked: AskedWhat, deps: Deps, ask: Ask) -> WhatAnswer:
+@router.post("/query/what", response_model=NearestWordsAnswer)
+def name_example(asked: NearestWordsRequest, deps: Deps, ask: Ask) -> NearestWordsAnswer:
     """What is this? The words that a pixel, a splat, a region or a vector is most like."""
     lift = find_lift(asked.lift, deps)
     request = _word_request("what", asked, lift, deps) | {"example": asked.example, "top": asked.top}
-    return WhatAnswer(
+    return NearestWordsAnswer(
         lift=lift.id, encoder=encoder_label(request["encoder"]), example=shown(asked.example), **ask(request).header
     )
 

@@ -62,7 +62,7 @@ def get_selection(
 
 @router.post(ONE + "/edits", response_model=models.SelectionDetail)
 def edit_selection(
-    lift: str, selection: SelectionId, asked: models.AskedEdit, deps: Deps, ask: Ask, match: IfMatch = None
+    lift: str, selection: SelectionId, asked: models.EditRequest, deps: Deps, ask: Ask, match: IfMatch = None
 ) -> Response:
     """Add, take away, grow, shrink or set: a step of its history, which PATCH goes back."""
     record = deps.store.lifts.get(deps.owner, lift)
@@ -97,22 +97,24 @@ def delete_selection(lift: str, selection: SelectionId, deps: Deps, match: IfMat
     return Response(status_code=204)
 
 
-@router.patch("/lifts/{lift}/objects/{thing}", response_model=models.Thing)
-def change_thing(lift: str, thing: ObjectId, change: models.ThingChange, deps: Deps, ask: Ask) -> models.Thing:
-    """Give a thing of a lift a name of your own, or hide it from lists; what is left out stays."""
+@router.patch("/lifts/{lift}/objects/{object}", response_model=models.ObjectLabel)
+def change_object_label(
+    lift: str, object_id: ObjectId, change: models.ObjectLabelChange, deps: Deps, ask: Ask
+) -> models.ObjectLabel:
+    """Give an object of a lift a name of your own, or hide it from lists; fields that are left out stay."""
     record = deps.store.lifts.get(deps.owner, lift)
     count = ask(scene_request("count_objects", record, deps)).header["count"]
-    if thing >= count:
-        raise NotFound("thing", expected=f"one of the lift's {count} objects", got=str(thing))
-    deps.store.selections.change_thing(record.id, thing, change.model_dump(exclude_unset=True))
-    name, is_hidden = deps.store.selections.things(deps.owner, record.id).get(thing, (None, False))
-    return models.Thing(id=thing, name=name, hidden=is_hidden)
+    if object_id >= count:
+        raise NotFound("object", expected=f"one of the lift's {count} objects", got=str(object_id))
+    deps.store.selections.change_object_label(record.id, object_id, change.model_dump(exclude_unset=True))
+    name, is_hidden = deps.store.selections.object_labels(deps.owner, record.id).get(object_id, (None, False))
+    return models.ObjectLabel(id=object_id, name=name, hidden=is_hidden)
 
 
-def _edited(asked: models.AskedEdit | None, lift: LiftRecord, deps: AppState, ask: Ask, before: bytes) -> SplatSet:
+def _edited(asked: models.EditRequest | None, lift: LiftRecord, deps: AppState, ask: Ask, before: bytes) -> SplatSet:
     """The splats after an edit of those before, by the query process; without one those."""
     if asked is None:
-        return SplatSet({"how": "set"}, 0, None, before)
+        return SplatSet({"operation": "set"}, 0, None, before)
     if asked.query is None:
         request = scene_request("edit", lift, deps) | NO_ENCODER
     else:

@@ -179,7 +179,7 @@ class SelectionStore:
             raise _none(selection.id)
         return zlib.decompress(row["splats"])
 
-    def things(self, owner: Owner, lift: str) -> dict[int, tuple[str | None, bool]]:
+    def object_labels(self, owner: Owner, lift: str) -> dict[int, tuple[str | None, bool]]:
         """Return the labels of the lift's objects: their names, and whether they are hidden."""
         select = (
             "SELECT thing, name, hidden FROM things JOIN jobs ON jobs.id = lift"
@@ -189,7 +189,7 @@ class SelectionStore:
             rows = connection.execute(select, owner.terms(lift=lift)).fetchall()
         return {row["thing"]: (row["name"], bool(row["hidden"])) for row in rows}
 
-    def change_thing(self, lift: str, thing: int, changes: dict[str, Any]) -> None:
+    def change_object_label(self, lift: str, object_id: int, changes: dict[str, Any]) -> None:
         """Set the ``name`` of an object (None: its own), or ``hidden``; the owner must be able to see the lift.
 
         Raises:
@@ -198,13 +198,13 @@ class SelectionStore:
         """
         with _lift_there(lift), self._database.write(is_counted=True) as connection:
             select = "SELECT count(*) FROM things WHERE lift = ? AND thing != ?"
-            number = connection.execute(select, (lift, thing)).fetchone()[0]
+            number = connection.execute(select, (lift, object_id)).fetchone()[0]
             if number >= MAX_LABELS:
-                raise OverLimit("thing", expected=f"at most {MAX_LABELS} changed objects of a lift", got="more")
-            insert(connection, "things", {"lift": lift, "thing": thing, "hidden": 0}, on_conflict="IGNORE")
+                raise OverLimit("object", expected=f"at most {MAX_LABELS} changed objects of a lift", got="more")
+            insert(connection, "things", {"lift": lift, "thing": object_id, "hidden": 0}, on_conflict="IGNORE")
             for column in changes.keys() & {"name", "hidden"}:
                 connection.execute(
-                    f"UPDATE things SET {column} = ? WHERE lift = ? AND thing = ?", (changes[column], lift, thing)
+                    f"UPDATE things SET {column} = ? WHERE lift = ? AND thing = ?", (changes[column], lift, object_id)
                 )
 
     def _keep(

@@ -137,7 +137,7 @@ def address(path: str, job: str, asset: str) -> str:
     for name, value in {
         "kind": "cameras",
         "asset": asset,
-        "thing": "0",
+        "object": "0",
         "selection": "0" * 16,
         "share": "0" * 12,
     }.items():

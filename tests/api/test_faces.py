@@ -88,7 +88,9 @@ class Faces:
             if reply.status_code != 200:
                 return None
             told |= reply.json()
-        return {name: told[name] for name in (*lc.Answer.model_fields, *lc.Objects.model_fields)}
+        fields = (*lc.Answer.model_fields, *lc.Answer.model_computed_fields)
+        fields += (*lc.Objects.model_fields, *lc.Objects.model_computed_fields)
+        return {name: told[name] for name in fields}
 
     def command(self, asked: dict[str, Any]) -> dict[str, Any] | None:
         """The same of the command line; it takes feature packs where the lift remembers them."""
@@ -126,7 +128,7 @@ def test_words_and_things_have_the_same_answers(faces: Faces, table: Path, tmp_p
     encoder = faces.scene.encoder(f"table:{table}")
     expected = {
         "segment": faces.scene.segment(encoder=encoder).summary,
-        "what": models.BestWords(example="splat:0", words=faces.scene.what("splat:0", encoder=encoder)),
+        "what": models.BestWords(example="splat:0", words=faces.scene.nearest_words("splat:0", encoder=encoder)),
         "objects": faces.scene.catalogue(faces.scene.words(encoder), encoder=encoder).summary(features=True),
     }
     served = faces.client.put("/assets/table", content=table.read_bytes()).json()["id"]
@@ -142,7 +144,7 @@ def test_words_and_things_have_the_same_answers(faces: Faces, table: Path, tmp_p
         del one["hidden"]  # which the service alone knows
     printed = {
         "segment": faces.printed("segment", *faces.places)["answer"],
-        "what": faces.printed("segment", *faces.places, "--what", "splat:0")["examples"][0],
+        "what": faces.printed("segment", *faces.places, "--example", "splat:0")["examples"][0],
         "objects": faces.printed("objects", beside, "--features")["answer"],
     }
     for name, answer in expected.items():

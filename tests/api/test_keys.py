@@ -106,7 +106,7 @@ def naming(method: str, path: str, job: str, asset: str, server: Guarded) -> lis
     """Requests to a route that name a job, a lift or an asset, once for each place that takes a name."""
     if method == "PATCH" or "/selections" in path or "/shares" in path:
         name = {"encoder" if path.startswith("/assets") else "name": "a name"}
-        return [{"json": {"how": "grow"} if path.endswith("/edits") else name}]
+        return [{"json": {"operation": "grow"} if path.endswith("/edits") else name}]
     of_views = {"/photo": {}, "/regions": {"x": 1, "y": 1}, "/regions/mask": {"level": 0, "region": 0}}
     place = next((more for end, more in of_views.items() if path.endswith(end)), None)
     if place is not None:

@@ -86,7 +86,7 @@ def test_word_finds_its_cluster_in_numbers_objects_scores_and_a_mask(
     middle = (cluster - 1) * 1.2
     assert answer["box"]["low"][0] <= thing["box"]["low"][0] < middle < thing["box"]["high"][0]
     assert thing["centre"][0] == pytest.approx(middle, abs=0.2)
-    assert thing["splats"] + found["strays"] == found["count"] and thing["score"] >= 0.5
+    assert thing["splats"] + found["unassigned_splats"] == found["count"] and thing["score"] >= 0.5
     scores = array(client.get(answer["links"]["scores"]).content)
     assert (scores.shape, scores.dtype) == ((3 * SPLATS_A_CLUSTER,), np.float32)
     assert scores[answer["top"][0]["splat"]] == pytest.approx(best[0]) == scores.max()
@@ -139,7 +139,7 @@ def test_answer_says_what_is_known_of_presence(client: TestClient, lift: dict[st
     asked = {"lift": lift["id"], "text": "lamp"}
     for route in ("/query", "/query/objects"):
         told = client.get(route, params=asked).json()
-        assert told["clear"] is True and told["present"] is None and "200 words" in told["why"]
+        assert told["clear"] is True and told["present"] is None and "200 words" in told["reason"]
     kept = client.get("/query", params=asked | {"absent": "keep"}).json()
     assert "absent=keep" in kept["links"]["objects"] and kept["count"] > 0
     nothing = client.get("/query", params=asked | {"negatives": "book", "threshold": 1}).json()
@@ -202,7 +202,7 @@ def test_every_question_has_a_tag_of_its_own(client: TestClient, lift: dict[str,
 def test_render_shows_colours_features_or_depth(client: TestClient, lift: dict[str, Any]) -> None:
     asked = {"lift": lift["id"], "view": "middle"}
     plain, features, depth = (
-        client.get("/render", params=asked | {"what": what}) for what in ("rgb", "pca", "depth")
+        client.get("/render", params=asked | {"channel": channel}) for channel in ("rgb", "pca", "depth")
     )
     assert len({reply.headers["etag"] for reply in (plain, features, depth)}) == 3
     assert picture(features.content).shape == picture(plain.content).shape == (HEIGHT, WIDTH, 3)
@@ -211,7 +211,7 @@ def test_render_shows_colours_features_or_depth(client: TestClient, lift: dict[s
         assert (shown.size, shown.mode) == ((WIDTH, HEIGHT), "L")
         near, far = (float(shown.info[name]) for name in ("depth-near", "depth-far"))
     assert DISTANCE - 0.5 < near < far < DISTANCE + 0.5
-    lacking = assert_problem(client.get("/render", params=asked | {"what": "cluster"}))
+    lacking = assert_problem(client.get("/render", params=asked | {"channel": "cluster"}))
     assert lacking["type"] == "/problems/invalid-query" and "aggregation" in lacking["detail"]
 
 
@@ -335,13 +335,13 @@ def test_draft_is_sent_without_its_name_and_closed_however_that_ends(tmp_path: P
         ("/query", {"text": "apple", "view": "behind"}, 404, "view"),
         ("/query", {"text": "apple", "top": -1}, 422, "top"),
         ("/query", {"text": "apple", "absent": "hide"}, 422, "absent"),
-        ("/query", {"text": "apple", "weigh": "confidence"}, 422, "weigh"),  # this lift was not reweighted
+        ("/query", {"text": "apple", "weight_by": "confidence"}, 422, "weight_by"),  # this lift was not reweighted
         ("/query", {"text": "apple", "encoder": "table:/etc/passwd"}, 422, "encoder"),
         ("/query", {"text": "apple", "encoder": "spare"}, 422, "encoder"),  # 5 channels and not 8
         ("/query/mask", {"text": "apple"}, 422, "view"),
         ("/query/scores", {"text": "apple", "lift": "../../etc/passwd"}, 422, "lift"),
         ("/query/splats", {"text": "apple", "what": "mesh"}, 422, "what"),
-        ("/render", {"view": "left", "what": "x-rays"}, 422, "what"),
+        ("/render", {"view": "left", "channel": "x-rays"}, 422, "channel"),
     ],
 )
 def test_question_that_leads_nowhere_names_what_is_wrong(
@@ -360,7 +360,7 @@ def test_question_that_leads_nowhere_names_what_is_wrong(
         ("/query/mask", {"text": ["lamp"], "camera": {"viewmat": np.zeros((4, 4)).tolist()}}, "camera 'camera' pose"),
         ("/query/mask", {"text": ["lamp"], "camera": {"viewmat": [[1, 0, 0, 0]] * 3}}, "camera.viewmat"),
         ("/render", {"view": "middle", "camera": {"fx": FOCAL}}, "view"),
-        ("/render", {"view": "middle", "what": "confidence"}, "what"),
+        ("/render", {"view": "middle", "channel": "confidence"}, "channel"),
         ("/query/segment", {"words": []}, "words"),
         ("/query/segment", {"words": ["lamp", "lamp"]}, "words"),
         ("/query/segment", {"words": ["zeppelin"]}, "text"),
@@ -418,12 +418,12 @@ def test_texts_are_asked_as_words_and_others_are_refused_with_those_that_can_be(
 ) -> None:
     asked = {"lift": lift["id"], "table": own_table}
     answer = client.get("/query", params=asked | {"text": "two old lights"}).json()
-    assert answer["wording"] == [{"text": "two old lights", "word": "light", "how": "head"}]
+    assert answer["wording"] == [{"text": "two old lights", "word": "light", "match": "head", "how": "head"}]
     assert client.get("/query", params=asked | {"text": "light"}).json()["wording"] == []
     problem = assert_problem(client.get("/query", params=asked | {"text": "boaat"}))
     assert (problem["argument"], problem["nearest"]) == ("text.0", ["boat"])
     words = client.get("/query/words", params=asked | {"text": "no"}).json()
-    assert (words["any_text"], words["words"]) == (False, [{"word": "novel", "typed": "novel"}])
+    assert (words["open_vocabulary"], words["words"]) == (False, [{"word": "novel", "typed": "novel"}])
     assert "nearest" not in assert_problem(client.get("/query/words", params=asked | {"lift": "0" * 32}))
     for vocabulary in ({}, {"table": own_table}, {"encoder": "default"}):  # no name of a file of the server
         refused = assert_problem(client.get("/query", params={"lift": lift["id"], "text": "boaat"} | vocabulary))

@@ -43,7 +43,7 @@ def route(client: TestClient, lift: dict[str, Any]) -> Iterator[str]:
 
 
 def begun(client: TestClient, route: str, **edit: Any) -> dict[str, Any]:
-    asked = {"name": "mine"} | ({"edit": {"how": "set", **edit}} if edit else {})
+    asked = {"name": "mine"} | ({"edit": {"operation": "set", **edit}} if edit else {})
     reply = client.post(route, json=asked)
     assert reply.status_code == 201, reply.text
     assert reply.headers["location"] == reply.json()["links"]["self"]
@@ -65,13 +65,13 @@ def test_selection_is_begun_edited_and_gone_back_in(client: TestClient, route: s
     assert 0 < selection["count"] == len(lamp) < ALL
     assert (selection["step"], selection["first"], selection["last"]) == (0, 0, 0)
     edits = selection["links"]["edits"]
-    with_apple = client.post(edits, json={"how": "add", "area": "middle:box:0,0,10,24", "through": True}).json()
+    with_apple = client.post(edits, json={"operation": "add", "area": "middle:box:0,0,10,24", "through": True}).json()
     assert with_apple["count"] == len(lamp) + SPLATS_A_CLUSTER and with_apple["box"] is not None
     assert [step["count"] for step in with_apple["history"]] == [len(lamp), with_apple["count"]]
     assert with_apple["history"][1]["edit"]["area"] == "middle:box:0,0,10,24"
     back = client.patch(selection["links"]["self"], json={"step": 0}).json()
     assert (back["step"], back["last"], splats_of(client, back)) == (0, 1, lamp)
-    grown = client.post(edits, json={"how": "grow", "steps": 9}).json()  # what was undone is forgotten
+    grown = client.post(edits, json={"operation": "grow", "steps": 9}).json()  # what was undone is forgotten
     assert (grown["step"], grown["last"]) == (1, 1)
     assert splats_of(client, grown) == list(range(2 * SPLATS_A_CLUSTER, ALL))
     renamed = client.patch(selection["links"]["self"], json={"name": "the lamp"}).json()
@@ -92,7 +92,7 @@ def test_selection_is_asked_exported_and_an_example(client: TestClient, lift: di
     like = {"lift": lift["id"], "like": f"selection:{selection['id']}"}
     assert client.get("/query", params=like).json()["count"] > 10
     tag = client.get(selection["links"]["selection"]).headers["etag"]
-    client.post(selection["links"]["edits"], json={"how": "set", "query": {"sets": ["object:0"]}})
+    client.post(selection["links"]["edits"], json={"operation": "set", "query": {"sets": ["object:0"]}})
     changed = client.get(selection["links"]["selection"], headers={"If-None-Match": tag})
     assert changed.status_code == 200 and array(changed.content).sum() > 3
 
@@ -101,13 +101,17 @@ def test_edit_of_an_older_version_is_refused(client: TestClient, route: str) -> 
     selection = begun(client, route, **LAMP)
     edits, own = selection["links"]["edits"], selection["links"]["self"]
     tag = client.get(own).headers["etag"]
-    first = client.post(edits, json={"how": "grow"}, headers={"If-Match": tag})
+    first = client.post(edits, json={"operation": "grow"}, headers={"If-Match": tag})
     assert first.status_code == 200 and first.headers["etag"] != tag
-    for method, path, body in (("POST", edits, {"how": "grow"}), ("PATCH", own, {"step": 0}), ("DELETE", own, None)):
+    for method, path, body in (
+        ("POST", edits, {"operation": "grow"}),
+        ("PATCH", own, {"step": 0}),
+        ("DELETE", own, None),
+    ):
         late = client.request(method, path, json=body, headers={"If-Match": tag})
         assert (late.status_code, late.json()["type"]) == (412, "/problems/changed")
     for tag in ("", "another", '"another"'):
-        assert client.post(edits, json={"how": "grow"}, headers={"If-Match": tag}).status_code == 412
+        assert client.post(edits, json={"operation": "grow"}, headers={"If-Match": tag}).status_code == 412
     assert client.patch(own, json={"step": 0}, headers={"If-Match": f"W/{first.headers['etag']}"}).status_code == 200
     assert client.delete(own, headers={"If-Match": "*"}).status_code == 204
 
@@ -121,34 +125,34 @@ def test_edit_that_another_one_overtakes_is_refused(
 
     def overtaken(*wanted: Any) -> Any:
         monkeypatch.undo()
-        assert client.post(edits, json={"how": "set"}).status_code == 200
+        assert client.post(edits, json={"operation": "set"}).status_code == 200
         return call(*wanted)
 
     monkeypatch.setattr(queries, "call", overtaken)
-    late = assert_problem(client.post(edits, json={"how": "grow"}, headers=match))
+    late = assert_problem(client.post(edits, json={"operation": "grow"}, headers=match))
     assert (late["status"], late["argument"]) == (status, "selection")
     assert client.get(selection["links"]["self"]).json()["count"] == 0
-    assert client.post(edits, json={"how": "grow"}).status_code == 200
+    assert client.post(edits, json={"operation": "grow"}).status_code == 200
 
 
 @pytest.mark.parametrize(
     ("body", "argument"),
     [
-        ({"how": "add"}, "how"),
-        ({"how": "grow", "bits": "AA=="}, "how"),
-        ({"how": "add", "bits": "AA=="}, "bits"),
-        ({"how": "add", "bits": "!"}, "bits"),
-        ({"how": "add", "area": "middle:3,3"}, "area"),
-        ({"how": "add", "box": 3}, "box"),
-        ({"how": "add", "box": []}, "box"),
-        ({"how": "add", "box": "ab"}, "box"),
-        ({"how": "add", "box": [1, 2]}, "box.low"),
-        ({"how": "add", "area": "nowhere:box:0,0,3,3"}, "view"),
-        ({"how": "add", "query": {"sets": ["selection:0123456789abcdef"]}}, "selection"),
-        ({"how": "add", "query": {"sets": ["object:77"]}}, "object"),
-        ({"how": "add", "query": {"text": ["lamp"], "sets": ["object:0"]}}, "sets"),
-        ({"how": "add", "query": {"text": ["lamp"], "lift": "0" * 32}}, "edit.query.lift"),
-        ({"how": "shrink", "steps": 0}, "steps"),
+        ({"operation": "add"}, "operation"),
+        ({"operation": "grow", "bits": "AA=="}, "operation"),
+        ({"operation": "add", "bits": "AA=="}, "bits"),
+        ({"operation": "add", "bits": "!"}, "bits"),
+        ({"operation": "add", "area": "middle:3,3"}, "area"),
+        ({"operation": "add", "box": 3}, "box"),
+        ({"operation": "add", "box": []}, "box"),
+        ({"operation": "add", "box": "ab"}, "box"),
+        ({"operation": "add", "box": [1, 2]}, "box.low"),
+        ({"operation": "add", "area": "nowhere:box:0,0,3,3"}, "view"),
+        ({"operation": "add", "query": {"sets": ["selection:0123456789abcdef"]}}, "selection"),
+        ({"operation": "add", "query": {"sets": ["object:77"]}}, "object"),
+        ({"operation": "add", "query": {"text": ["lamp"], "sets": ["object:0"]}}, "sets"),
+        ({"operation": "add", "query": {"text": ["lamp"], "lift": "0" * 32}}, "edit.query.lift"),
+        ({"operation": "shrink", "steps": 0}, "steps"),
     ],
 )
 def test_wrong_edits_are_problems_and_change_nothing(
@@ -167,7 +171,9 @@ def test_selections_and_their_history_are_bounded(
     selection = begun(client, route)
     last = selection
     for _ in range(4):
-        last = client.post(selection["links"]["edits"], json={"how": "set", "query": {"sets": ["object:0"]}}).json()
+        last = client.post(
+            selection["links"]["edits"], json={"operation": "set", "query": {"sets": ["object:0"]}}
+        ).json()
     assert (last["step"], last["first"], last["last"]) == (4, 2, 4)
     assert client.patch(selection["links"]["self"], json={"step": 1}).status_code == 422
     monkeypatch.setattr(module, "MOST", 1)
@@ -181,7 +187,7 @@ def test_selections_of_a_lift_take_no_more_bytes_than_its_splats_allow(
     monkeypatch.setattr(module, "MOST_BYTES", 0)
     monkeypatch.setattr(module, "BYTES_A_SPLAT", 2)
     edits = begun(client, route)["links"]["edits"]
-    while (reply := client.post(edits, json={"how": "set"})).status_code == 200:
+    while (reply := client.post(edits, json={"operation": "set"})).status_code == 200:
         assert reply.json()["step"] < 2 * lift["count"]
     assert assert_problem(reply)["type"] == "/problems/over-limit"
     assert client.delete(client.get(route).json()["selections"][0]["links"]["self"]).status_code == 204
@@ -215,7 +221,7 @@ def test_splat_tells_its_thing(client: TestClient, lift: dict[str, Any]) -> None
 @pytest.mark.parametrize("corner", ["NaN", "Infinity", "1e400"])
 def test_box_without_end_is_a_problem(client: TestClient, route: str, corner: str) -> None:
     selection = begun(client, route)
-    body = f'{{"how": "add", "box": {{"low": [0, 0, 0], "high": [1, 1, {corner}]}}}}'
+    body = f'{{"operation": "add", "box": {{"low": [0, 0, 0], "high": [1, 1, {corner}]}}}}'
     reply = client.post(selection["links"]["edits"], content=body, headers={"Content-Type": "application/json"})
     assert (reply.status_code, reply.json()["argument"][:3]) == (422, "box")
 
@@ -223,7 +229,7 @@ def test_box_without_end_is_a_problem(client: TestClient, route: str, corner: st
 def test_area_of_a_vast_camera_is_a_problem(client: TestClient, lift: dict[str, Any], route: str) -> None:
     (view,) = client.get(f"/lifts/{lift['id']}/views", params={"limit": 1}).json()["views"]
     vast = {"area": "vast:stroke:0,0,9,9", "camera": view | {"width": 32768, "height": 32768}}
-    reply = client.post(begun(client, route)["links"]["edits"], json={"how": "add", **vast})
+    reply = client.post(begun(client, route)["links"]["edits"], json={"operation": "add", **vast})
     assert (reply.status_code, reply.json()["argument"]) == (422, "camera")
 
 
@@ -236,7 +242,7 @@ def test_history_has_no_vectors(client: TestClient, lift: dict[str, Any], route:
 def test_export_takes_the_step_that_is_shown(client: TestClient, lift: dict[str, Any], route: str) -> None:
     selection = begun(client, route, query={"sets": ["object:0"]})
     client.get(selection["links"]["query"])  # whose answer is kept
-    other = client.post(selection["links"]["edits"], json={"how": "set"}).json()
+    other = client.post(selection["links"]["edits"], json={"operation": "set"}).json()
     assert client.get(other["links"]["query"]).json()["count"] == 0
     assert client.patch(selection["links"]["self"], json={"step": 0}).status_code == 200
     mine = {"name": "mine", "sets": [f"selection:{selection['id']}"]}
@@ -258,11 +264,11 @@ def exported_counts(client: TestClient, *questions: dict[str, Any]) -> dict[str,
 
 def test_lift_that_is_deleted_meanwhile_takes_no_selection_and_no_name(client: TestClient) -> None:
     selections = parts_of(client).store.selections
-    nothing = module.SplatSet({"how": "set"}, 0, None, b"\0")
+    nothing = module.SplatSet({"operation": "set"}, 0, None, b"\0")
     with pytest.raises(NotFound):
         selections.create(SERVICE, "0" * 32, "mine", nothing)
     with pytest.raises(NotFound):
-        selections.change_thing("0" * 32, 0, {"name": "the mug"})
+        selections.change_object_label("0" * 32, 0, {"name": "the mug"})
 
 
 @pytest.fixture
@@ -276,7 +282,7 @@ def test_selection_belongs_to_whom_its_lift_does_and_goes_with_it(hers: Guarded)
     own = hers.ask("alice", "POST", route, json={"name": "hers"}).json()["links"]["self"]
     assert hers.ask("boss", "GET", own).status_code == 200
     for method, path in (("GET", route), ("GET", own), ("DELETE", own), ("PATCH", own), ("POST", f"{own}/edits")):
-        body = {"how": "grow"} if method == "POST" else {} if method == "PATCH" else None
+        body = {"operation": "grow"} if method == "POST" else {} if method == "PATCH" else None
         assert hers.ask("bob", method, path, json=body).status_code == 404
     assert hers.ask("bob", "DELETE", f"/lifts/{hers.done}").status_code == 404
     assert hers.ask("alice", "DELETE", f"/lifts/{hers.done}").status_code == 204

@@ -50,7 +50,7 @@ SHAPES: dict[str, type[BaseModel]] = {  # a field that no other answer has -> th
     "counts": models.Asset,
     "attempt": models.Job,
     "statistics": models.QueryAnswer,
-    "strays": models.ObjectsAnswer,
+    "unassigned_splats": models.ObjectsAnswer,
     "detail": models.Problem,
 }
 
@@ -78,7 +78,7 @@ def test_python_example_of_files_finds_the_apple(page: str, scene_folder: Path) 
     found = names["apple"].splats
     assert torch.equal(found, result.query(codebook()[WORDS.index("apple")]).splats)
     assert found.any() and float(means[found, 0].max()) < 0  # the apple is the cluster on the left
-    assert len(names["apple"].objects.found) == 1
+    assert len(names["apple"].objects.objects) == 1
 
 
 def test_sams_masks_make_a_lift_that_knows_the_words(scene_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

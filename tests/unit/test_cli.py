@@ -77,7 +77,11 @@ def test_scene_is_lifted_inspected_and_queried(scene: Path, capsys: pytest.Captu
     assert "\n  object 1: 1 splats, 100.0% of the selection, score 0.9" in out and "in no object" not in out
     status, out, err = run(capsys, *question, "--objects", "--json")
     (thing,) = json.loads(out)["objects"]
-    assert thing["splats"] == 1 and thing["box"] == [thing["centre"]] * 2 and json.loads(out)["strays"] == 0
+    assert (
+        thing["splats"] == 1
+        and thing["box"] == [thing["centre"]] * 2
+        and json.loads(out)["answer"]["unassigned_splats"] == 0
+    )
     status, out, err = run(capsys, "inspect", scene / "lift.safetensors", "--json")
     assert json.loads(out)["kind"] == "lift"
     certificate, timings = run(capsys, *lift_arguments(scene, "--verbose"))[1].split("timings:\n")

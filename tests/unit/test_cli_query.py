@@ -149,9 +149,13 @@ def test_every_term_and_option_is_part_of_the_query(
 
     monkeypatch.setattr("liftcore.query.ask.ask", ask)
     question = ["query", scene / "lift.safetensors", "--like", "splat:1", "--unlike", "splat:0"]
-    for options in ([], ["--threshold", "0.25", "--keep", "largest"], ["--instances", "3", "--weigh", "confidence"]):
+    for options in (
+        [],
+        ["--threshold", "0.25", "--keep", "largest"],
+        ["--instances", "3", "--weight-by", "confidence"],
+    ):
         assert run(capsys, *question, *options)[0] == cli.INTERRUPTED
-    told = [(query.threshold, query.keep, query.instances, query.weigh) for query in asked]
+    told = [(query.threshold, query.keep, query.instances, query.weight_by) for query in asked]
     plain = "evidence"
     assert told == [
         ("auto", "all", None, plain), (0.25, "largest", None, plain), ("auto", "all", 3, "confidence"),

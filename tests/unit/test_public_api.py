@@ -469,8 +469,8 @@ def test_every_public_value_is_shown_in_a_line_that_says_its_size(scene):
     others = [cameras, cameras["v0"].replace(name="x" * 300), *views.values(), long, lc.LiftSettings.of()]
     others += [
         answer.objects,
-        *(answer.objects.found if answer.objects else ()),
-        *segmentation.found,
+        *(answer.objects.objects if answer.objects else ()),
+        *segmentation.named_words,
         catalogue,
         *catalogue.objects,
     ]
@@ -479,11 +479,11 @@ def test_every_public_value_is_shown_in_a_line_that_says_its_size(scene):
     query = lc.Query(text=["a" * 99], like=["splat:1", (1.0,) * made.features.shape[1]], absent="keep")
     found = opened.ask(lc.Query(like=["splat:1"]))
     thing = {"splats": 1, "share": 0.5, "score": 0.5, "box": box}
-    others += [opened, query, found, opened.objects(found), opened.look(found, "v0")]
+    others += [opened, query, found, opened.objects(found), opened.view_mask(found, "v0")]
     others += [lc.FeatureGrid(np.ones((3, 4, 5))), lc.Picture(camera=cameras["v0"])]
     others += [models.OwnCamera.of(cameras["v0"])]
     sized_thing: dict[str, Any] = thing | {"centre": box[0], "size": box[1]}
-    others += [lc.FoundObject(**sized_thing), opened.world, lc.WorldFrame(up=(0, -3, 0), metres_per_unit=0.1)]
+    others += [lc.SelectedObject(**sized_thing), opened.world, lc.WorldFrame(up=(0, -3, 0), metres_per_unit=0.1)]
     others += [lc.NamedSplats(word="a" * 99, row=0, value=1, colour=(1, 2, 3), margin=0.1, threshold=0.2, **thing)]
     others += [lc.SceneObject(id=0, name=None, views=("v",) * 99, feature=(0.1,) * 512, **sized_thing)]
     others += [lc.CoveringRegion(example="region:v:0:1", view="v" * 99, level=0, region=1, share=0.5)]

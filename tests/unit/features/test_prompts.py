@@ -207,7 +207,9 @@ def test_a_lift_of_prompts_is_asked_in_its_words_alone(tmp_path: Path, capsys: p
     pack.unlink()  # the lift alone is asked
     status, out, err = run(capsys, "query", lifted, "a red apple", "--json")
     assert (status, err, json.loads(out)["selected"]) == (0, "", 20)
-    assert json.loads(out)["present"] is None and "not known" in json.loads(out)["why"]  # as no other words compete
+    assert (
+        json.loads(out)["present"] is None and "not known" in json.loads(out)["answer"]["reason"]
+    )  # as no other words compete
     status, out, _ = run(capsys, "segment", lifted, "--json")
     assert (status, {named["word"] for named in json.loads(out)["found"]}) == (0, {"Lamp", "red apple"})
     status, _, err = run(capsys, "query", lifted, "red ample")

@@ -90,20 +90,22 @@ def test_negatives_take_away_and_unseen_splats_are_never_selected(exact: Scene) 
         assert all_seen.count == COUNT - 1
 
 
-@pytest.mark.parametrize("weigh", ["evidence", "confidence"])
-def test_splats_without_evidence_or_confidence_do_not_decide_the_threshold(exact: Scene, weigh: str) -> None:
+@pytest.mark.parametrize("weight_by", ["evidence", "confidence"])
+def test_splats_without_evidence_or_confidence_do_not_decide_the_threshold(exact: Scene, weight_by: str) -> None:
     plain = ask(exact, "x", Axes())
     stray = np.zeros((COUNT, CHANNELS))
     stray[:, 0], stray[:, 1] = 1.0, np.linspace(0.0, 3.0, COUNT)  # scores all over the range
     weights = torch.cat([torch.ones(COUNT), torch.full((COUNT,), 1e-4)])
     crowd = of(
-        exact, np.concatenate([exact.features, stray]), **{{"evidence": "total_weight"}.get(weigh, weigh): weights}
+        exact,
+        np.concatenate([exact.features, stray]),
+        **{{"evidence": "total_weight"}.get(weight_by, weight_by): weights},
     )
-    answer = ask(crowd, Query.of(("x",), weigh=weigh), Axes())
+    answer = ask(crowd, Query.of(("x",), weight_by=weight_by), Axes())
     plainly = ask(crowd, Query.of(("x",)), Axes())
     assert np.array_equal(answer.scores, plainly.scores)
     assert (answer.threshold.explanation == plainly.threshold.explanation) == (
-        weigh == "evidence"
+        weight_by == "evidence"
     )  # which tells the share above it
     assert np.array_equal(answer.selected[:COUNT], plain.selected)
     assert answer.selected[COUNT] and answer.count > plain.count  # they are selected all the same
@@ -151,10 +153,10 @@ def test_what_cannot_be_asked_is_refused(scene: Scene) -> None:
         (lambda: ask(of_space(""), "x"), r"text space: not named\), got no encoder"),
         (lambda: ask(of_space("axes"), "x"), r"text space: axes\), got no encoder"),
         (
-            lambda: question(scene, Query.of(("x",), weigh="confidence"), Axes()),
+            lambda: question(scene, Query.of(("x",), weight_by="confidence"), Axes()),
             "a lift with confidence.*preset default",
         ),
-        (lambda: Query.of(("x",), weigh="light"), "weigh: expected one of total weight, confidence"),
+        (lambda: Query.of(("x",), weight_by="light"), "weight_by: expected one of evidence, confidence"),
         (lambda: Query.of(()), "query: expected a text or an example"),
         (lambda: Query.of(("a",) * 65), "at most 64"),
         (lambda: Query.of(("a",), keep="some"), "keep: expected"),
@@ -163,7 +165,7 @@ def test_what_cannot_be_asked_is_refused(scene: Scene) -> None:
         with pytest.raises(InvalidQuery, match=message):
             refused()
     sure = LiftResult.of(replace(scene.lift, confidence=torch.ones(len(scene.features))))
-    told, plain = (sure.query(np.eye(CHANNELS)[0], weigh=weigh) for weigh in ("confidence", "evidence"))
+    told, plain = (sure.query(np.eye(CHANNELS)[0], weight_by=weight_by) for weight_by in ("confidence", "evidence"))
     assert torch.equal(told.splats, plain.splats) and told.threshold == plain.threshold
 
 
@@ -173,7 +175,7 @@ def test_vectors_are_asked_as_their_words_are(scene: Scene) -> None:
         found = LiftResult.of(scene.lift).query(positive, torch.eye(CHANNELS)[1], splats=scene.splats)
         assert found.scores.numpy().tolist() == words.scores.tolist() and found.threshold == words.threshold.value
         assert np.array_equal(found.splats.numpy(), words.selected) and found.clear
-        assert found.objects is not None and len(found.objects.found) == 1
+        assert found.objects is not None and len(found.objects.objects) == 1
     alike = LiftResult.of(replace(scene.lift, features=torch.ones(COUNT, CHANNELS)))
     alone = alike.query(torch.eye(CHANNELS)[0])
     assert not alone.clear and alone.objects is None

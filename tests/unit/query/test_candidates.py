@@ -75,8 +75,8 @@ def test_a_part_that_no_word_stands_for_may_be_any_part_of_its_thing(nested: Sce
     words = np.stack([nested.features[row], -nested.features[row]]).astype(np.float32)
     table = TableEncoder("words", ["apple", "lamp"], words)
     answer = nested.ask("the apple's stalk", encoder=table)
-    assert answer.count and [word.how for word in answer.wording] == ["head"]
+    assert answer.count and [word.match for word in answer.wording] == ["head"]
     assert sorted((one.id, one.kind) for one in answer.candidates) == [(3, "part"), (4, "part")]
-    assert "'stalk'" in answer.why and "all of 'apple'" in answer.why
+    assert "'stalk'" in answer.reason and "all of 'apple'" in answer.reason
     assert sum(one.share for one in answer.candidates) <= 1 + 1e-6
     assert nested.ask("the apple", encoder=table).candidates == ()

@@ -35,15 +35,15 @@ def means(scene: Scene, cluster: int) -> np.ndarray:
     return scene.splats.means.numpy()[cluster * SPLATS_A_CLUSTER : (cluster + 1) * SPLATS_A_CLUSTER]
 
 
-@pytest.mark.parametrize("weigh", ["evidence", "confidence"])
-def test_clusters_that_are_apart_are_objects_with_their_boxes(weigh: str, scene: Scene) -> None:
+@pytest.mark.parametrize("weight_by", ["evidence", "confidence"])
+def test_clusters_that_are_apart_are_objects_with_their_boxes(weight_by: str, scene: Scene) -> None:
     confidence = torch.rand(len(scene.features), generator=torch.Generator().manual_seed(0))
     answer = of(scene, 0, 2)
-    answer = answer_with(answer, weigh=weigh)
+    answer = answer_with(answer, weight_by=weight_by)
     found = objects(Scene(replace(scene.lift, confidence=confidence), scene.splats), answer)
-    assert len(found.found) == 2 and found.strays == 0
-    total_weight = scene.total_weight * (confidence.numpy() if weigh == "confidence" else 1)
-    for number, thing in enumerate(found.found):
+    assert len(found.objects) == 2 and found.unassigned_splats == 0
+    total_weight = scene.total_weight * (confidence.numpy() if weight_by == "confidence" else 1)
+    for number, thing in enumerate(found.objects):
         rows = np.flatnonzero(found.numbers == number)
         cluster = rows[0] // SPLATS_A_CLUSTER
         assert rows.tolist() == list(range(cluster * SPLATS_A_CLUSTER, (cluster + 1) * SPLATS_A_CLUSTER))
@@ -55,18 +55,18 @@ def test_clusters_that_are_apart_are_objects_with_their_boxes(weigh: str, scene:
         assert (np.array(thing.box[0]) >= low).all() and (np.array(thing.box[1]) <= high).all()
         assert np.array(thing.box) == pytest.approx(np.stack([low, high]), abs=0.3)
         assert thing.centre == pytest.approx(np.mean(thing.box, axis=0))
-    assert found.found[0].share >= found.found[1].share
+    assert found.objects[0].share >= found.objects[1].share
     assert (found.numbers[SPLATS_A_CLUSTER : 2 * SPLATS_A_CLUSTER] == -1).all()
     nothing = objects(scene, of(scene))
-    assert (nothing.found, nothing.strays) == ((), 0) and (nothing.numbers == -1).all()
+    assert (nothing.objects, nothing.unassigned_splats) == ((), 0) and (nothing.numbers == -1).all()
 
 
 def test_single_splats_elsewhere_are_strays_and_stretch_no_box(scene: Scene) -> None:
     alone, with_stray = objects(scene, of(scene, 0)), objects(scene, of(scene, 0, rows=(2 * SPLATS_A_CLUSTER,)))
-    assert len(with_stray.found) == 1 and with_stray.strays == 1
+    assert len(with_stray.objects) == 1 and with_stray.unassigned_splats == 1
     assert with_stray.numbers[2 * SPLATS_A_CLUSTER] == -1
-    assert with_stray.found[0].box == alone.found[0].box
-    assert with_stray.found[0].share < alone.found[0].share == 1.0
+    assert with_stray.objects[0].box == alone.objects[0].box
+    assert with_stray.objects[0].share < alone.objects[0].share == 1.0
     cluster = np.arange(SPLATS_A_CLUSTER)  # likewise of a thing that is given
     box = module.object_box(scene.splats, cluster, np.ones(len(cluster)))
     strayed = np.append(cluster, 2 * SPLATS_A_CLUSTER)
@@ -95,22 +95,22 @@ def test_small_fragment_of_another_thing_is_no_object_beside_a_whole_one(scene: 
             object_views=torch.zeros((3, 3), dtype=torch.int32),
         )
         found[name] = objects(Scene(lift, scene.splats), answer_with(answer, selected=selected))
-    assert {name: len(one.found) for name, one in found.items()} == {
+    assert {name: len(one.objects) for name, one in found.items()} == {
         "of the last": 1,
         "a thing itself": 2,
         "a thing with a leak beside it": 2,
         "of none": 2,
     }
-    assert found["of the last"].strays == len(fragment)
+    assert found["of the last"].unassigned_splats == len(fragment)
     large = answer.selected | np.isin(np.arange(len(things)), count + near[:12])
     lift = replace(scene.lift, object=torch.from_numpy(things), object_views=torch.zeros((2, 3), dtype=torch.int32))
-    assert len(objects(Scene(lift, scene.splats), answer_with(answer, selected=large)).found) == 2
+    assert len(objects(Scene(lift, scene.splats), answer_with(answer, selected=large)).objects) == 2
 
 
 def test_who_keeps_the_largest_gets_it_alone_also_as_a_file(scene: Scene) -> None:
     both, largest = objects(scene, of(scene, 0, 2)), objects(scene, of(scene, 0, 2, keep="largest"))
-    assert largest.found == both.found[:1]
-    assert largest.strays == both.found[1].splats
+    assert largest.objects == both.objects[:1]
+    assert largest.unassigned_splats == both.objects[1].splats
     kept = b"".join(object_splats(scene, of(scene, 0, 2, keep="largest")))
     assert kept == ply(splat_rows()[both.numbers == 0])
     with_stray = of(scene, 0, 2, rows=(3 * SPLATS_A_CLUSTER // 2,))
@@ -119,12 +119,12 @@ def test_who_keeps_the_largest_gets_it_alone_also_as_a_file(scene: Scene) -> Non
 
 def test_so_many_instances_are_kept_by_their_scores(scene: Scene) -> None:
     all_three, two = objects(scene, of(scene, 0, 1, 2)), objects(scene, of(scene, 0, 1, 2, instances=2))
-    assert len(all_three.found) == 3 and two.strays == SPLATS_A_CLUSTER
+    assert len(all_three.objects) == 3 and two.unassigned_splats == SPLATS_A_CLUSTER
     assert (two.numbers[:SPLATS_A_CLUSTER] == -1).all()  # the later clusters have the higher scores
-    assert two.found == tuple(
-        thing for thing in all_three.found if thing.score > min(t.score for t in all_three.found)
+    assert two.objects == tuple(
+        thing for thing in all_three.objects if thing.score > min(t.score for t in all_three.objects)
     )
-    assert objects(scene, of(scene, 0, 2, instances=9)).found == objects(scene, of(scene, 0, 2)).found
+    assert objects(scene, of(scene, 0, 2, instances=9)).objects == objects(scene, of(scene, 0, 2)).objects
     for count in (0, 101):
         with pytest.raises(InvalidQuery, match="instances: expected 1 to 100"):
             of(scene, 0, instances=count)
@@ -138,10 +138,10 @@ def test_objects_of_fewer_splats_are_outliers(scene: Scene) -> None:
     answer = of(scene, 0)
     for size, count in ((1, 2), (SPLATS_A_CLUSTER - 5, 2), (SPLATS_A_CLUSTER - 4, 1), (SPLATS_A_CLUSTER + 1, 0)):
         found = objects(scene, answer_with(answer, selected=selected, min_size=size))
-        assert (len(found.found), found.numbers[stray]) == (count, -1)
-        assert found.strays == selected.sum() - sum(thing.splats for thing in found.found)
+        assert (len(found.objects), found.numbers[stray]) == (count, -1)
+        assert found.unassigned_splats == selected.sum() - sum(thing.splats for thing in found.objects)
     none = answer_with(answer, selected=selected, min_size=SPLATS_A_CLUSTER + 1, keep="largest")
-    assert objects(scene, none).found == ()
+    assert objects(scene, none).objects == ()
 
 
 def test_tails_of_a_thousandth_are_not_in_the_box() -> None:
@@ -157,7 +157,7 @@ def test_tails_of_a_thousandth_are_not_in_the_box() -> None:
 
 def test_more_splats_than_are_grouped_are_refused(scene: Scene, monkeypatch) -> None:
     monkeypatch.setattr(module, "MOST_SPLATS", SPLATS_A_CLUSTER)
-    assert objects(scene, of(scene, 0)).found
+    assert objects(scene, of(scene, 0)).objects
     with pytest.raises(InvalidQuery, match=r"threshold: expected at most 20 splats.*got 21; name a higher"):
         objects(scene, of(scene, 0, rows=(2 * SPLATS_A_CLUSTER,)))
 
@@ -168,8 +168,8 @@ def test_a_twentieth_of_the_evidence_of_the_largest_makes_an_object(scene: Scene
         total_weight = torch.ones(rows)
         total_weight[2 * SPLATS_A_CLUSTER :] = share
         weighed = Scene(replace(scene.lift, total_weight=total_weight))
-        assert len(objects(weighed, of(scene, 0, 2)).found) == count
+        assert len(objects(weighed, of(scene, 0, 2)).objects) == count
     bare = Scene(replace(scene.lift, total_weight=torch.zeros(rows)))  # without any, splats count alike
     found = objects(bare, of(scene, 0, rows=(2 * SPLATS_A_CLUSTER, 2 * SPLATS_A_CLUSTER + 1)))
-    assert found.found[0].splats == SPLATS_A_CLUSTER
-    assert sum(thing.share for thing in found.found) <= 1.0
+    assert found.objects[0].splats == SPLATS_A_CLUSTER
+    assert sum(thing.share for thing in found.objects) <= 1.0

@@ -58,7 +58,7 @@ def test_absent_words_select_nothing_and_present_ones_do(clip: Scene, table: Tab
     absent = np.random.default_rng(1).choice(others, 60, replace=False).tolist()
     for word in THINGS:
         found = ask(clip, word, table)
-        assert found.present and found.count > 0 and "is there" in found.why
+        assert found.present and found.count > 0 and "is there" in found.reason
     answers = [ask(clip, word, table) for word in absent]
     assert sum(one.count == 0 for one in answers) >= 57
     assert all((one.present is False) == (one.count == 0) for one in answers)
@@ -66,8 +66,8 @@ def test_absent_words_select_nothing_and_present_ones_do(clip: Scene, table: Tab
 
 def test_absent_thing_shows_nothing_unless_kept(clip: Scene, table: TableEncoder) -> None:
     nothing = ask(clip, "sofa", table)
-    assert nothing.threshold.value == np.inf and nothing.threshold.explanation == nothing.why
-    assert objects(clip, nothing).found == ()
+    assert nothing.threshold.value == np.inf and nothing.threshold.explanation == nothing.reason
+    assert objects(clip, nothing).objects == ()
     seen = view_mask(clip, nothing, "middle")
     assert not seen.mask.any() and not seen.attention.any()
     with pytest.raises(InvalidQuery, match="absent=keep"):
@@ -85,7 +85,7 @@ def test_of_several_words_the_absent_ones_are_left_out(clip: Scene, table: Table
 
     cat = ask(clip, "cat", table)
     both = ask(clip, Query.of(("sofa", "cat")), table)
-    assert same(both, cat) and both.present and "'sofa' is not there" in both.why
+    assert same(both, cat) and both.present and "'sofa' is not there" in both.reason
     assert not same(ask(clip, Query.of(("sofa", "cat"), absent="keep"), table), cat)
     assert ask(clip, Query.of(("cat",), ("sofa",)), table).presence == cat.presence  # negatives are not questioned
     example = Query.of((SplatTerm(0), "sofa"))
@@ -147,7 +147,7 @@ def test_without_references_presence_is_not_known(clip: Scene, table: TableEncod
     axes = TableEncoder("axes", ("cat",), np.eye(512, dtype=np.float32)[:1])
     unknown = ask(clip, "cat", axes)
     assert (unknown.present, unknown.presence) == (None, None) and unknown.count > 0
-    assert "200 words" in unknown.why
+    assert "200 words" in unknown.reason
     few = TableEncoder("few", ("cat", "sofa"), table.encode(["cat", "sofa"]))  # of CLIP's, as its vectors tell
     assert ask(clip, "sofa", few).presence == ask(clip, "sofa", table).presence
 
@@ -182,7 +182,8 @@ def test_texts_are_asked_as_their_vectors_are(
     for encoder in (table, "lvis", LVIS_TABLE, None):
         told = lift.query("cat", ["pizza"], encoder=encoder)
         assert torch.equal(told.scores, cat.scores) and torch.equal(told.splats, cat.splats)
-        assert (told.present, told.presence) == (cat.present, cat.presence) and told.why.startswith("'cat' is there")
+        assert (told.present, told.presence) == (cat.present, cat.presence)
+        assert told.reason.startswith("'cat' is there")
     assert opened == [lift.metadata.text_space]
     wrong: Any
     for wrong in (7, "no such encoder", TableEncoder):
@@ -196,5 +197,5 @@ def test_texts_are_asked_as_their_vectors_are(
 def test_many_words_follow_the_same_rule(clip: Scene, table: TableEncoder) -> None:
     words = ["cat", "sofa", "lamp"]  # without its nearest words, a sofa would have splats of its own
     found = segment(clip, words, table.encode(words))
-    assert [one.word for one in found.found] == ["cat"]
+    assert [one.word for one in found.named_words] == ["cat"]
     assert set(found.labels.tolist()) <= {-1, 0}

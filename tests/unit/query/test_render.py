@@ -104,7 +104,7 @@ def test_strays_are_not_in_a_mask(scene: Scene) -> None:
     opaque[STRAY] = 9.0
     scene.__dict__["splats"] = replace(scene.splats, log_scales=large, opacity_logits=opaque)
     answer = of(scene, 0, rows=(STRAY,))
-    assert objects(scene, answer).strays == 1
+    assert objects(scene, answer).unassigned_splats == 1
     assert (mostly(scene, answer.selected) & ~mostly(scene, of(scene, 0).selected)).any()  # it could be seen
     seen = view_mask(scene, answer, "middle")
     assert np.array_equal(seen.mask, mostly(scene, of(scene, 0).selected))

@@ -41,7 +41,7 @@ def test_files_are_those_of_the_answer_and_no_others(scene: Scene, tmp_path: Pat
     scene.export(tmp_path / "scores.npy", answer, "scores")
     assert np.array_equal(np.load(tmp_path / "scores.npy"), answer.scores)
     scene.export(tmp_path / "x.ply", "x", encoder=AXES)
-    assert lc.read_splats(tmp_path / "x.ply").count == answer.count - scene.objects(answer).strays
+    assert lc.read_splats(tmp_path / "x.ply").count == answer.count - scene.objects(answer).unassigned_splats
     scene.export(tmp_path / "mask.png", lc.Query(text=["x"], view="middle"), "mask", encoder=AXES)
     assert (tmp_path / "mask.png").read_bytes() == b"".join(scene.blocks_of(answer, "mask", view="middle"))
     for what, told in (("mesh", "what: expected one of object, coloured"), ("mask", "view: expected")):
@@ -51,7 +51,7 @@ def test_files_are_those_of_the_answer_and_no_others(scene: Scene, tmp_path: Pat
 
 
 def test_view_of_a_question_is_a_name_or_a_camera(scene: Scene) -> None:
-    by_name = scene.look(lc.Query(text=["x"], view="middle"), encoder=AXES)
+    by_name = scene.view_mask(lc.Query(text=["x"], view="middle"), encoder=AXES)
     camera = scene.cameras["middle"]
     for query, view in ((lc.Query.of("x", camera=camera), None), ("x", camera), ("x", "middle")):
         assert np.array_equal(scene.mask(query, view, encoder=AXES), by_name.mask)

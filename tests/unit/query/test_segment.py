@@ -48,18 +48,19 @@ def test_every_splat_gets_the_word_that_it_is_most_like(clear: Scene) -> None:
     assert np.array_equal(found.labels, np.array([1, 2, 0])[CLUSTER])
     assert (found.margin > 0.5).all()
     means = clear.splats.means.numpy()
-    for named in found.found:
+    for named in found.named_words:
         mine = means[found.labels == named.row]
         assert named.splats == SPLATS_A_CLUSTER and named.share == pytest.approx(1 / 3, abs=1e-6)
         assert np.array(named.box) == pytest.approx(np.stack([mine.min(axis=0), mine.max(axis=0)]), abs=0.3)
         assert named.score > 0.9 and 0 < named.threshold < 1
-    assert [found.found[value - 1].word for value in found.values[::SPLATS_A_CLUSTER]] == ["apple", "book", "lamp"]
+    names = [found.named_words[value - 1].word for value in found.values[::SPLATS_A_CLUSTER]]
+    assert names == ["apple", "book", "lamp"]
 
 
 def test_words_that_are_not_there_name_nothing(clear: Scene) -> None:
     between = (EYE[0] + EYE[5]) / np.sqrt(2)  # what the first cluster is most like, but for its own word
     found = segment(clear, ["apple", "pear", "book", "lamp", "void"], np.stack([EYE[0], between, *EYE[[1, 2, 7]]]))
-    assert {named.word for named in found.found} == {"apple", "book", "lamp"}
+    assert {named.word for named in found.named_words} == {"apple", "book", "lamp"}
     assert np.array_equal(found.labels, np.array([0, 2, 3])[CLUSTER])
 
 
@@ -70,7 +71,7 @@ def test_splats_of_no_word_and_unseen_ones_are_named_none(clear: Scene) -> None:
     hidden = Scene(replace(clear.lift, seen=torch.arange(COUNT) != 3), clear.splats)
     assert segment(hidden, ["apple", "book", "lamp"], EYE[:3]).labels[3] == -1
     flat = Scene(replace(clear.lift, features=torch.ones(COUNT, CHANNELS)), clear.splats)  # of equal scores
-    assert segment(flat, ["apple", "book"], EYE[:2]).found == ()
+    assert segment(flat, ["apple", "book"], EYE[:2]).named_words == ()
 
 
 def test_splat_of_no_word_gets_the_one_of_most_of_its_node(clear: Scene) -> None:
@@ -207,12 +208,12 @@ def test_command_names_splats_and_examples(tiny_lift: Path, tmp_path: Path, caps
         "splats": 60,
         "none": told["none"],
     }
-    assert [[*one["box"].values()] for one in told["found"]] == [one["box"] for one in document["found"]]
+    assert [[*one["box"].values()] for one in told["named_words"]] == [one["box"] for one in document["found"]]
     assert document["files"] == {kind: str(path) for kind, path in files.items()}
     values = np.load(files["splat_labels"])
     for named in document["found"]:
         assert (values == named["value"]).sum() == named["splats"]
-    asked = [*command, "--words", str(tmp_path / "words.txt"), "--what", "splat:0", "--top", "1"]
+    asked = [*command, "--words", str(tmp_path / "words.txt"), "--example", "splat:0", "--top", "1"]
     assert cli.main([*asked, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     (best,) = document["examples"]
@@ -221,7 +222,7 @@ def test_command_names_splats_and_examples(tiny_lift: Path, tmp_path: Path, caps
     assert capsys.readouterr().out.startswith("splat:0: apple ")
     assert cli.main([*command, "--words", str(tmp_path / "words.txt")]) == 0
     assert "2 of 2 words are there" in capsys.readouterr().out
-    for wrong in (["--labels", "l.png"], ["--words", str(tmp_path / "none.txt")], ["--what", "nothing"]):
+    for wrong in (["--labels", "l.png"], ["--words", str(tmp_path / "none.txt")], ["--example", "nothing"]):
         assert cli.main([*command, *wrong]) == 2
         assert capsys.readouterr().err.count("\n") == 1
 

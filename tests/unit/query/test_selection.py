@@ -114,7 +114,7 @@ def test_what_hubs_hide_is_not_sure_and_shown(scene: Scene, table: TableEncoder)
     words = [word for word in ("cat", "boat", "pizza") for _ in range(200)]
     drawn = lifted(scene, pictures(table, words, 0.2, hub=0.3))
     found = ask(drawn, "pizza", table)
-    assert found.present is None and "not sure" in found.why
+    assert found.present is None and "not sure" in found.reason
     assert found.presence is not None and found.presence < 0.5
     assert found.selected[400:].mean() > 0.9 and found.count < 300
     assert ask(drawn, "sofa", table).present is False
@@ -193,8 +193,8 @@ def test_phrase_finds_the_part_within_the_thing_alone(phrase: str, handles: Scen
     wanted = np.concatenate([np.arange(first, first + 50) for first in (140, 300, 500)])
     assert answer.selected[wanted].mean() > 0.9 and not np.delete(answer.selected, wanted).any()
     (wording,) = answer.wording
-    assert (wording.text, wording.word, wording.how) == (phrase, "handle of the mug", "part")
-    assert answer.present is not False and "Within it" in answer.why and answer.query.text == [phrase]
+    assert (wording.text, wording.word, wording.match) == (phrase, "handle of the mug", "part")
+    assert answer.present is not False and "Within it" in answer.reason and answer.query.text == [phrase]
     together = answers(handles, [question(handles, Query.of(some), table) for some in ("cat", phrase)])
     assert (together[1].scores == answer.scores).all() and (together[1].selected == answer.selected).all()
 
@@ -209,15 +209,15 @@ def test_part_of_a_thing_without_one_or_of_none_is_not_there(handles: Scene, tab
     for phrase in ("handle of the cat", "the cat's handle", "handle of the teapot"):
         answer = ask(handles, phrase, table)
         assert answer.count == 0 and answer.present is False, phrase
-    assert "teapot" in answer.why and "no parts" in answer.why
+    assert "teapot" in answer.reason and "no parts" in answer.reason
     loose = ask(handles, "cat handle", table)  # two nouns in a row, which may mean something else
-    assert loose.count == ask(handles, "handle", table).count > 0 and loose.wording[0].how == "head"
+    assert loose.count == ask(handles, "handle", table).count > 0 and loose.wording[0].match == "head"
 
 
 def test_part_that_is_nearly_all_of_the_thing_is_none(handles: Scene, table: TableEncoder) -> None:
     words = TableEncoder("words", ["cat", "handle"], table.encode(["cat", "cat"]))
     answer = ask(handles, Query.of(("handle of the cat",), threshold=0.0), words)
-    assert answer.count == 0 and answer.present is False and "no part" in answer.why
+    assert answer.count == 0 and answer.present is False and "no part" in answer.reason
     assert ask(handles, Query.of(("handle of the cat",), threshold=0.0, absent="keep"), words).count == 300
 
 

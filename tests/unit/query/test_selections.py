@@ -42,7 +42,7 @@ def test_edits_take_splats_by_box_area_question_and_booleans(scene: Scene) -> No
     assert rows_of(selection.splats) == rows_of(cluster(0))
     selection.edit("set", area="middle:box:20,0,32,24", through=True)
     assert rows_of(selection.splats) == rows_of(cluster(2))
-    assert [edit["how"] for edit in selection.history] == ["set", "add", "remove", "set"]
+    assert [edit["operation"] for edit in selection.history] == ["set", "add", "remove", "set"]
 
 
 def test_edits_are_undone_and_redone_one_by_one(scene: Scene) -> None:
@@ -126,7 +126,7 @@ def test_selection_is_asked_and_exported_as_it_is(scene: Scene, tmp_path: Path) 
     answer = scene.ask(Query(sets=["selection:mine"]))
     assert rows_of(answer.selected) == rows_of(strange) and answer.present and answer.count == 21
     found = scene.objects(answer)
-    assert [one.splats for one in found.objects] == [21] and found.strays == 0
+    assert [one.splats for one in found.objects] == [21] and found.unassigned_splats == 0
     assert found.objects[0].box == scene.select("mine").box
     scene.export(tmp_path / "object.ply", answer, "object")
     assert Scene(scene.lift).splats.count == 60

@@ -27,7 +27,7 @@ def test_every_word_of_a_table_is_asked_as_it_is() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "word", "how"),
+    ("text", "word", "match"),
     [
         ("tea cup", "teacup", "spelling"), ("table-cloth", "tablecloth", "spelling"),
         ("Tea-Pot?", "teapot", "spelling"), ("octopus", "octopus (animal)", "qualifier"),
@@ -50,8 +50,8 @@ def test_every_word_of_a_table_is_asked_as_it_is() -> None:
         ("earring on the table", "earring", "head"),
     ],
 )  # fmt: skip
-def test_text_is_asked_as_the_word_that_stands_for_it(text: str, word: str, how: str) -> None:
-    assert lvis().find(text) == (text, word, how)
+def test_text_is_asked_as_the_word_that_stands_for_it(text: str, word: str, match: str) -> None:
+    assert lvis().find(text) == (text, word, match)
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def test_answer_says_what_a_text_was_asked_as(scene: Scene) -> None:
     table = TableEncoder("words", ["apple", "book", "lamp"], np.eye(3, scene.channels, dtype=np.float32))
     answer = scene.ask("some red apples", encoder=table, places=False)
     (wording,) = answer.wording
-    assert (wording.text, wording.word, wording.how) == ("some red apples", "apple", "head")
+    assert (wording.text, wording.word, wording.match) == ("some red apples", "apple", "head")
     assert (answer.scores == scene.ask("apple", encoder=table, places=False).scores).all()
     assert scene.ask("apple", encoder=table, places=False).wording == ()
     with pytest.raises(InvalidQuery, match="got 'boook'") as caught:
@@ -144,4 +144,4 @@ def test_answer_says_what_a_text_was_asked_as(scene: Scene) -> None:
         scene.ask("sky", encoder=table)
     assert set(caught.value.nearest or ()) == {"apple", "book", "lamp"}  # what is in the scene
     assert scene.askable("ap", encoder=table).words[0].word == "apple"
-    assert set(scene.askable(encoder=table).here) == {"apple", "book", "lamp"}
+    assert set(scene.askable(encoder=table).scene_words) == {"apple", "book", "lamp"}

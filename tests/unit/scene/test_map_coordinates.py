@@ -308,8 +308,8 @@ def asked_of(splats: Splats, cameras: Cameras, views: dict[str, Any]) -> dict[st
     return {
         "top": [one.position for one in best.top],
         "box": best.box,
-        "objects": [point for one in parts.found for point in (one.centre, *one.box)],
-        "words": [point for one in words.found for point in one.box],
+        "objects": [point for one in parts.objects for point in (one.centre, *one.box)],
+        "words": [point for one in words.named_words for point in one.box],
         "labels": [one["oriented_box"]["centre"] for one in told["instances"]],
         "catalogue": [point for one in things.objects for point in (one.centre, *one.box)],
         "table": np.array(rows, float).reshape(-1, 3),

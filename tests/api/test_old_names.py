@@ -1,0 +1,93 @@
+"""Names of fields before they were renamed: parameters and bodies are still read by them, and replies have both."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from .test_problems import assert_problem
+
+
+@pytest.mark.parametrize(
+    ("path", "fields", "old", "new", "values"),
+    [
+        ("/query/scores", {"like": ["splat:1"]}, "weigh", "weight_by", ("evidence", "confidence")),
+        ("/render", {"view": "middle"}, "what", "channel", ("pca", "rgb")),
+    ],
+)
+def test_old_names_of_fields_are_read_and_contradictions_are_refused(
+    client: TestClient, lift: dict[str, Any], path: str, fields: dict[str, Any], old: str, new: str, values: Any
+) -> None:
+    def reply(method: str, **names: Any) -> Any:
+        request = fields | names | {"lift": lift["id"]}
+        return client.get(path, params=request) if method == "GET" else client.post(path, json=request)
+
+    value, other = values
+    for method in ("GET", "POST"):
+        expected = reply(method, **{new: value})
+        assert expected.status_code == 200
+        assert reply(method, **{old: value}).content == expected.content
+        assert reply(method, **{old: value, new: value}).content == expected.content
+        for names in ({old: other, new: value}, {old: value, new: other}):
+            problem = assert_problem(reply(method, **names))
+            assert (problem["status"], problem["argument"]) == (422, new) and old in problem["expected"]
+        wrong = assert_problem(reply(method, **{old: "nothing"}))
+        assert (wrong["status"], wrong["argument"]) == (422, new)
+    unknown = assert_problem(reply("GET", weight="evidence"))
+    names = unknown["expected"].split(", ")
+    assert new in names and old not in names
+
+
+def test_edits_are_read_by_their_old_names_and_listed_by_both(client: TestClient, lift: dict[str, Any]) -> None:
+    route = f"/lifts/{lift['id']}/selections"
+    edit = {"how": "set", "query": {"like": ["splat:1"], "weigh": "evidence", "keep": "largest"}}
+    selection = client.post(route, json={"name": "old", "edit": edit}).json()
+    edits = selection["links"]["edits"]
+    assert client.post(edits, json={"how": "grow", "operation": "grow"}).status_code == 200
+    problem = assert_problem(client.post(edits, json={"how": "grow", "operation": "shrink"}))
+    assert (problem["status"], problem["argument"]) == (422, "operation")
+    history = client.get(selection["links"]["self"]).json()["history"]
+    assert [(step["edit"]["operation"], step["edit"]["how"]) for step in history] == [("set",) * 2, ("grow",) * 2]
+    client.delete(selection["links"]["self"])
+
+
+def test_replies_have_old_names_beside_the_new_ones(client: TestClient, lift: dict[str, Any], table: Any) -> None:
+    query = {"lift": lift["id"], "text": "lamp"}
+    table_id = client.put("/assets/table", content=table.read_bytes()).json()["id"]
+    replies = (
+        (client.get("/query", params=query), ("reason", "why")),
+        (client.get("/query/objects", params=query), ("reason", "why"), ("unassigned_splats", "strays")),
+        (client.get("/query/words", params={"lift": lift["id"]}), ("scene_words", "here")),
+        (client.get("/query/words", params={"lift": lift["id"]}), ("open_vocabulary", "any_text")),
+        (
+            client.post("/query/segment", json={"lift": lift["id"], "table": table_id}),
+            ("named_words", "found"), ("word_count", "words"),
+        ),
+    )  # fmt: skip
+    for reply, *pairs in replies:
+        document = reply.json()
+        for new, old in pairs:
+            assert document[new] == document[old], reply.request.url
+
+
+def test_a_zip_of_things_is_one_of_objects(client: TestClient, lift: dict[str, Any]) -> None:
+    old, new = (client.post("/query/export", json={"lift": lift["id"], "of": of}) for of in ("things", "objects"))
+    assert (old.status_code, old.content) == (new.status_code, new.content)
+    assert old.headers.get("content-disposition") == new.headers.get("content-disposition")
+    assert assert_problem(client.post("/query/export", json={"lift": lift["id"], "of": "odd"}))["status"] == 422
+
+
+def test_old_names_are_deprecated_in_the_description_of_the_routes(client: TestClient) -> None:
+    document = client.get("/openapi.json").json()
+    parameters = {item["name"]: item for item in document["paths"]["/query"]["get"]["parameters"]}
+    assert parameters["weigh"]["deprecated"] and "deprecated" not in parameters["weight_by"]
+    schemas = document["components"]["schemas"]
+    expected = {
+        "Question": {"weigh"}, "RenderRequest": {"what"}, "EditRequest": {"how"}, "QueryAnswer": {"why"},
+        "ObjectsAnswer": {"why", "strays"}, "WordsAnswer": {"any_text", "here"}, "SegmentAnswer": {"words", "found"},
+    }  # fmt: skip
+    for name, fields in expected.items():
+        properties = schemas[name]["properties"]
+        assert {field for field, schema in properties.items() if schema.get("deprecated")} == fields, name
