@@ -40,14 +40,14 @@ ROUNDING = 1e-6  # of the last row of a pose
 MIN_FOCAL, MAX_FOCAL = 1e-3, 1e9  # pixels; float64 squares of what they project stay finite
 MAX_OFF_CENTRE = 1e9  # pixels of the principal point
 MAX_REACH = 1e12  # scene units from the origin; float32 has no detail left long before
-MAX_VIEWS = 100_000  # of a scene: many times what anybody lifts, and read and checked in seconds
+MAX_VIEWS = 100_000  # of a scene: far more than real ones have, and still read and checked in seconds
 FEWER_VIEWS = "lift fewer photos, such as every second one"
-NEAREST = 3  # views named when one is unknown
-NEARLY_ALL = 0.995  # a share that would be told as 100%
-SHOWN = 120  # characters of a name that is unknown
-SKIPPED = 3  # views named of those that were skipped
+NEAREST = 3  # views in the error of an unknown one
+NEARLY_ALL = 0.995  # a share that would be printed as 100%
+MAX_TEXT = 120  # characters of a value in an error
+MAX_LISTED = 3  # skipped views in a warning
 SAME_NAMES = (
-    "a view is known by its photo's name without the suffix: rename photos, or, where training and test photos share "
+    "a view has its photo's name without the suffix: rename photos, or, where training and test photos share "
     "names (Blender's scenes; Inria's cameras.json has the test views first), take one of both out or put "
     "their folders before them (train/r_0)"
 )
@@ -98,7 +98,7 @@ class Camera:
         name: str = "",
     ) -> None:
         if not isinstance(name, str):
-            raise InvalidCameras("camera name", expected="a text, as of a photo", got=repr(name)[:SHOWN])
+            raise InvalidCameras("camera name", expected="a text, as of a photo", got=repr(name)[:MAX_TEXT])
         if lens is not None and not isinstance(lens, Lens):
             hint = "read_cameras reads lenses of COLMAP and nerfstudio; undistorted photos need none"
             raise InvalidCameras(f"camera {name!r} lens", expected="a Lens, or None", got=repr(lens)[:80], hint=hint)
@@ -123,7 +123,7 @@ class Camera:
         viewmat: Matrix,
         lens: Lens | None = None,
     ) -> Camera:
-        """A camera of its intrinsics in pixels, the principal point from the left and top edge of the image."""
+        """Make a camera of intrinsics in pixels, the principal point from the left and top edge of the image."""
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         return cls(viewmat, K, width, height, lens=lens, name=name)
 
@@ -138,7 +138,7 @@ class Camera:
         convention: Convention,
         name: str = "",
     ) -> Camera:
-        """A camera of its pose in the world, whose axes follow a named convention.
+        """Return a camera of its pose in the world, whose axes follow a named convention.
 
         Args:
             pose: [4, 4] or [3, 4] camera to world, rigid: the columns are the camera's axes and its centre.
@@ -153,13 +153,13 @@ class Camera:
         if not isinstance(convention, str) or convention not in CAMERA_AXES:
             expected, got = " or ".join(map(repr, CAMERA_AXES)), repr(convention)[:80]
             raise InvalidCameras(f"camera {name!r} convention", expected=expected, got=got)
-        given = _matrix(pose)
-        if given.shape not in ((4, 4), (3, 4)):
-            expected, got = "a finite 4x4 or 3x4 matrix", f"shape {list(given.shape)}"
+        pose_matrix = _matrix(pose)
+        if pose_matrix.shape not in ((4, 4), (3, 4)):
+            expected, got = "a finite 4x4 or 3x4 matrix", f"shape {list(pose_matrix.shape)}"
             raise InvalidCameras(f"camera {name!r} pose", expected=expected, got=got)
-        viewmat = viewmat_of(given[:3, :3] * CAMERA_AXES[convention], given[:3, 3])
-        if len(given) == 4:
-            viewmat[3] = given[3]  # refused if it is no pose's
+        viewmat = viewmat_of(pose_matrix[:3, :3] * CAMERA_AXES[convention], pose_matrix[:3, 3])
+        if len(pose_matrix) == 4:
+            viewmat[3] = pose_matrix[3]  # refused if it is no pose's
         return cls(viewmat, K, width, height, name=name)
 
     def transformed(
@@ -170,16 +170,16 @@ class Camera:
         rotation: Numbers | None = None,
         translation: Numbers | None = None,
     ) -> Camera:
-        """The camera in another frame of the world, ``p' = scale R p + translation`` (`Splats.transformed`).
+        """Return the camera in another frame of the world, ``p' = scale R p + translation`` (`Splats.transformed`).
 
         Raises:
             InvalidInput: it is no similarity.
         """
         move = Similarity.of(matrix, scale, rotation, translation)
-        turn = self.viewmat[:3, :3] @ move.rotation.T
+        rotation_product = self.viewmat[:3, :3] @ move.rotation.T
         pose = np.eye(4)
-        pose[:3, :3] = turn
-        pose[:3, 3] = move.scale * self.viewmat[:3, 3] - turn @ move.translation
+        pose[:3, :3] = rotation_product
+        pose[:3, 3] = move.scale * self.viewmat[:3, 3] - rotation_product @ move.translation
         return replace(self, viewmat=pose)
 
     def __repr__(self) -> str:
@@ -189,7 +189,7 @@ class Camera:
         return one_line(self, repr(self.name[-NAME_SHOWN:]), f"{self.width}x{self.height}", *K, *kind)
 
     def replace(self, **changes: Any) -> Camera:
-        """The same camera with other fields, or with another ``fx``, ``fy``, ``cx`` or ``cy``.
+        """Return the same camera with other fields, or with another ``fx``, ``fy``, ``cx`` or ``cy``.
 
         Raises:
             InvalidCameras: there is no such field, or as the constructor has it.
@@ -201,11 +201,13 @@ class Camera:
                 try:
                     K[place] = value
                 except (TypeError, ValueError):
-                    self._refuse(key, "a number of pixels", repr(value)[:SHOWN])
-        known = [field.name for field in fields(self)]
+                    self._refuse(key, "a number of pixels", repr(value)[:MAX_TEXT])
+        field_names = [field.name for field in fields(self)]
         for key in changes:
-            if key not in known:
-                self._refuse(repr(key), f"one of {', '.join([*known, 'fx', 'fy', 'cx', 'cy'])}", "an unknown field")
+            if key not in field_names:
+                self._refuse(
+                    repr(key), f"one of {', '.join([*field_names, 'fx', 'fy', 'cx', 'cy'])}", "an unknown field"
+                )
         return replace(self, K=K, **changes)
 
     def _check_intrinsics(self) -> None:
@@ -215,7 +217,7 @@ class Camera:
             got = f"shape {list(K.shape)}"
             if K.shape == (3, 3):
                 got = "; ".join(" ".join(f"{value:g}" for value in row) for row in K)
-            self._refuse("K", f"a 3x3 matrix ({rows}) without skew", got[:SHOWN])
+            self._refuse("K", f"a 3x3 matrix ({rows}) without skew", got[:MAX_TEXT])
         intrinsics = (self.fx, self.fy, self.cx, self.cy)
         if not all(math.isfinite(value) for value in intrinsics) or self.fx <= 0 or self.fy <= 0:
             self._refuse("intrinsics", "finite fx, fy, cx, cy with positive focal lengths", str(intrinsics))
@@ -269,8 +271,8 @@ class Camera:
     @property
     def photo_size(self) -> tuple[int, int]:
         """Width and height in pixels of the photo that it stands for: with a lens larger than its own."""
-        whole = self.lens or self
-        return whole.width, whole.height
+        image = self.lens or self
+        return image.width, image.height
 
     @property
     def centre(self) -> np.ndarray:
@@ -282,7 +284,7 @@ class Camera:
         return centre
 
     def about(self, origin: Origin) -> Camera:
-        """The same camera in the world frame less an origin: a point p - origin lies where p did."""
+        """Return the same camera in the world frame less an origin: a point p - origin lies where p did."""
         if origin == FILE_ORIGIN:
             return self
         pose = self.viewmat.copy()
@@ -291,19 +293,19 @@ class Camera:
 
 
 def _matrix(values: Any) -> np.ndarray:
-    """A read-only copy as f64 on the CPU, of numpy, nested lists or torch, which is not imported for it."""
+    """Return a read-only copy as f64 on the CPU, of numpy, nested lists or torch, which is not imported for it."""
     if hasattr(values, "detach"):
         values = values.detach().cpu().numpy()
     try:
-        found = np.array(values, dtype=np.float64)
+        matrix = np.array(values, dtype=np.float64)
     except (TypeError, ValueError):
-        found = np.full((0,), np.nan)  # no numbers: refused by its shape
-    found.setflags(write=False)
-    return found
+        matrix = np.full((0,), np.nan)  # no numbers: refused by its shape
+    matrix.setflags(write=False)
+    return matrix
 
 
 def _pixels(side: Any) -> int:
-    """A whole number of any kind, as readers of JSON and arrays have it; 0, which is refused, of anything else."""
+    """Convert a whole number of any type to int; anything else becomes 0, which is refused."""
     try:
         return int(side) if int(side) == side and not isinstance(side, bool) else 0
     except (TypeError, ValueError, OverflowError):
@@ -322,10 +324,10 @@ class Cameras(Mapping[str, Camera]):
 
     Args:
         views: a mapping of names to cameras, whose names win over those of the cameras; or named cameras.
-        frame: the name of the file by which they were moved to the frame of the splats.
-        of_nerfstudio: as nerfstudio's own converter writes them, and not moved.
+        frame: the name of the file with the transform that was applied, to the frame of the splats; None: none.
+        of_nerfstudio: written by nerfstudio's own converter, and not transformed.
         world: which way is up, where their file says it.
-        warnings: of their reader, for whoever plans or lifts with them: what was skipped, or lies beside unread.
+        warnings: of their reader, also shown by plans and lifts: views that were skipped, files that were not read.
 
     Raises:
         InvalidCameras: there are none, more than MAX_VIEWS, two of one name, or something else than cameras.
@@ -344,16 +346,16 @@ class Cameras(Mapping[str, Camera]):
         self.of_nerfstudio = of_nerfstudio
         self.world = world
         self.warnings = tuple(warnings)
-        alone = _cameras_in(views)
+        cameras = _cameras_in(views)
         if isinstance(views, Mapping):
-            named = [view if view.name == name else view.replace(name=name) for name, view in views.items()]
+            renamed_views = [view if view.name == name else view.replace(name=name) for name, view in views.items()]
         else:
-            named = alone
-        if not named:
+            renamed_views = cameras
+        if not renamed_views:
             raise InvalidCameras("cameras", expected="at least one view", got="none")
-        check_count(len(named), "cameras")
+        check_count(len(renamed_views), "cameras")
         self._by_name: dict[str, Camera] = {}
-        for camera in named:
+        for camera in renamed_views:
             if camera.name in self._by_name:
                 got = f"{camera.name!r} twice"
                 hint = SAME_NAMES if camera.name else "give a dict of names to cameras, or Camera(..., name=...)"
@@ -361,24 +363,24 @@ class Cameras(Mapping[str, Camera]):
             self._by_name[camera.name] = camera
 
     def __getitem__(self, name: str) -> Camera:
-        """The view of that name, or of a name that pairs with it (`view_pairs`): lifts of before name rigs otherwise.
+        """Return the view of a name, or of one that pairs with it (`view_pairs`), as older lifts name rigs otherwise.
 
         Raises:
             NotFound: no view has it; the error, which is a KeyError, names the nearest ones.
         """
         if not isinstance(name, str):
-            expected, got = "the name of a camera", f"{type(name).__name__} {name!r}"[:SHOWN]
+            expected, got = "the name of a camera", f"{type(name).__name__} {name!r}"[:MAX_TEXT]
             raise NotFound("view", expected=expected, got=got, hint="list(cameras) are the names, in their order")
-        plain = without_image_suffix(name)  # a photo's file names its view
-        found = self._by_name.get(composed(name)) or self._by_name.get(plain)
-        found = found or self._by_name.get(cameras_of_views([plain], self).get(plain, ""))
-        if found is None:
-            got, hint = repr(name[:SHOWN]), nearest(name, self, NEAREST)
+        view_name = without_image_suffix(name)  # a photo's file names its view
+        camera = self._by_name.get(composed(name)) or self._by_name.get(view_name)
+        camera = camera or self._by_name.get(cameras_of_views([view_name], self).get(view_name, ""))
+        if camera is None:
+            got, hint = repr(name[:MAX_TEXT]), nearest(name, self, NEAREST)
             raise NotFound("view", expected="the name of a camera", got=got, hint=hint)
-        return found
+        return camera
 
     def __contains__(self, name: object) -> bool:
-        """Whether a view has exactly that name."""
+        """Return True if a view has exactly that name."""
         return isinstance(name, str) and composed(name) in self._by_name
 
     def __iter__(self) -> Iterator[str]:
@@ -388,8 +390,8 @@ class Cameras(Mapping[str, Camera]):
         return len(self._by_name)
 
     def __repr__(self) -> str:
-        some = ", ".join(repr(name[-NAME_SHOWN:]) for name in list(self)[:2]) + (", ..." if len(self) > 2 else "")
-        return one_line(self, f"{len(self)} views: {some}")
+        listing = ", ".join(repr(name[-NAME_SHOWN:]) for name in list(self)[:2]) + (", ..." if len(self) > 2 else "")
+        return one_line(self, f"{len(self)} views: {listing}")
 
     def transformed(
         self,
@@ -399,17 +401,17 @@ class Cameras(Mapping[str, Camera]):
         rotation: Numbers | None = None,
         translation: Numbers | None = None,
     ) -> Cameras:
-        """All cameras in another frame of the world (`Camera.transformed`).
+        """Return all cameras in another frame of the world (`Camera.transformed`).
 
         Raises:
             InvalidInput: it is no similarity.
         """
-        moved = [
+        cameras = [
             camera.transformed(matrix, scale=scale, rotation=rotation, translation=translation)
             for camera in self.values()
         ]
         world = self.world.transformed(Similarity.of(matrix, scale, rotation, translation))
-        return Cameras(moved, world=world, warnings=self.warnings)
+        return Cameras(cameras, world=world, warnings=self.warnings)
 
     @property
     def distorted(self) -> tuple[str, ...]:
@@ -417,23 +419,23 @@ class Cameras(Mapping[str, Camera]):
         return tuple(name for name, camera in self._by_name.items() if camera.lens is not None)
 
 
-def _cameras_in(given: Any) -> list[Camera]:
-    """The cameras of a mapping or of a sequence, or a refusal of what is none of these, such as a path."""
-    values = given.values() if isinstance(given, Mapping) else given
-    many = isinstance(values, Iterable) and not isinstance(values, str | np.ndarray)
-    found: list[Any] = list(values) if many else [values]
-    names = [name for name in given if not isinstance(name, str)] if isinstance(given, Mapping) else []
+def _cameras_in(views: Any) -> list[Camera]:
+    """Return the cameras of a mapping or a sequence, and refuse anything else, such as a path."""
+    values = views.values() if isinstance(views, Mapping) else views
+    is_sequence = isinstance(values, Iterable) and not isinstance(values, str | np.ndarray)
+    cameras: list[Any] = list(values) if is_sequence else [values]
+    names = [name for name in views if not isinstance(name, str)] if isinstance(views, Mapping) else []
     if names:
         raise InvalidCameras("cameras", expected="names that are texts, as of photos", got=repr(names[0])[:80])
-    strange = [one for one in found if not isinstance(one, Camera)]
-    if strange:
-        got, hint = f"{type(strange[0]).__name__} {strange[0]!r}"[:80], "read_cameras(path) makes them of a file"
+    wrong = [item for item in cameras if not isinstance(item, Camera)]
+    if wrong:
+        got, hint = f"{type(wrong[0]).__name__} {wrong[0]!r}"[:80], "read_cameras(path) makes them of a file"
         raise InvalidCameras("cameras", expected="a Camera for each name", got=got, hint=hint)
-    return found
+    return cameras
 
 
 def viewmat_of(camera_to_world: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """[4, 4] f64 of a camera's axes in the world, [3, 3], and its centre, [3]; a ``Camera`` validates it."""
+    """Return [4, 4] f64 of a camera's axes in the world, [3, 3], and its centre, [3]; a ``Camera`` validates it."""
     pose = np.eye(4)
     pose[:3, :3] = camera_to_world.T
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows is not finite, and is refused as such
@@ -443,7 +445,7 @@ def viewmat_of(camera_to_world: np.ndarray, centre: np.ndarray) -> np.ndarray:
 
 @contextmanager
 def cameras_from(source: str) -> Iterator[None]:
-    """Name the file in what its cameras themselves find wrong, where the error does not name it."""
+    """Name the file in errors of its cameras that do not name it."""
     try:
         yield
     except InvalidCameras as error:
@@ -455,7 +457,7 @@ def cameras_from(source: str) -> Iterator[None]:
 
 @contextmanager
 def pose_from() -> Iterator[None]:
-    """Raise what is wrong with the numbers of a pose as an `InvalidPose`."""
+    """Raise errors of a pose's numbers as `InvalidPose`."""
     try:
         yield
     except InvalidCameras as error:
@@ -465,7 +467,7 @@ def pose_from() -> Iterator[None]:
 def read_views(
     views: Iterable[tuple[str, R]], cameras_of: Callable[[str, R], list[Camera]]
 ) -> tuple[list[Camera], list[str]]:
-    """The cameras of a file's views, and a warning that names those that were skipped for a broken pose.
+    """Return the cameras of a file's views, and a warning that names those that were skipped for a broken pose.
 
     Args:
         views: names and records. cameras_of: of a name and its record, its cameras.
@@ -485,9 +487,9 @@ def read_views(
     first = next(iter(broken.values()))
     if not cameras:
         raise first
-    some = ", ".join(map(repr, list(broken)[:SKIPPED])) + (", ..." if len(broken) > SKIPPED else "")
+    listing = ", ".join(map(repr, list(broken)[:MAX_LISTED])) + (", ..." if len(broken) > MAX_LISTED else "")
     count = f"{len(broken)} cameras were skipped for broken poses and {len(cameras)} read"
-    return cameras, [f"{count}: {some}, the first with {first.got} in place of {first.expected}"]
+    return cameras, [f"{count}: {listing}, the first with {first.got} in place of {first.expected}"]
 
 
 def check_count(count: int, source: str) -> None:
@@ -497,12 +499,12 @@ def check_count(count: int, source: str) -> None:
         InvalidCameras: there are more than MAX_VIEWS.
     """
     if count > MAX_VIEWS:
-        most = f"at most {MAX_VIEWS} views"
-        raise InvalidCameras(source, expected=most, got=f"{count} or more", hint=FEWER_VIEWS)
+        limit = f"at most {MAX_VIEWS} views"
+        raise InvalidCameras(source, expected=limit, got=f"{count} or more", hint=FEWER_VIEWS)
 
 
 def behind_lens(camera: Camera, distortion: Distortion) -> Camera:
-    """The camera of a distorted photo, from a camera with the photo's size and intrinsics.
+    """Return the camera of a distorted photo, from a camera with the photo's size and intrinsics.
 
     Raises:
         InvalidCameras: a pinhole would see hardly anything of the photo.
@@ -519,7 +521,7 @@ def behind_lens(camera: Camera, distortion: Distortion) -> Camera:
 
 
 def faces_of(name: str, width: int, height: int, viewmat: np.ndarray) -> list[Camera]:
-    """The six faces of a panorama: pinholes of 90 degrees, square.
+    """Return the six faces of a panorama: pinholes of 90 degrees, square.
 
     Args:
         name: of the panorama. width: pixels of its photo. height: likewise. viewmat: [4, 4] world to its camera.
@@ -528,32 +530,32 @@ def faces_of(name: str, width: int, height: int, viewmat: np.ndarray) -> list[Ca
         InvalidCameras: a size or the pose is out of range.
     """
     Camera.pinhole(name, width, height, 1.0, 1.0, 0.0, 0.0, viewmat)  # refuses under the panorama's own name
-    found = []
+    faces = []
     for turn in TURNS:
         face, pose = Face(name, width, height, turn), np.array(viewmat, dtype=np.float64)
         pose[:3] = face.rotation @ pose[:3]
         lens = (face.side, face.side, face.fx, face.fy, face.side / 2, face.side / 2)
-        found.append(Camera.pinhole(f"{name}@{turn}", *lens, viewmat=pose).replace(face=face))
-    return found
+        faces.append(Camera.pinhole(f"{name}@{turn}", *lens, viewmat=pose).replace(face=face))
+    return faces
 
 
 def photo_sizes(photos: Collection[str], cameras: Cameras) -> dict[str, tuple[int, int]]:
-    """Photo's name -> width and height in pixels, as the camera or the panorama says that it is paired with."""
+    """Return photo's name -> width and height in pixels, from its camera or panorama."""
     panoramas = {
         camera.face.photo: (camera.face.width, camera.face.height) for camera in cameras.values() if camera.face
     }
-    known = {name: camera.photo_size for name, camera in cameras.items()}
-    paired = cameras_of_views(photos, [*known, *(name for name in panoramas if name not in known)])
-    return {photo: known.get(name) or panoramas[name] for photo, name in paired.items()}
+    sizes = {name: camera.photo_size for name, camera in cameras.items()}
+    paired = cameras_of_views(photos, [*sizes, *(name for name in panoramas if name not in sizes)])
+    return {photo: sizes.get(name) or panoramas[name] for photo, name in paired.items()}
 
 
 def drawn_by(camera: Camera) -> Camera:
-    """The pinhole that draws pictures of a camera: its own, or one that sees all that its lens's photo shows."""
+    """Return the pinhole that renders images of a camera: itself, or one that covers its distorted photo."""
     return camera if camera.lens is None else _pinhole(camera, camera.lens, camera.lens.outer)
 
 
 def pixel_of(camera: Camera, x: int, y: int) -> tuple[int, int] | None:
-    """The pixel of ``drawn_by`` that shows what the photo's pixel does; None where it shows none of it."""
+    """Return the pixel of ``drawn_by`` that shows what the photo's pixel does; None where it shows none of it."""
     if camera.lens is None:
         return x, y
     pinhole, lens = drawn_by(camera), camera.lens
@@ -564,21 +566,25 @@ def pixel_of(camera: Camera, x: int, y: int) -> tuple[int, int] | None:
 
 
 def distortion_warning(views: Sequence[Camera]) -> list[str]:
-    """What is to be said of distorted views, if there are some."""
+    """Return warnings of distorted views and faces of panoramas, if there are any."""
     faces = sum(camera.face is not None for camera in views)
-    told = [f"{faces} of {len(views)} views are faces of panoramas, and read the features of those"] if faces else []
+    warnings = (
+        [f"{faces} of {len(views)} views are faces of panoramas, and read the features of those"] if faces else []
+    )
     shares = [camera.lens.share for camera in views if camera.lens is not None]
     if not shares:
-        return told
+        return warnings
     least = min(shares)
     lifted = "nearly all" if least > NEARLY_ALL else f"{least:.0%} or more"
     return [
-        *told,
+        *warnings,
         f"{len(shares)} of {len(views)} views are of distorted photos, of each of which {lifted} is "
         "lifted: features must be of the photos as they were taken, not of undistorted ones",
     ]
 
 
-def _pinhole(camera: Camera, lens: Lens, seen: Rectangle) -> Camera:
-    width, height = seen.right - seen.left, seen.bottom - seen.top
-    return camera.replace(width=width, height=height, cx=lens.cx - seen.left, cy=lens.cy - seen.top, lens=lens)
+def _pinhole(camera: Camera, lens: Lens, rectangle: Rectangle) -> Camera:
+    width, height = rectangle.right - rectangle.left, rectangle.bottom - rectangle.top
+    return camera.replace(
+        width=width, height=height, cx=lens.cx - rectangle.left, cy=lens.cy - rectangle.top, lens=lens
+    )

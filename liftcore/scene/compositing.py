@@ -1,4 +1,4 @@
-"""How splats meet rays: the field's constants, and what a lift or a render may choose of them.
+"""Parameters of compositing along rays: the field's constants, and the choices of a lift or a render.
 
 Nothing here loads torch: settings share these values with processes that never compute.
 """
@@ -30,7 +30,7 @@ MOST_OF_A_RAY = 64  # the largest k of top-k
 
 @dataclass(frozen=True)
 class CompositingParams:
-    """How splats are composited along a ray, front to back.
+    """Parameters of compositing along a ray, front to back.
 
     ``antialiased``: alpha at a splat's centre is ``sigmoid(scale theta) sqrt(det(cov) / det(cov + low-pass))``: the
     low-pass makes a small splat larger on the screen, and the compensation takes as much of its opacity. The scale
@@ -46,7 +46,7 @@ class CompositingParams:
     offset: tuple[int, int] = (0, 0)  # the first such pixel (x, y), each below the stride
 
     def __post_init__(self) -> None:
-        """Refuse numbers that mean nothing on a ray.
+        """Refuse invalid numbers.
 
         Raises:
             InvalidSettings: one is out of its range; the error names it.
@@ -61,12 +61,12 @@ class CompositingParams:
                 raise InvalidSettings(name, expected=expected, got=repr(value)[:80])
 
     def __repr__(self) -> str:
-        others = [field for field in fields(self) if getattr(self, field.name) != field.default]
-        return one_line(self, *(f"{field.name}={getattr(self, field.name)!r}" for field in others))
+        changed_fields = [field for field in fields(self) if getattr(self, field.name) != field.default]
+        return one_line(self, *(f"{field.name}={getattr(self, field.name)!r}" for field in changed_fields))
 
 
 class Selection(StrEnum):
-    """Which of a ray's weights count."""
+    """The selection of a ray's weights."""
 
     ALL = "all"
     TOP_K = "top-k"  # the k largest of the ray, equal ones near to far (argmax lifting: k = 1; Dr. Splat)
@@ -76,7 +76,7 @@ class Selection(StrEnum):
 
 @dataclass(frozen=True)
 class Weighting:
-    """What counts as the weight of a splat on a ray: some of ``w = alpha T``, to a power."""
+    """The definition of a splat's weight on a ray: some of ``w = alpha T``, to a power."""
 
     power: int = 1  # 0, 1 or 2 of what was selected; 0: each kept weight counts one
     selection: Selection = Selection.ALL
@@ -117,5 +117,5 @@ def check_weighting(weighting: Weighting) -> None:
 
 
 def every_pixel(params: CompositingParams) -> CompositingParams:
-    """The same without a stride: images are whole."""
+    """Return the parameters without a stride, as renderings have all pixels."""
     return replace(params, stride=1, offset=(0, 0))

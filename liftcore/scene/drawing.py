@@ -1,4 +1,4 @@
-"""A picture in the pixels of a photo, whose lens bends what a pinhole draws."""
+"""Rendering of a pinhole resampled to the pixels of a distorted photo."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ BAND_PIXELS = 1 << 20  # of a distorted photo, carried at a time
 
 
 def in_photo(camera: Camera, draw: Callable[[Camera], Tensor]) -> Tensor:
-    """A picture in the pixels of a camera's photo: what a pinhole drew, seen through the lens.
+    """Resample the rendering of a pinhole to the pixels of a camera's photo, through its lens.
 
     Args:
         camera: of the photo. draw: makes a picture [H, W, ..] of a pinhole.
@@ -36,18 +36,18 @@ def in_photo(camera: Camera, draw: Callable[[Camera], Tensor]) -> Tensor:
 
 
 def _read(image: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """[h, w, ..], an image at places [h, w] in its pixels; zero where these lie outside."""
+    """Return [h, w, ..], an image at places [h, w] in its pixels; zero where these lie outside."""
     height, width = image.shape[:2]
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     u, v = torch.where(inside, u, 0.0), torch.where(inside, v, 0.0)
     shape = (*inside.shape, *(1 for _ in image.shape[2:]))
     if not image.is_floating_point():
         return image[v.long(), u.long()] * inside.reshape(shape)
-    found = torch.zeros((*inside.shape, *image.shape[2:]), dtype=image.dtype)
+    output = torch.zeros((*inside.shape, *image.shape[2:]), dtype=image.dtype)
     left, top = (u - 0.5).floor(), (v - 0.5).floor()
     for row in (top, top + 1):
         for column in (left, left + 1):
             share = (1 - (u - 0.5 - column).abs()) * (1 - (v - 0.5 - row).abs()) * inside
-            taken = image[row.clamp(0, height - 1).long(), column.clamp(0, width - 1).long()]
-            found += taken * share.to(image.dtype).reshape(shape)
-    return found
+            nearest = image[row.clamp(0, height - 1).long(), column.clamp(0, width - 1).long()]
+            output += nearest * share.to(image.dtype).reshape(shape)
+    return output

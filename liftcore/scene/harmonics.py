@@ -1,4 +1,4 @@
-"""Colours as spherical harmonics keep them; a renderer adds .5 to their sum."""
+"""Colours as spherical harmonics; a renderer adds .5 to their sum."""
 
 import math
 
@@ -8,12 +8,12 @@ SH_C0 = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant spherical harmonic
 
 
 def constant_terms(colours: np.ndarray) -> np.ndarray:
-    """The constant terms [..., 3] f64 of the harmonics that show colours [..., 3] in 0..1, alike from everywhere."""
+    """Return the constant terms [..., 3] f64 of view-independent colours [..., 3] in 0..1."""
     return (np.asarray(colours, np.float64) - 0.5) / SH_C0
 
 
 def band_values(band: int, directions: np.ndarray) -> np.ndarray:
-    """[n, 2 band + 1] f64, real spherical harmonics of unit vectors [n, 3], ordered and signed as 3DGS does.
+    """Return [n, 2 band + 1] f64, real spherical harmonics of unit vectors [n, 3], ordered and signed as 3DGS does.
 
     Column ``band + m`` is ``(-1)^m N d^|m|P_band/dz^|m|`` times the real (m >= 0) or imaginary part of
     ``(x + i y)^|m|``, N such that the square integrates to one.
@@ -31,8 +31,8 @@ def band_values(band: int, directions: np.ndarray) -> np.ndarray:
 
 
 def band_rotation(band: int, rotation: np.ndarray) -> np.ndarray:
-    """[2 band + 1, 2 band + 1] f64, what turns coefficients of a band as ``rotation`` [3, 3] turns the scene."""
+    """Return [2 band + 1, 2 band + 1] f64, which rotates coefficients of a band by ``rotation`` [3, 3]."""
     directions = np.random.default_rng(band).normal(size=(8 * (2 * band + 1), 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    turned = band_values(band, directions @ rotation)  # rows are R^T d
-    return np.linalg.lstsq(band_values(band, directions), turned, rcond=None)[0]
+    rotated = band_values(band, directions @ rotation)  # rows are R^T d
+    return np.linalg.lstsq(band_values(band, directions), rotated, rcond=None)[0]

@@ -1,4 +1,4 @@
-"""What a splat may be: the names of the kernels and the numbers of a lobe, for those who load no torch, too."""
+"""Kernels of splats: their names, and the numbers of a lobe; without torch."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ DARK_LOBE = -10.0  # r g b of a lobe that adds nothing: its softplus of sharpnes
 
 
 class Kernel(StrEnum):
-    """The footprint that a splat leaves on a ray."""
+    """The kernel of a splat along a ray."""
 
     GAUSSIAN_3D = "3dgs"
     GAUSSIAN_2D = "2dgs"
@@ -20,7 +20,7 @@ class Kernel(StrEnum):
 
 
 def kernel_named(name: Kernel | str) -> Kernel:
-    """The kernel of a name.
+    """Return the kernel of a name.
 
     Raises:
         InvalidSplats: there is none of that name.
@@ -32,5 +32,5 @@ def kernel_named(name: Kernel | str) -> Kernel:
 
 
 def scale_count(kernel: Kernel) -> int:
-    """Two for the flat splats of 2DGS, three for the others."""
+    """Return the number of a splat's scales: two for the flat ones of 2DGS, three for others."""
     return 2 if kernel is Kernel.GAUSSIAN_2D else 3

@@ -1,4 +1,4 @@
-"""The nearest splats of each splat, and how alike they are in place and colour: the graph of a scene."""
+"""The nearest splats of each splat, and their affinity in position and colour: the graph of a scene."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ COLOUR_WIDTH = 0.1  # standard deviation of colours in 0..1, over all three chan
 LEAST_AFFINITY = 1e-6  # of pairs in the graph: weaker ones move nothing
 PATCH = 1 << 12  # splats that lie together
 _PIECE = 1 << 12  # points whose neighbours are worked on at once: what is made of them stays in the cache
-_APART = 1e-12  # of the farthest coordinate
+_JITTER = 1e-12  # of the farthest coordinate
 
 T = TypeVar("T")
 
@@ -34,7 +34,7 @@ def map_nearest(
         means: [n, 3] f64, n at least one.
         work: takes ``own`` [m] i32, the numbers of points that lie near one another, and ``near`` [m, k] i32 with
             ``k = min(NEIGHBOURS + 1, n)``, the nearest first: each point is among its own.
-        threads: None takes the cores that this process may use. The number changes no bit.
+        threads: None uses the cores of this process. The result is bitwise identical for any number.
 
     Returns:
         What ``work`` returned, in an order that depends on the points alone.
@@ -44,24 +44,24 @@ def map_nearest(
     places = set_apart(means)
     tree = KDTree(places)
     # Leaf by leaf: points that are worked on one after the other have the same neighbours.
-    order, most = tree.indices.astype(np.int32), min(NEIGHBOURS + 1, len(means))
+    order, neighbour_count = tree.indices.astype(np.int32), min(NEIGHBOURS + 1, len(means))
 
     def work_piece(first: int) -> T:
-        own = order[first : first + _PIECE]
-        near = np.asarray(tree.query(places[own], most)[1], np.int32).reshape(len(own), most)
-        return work(own, near)
+        rows = order[first : first + _PIECE]
+        near = np.asarray(tree.query(places[rows], neighbour_count)[1], np.int32).reshape(len(rows), neighbour_count)
+        return work(rows, near)
 
     with ThreadPoolExecutor(threads or cores()) as pool:
         return list(pool.map(work_piece, range(0, len(means), _PIECE)))
 
 
 def set_apart(points: np.ndarray) -> np.ndarray:
-    """Points [n, d] f64, moved by less than float32 can tell.
+    """Return points [n, d] f64, shifted by less than float32 resolves.
 
     Those at one place would make a leaf of a tree that no search can divide.
     """
     extent = float(np.abs(points).max()) or 1.0
-    return points + _APART * extent * np.random.default_rng(0).random(points.shape)
+    return points + _JITTER * extent * np.random.default_rng(0).random(points.shape)
 
 
 @dataclass(frozen=True)
@@ -87,21 +87,21 @@ class SplatGraph:
         """Find the neighbours of all splats.
 
         Args:
-            threads: None takes the cores that this process may use. The number changes no bit.
+            threads: None uses the cores of this process. The result is bitwise identical for any number.
         """
         from scipy.sparse import csr_array
 
         means, colours = splats.means.cpu().numpy().astype(np.float64), base_colours(splats)
 
-        def weigh(own: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        def weigh(rows: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             near = near[:, 1:]  # the first is itself
-            distances = np.linalg.norm(means[near] - means[own][:, None], axis=2)
+            distances = np.linalg.norm(means[near] - means[rows][:, None], axis=2)
             exponents = (distances / _scales(distances)[:, None]) ** 2
             if colours is not None:
-                exponents += (((colours[near] - colours[own][:, None]) / COLOUR_WIDTH) ** 2).sum(axis=2)
+                exponents += (((colours[near] - colours[rows][:, None]) / COLOUR_WIDTH) ** 2).sum(axis=2)
             affinities = np.exp(-0.5 * exponents).astype(np.float32)
             affinities[affinities < LEAST_AFFINITY] = 0.0
-            return own, near, affinities
+            return rows, near, affinities
 
         parts = map_nearest(means, weigh, threads)
         order, near, affinities = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -121,17 +121,17 @@ class SplatGraph:
         indices = graph.indices.astype(np.int32, copy=False)
         return cls(order, graph.indptr.astype(np.int64), indices, graph.data, colours is not None)
 
-    def patches(self, most: int) -> Self:
-        """The graph of at most that many splats, in evenly spaced patches of PATCH; of all where they are no more."""
+    def patches(self, limit: int) -> Self:
+        """Return the graph of at most ``limit`` splats, in evenly spaced patches of PATCH splats."""
         from scipy.sparse import csr_array
 
         count = len(self.order)
-        if count <= most:
+        if count <= limit:
             return self
-        firsts = np.linspace(0, count - PATCH, max(most // PATCH, 1)).astype(np.int64)
+        firsts = np.linspace(0, count - PATCH, max(limit // PATCH, 1)).astype(np.int64)
         rows = np.unique((firsts[:, None] + np.arange(PATCH)).ravel())
-        whole = csr_array((self.affinities, self.neighbours, self.starts), shape=(count, count))
-        part = csr_array(whole[rows][:, rows])
+        graph = csr_array((self.affinities, self.neighbours, self.starts), shape=(count, count))
+        part = csr_array(graph[rows][:, rows])
         part.sort_indices()
         indices = part.indices.astype(np.int32, copy=False)
         return replace(
@@ -144,14 +144,14 @@ class SplatGraph:
 
 
 def base_colours(splats: Splats) -> np.ndarray | None:
-    """[P, 3] f32 in 0..1, the colours of degree 0; None where the splats have none."""
+    """Return [P, 3] f32 in 0..1, the colours of degree 0; None where the splats have none."""
     if splats.sh is None:
         return None
     return (0.5 + SH_C0 * splats.sh[:, 0].float()).clamp(0.0, 1.0).cpu().numpy()
 
 
 def _scales(distances: np.ndarray) -> np.ndarray:
-    """[m] f64 above zero: the median of the distances [m, k], else the largest, where points share a place."""
+    """Return [m] f64 above zero: the median of the distances [m, k], else the largest, where points share a place."""
     if not distances.shape[1]:
         return np.ones(len(distances))
     medians, largest = np.median(distances, axis=1), distances.max(axis=1)

@@ -20,7 +20,7 @@ Origin = tuple[float, float, float]  # f64, frame of the file, scene units
 FILE_ORIGIN: Origin = (0.0, 0.0, 0.0)  # of scenes whose means are as their file has them
 SAMPLE = 4096  # splats that decide, evenly spaced
 MIDDLE = (0.1, 0.5, 0.9)  # quantiles of their positions: floaters decide nothing
-APART = 16.0  # extents of the scene between it and the file's origin: nearer, float32 loses too few bits
+MIN_DISTANCE = 16.0  # extents of the scene between it and the file's origin: nearer, float32 loses too few bits
 COARSE = 1 / 64  # of a splat's size, which float32's step there may be
 LARGEST_SCALE = 80.0  # log: its exponential is a float32
 MAP_REACH = 1e4  # scene units from the origin: so far, positions need more digits than elsewhere
@@ -28,7 +28,7 @@ FARTHEST = 1e12  # scene units, as far as cameras may be
 
 
 def local_origin(means: np.ndarray | Tensor, log_scales: np.ndarray | Tensor) -> Origin:
-    """An origin near splats where float32 would round their positions coarsely; zeros for all others.
+    """Return an origin near splats where float32 would round their positions coarsely; zeros for all others.
 
     It needs both that the scene lies many of its own extents away and that float32's step there is coarse for the
     splats, so it does not depend on the unit, and a scene about its own origin keeps every bit. It is a multiple of
@@ -39,7 +39,7 @@ def local_origin(means: np.ndarray | Tensor, log_scales: np.ndarray | Tensor) ->
     """
     middle, extent = _middle_and_extent(means)
     reach, size = float(np.abs(middle).max()), usual_size(log_scales)
-    if not APART * extent < reach <= FARTHEST or float32_step(reach) <= COARSE * size:
+    if not MIN_DISTANCE * extent < reach <= FARTHEST or float32_step(reach) <= COARSE * size:
         return FILE_ORIGIN
     unit = 2.0 ** np.ceil(np.log2(max(extent, min(size, reach), float32_step(reach))))
     x, y, z = (np.round(middle / unit) * unit + 0.0).tolist()  # no minus zero
@@ -47,30 +47,30 @@ def local_origin(means: np.ndarray | Tensor, log_scales: np.ndarray | Tensor) ->
 
 
 def float32_step(reach: float) -> float:
-    """What float32 tells apart at a distance from its origin."""
+    """Return the resolution of float32 at a distance from its origin."""
     return float(np.spacing(np.float32(reach)))
 
 
 def lies_apart(means: np.ndarray) -> bool:
-    """Whether splats lie far enough from the origin of their file for one of their own, by their means alone."""
+    """Return True if splats are far enough from their file's origin to need one of their own, by means alone."""
     middle, extent = _middle_and_extent(means)
-    return float(np.abs(middle).max()) > APART * extent
+    return float(np.abs(middle).max()) > MIN_DISTANCE * extent
 
 
 def extent_of_most(means: np.ndarray | Tensor) -> float:
-    """The largest side of the box about the middle four fifths of the finite means [P, 3], scene units; 0 of none."""
+    """Return the largest side of the box about the middle 80% of the finite means [P, 3], scene units; 0 of none."""
     return _middle_and_extent(means)[1]
 
 
 def usual_size(log_scales: np.ndarray | Tensor) -> float:
-    """The median of the splats' larger scales, scene units; 0 where none is finite."""
+    """Return the median of the splats' larger scales, scene units; 0 where none is finite."""
     sizes = _sample(log_scales).max(axis=1)
     sizes = sizes[np.isfinite(sizes)]
     return float(np.exp(np.median(sizes).clip(max=LARGEST_SCALE))) if len(sizes) else 0.0
 
 
 def _middle_and_extent(means: np.ndarray | Tensor) -> tuple[np.ndarray, float]:
-    """The middle [3] of the finite means, and the largest side of the box about most of them; zeros of none."""
+    """Return the middle [3] of the finite means, and the largest side of the box about most; zeros of none."""
     places = _sample(means)
     places = places[np.isfinite(places).all(axis=1)]
     low, middle, high = np.quantile(places, MIDDLE, axis=0) if len(places) else np.zeros((3, 3))
@@ -78,6 +78,6 @@ def _middle_and_extent(means: np.ndarray | Tensor) -> tuple[np.ndarray, float]:
 
 
 def _sample(values: np.ndarray | Tensor) -> np.ndarray:
-    """SAMPLE rows at most, evenly spaced, as f64."""
-    some = values[:: -(-len(values) // SAMPLE)]
-    return (some if isinstance(some, np.ndarray) else some.detach().cpu().numpy()).astype(np.float64)
+    """Return at most SAMPLE rows, evenly spaced, as f64."""
+    sample = values[:: -(-len(values) // SAMPLE)]
+    return (sample if isinstance(sample, np.ndarray) else sample.detach().cpu().numpy()).astype(np.float64)

@@ -27,7 +27,7 @@ TURNS = {
 
 @dataclass(frozen=True)
 class Face:
-    """A face of the cube around a panorama's camera, by what it shows of the photo."""
+    """A face of the cube around a panorama's camera."""
 
     photo: str  # the name of the panorama, as its features have it
     width: int  # pixels of the panorama
@@ -52,13 +52,13 @@ class Face:
         return np.array(TURNS[self.turn], dtype=np.float64)
 
     def on_photo(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where on the panorama, in pixels, rays lie that pass (x, y) on the plane one unit before the face."""
+        """Project rays through (x, y), on the plane one unit before the face, to pixels of the panorama."""
         u, v, w = np.einsum("ij,i...->j...", self.rotation, np.stack([x, y, np.ones_like(x)]))
         across, down = np.arctan2(u, w) / (2 * np.pi) + 0.5, np.arctan2(v, np.hypot(u, w)) / np.pi + 0.5
         return across * self.width, down * self.height
 
 
 def with_panoramas(cameras: Collection[str]) -> set[str]:
-    """The names of cameras, and those of the panoramas that some of them are faces of."""
+    """Return the names of cameras, and those of the panoramas that some of them are faces of."""
     parts = (name.rpartition("@") for name in cameras)
     return {*cameras, *(photo for photo, _, turn in parts if photo and turn in TURNS)}

@@ -1,4 +1,4 @@
-"""How a scene was moved: the similarity between two sets of its splats, found without a hint.
+"""Registration: the similarity between two sets of a scene's splats, without an initial guess.
 
 Editors turn, scale and shift a scene, and reorder or drop its rows. Colour, opacity and shape of a splat stay through
 all of it, so splats are matched by these, and the similarity that most matches agree on is kept (RANSAC), then fitted
@@ -24,13 +24,13 @@ TRIALS = 4_000  # triples of matches
 NEAR = 0.01  # of the scene's extent: matches that lie so near after the move agree with it
 LEAST_AGREEING = 30  # matches, fewer of which are an accident
 CLEAR = 0.7  # of the second nearest's distance, that a match's is at most
-SAME = 1e-9  # distance of splats that look alike
+MIN_SEPARATION = 1e-9  # distance of splats that look alike
 ROUNDS = 5  # of fitting to the matches that agree
 _WIDTHS = (0.02, 0.02, 0.02, 0.05, 0.1, 0.1)  # of colours, opacity, and ratios of scales as logs
 
 
 def find_similarity(old: Splats, new: Splats) -> Similarity:
-    """The similarity that takes the splats of a scene to where those of an edited copy lie.
+    """Return the similarity that takes the splats of a scene to where those of an edited copy lie.
 
     Args:
         old, new: of one scene, in any order and number.
@@ -43,7 +43,7 @@ def find_similarity(old: Splats, new: Splats) -> Similarity:
     generator = np.random.default_rng(0)
     rows = np.sort(generator.permutation(new.count)[:SAMPLES])
     distances, nearest = KDTree(set_apart(_descriptors(old))).query(_descriptors(new)[rows], 2)
-    clear = (distances[:, 0] < CLEAR * distances[:, 1]) | (distances[:, 0] < SAME)
+    clear = (distances[:, 0] < CLEAR * distances[:, 1]) | (distances[:, 0] < MIN_SEPARATION)
     targets = new.positions(rows[clear]).astype(np.float64)
     sources = old.positions(np.asarray(nearest)[clear, 0]).astype(np.float64)
     best, agreeing = None, np.zeros(len(sources), bool)
@@ -70,7 +70,7 @@ def find_similarity(old: Splats, new: Splats) -> Similarity:
 
 
 def fit_similarity(sources: np.ndarray, targets: np.ndarray) -> Similarity | None:
-    """The similarity from points [n, 3] f64 to others by least squares; None where points coincide."""
+    """Return the similarity from points [n, 3] f64 to others by least squares; None where points coincide."""
     middle, aim = sources.mean(axis=0), targets.mean(axis=0)
     spread = ((sources - middle) ** 2).sum()
     if not spread > 0:
@@ -84,7 +84,7 @@ def fit_similarity(sources: np.ndarray, targets: np.ndarray) -> Similarity | Non
 
 
 def _descriptors(splats: Splats) -> np.ndarray:
-    """[P, 6] f64, what no similarity changes of a splat: colour, opacity, ratios of its scales."""
+    """Return [P, 6] f64, what no similarity changes of a splat: colour, opacity, ratios of its scales."""
     colours = base_colours(splats)
     colours = np.zeros((splats.count, 3)) if colours is None else colours
     scales = np.sort(splats.log_scales.cpu().numpy().astype(np.float64).clip(-30, 30), axis=1)

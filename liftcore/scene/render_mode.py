@@ -1,4 +1,4 @@
-"""How splats were trained, as their files say it, and so how they are to be rendered.
+"""Render mode of splats: how they were trained, from their files, and so how to render them.
 
 Trainers and editors say it in four places: comments of a PLY (``SplatRenderMode: default | mip | 2dgs`` of Brush,
 gsplat, nerfstudio and splat-transform, ``antialiased 0 | 1`` of Postshot), a flag of an SPZ, ``model`` in the
@@ -21,7 +21,7 @@ BY_HAND = "set by hand"  # of `rendering_reason`: the setting was not auto
 
 
 class RenderModel(StrEnum):
-    """What a renderer has to do with splats."""
+    """The mode in which a renderer must draw splats."""
 
     CLASSIC = "classic"  # Gaussians with the low-pass alone
     ANTIALIASED = "antialiased"  # and their opacity lowered as the low-pass widens them (the mip filter)
@@ -30,7 +30,7 @@ class RenderModel(StrEnum):
 
 @dataclass(frozen=True)
 class RenderMode:
-    """A model, and what says so."""
+    """A render mode, and its source."""
 
     model: RenderModel
     source: str  # what says so, in words that go before "says"; "" of values in memory
@@ -48,14 +48,14 @@ _COMMENT = re.compile(
 )
 CONFIGS = ("cfg.yml", "config.yml")  # of gsplat's simple_trainer and of nerfstudio, beside or above what they train
 MAX_CONFIG_BYTES = 1 << 18
-_SHOWN = 60  # characters of a file's words
+_MAX_TEXT = 60  # characters of a file's words
 _OF_GSPLAT = re.compile(r"^antialiased: *(true|false) *$", re.M)
 _GSPLAT_DISCS = re.compile(r"^model_type: *2dgs *$", re.M)
 _OF_NERFSTUDIO = re.compile(r"^ +rasterize_mode: *(classic|antialiased) *$", re.M)
 
 
 def render_mode_of(mode: RenderMode | str | None) -> RenderMode | None:
-    """The mode of a name: ``classic``, ``antialiased`` or ``2dgs``; None stays None.
+    """Return the mode of a name: ``classic``, ``antialiased`` or ``2dgs``; None stays None.
 
     Raises:
         InvalidSplats: there is none of that name.
@@ -63,52 +63,52 @@ def render_mode_of(mode: RenderMode | str | None) -> RenderMode | None:
     if mode is None or isinstance(mode, RenderMode):
         return mode
     if not isinstance(mode, str) or mode not in set(RenderModel):
-        raise InvalidSplats("render_mode", expected=" or ".join(RenderModel), got=repr(mode)[:_SHOWN])
+        raise InvalidSplats("render_mode", expected=" or ".join(RenderModel), got=repr(mode)[:_MAX_TEXT])
     return RenderMode(RenderModel(mode), "")
 
 
 def kernel_of_mode(mode: RenderMode | None) -> Kernel:
-    """The kernel of splats whose numbers may be of several."""
+    """Return the kernel of splats whose numbers may be of several."""
     return Kernel.GAUSSIAN_2D if mode is not None and mode.model is RenderModel.DISCS else Kernel.GAUSSIAN_3D
 
 
 def mode_of_word(word: object, source: str) -> tuple[RenderMode | None, tuple[str, ...]]:
-    """The mode that a word of a file names, and a warning where it names none.
+    """Return the mode that a word of a file names, and a warning where it names none.
 
     Args:
         source: where the word stands, such as ``'model' in meta.json``.
     """
     model = _BY_NAME.get(word.strip().lower()) if isinstance(word, str) else None
     if model is None:
-        return None, (f"{source} names a way to render that is not known: taken for classic",)
+        return None, (f"{source} names a render mode that is not known: taken for classic",)
     return RenderMode(model, source), ()
 
 
 def mode_of_comments(lines: Iterable[str]) -> tuple[RenderMode | None, tuple[str, ...]]:
-    """What the header lines of a PLY say, the last of them if several do, and warnings of what contradicts itself."""
+    """Return the mode in the header lines of a PLY, the last of several, and warnings of contradictions."""
     modes: list[RenderMode] = []
     warnings: list[str] = []
     for line in lines:
         match = _COMMENT.fullmatch(line.strip())
         if match is None:
             continue
-        source = f"the comment {line.strip()[8:].strip()[:_SHOWN]!r}"
+        source = f"the comment {line.strip()[8:].strip()[:_MAX_TEXT]!r}"
         word = (
             match["mode"]
             if match["mode"] is not None
             else ("mip" if match["flag"].lower() in ("1", "true") else "default")
         )
-        mode, told = mode_of_word(word, source)
+        mode, mode_warnings = mode_of_word(word, source)
         modes += [mode] if mode else []
-        warnings += told
+        warnings += mode_warnings
     if len({mode.model for mode in modes}) > 1:
         first, last = modes[0], modes[-1]
-        warnings.append(f"{first.source} and {last.source} contradict each other: the last one is believed")
+        warnings.append(f"{first.source} and {last.source} contradict each other: the last one is used")
     return (modes[-1] if modes else None), tuple(warnings)
 
 
 def mode_beside(path: Path) -> RenderMode | None:
-    """What the configuration of gsplat or nerfstudio says, in the folder of a file that they trained or above it."""
+    """Return the mode of gsplat's or nerfstudio's configuration, in the folder of a trained file or its parent."""
     folder = path.resolve().parent
     for place in (folder, folder.parent):
         for name in CONFIGS:
@@ -130,7 +130,7 @@ def mode_beside(path: Path) -> RenderMode | None:
 
 
 def rendering_reason(mode: RenderMode | None, antialiased: bool) -> str:
-    """Why splats are rendered as they are, in words; ``antialiased`` is what the settings came to."""
+    """Describe the reason of a render mode; ``antialiased`` is the value in use."""
     if mode is None:
         return BY_HAND if antialiased else "nothing says otherwise"
     source = mode.source or "render_mode of the splats"
@@ -140,7 +140,7 @@ def rendering_reason(mode: RenderMode | None, antialiased: bool) -> str:
 
 
 def rendering_warnings(mode: RenderMode | None, antialiased: bool, kernel: Kernel) -> list[str]:
-    """A warning where 3D Gaussians are rendered otherwise than is said of their training."""
+    """Warn if 3D Gaussians are rendered in another mode than they were trained in."""
     if mode is None or kernel is not Kernel.GAUSSIAN_3D or mode.model is RenderModel.DISCS:
         return []
     if (mode.model is RenderModel.ANTIALIASED) is antialiased:

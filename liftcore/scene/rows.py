@@ -1,4 +1,4 @@
-"""Rows of a table over splats: those that a mask, a slice or numbers choose."""
+"""Rows of a table over splats, selected by a mask, a slice or numbers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Rows = Any  # a boolean mask [P], a slice, or whole numbers [n]; of numpy, torch
 
 
 def chosen_rows(keep: Rows, count: int) -> Tensor:
-    """The numbers [n] i64, on the CPU, of the rows that are kept, in the order in which they are named.
+    """Return the numbers [n] i64, on the CPU, of the selected rows, in the order of the selection.
 
     Args:
         keep: booleans [P], a slice, or whole numbers [n], of which negative ones count from the end. count: P.
@@ -31,14 +31,14 @@ def chosen_rows(keep: Rows, count: int) -> Tensor:
         except TypeError:
             raise InvalidInput("keep", expected=expected, got=repr(keep)[:80]) from None
     else:
-        given = _as_tensor(keep, expected)
-        if given.dtype == torch.bool:
-            if len(given) != count:
-                got, hint = f"a mask of {len(given)}", "a mask has an entry for each row"
+        selection = _as_tensor(keep, expected)
+        if selection.dtype == torch.bool:
+            if len(selection) != count:
+                got, hint = f"a mask of {len(selection)}", "a mask has an entry for each row"
                 raise InvalidInput("keep", expected=expected, got=got, hint=hint)
-            rows = torch.nonzero(given)[:, 0]
+            rows = torch.nonzero(selection)[:, 0]
         else:
-            rows = given.to(torch.int64)
+            rows = selection.to(torch.int64)
             wrong = rows[(rows < -count) | (rows >= count)]
             if len(wrong):
                 raise InvalidInput("keep", expected=expected, got=f"row {int(wrong[0])} of {count}")
@@ -50,25 +50,25 @@ def chosen_rows(keep: Rows, count: int) -> Tensor:
 
 def _as_tensor(keep: Any, expected: str) -> Tensor:
     if isinstance(keep, torch.Tensor):
-        given = keep.detach().cpu()
+        selection = keep.detach().cpu()
     else:
         try:
-            given = torch.from_numpy(np.array(keep))
+            selection = torch.from_numpy(np.array(keep))
         except (TypeError, ValueError):
             got = f"{type(keep).__name__} {keep!r}"[:80]
             raise InvalidInput("keep", expected=expected, got=got) from None
-    if given.ndim == 2 and given.shape[1] == 1:
-        given = given[:, 0]
-    if given.shape == (0,) and given.dtype != torch.bool:  # an empty list, which has no type
-        return given.to(torch.int64)
-    if given.ndim != 1 or given.is_floating_point() or given.is_complex():
-        kind = str(given.dtype).removeprefix("torch.")
-        got = f"{kind} {list(given.shape)}" if given.ndim else f"{keep!r}"[:80]
-        hint = "a single row is keep=[row]" if not given.ndim else ""
+    if selection.ndim == 2 and selection.shape[1] == 1:
+        selection = selection[:, 0]
+    if selection.shape == (0,) and selection.dtype != torch.bool:  # an empty list, which has no type
+        return selection.to(torch.int64)
+    if selection.ndim != 1 or selection.is_floating_point() or selection.is_complex():
+        kind = str(selection.dtype).removeprefix("torch.")
+        got = f"{kind} {list(selection.shape)}" if selection.ndim else f"{keep!r}"[:80]
+        hint = "a single row is keep=[row]" if not selection.ndim else ""
         raise InvalidInput("keep", expected=expected, got=got, hint=hint)
-    return given
+    return selection
 
 
 def _forward(keep: slice, count: int) -> Tensor:
-    """The rows of a slice, whose step may be negative, which torch does not take."""
+    """Return the rows of a slice, whose step may be negative, which torch does not take."""
     return torch.tensor(range(*keep.indices(count)), dtype=torch.int64)

@@ -1,4 +1,4 @@
-"""Similarities: how a scene is scaled, turned and shifted to another frame."""
+"""Similarities: scale, rotation and translation of a scene to another frame."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Similarity:
         rotation: Numbers | None = None,
         translation: Numbers | None = None,
     ) -> Similarity:
-        """A similarity of its matrix, or of its parts.
+        """Return a similarity of its matrix, or of its parts.
 
         Args:
             matrix: [4, 4] or [3, 4], (s R | t). None: of the parts.
@@ -48,8 +48,8 @@ class Similarity:
             InvalidInput: it is none, such as a reflection, a shear or a scale for each axis; or both forms are given.
         """
         if matrix is not None:
-            plain = isinstance(scale, float | int) and scale == 1.0
-            if not plain or rotation is not None or translation is not None:
+            is_default = isinstance(scale, float | int) and scale == 1.0
+            if not is_default or rotation is not None or translation is not None:
                 got = "matrix beside scale, rotation or translation"
                 raise InvalidInput("matrix", expected="a matrix, or the parts of one", got=got)
             return cls._of_matrix(_numbers("matrix", matrix, ((4, 4), (3, 4))))
@@ -92,25 +92,25 @@ def _numbers(name: str, values: Any, shapes: tuple[tuple[int, ...], ...]) -> np.
         values = values.detach().cpu().numpy()
     expected = f"finite numbers {' or '.join(str(list(shape)) for shape in shapes)}"
     try:
-        found = np.array(values, dtype=np.float64)
+        array = np.array(values, dtype=np.float64)
     except (TypeError, ValueError):
         raise InvalidInput(name, expected=expected, got=repr(values)[:80]) from None
-    if found.shape not in shapes or not np.isfinite(found).all() or np.abs(found).max() > LARGEST:
+    if array.shape not in shapes or not np.isfinite(array).all() or np.abs(array).max() > LARGEST:
         got = (
-            f"shape {list(found.shape)}"
-            if found.shape not in shapes
+            f"shape {list(array.shape)}"
+            if array.shape not in shapes
             else f"numbers that are none or beyond {LARGEST:g}"
         )
         raise InvalidInput(name, expected=expected, got=got)
-    return found
+    return array
 
 
 def _proper(name: str, rotation: np.ndarray) -> np.ndarray:
-    """The nearest rotation to a matrix that is one but for rounding."""
+    """Return the nearest rotation to a matrix that is one but for rounding."""
     off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if off > NEAR or np.linalg.det(rotation) < 0:
-        what = "a reflection" if off <= NEAR else f"a matrix off by {off:.2g}"
+        description = "a reflection" if off <= NEAR else f"a matrix off by {off:.2g}"
         hint = "" if off <= NEAR else "a scale for each axis, or a shear, would make no Gaussians of Gaussians"
-        raise InvalidInput(name, expected="a proper rotation", got=what, hint=hint)
+        raise InvalidInput(name, expected="a proper rotation", got=description, hint=hint)
     left, _, right = np.linalg.svd(rotation)
     return left @ right

@@ -40,7 +40,7 @@ SH_ROWS = (1, 4, 9, 16, 25)  # (degree + 1)^2
 _BEYOND = {"opacity_logits": (True, True), "log_scales": (True, False)}  # whether -inf and +inf have a meaning
 ROUNDED = 0.25  # of a splat's size: a coarser float32 has moved splats visibly
 WIDEST = 4.0  # spacings of splats that lie spread over a square as wide as their scene
-MANY = 100  # splats: what all of so many have in common is no accident
+MIN_SAMPLE = 100  # splats: what all of so many have in common is no accident
 _GEOMETRY = ("means", "quats", "log_scales", "opacity_logits", "beta")  # what rays meet; all else is colour
 
 
@@ -138,16 +138,16 @@ class Splats:
             for name, (values, shape) in shapes.items()
             if values is not None
         }
-        origin, rounding = _moved_to_origin(columns, means, origin)
-        columns, repairs = _repaired(columns)
+        origin, rounding = _move_to_origin(columns, means, origin)
+        columns, repairs = _repair_columns(columns)
         for name in shapes:
             object.__setattr__(self, name, columns.get(name))
-        others = {name: _extra(name, values, count) for name, values in (extras or {}).items()}
-        fixed = {"kernel": kernel, "extras": others, "layout": tuple(layout), "header": tuple(header)}
+        extra_columns = {name: _extra(name, values, count) for name, values in (extras or {}).items()}
+        fixed = {"kernel": kernel, "extras": extra_columns, "layout": tuple(layout), "header": tuple(header)}
         mode = render_mode_of(render_mode)
-        doubts = [*_doubts(mode, kernel), *_activation_warnings(columns)]
-        told = tuple(dict.fromkeys((*warnings, *repairs, *doubts, *rounding)))
-        fixed |= {"render_mode": mode, "origin": origin, "world": world, "warnings": told}
+        doubts = [*_kernel_warnings(mode, kernel), *_activation_warnings(columns)]
+        all_warnings = tuple(dict.fromkeys((*warnings, *repairs, *doubts, *rounding)))
+        fixed |= {"render_mode": mode, "origin": origin, "world": world, "warnings": all_warnings}
         for name, value in fixed.items():
             object.__setattr__(self, name, value)
         if self.sh is not None and self.sh.shape[1] not in SH_ROWS:
@@ -199,8 +199,8 @@ class Splats:
         kernel = kernel_named(kernel)
         if scales.ndim == 2 and scales.shape[1] == 3:
             scales = scales[:, : scale_count(kernel)]
-        given = {"colors": colors, "sh0": sh0, "features_dc": features_dc}
-        first = {name: _floats(name, values) for name, values in given.items() if values is not None}
+        colour_arguments = {"colors": colors, "sh0": sh0, "features_dc": features_dc}
+        first = {name: _floats(name, values) for name, values in colour_arguments.items() if values is not None}
         if len(first) > 1:
             raise InvalidSplats(list(first)[1], expected="colours once", got=" and ".join(first))
         sh = first.get("colors")
@@ -225,7 +225,7 @@ class Splats:
         return self.count
 
     def __getitem__(self, keep: Rows) -> Splats:
-        """The splats that a mask [P], a slice or row numbers [n] choose; all columns, extras and the origin follow.
+        """Return the splats of a mask [P], a slice or row numbers [n], with all columns, extras and the origin.
 
         Raises:
             InvalidInput: they choose no splat, or are none of these (`liftcore.scene.rows`).
@@ -243,7 +243,7 @@ class Splats:
         rotation: Numbers | None = None,
         translation: Numbers | None = None,
     ) -> Splats:
-        """The splats in another frame, ``p' = scale R p + translation``: places, sizes, turns and colours.
+        """Return the splats in another frame, ``p' = scale R p + translation``: places, sizes, turns and colours.
 
         Spherical harmonics of all degrees, the lobes of DBS and normals turn with them, so that cameras moved alike
         (`Camera.transformed`) see the same.
@@ -265,39 +265,41 @@ class Splats:
             fields["means"] = (move.scale * (self.means.double() @ turn.T.to(place))).float()
             origin = move.points(np.array([self.origin]))[0].tolist()
         if move.rotation.tolist() != np.eye(3).tolist():
-            fields["quats"] = _turned_quats(self.quats, move.rotation)
+            fields["quats"] = _rotate_quats(self.quats, move.rotation)
             if self.sh is not None:
-                fields["sh"] = _turned_harmonics(self.sh, move.rotation)
+                fields["sh"] = _rotate_harmonics(self.sh, move.rotation)
             if self.sb_params is not None:
-                fields["sb_params"] = _turned_lobes(self.sb_params, turn.to(place))
+                fields["sb_params"] = _rotate_lobes(self.sb_params, turn.to(place))
             if set(NORMALS) <= self.extras.keys():
                 normals = torch.stack([self.extras[name].double() for name in NORMALS], dim=1)
                 columns = (normals @ turn.T.to(normals.device)).unbind(dim=1)
                 kinds = [self.extras[name].dtype for name in NORMALS]
-                own = {name: one.to(kind) for name, one, kind in zip(NORMALS, columns, kinds, strict=True)}
-                fields["extras"] = {**self.extras, **own}
+                rotated_normals = {
+                    name: column.to(kind) for name, column, kind in zip(NORMALS, columns, kinds, strict=True)
+                }
+                fields["extras"] = {**self.extras, **rotated_normals}
         return replace(self, **fields, origin=origin, world=self.world.transformed(move))
 
     def cpu(self) -> Splats:
-        """The same with its tensors on the CPU."""
+        """Return the same with its tensors on the CPU."""
         if self.means.device.type == "cpu":
             return self
         columns = {name: value.cpu() for name, value in vars(self).items() if isinstance(value, torch.Tensor)}
         return replace(self, **columns, extras={name: column.cpu() for name, column in self.extras.items()})
 
     def positions(self, rows: Any = slice(None)) -> np.ndarray:
-        """The means [n, 3] of these rows, or of all, in the world frame: f32, or f64 where an origin is added."""
+        """Return the means [n, 3] of these rows, or of all, in the world frame: f32, or f64 if an origin is added."""
         means = self.means.detach().cpu().numpy()[rows]
         return means if self.origin == FILE_ORIGIN else means.astype(np.float64) + self.origin
 
     @property
     def count(self) -> int:
-        """P."""
+        """Number of splats, P."""
         return self.means.shape[0]
 
     @property
     def antialiased(self) -> bool:
-        """Whether they were trained with the mip filter's opacity compensation, as far as is said."""
+        """True if they were trained with the mip filter's opacity compensation, as far as is known."""
         model = None if self.render_mode is None else self.render_mode.model
         return model is RenderModel.ANTIALIASED and self.kernel is Kernel.GAUSSIAN_3D
 
@@ -307,12 +309,12 @@ class Splats:
         return None if self.sh is None else int(self.sh.shape[1] ** 0.5) - 1
 
 
-def _moved_to_origin(
+def _move_to_origin(
     columns: dict[str, Tensor], means: Array, origin: Sequence[float] | None
 ) -> tuple[Origin, list[str]]:
-    """The origin of the means, which are moved to it where it is chosen here; a warning where they came rounded."""
-    given = shared_tensor(means)
-    if origin is not None and (any(origin) or given.dtype != torch.float64):
+    """Return the origin of the means, which are shifted if it is chosen here, and a warning of rounded means."""
+    stored = shared_tensor(means)
+    if origin is not None and (any(origin) or stored.dtype != torch.float64):
         try:
             x, y, z = (float(value) for value in origin)
         except (TypeError, ValueError):
@@ -320,16 +322,16 @@ def _moved_to_origin(
         if not all(map(math.isfinite, (x, y, z))):
             raise InvalidSplats("origin", expected="three finite numbers", got=repr(origin)[:80])
         return (x, y, z), []
-    chosen = local_origin(given, columns["log_scales"])
-    if chosen == FILE_ORIGIN:
-        return chosen, []
-    offset = torch.tensor(chosen, dtype=torch.float64, device=given.device)
-    columns["means"] = (given.double() - offset).to(torch.float32)
-    step = float32_step(max(map(abs, chosen)))
-    if given.dtype == torch.float64 or step <= ROUNDED * usual_size(columns["log_scales"]):
-        return chosen, []
-    what = f"positions came in float32, which tells {step:.2g} scene units apart where the splats lie"
-    return chosen, [f"{what}, {max(map(abs, chosen)):.3g} from the origin of their file: store them as doubles"]
+    local = local_origin(stored, columns["log_scales"])
+    if local == FILE_ORIGIN:
+        return local, []
+    offset = torch.tensor(local, dtype=torch.float64, device=stored.device)
+    columns["means"] = (stored.double() - offset).to(torch.float32)
+    step = float32_step(max(map(abs, local)))
+    if stored.dtype == torch.float64 or step <= ROUNDED * usual_size(columns["log_scales"]):
+        return local, []
+    summary = f"positions came in float32, whose resolution is {step:.2g} scene units at the splats"
+    return local, [f"{summary}, {max(map(abs, local)):.3g} from the origin of their file: store them as doubles"]
 
 
 def _activation_warnings(columns: Mapping[str, Tensor]) -> list[str]:
@@ -338,7 +340,7 @@ def _activation_warnings(columns: Mapping[str, Tensor]) -> list[str]:
     In a small unit all scales may be above 1. They are no logarithms where their exponentials are much larger than so
     many splats need to cover a scene of that extent.
     """
-    if len(columns["means"]) < MANY:
+    if len(columns["means"]) < MIN_SAMPLE:
         return []
     logits, warnings = columns["opacity_logits"], []
     logits = logits[~logits.isneginf()]
@@ -356,10 +358,10 @@ def _activation_warnings(columns: Mapping[str, Tensor]) -> list[str]:
     return warnings
 
 
-def _in_range(name: str, values: Tensor, most: float, expected: str) -> Tensor:
-    """Activated values, of which none but NaN may lie outside; NaN stays, as everywhere."""
-    if bool(((values < 0) | (values > most)).any()):
-        low, high = (float(one) for one in torch.aminmax(values[~values.isnan()]))
+def _in_range(name: str, values: Tensor, maximum: float, expected: str) -> Tensor:
+    """Check the range of activated values; NaN stays, as everywhere."""
+    if bool(((values < 0) | (values > maximum)).any()):
+        low, high = (float(end) for end in torch.aminmax(values[~values.isnan()]))
         hint = "parameters of a training, which are logarithms and logits, come with activated=False"
         raise InvalidSplats(
             name, expected=f"{expected}, as activated=True says", got=f"{low:.3g}..{high:.3g}", hint=hint
@@ -368,7 +370,7 @@ def _in_range(name: str, values: Tensor, most: float, expected: str) -> Tensor:
 
 
 def joined_harmonics(first: Tensor, rest: Array | None, names: tuple[str, str]) -> Tensor:
-    """[P, K, 3] f32 of the constant terms [P, 3] or [P, 1, 3] and all others [P, K - 1, 3], or None.
+    """Return [P, K, 3] f32 of the constant terms [P, 3] or [P, 1, 3] and all others [P, K - 1, 3], or None.
 
     Args:
         names: of both, for errors.
@@ -386,17 +388,17 @@ def joined_harmonics(first: Tensor, rest: Array | None, names: tuple[str, str]) 
         raise InvalidSplats(" and ".join(names), expected=expected, got=got) from None
 
 
-def _turned_quats(quats: Tensor, rotation: np.ndarray) -> Tensor:
-    """[P, 4] f32, of splats that are turned: the product of a rotation's quaternion and theirs."""
+def _rotate_quats(quats: Tensor, rotation: np.ndarray) -> Tensor:
+    """Return [P, 4] f32, of splats that are turned: the product of a rotation's quaternion and theirs."""
     product = torch.from_numpy(product_matrix(rotation))
-    own = quats.double()
-    largest = own.abs().amax(dim=1, keepdim=True)
-    identity = own.new_tensor([1.0, 0.0, 0.0, 0.0])
-    return (torch.where(largest > 0, own, identity) @ product.T.to(own.device)).float()
+    stored = quats.double()
+    largest = stored.abs().amax(dim=1, keepdim=True)
+    identity = stored.new_tensor([1.0, 0.0, 0.0, 0.0])
+    return (torch.where(largest > 0, stored, identity) @ product.T.to(stored.device)).float()
 
 
-def _turned_harmonics(sh: Tensor, rotation: np.ndarray) -> Tensor:
-    """[P, K, 3] f32, coefficients of colours that are turned with the scene, band by band."""
+def _rotate_harmonics(sh: Tensor, rotation: np.ndarray) -> Tensor:
+    """Return [P, K, 3] f32, coefficients of colours that are turned with the scene, band by band."""
     bands = [sh[:, :1]]
     for band in range(1, int(sh.shape[1] ** 0.5)):
         turn = torch.from_numpy(band_rotation(band, rotation)).to(sh)
@@ -404,8 +406,8 @@ def _turned_harmonics(sh: Tensor, rotation: np.ndarray) -> Tensor:
     return torch.cat(bands, dim=1)
 
 
-def _turned_lobes(lobes: Tensor, turn: Tensor) -> Tensor:
-    """[P, S, 6] f32, with the directions (theta, phi) of beta lobes turned by [3, 3] f64."""
+def _rotate_lobes(lobes: Tensor, turn: Tensor) -> Tensor:
+    """Return [P, S, 6] f32, with the directions (theta, phi) of beta lobes turned by [3, 3] f64."""
     theta, phi = lobes[..., 3].double(), lobes[..., 4].double()
     towards = torch.stack([theta.sin() * phi.cos(), theta.sin() * phi.sin(), theta.cos()], dim=-1) @ turn.T
     across = torch.linalg.vector_norm(towards[..., :2], dim=-1)
@@ -415,29 +417,29 @@ def _turned_lobes(lobes: Tensor, turn: Tensor) -> Tensor:
     return torch.cat([lobes[..., :3], angles.float(), lobes[..., 5:]], dim=-1)
 
 
-def _doubts(mode: RenderMode | None, kernel: Kernel) -> list[str]:
-    """A warning where the kernel is not what is said of the training."""
+def _kernel_warnings(mode: RenderMode | None, kernel: Kernel) -> list[str]:
+    """Warn if the kernel contradicts the render mode of the training."""
     if mode is None or mode.model is RenderModel.CLASSIC:
         return []
-    meant = Kernel.GAUSSIAN_2D if mode.model is RenderModel.DISCS else Kernel.GAUSSIAN_3D
+    expected = Kernel.GAUSSIAN_2D if mode.model is RenderModel.DISCS else Kernel.GAUSSIAN_3D
     source = mode.source or f"render_mode={str(mode.model)!r}"
-    return [] if meant is kernel else [f"{source} says {mode.model}, but the splats are taken for {kernel}"]
+    return [] if expected is kernel else [f"{source} says {mode.model}, but the splats are read as {kernel}"]
 
 
 def shared_tensor(values: object) -> Tensor:
-    """A tensor over the same memory where torch can have it; a reversed array, or one of other bytes, is copied."""
+    """Return a tensor over the same memory; arrays with negative strides or another byte order are copied."""
     if isinstance(values, torch.Tensor) or hasattr(values, "__cuda_array_interface__"):  # the latter as CuPy's are
         return torch.as_tensor(values).detach()
     array = np.asarray(values)
     if not array.dtype.isnative:
         array = array.astype(array.dtype.newbyteorder("="))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of arrays that must not be written to: nobody does
+        warnings.simplefilter("ignore", UserWarning)  # of read-only arrays: no caller writes to them
         return torch.from_numpy(np.ascontiguousarray(array))
 
 
 def _extra(name: str, values: Array, count: int) -> Tensor:
-    """A column [P] of any type that the model does not know."""
+    """Convert a further column [P] of any type."""
     try:
         column = shared_tensor(values)
     except (TypeError, ValueError):
@@ -449,34 +451,34 @@ def _extra(name: str, values: Array, count: int) -> Tensor:
 
 
 def _floats(name: str, values: Array) -> Tensor:
-    """Values as f32 where they lie, without a copy where they are that already."""
+    """Convert values to f32 on their device, without a copy if they are f32."""
     try:
-        found = shared_tensor(values)
+        tensor = shared_tensor(values)
     except (TypeError, ValueError, RuntimeError) as error:
         expected, got = "an array of torch or numpy", f"{type(values).__name__} ({str(error)[:80]})"
         raise InvalidSplats(name, expected=expected, got=got) from None
-    if not found.is_floating_point():
-        raise InvalidSplats(name, expected="floats", got=str(found.dtype).removeprefix("torch."))
-    return found.to(torch.float32)
+    if not tensor.is_floating_point():
+        raise InvalidSplats(name, expected="floats", got=str(tensor.dtype).removeprefix("torch."))
+    return tensor.to(torch.float32)
 
 
 def _column(name: str, values: Array, shape: tuple[Any, ...], device: torch.device) -> Tensor:
-    """Values as f32 of a shape, whose ``...`` is any number."""
+    """Convert values to f32 of a shape, whose ``...`` is any number."""
     column = _floats(name, values)
     if len(shape) == 1 and column.ndim == 2 and column.shape[1] == 1:  # as Inria's code keeps opacities
         column = column[:, 0]
     if column.ndim != len(shape) or any(
-        want not in (..., side) for want, side in zip(shape, column.shape, strict=True)
+        expected not in (..., side) for expected, side in zip(shape, column.shape, strict=True)
     ):
-        wanted = ", ".join("any" if side is ... else str(side) for side in shape)
-        raise InvalidSplats(name, expected=f"floats of shape [{wanted}]", got=f"shape {list(column.shape)}")
+        sides = ", ".join("any" if side is ... else str(side) for side in shape)
+        raise InvalidSplats(name, expected=f"floats of shape [{sides}]", got=f"shape {list(column.shape)}")
     if column.device != device:
         raise InvalidSplats(name, expected=f"an array on {device}, where the means are", got=str(column.device))
     return column
 
 
-def _repaired(columns: dict[str, Tensor]) -> tuple[dict[str, Tensor], list[str]]:
-    """The columns with what is no number replaced (`Splats`), and a warning of each kind.
+def _repair_columns(columns: dict[str, Tensor]) -> tuple[dict[str, Tensor], list[str]]:
+    """Replace NaN and infinity in columns (`Splats`), and return a warning of each kind.
 
     Raises:
         InvalidSplats: no splat has a place, a size, a turn and an opacity.
@@ -497,8 +499,8 @@ def _repaired(columns: dict[str, Tensor]) -> tuple[dict[str, Tensor], list[str]]
             columns[name] = torch.where(row, values[(~rows[name]).nonzero()[0, 0]], values)
         columns["opacity_logits"] = columns["opacity_logits"].masked_fill(broken, -torch.inf)
         first = int(broken.nonzero()[0, 0])
-        what = "have a place, size, turn or opacity that is no number (NaN or infinite), and are never seen"
-        warnings.append(f"{int(broken.sum())} of {count} splats {what}; the first is splat {first}")
+        effect = "have a place, size, turn or opacity that is no number (NaN or infinite), and are invisible"
+        warnings.append(f"{int(broken.sum())} of {count} splats {effect}; the first is splat {first}")
     grey = [rows[name] for name in rows if name not in _GEOMETRY]
     if grey:
         grey = torch.stack(grey).any(dim=0)
@@ -508,13 +510,15 @@ def _repaired(columns: dict[str, Tensor]) -> tuple[dict[str, Tensor], list[str]]
             lobes = columns["sb_params"].masked_fill(grey[:, None, None], 0.0)
             lobes[..., :LOBE_COLOURS].masked_fill_(grey[:, None, None], DARK_LOBE)
             columns["sb_params"] = lobes
-        what = "have a colour that is no number (NaN or infinite), and are grey"
-        warnings.append(f"{int(grey.sum())} of {count} splats {what}; the first is splat {int(grey.nonzero()[0, 0])}")
+        effect = "have a colour that is no number (NaN or infinite), and are grey"
+        warnings.append(
+            f"{int(grey.sum())} of {count} splats {effect}; the first is splat {int(grey.nonzero()[0, 0])}"
+        )
     return columns, warnings
 
 
 def _all_meaningful(name: str, values: Tensor) -> bool:
-    """Whether all values have a meaning; the extremes carry NaN along, and need no memory of the tensor's size."""
+    """Return True if all values are valid; the extremes propagate NaN, and need little memory."""
     return not values.numel() or all(bool(_meaningful(name, end)) for end in torch.aminmax(values))
 
 

@@ -1,4 +1,4 @@
-"""Splats that touch, directly or through others: which of them hang together."""
+"""Splats that touch, and connected groups of them."""
 
 from __future__ import annotations
 
@@ -39,54 +39,54 @@ def touching(splats: Splats, rows: np.ndarray, threads: int | None = None) -> np
 
 
 def touching_pairs(splats: Splats, rows: np.ndarray, threads: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """[m] and [m] i32, places among the rows [n] of pairs that touch, each once or twice; arguments of `touching`."""
+    """Return [m] and [m] i32, indices among rows [n] of pairs that touch, each once or twice; args of `touching`."""
     if len(rows) < 2:
         return np.zeros(0, np.int32), np.zeros(0, np.int32)
     means = splats.means.cpu().numpy()[rows].astype(np.float64)
     shapes = np.concatenate([means, _covariances(splats, rows)], axis=1)
 
-    def look(own: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        touch = _touch(shapes[own], shapes[near])
-        return np.repeat(own, touch.sum(axis=1)), near[touch]
+    def find_touching(index: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        touch = _touch(shapes[index], shapes[near])
+        return np.repeat(index, touch.sum(axis=1)), near[touch]
 
-    own, near = zip(*map_nearest(means, look, threads), strict=True)
-    return np.concatenate(own), np.concatenate(near)
+    index, near = zip(*map_nearest(means, find_touching, threads), strict=True)
+    return np.concatenate(index), np.concatenate(near)
 
 
-def touch_pairwise(splats: Splats, one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """[n] bool, whether the splats of rows [n] i64 touch those of other rows [n] i64, each its own."""
-    means = [splats.means.cpu().numpy()[rows].astype(np.float64) for rows in (one, other)]
+def touch_pairwise(splats: Splats, first_rows: np.ndarray, second_rows: np.ndarray) -> np.ndarray:
+    """Return [n] bool, whether the splats of rows [n] i64 touch those of other rows [n] i64, each its own."""
+    means = [splats.means.cpu().numpy()[rows].astype(np.float64) for rows in (first_rows, second_rows)]
     first, second = (
         np.concatenate([places, _covariances(splats, rows)], axis=1)
-        for places, rows in zip(means, (one, other), strict=True)
+        for places, rows in zip(means, (first_rows, second_rows), strict=True)
     )
     return _touch(first, second[:, None])[:, 0]
 
 
-def _touch(own: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """[m, k] bool, which of its neighbours ``near`` [m, k, 9] each splat of ``own`` [m, 9] touches; centre, Sigma."""
-    own = own[:, None]
-    x, y, z = (near[..., axis] - own[..., axis] for axis in range(3))
+def _touch(splat_shapes: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Return [m, k] bool, True where a splat [m, 9] touches a neighbour [m, k, 9]; each is centre and Sigma."""
+    splat_shapes = splat_shapes[:, None]
+    x, y, z = (near[..., axis] - splat_shapes[..., axis] for axis in range(3))
     squares = (x * x, y * y, z * z, x * y, x * z, y * z)
     # s |d| of both sides, so that nothing is divided by a distance of zero.
-    mine, theirs = np.zeros(x.shape), np.zeros(x.shape)
+    spread, near_spread = np.zeros(x.shape), np.zeros(x.shape)
     for place, square in enumerate(squares, start=3):
-        mine += own[..., place] * square
-        theirs += near[..., place] * square
-    reach = REACH * (np.sqrt(np.maximum(mine, 0.0)) + np.sqrt(np.maximum(theirs, 0.0)))
+        spread += splat_shapes[..., place] * square
+        near_spread += near[..., place] * square
+    reach = REACH * (np.sqrt(np.maximum(spread, 0.0)) + np.sqrt(np.maximum(near_spread, 0.0)))
     return squares[0] + squares[1] + squares[2] <= reach
 
 
 def spreads_along(splats: Splats, rows: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """[n] f64, the standard deviations of splats [n] along a unit vector [3] of their frame."""
+    """Return [n] f64, the standard deviations of splats [n] along a unit vector [3] of their frame."""
     x, y, z = direction
     return np.sqrt(np.maximum(_covariances(splats, rows) @ (x * x, y * y, z * z, x * y, x * z, y * z), 0.0))
 
 
 def _covariances(splats: Splats, rows: np.ndarray) -> np.ndarray:
-    """[n, 6] f64, Sigma of each splat: xx, yy, zz, and twice xy, xz, yz."""
+    """Return [n, 6] f64, Sigma of each splat: xx, yy, zz, and twice xy, xz, yz."""
     scales = np.exp(splats.log_scales.cpu().numpy()[rows].astype(np.float64).clip(-MAX_LOG_SCALE, MAX_LOG_SCALE))
-    turned = rotation_matrices(splats.quats.cpu().numpy()[rows])[:, :, : scales.shape[1]]  # a disc has two axes
-    x, y, z = (turned * scales[:, None]).transpose(1, 2, 0)
+    axes = rotation_matrices(splats.quats.cpu().numpy()[rows])[:, :, : scales.shape[1]]  # a disc has two axes
+    x, y, z = (axes * scales[:, None]).transpose(1, 2, 0)
     products = (x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z)
     return np.stack([product.sum(axis=0) for product in products], axis=1)

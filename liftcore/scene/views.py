@@ -66,30 +66,30 @@ def without_image_suffix(image: str) -> str:
 
 
 def cameras_of_views(views: Collection[str], cameras: Collection[str]) -> dict[str, str]:
-    """View -> camera, of the views that have one.
+    """Return view -> camera, of the views that have one.
 
     Names pair as they are. Else one may have folders before it that the other leaves out, where no other view and no
     other camera ends like the shorter one: ``/photos/camA/000`` and ``camA/000``, ``camA/000`` and ``000``, but never
     ``train/000`` and ``test/000``.
     """
-    known = {composed(camera): camera for camera in cameras}
-    named = {composed(view): view for view in views}
-    ends = Counter(ending for name in named for ending in _endings(name))
-    ending_in = Counter(ending for name in known for ending in _endings(name))
-    alone = {ending: name for name in known for ending in _endings(name) if ending_in[ending] == 1}
+    by_camera_name = {composed(camera): camera for camera in cameras}
+    by_view_name = {composed(view): view for view in views}
+    ends = Counter(ending for name in by_view_name for ending in _endings(name))
+    ending_in = Counter(ending for name in by_camera_name for ending in _endings(name))
+    unique = {ending: name for name in by_camera_name for ending in _endings(name) if ending_in[ending] == 1}
     pairs = {}
-    for name, view in named.items():
-        shorter = (ending for ending in _endings(name) if ending == name or ending in known)
-        found = next((alone[ending] for ending in shorter if ending in alone and ends[ending] == 1), None)
-        if name in known:
-            pairs[view] = known[name]
-        elif found is not None:
-            pairs[view] = known[found]
+    for name, view in by_view_name.items():
+        shorter = (ending for ending in _endings(name) if ending == name or ending in by_camera_name)
+        match = next((unique[ending] for ending in shorter if ending in unique and ends[ending] == 1), None)
+        if name in by_camera_name:
+            pairs[view] = by_camera_name[name]
+        elif match is not None:
+            pairs[view] = by_camera_name[match]
     return pairs
 
 
 def require_pairs(views: Collection[str], cameras: Collection[str]) -> dict[str, str]:
-    """`cameras_of_views` of the views of features.
+    """Return `cameras_of_views` of the views of features, and refuse none.
 
     Raises:
         InvalidFeatures: no view has a camera.
@@ -106,7 +106,7 @@ def require_pairs(views: Collection[str], cameras: Collection[str]) -> dict[str,
 
 
 def _difference(views: Collection[str], cameras: Collection[str]) -> str:
-    """How names would pair, of the ways in which programs change them; empty where none pairs most of them."""
+    """Describe the change of names after which most pair, of those that programs make; empty if none does."""
     if sum(REPLACED in camera for camera in cameras) > len(cameras) / 2:
         return "names of cameras are not UTF-8: rename the photos, and their names in the camera file"
     names = [composed(view) for view in views]
@@ -119,18 +119,18 @@ def _difference(views: Collection[str], cameras: Collection[str]) -> str:
         f"by {behind!r}, with which views end": lambda name: name.removesuffix(behind),
         f"by {before!r}, with which views begin": lambda name: name.removeprefix(before),
     }
-    for how, changed in ways.items():
-        paired = cameras_of_views({changed(view) for view in views}, {changed(camera) for camera in cameras})
+    for difference, normalise in ways.items():
+        paired = cameras_of_views({normalise(view) for view in views}, {normalise(camera) for camera in cameras})
         if 2 * len(paired) > min(len(views), len(cameras)):
-            return f"they differ {how}: rename the files of the features, and pack them again"
+            return f"they differ {difference}: rename the files of the features, and pack them again"
     return ""
 
 
 def _shared_start(names: Sequence[str]) -> str:
-    """What all of several names begin with."""
+    """Return the common prefix of several names."""
     first, last = min(names, default=""), max(names, default="")  # which differ before any others do
-    same = next((k for k, (one, other) in enumerate(zip(first, last, strict=False)) if one != other), len(first))
-    return first[:same] if len(names) > 1 else ""
+    length = next((k for k, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), len(first))
+    return first[:length] if len(names) > 1 else ""
 
 
 def first_names(names: Collection[str]) -> str:

@@ -1,4 +1,4 @@
-"""Which way is up in a scene, and how long its unit is, as far as anybody says so.
+"""Direction of up in a scene, and length of its unit, as far as they are known.
 
 Splats and COLMAP's models say neither. glTF and USD say both, nerfstudio's frames which way is up; people can say it
 (``--up``, ``--metres-per-unit``, a distance that they know). Nothing is estimated. Without it sizes and distances are
@@ -27,32 +27,32 @@ Positive = Annotated[float, Field(ge=1 / LARGEST, le=LARGEST), NoBoolean]
 Point = tuple[Number, Number, Number]  # x y z, frame of the splats
 
 
-def _direction(given: Point) -> Point:
-    length = math.hypot(*given)
+def _direction(direction: Point) -> Point:
+    length = math.hypot(*direction)
     if not 1 / LARGEST <= length <= LARGEST:
         raise _wrong("a direction x y z, finite and not zero")
-    x, y, z = (axis / length + 0.0 for axis in given)  # 0.0 of -0.0
+    x, y, z = (axis / length + 0.0 for axis in direction)  # 0.0 of -0.0
     return x, y, z
 
 
-def _apart(given: tuple[Point, Point]) -> tuple[Point, Point]:
-    if not 1 / LARGEST <= math.dist(*given) <= LARGEST:
+def _check_points(points: tuple[Point, Point]) -> tuple[Point, Point]:
+    if not 1 / LARGEST <= math.dist(*points) <= LARGEST:
         raise _wrong("two points x y z, finite and apart")
-    return given
+    return points
 
 
 class KnownDistance(Body):
-    """Two points of a scene, and how far apart they are."""
+    """Two points of a scene, and their distance."""
 
     model_config = ConfigDict(frozen=True)
-    between: Annotated[tuple[Point, Point], AfterValidator(_apart)] = Field(
+    between: Annotated[tuple[Point, Point], AfterValidator(_check_points)] = Field(
         description="two points, x y z each, in the frame of the splats"
     )
     metres: Positive = Field(description="from one to the other")
 
 
 class WorldFrame(Body):
-    """How the frame of some splats lies in the world; null is not known."""
+    """Direction of up and length of a unit in the frame of some splats; null is not known."""
 
     model_config = ConfigDict(frozen=True)
     error_type: ClassVar = InvalidInput
@@ -67,13 +67,13 @@ class WorldFrame(Body):
 
     @field_validator("distance")
     @classmethod
-    def _in_place_of_the_unit(cls, given: KnownDistance | None, info: ValidationInfo) -> KnownDistance | None:
-        if given is not None and info.data.get("metres_per_unit") is not None:
+    def _check_unit_or_distance(cls, distance: KnownDistance | None, info: ValidationInfo) -> KnownDistance | None:
+        if distance is not None and info.data.get("metres_per_unit") is not None:
             raise _wrong("either a distance or metres per unit, not both")
-        return given
+        return distance
 
     @model_validator(mode="after")
-    def _measured(self) -> Self:
+    def _apply_distance(self) -> Self:
         if self.distance is None:
             return self
         metres = self.distance.metres / math.dist(*self.distance.between)
@@ -85,26 +85,26 @@ class WorldFrame(Body):
 
     @property
     def unit(self) -> Literal["metres", "scene units"]:
-        """What lengths are told in."""
+        """Unit of reported lengths."""
         return "scene units" if self.metres_per_unit is None else "metres"
 
     def length(self, value: float) -> float:
-        """A length in scene units, in `unit`."""
+        """Convert a length in scene units to `unit`."""
         return value * (self.metres_per_unit or 1.0)
 
     def known_or(self, other: WorldFrame) -> WorldFrame:
-        """What this one knows, and else what the other does."""
-        known = {name: value for name, value in self if value is not None}
-        return other.model_copy(update=known)
+        """Return the values known here, else those of the other."""
+        values = {name: value for name, value in self if value is not None}
+        return other.model_copy(update=values)
 
     def transformed(self, move: Similarity) -> WorldFrame:
-        """The same of a scene that was moved."""
+        """Return the frame of a scene that was transformed."""
         up = None if self.up is None else tuple((move.rotation @ self.up).tolist())
         metres = None if self.metres_per_unit is None else self.metres_per_unit / move.scale
         return WorldFrame(up=up, metres_per_unit=metres)
 
     def upright(self, axes: np.ndarray) -> np.ndarray:
-        """[4] f64, w x y z: the shortest turn that brings up to +Y in a frame; none where it is not known.
+        """Return [4] f64, w x y z: the shortest turn that brings up to +Y in a frame; none where it is not known.
 
         Args:
             axes: [3, 3], a rotation of the frame of the splats to that frame.
@@ -118,7 +118,7 @@ class WorldFrame(Body):
         return turn / np.linalg.norm(turn)
 
     def placement(self, axes: np.ndarray, *, in_metres: bool) -> np.ndarray:
-        """[4, 4] f64: what brings splats in a frame (`upright`) to +Y up, and to metres as far as these are known."""
+        """Return the transform [4, 4] f64 of a frame (`upright`) to +Y up, and to metres if they are known."""
         import numpy as np
 
         from liftcore.scene.quaternions import rotation_matrices
@@ -132,10 +132,10 @@ UNKNOWN = WorldFrame()
 UPRIGHT = WorldFrame(up=(0.0, -1.0, 0.0))  # of splats in the frame of PLYs that come from one with +Y up
 
 
-def world_of(told: Any) -> WorldFrame:
-    """What a file of ours says of its frame; nothing where that is none."""
+def world_of(entry: Any) -> WorldFrame:
+    """Parse the frame stored in a file of ours; unknown if it is invalid."""
     try:
-        return WorldFrame.model_validate(told if isinstance(told, dict) else {})
+        return WorldFrame.model_validate(entry if isinstance(entry, dict) else {})
     except InvalidInput:
         return UNKNOWN
 
