@@ -185,6 +185,13 @@ def iso_of(name: str, *, optional: bool = False) -> Any:
     return computed_field(return_type=kind, description=f"{name} as ISO 8601, in UTC")(property(moment))
 
 
+def old_field(new: str, kind: Any) -> Any:
+    """Return a field by the old name of another: a reply has both until version 1 of the API ends."""
+    value = property(lambda self: getattr(self, new))
+    extra: dict[str, Any] = {"deprecated": True}
+    return computed_field(return_type=kind, description=f"`{new}`, by its old name", json_schema_extra=extra)(value)
+
+
 class Asset(BaseModel):
     """An uploaded file."""
 
@@ -272,9 +279,9 @@ class Progress(BaseModel):
 
 
 class Plan(BaseModel):
-    """What a lift sets out to do: ``summary``, ``warnings``, and what its certificate will have as ``plan``."""
+    """What a lift sets out to do: ``summary``, ``warnings``, and what its diagnostics will have as ``plan``."""
 
-    model_config = ConfigDict(extra="allow")  # the certificate's numbers
+    model_config = ConfigDict(extra="allow")  # the numbers of the diagnostics
 
     summary: list[str] = Field(description="the plan for people, a few lines")
     warnings: list[str] = Field(description="of what is lifted, and of what the machine has for it today")
@@ -357,7 +364,8 @@ class LiftResult(BaseModel):
         description="of the positions of its `.splat` and `.spz`; zeros but in map coordinates",
     )
     world: WorldFrame = Field(description="which way is up and how long a scene unit is, as far as it is known")
-    certificate: dict[str, Any]
+    diagnostics: dict[str, Any] = Field(description="what the lift measured of itself, and its warnings")
+    diagnostics = old_field("diagnostics", dict[str, Any])
     timings: dict[str, float] = Field(description="seconds a stage")
     created: Seconds
     created_at = iso_of("created")

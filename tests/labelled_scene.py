@@ -66,7 +66,7 @@ def write_lift(folder: Path, name: str = "kitchen.lift.safetensors") -> Path:
         encoder="by hand",
         text_space=f"table:{folder / 'words.safetensors'}",
         views=(LIFTED,),
-        certificate={},
+        diagnostics={},
         timings={},
     )
     seen, ones = torch.ones(count, dtype=torch.bool), torch.ones(count)

@@ -70,7 +70,7 @@ def run(options: argparse.Namespace) -> int:
     with writing(out):
         result.save(options.output, progress=True)
     (plan,) = plans
-    warnings = result.metadata.certificate["warnings"]
+    warnings = result.metadata.diagnostics["warnings"]
     document = {"out": str(options.output), **_summary(result), "warnings": [*plan.warnings, *warnings]}
     lift_warnings = [
         warning for warning in warnings if warning not in plan.told
@@ -135,6 +135,7 @@ def pairs_of(pairs: Sequence[str]) -> dict[str, Any]:
         key, equals, text = pair.partition("=")
         if not equals or not key:
             raise InvalidSettings("--set", expected="key=value", got=repr(pair))
+        key = LiftSettings.old_names.get(key, key)
         if key not in LiftSettings.model_fields:
             hint = LiftSettings.hint_of_name(key)
             raise InvalidSettings("--set", expected="a setting of a lift", got=f"the unknown {key[:80]!r}", hint=hint)
@@ -181,9 +182,10 @@ def _summary(result: LiftResult) -> dict[str, Any]:
         "encoder": metadata.encoder,
         "text_space": metadata.text_space,
         "world": metadata.world.model_dump(mode="json"),
-        "certificate": metadata.certificate,
+        "diagnostics": metadata.diagnostics,
+        "certificate": metadata.diagnostics,
         "timings": metadata.timings,
-        "settings": metadata.settings.model_dump(mode="json"),
+        "settings": metadata.settings.with_old_names(metadata.settings.model_dump(mode="json")),
     }
 
 
@@ -197,7 +199,7 @@ def _lines(document: dict[str, Any], cameras: Path, verbose: bool) -> Iterable[s
     yield from _verdict(document, cameras)
     if not verbose:
         return
-    for key, value in document["certificate"].items():
+    for key, value in document["diagnostics"].items():
         if key not in ("plan", "warnings"):  # --explain prints the whole plan
             yield f"  {key}: {smoothing_line(value) if key == 'smoothing' else short_text(value)}"
     yield "timings:"
@@ -208,18 +210,18 @@ def _verdict(document: dict[str, Any], cameras: Path) -> Iterable[str]:
     """Yield the verdict: coverage of rays, smoothing, warnings, and the next command."""
     from liftcore.text import NO_WORDS
 
-    certificate = document["certificate"]
-    row_sum = certificate["row_sum_mean"]
+    diagnostics = document["diagnostics"]
+    row_sum = diagnostics["row_sum_mean"]
     if row_sum is not None:
         note = "as in a scene without holes" if row_sum >= CLOSED_SCENE_ROW_SUM else "so parts of rays hit no splat"
         yield f"splats fill {row_sum:.1%} of a ray on average, {note}"
-    if "candidates" in certificate.get("smoothing", {}):
-        yield smoothing_line(certificate["smoothing"])
-    masks = certificate.get("reweighting", {}).get("masks")
+    if "candidates" in diagnostics.get("smoothing", {}):
+        yield smoothing_line(diagnostics["smoothing"])
+    masks = diagnostics.get("reweighting", {}).get("masks")
     if masks is not None and not document["settings"]["smoothness"] and (not masks or document["views"] <= FEW_VIEWS):
         of = f"{document['views']} views of masks" if masks else "maps without masks"
         yield f"for {of}: --set smoothness=auto smooths as far as it helps halves of the views to predict each other"
-    if certificate["warnings"]:
+    if diagnostics["warnings"]:
         yield "see the warnings: splatlift check tests whether photos, cameras and splats match"
     space = document["text_space"]
     if not space:

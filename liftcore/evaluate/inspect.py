@@ -322,12 +322,14 @@ def describe_lift(lift: Lift) -> dict[str, Any]:
         "dtype": str(lift.features.dtype).removeprefix("torch."),
         "seen_share": float(lift.seen.float().mean()),
         "total_weight": _ends(lift.total_weight),
+        "evidence": _ends(lift.total_weight),
         "agreement": _ends(lift.agreement[lift.seen]),
         "encoder": metadata.encoder,
         "text_space": metadata.text_space,
         "views": len(metadata.views),
-        "settings": metadata.settings.model_dump(mode="json"),
-        "certificate": metadata.certificate,
+        "settings": metadata.settings.with_old_names(metadata.settings.model_dump(mode="json")),
+        "diagnostics": metadata.diagnostics,
+        "certificate": metadata.diagnostics,
         "timings": metadata.timings,
         "version": metadata.version,
         "inputs": [file.path for file in (metadata.splats, metadata.cameras, *metadata.features)],
@@ -346,7 +348,7 @@ def _lift_warnings(lift: Lift, metadata: LiftMetadata) -> list[str]:
     count = len(lift.features)
     unseen = int((~lift.seen).sum())
     bad = int((~torch.isfinite(lift.features)).any(dim=1).sum())
-    warnings = list(metadata.certificate.get("warnings", ()))
+    warnings = list(metadata.diagnostics.get("warnings", ()))
     if unseen:
         warnings.append(f"{unseen} of {count} {UNSEEN}")
     if bad:

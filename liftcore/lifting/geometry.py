@@ -73,7 +73,7 @@ def weight_request(views: LiftViews, number: int, settings: LiftSettings, by_row
     camera, features = views[number]
     observation = as_read(features, settings, camera.name)
     params = strided(settings.lift_params, settings, camera, number)
-    pixels = sample_pixels(camera, -(-settings.certificate_rays // len(views)), (settings.seed, number), params)
+    pixels = sample_pixels(camera, -(-settings.diagnostic_rays // len(views)), (settings.seed, number), params)
     regions, codebook = as_regions(observation, by_rows)
     if isinstance(features, Regions) and isinstance(observation, Regions) and codebook.tuples is None:
         levels = region_levels(observation)

@@ -397,7 +397,7 @@ class OpenedLift:
     def kernel(self) -> str:
         """The kernel that was lifted with; ``auto`` where the lift does not say what that was."""
         chosen = self.metadata.settings.kernel
-        plan = self.metadata.certificate.get("plan")
+        plan = self.metadata.diagnostics.get("plan")
         lifted = plan.get("kernel") if chosen == "auto" and isinstance(plan, dict) else chosen
         return str(lifted) if lifted in set(Kernel) else chosen
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     AnyLift = TypeVar("AnyLift", bound=Lift)
 
-OF_FEATURES = ("residual", "surrogate", "beta", "bound")  # of the certificate: sampled rays against the features
+OF_FEATURES = ("residual", "surrogate", "beta", "bound")  # of the diagnostics: sampled rays against the features
 MEMORY_SHARE = 0.5  # of the free memory: larger features are held in a mapped file
 
 
@@ -69,15 +69,15 @@ def refine(
     X = zeros(tuple(lift.features.shape), lift.features.dtype, name="features", in_file=in_file).copy_(lift.features)
     graph = SplatGraph.of(splats, threads)
     X, facts = smooth(X, graph, lift.total_weight, lift.confidence, lift.seen, strength, progress, threads)
-    certificate: dict[str, Any] = lift.diagnostics | {"smoothing": facts}
-    certificate |= {name: None for name in OF_FEATURES if name in certificate}
-    if "beta" in certificate:
-        certificate["beta"] = {"median": None, "p99": None, "max": None}
+    diagnostics: dict[str, Any] = lift.diagnostics | {"smoothing": facts}
+    diagnostics |= {name: None for name in OF_FEATURES if name in diagnostics}
+    if "beta" in diagnostics:
+        diagnostics["beta"] = {"median": None, "p99": None, "max": None}
     if "warning" in facts:
-        certificate["warnings"] = [*certificate.get("warnings", ()), facts["warning"]]
+        diagnostics["warnings"] = [*diagnostics.get("warnings", ()), facts["warning"]]
     changes = {
         "settings": settings.model_copy(update={"smoothness": strength}),
-        "certificate": certificate,
+        "diagnostics": diagnostics,
         "timings": lift.metadata.timings | {"smooth": time.perf_counter() - start},
     }
     return replace(lift, features=X, metadata=lift.metadata.model_copy(update=changes)).to(place)

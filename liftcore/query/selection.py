@@ -198,7 +198,7 @@ def correct_by_objects(
 
 def levels_disagree(scene: OpenedLift) -> bool:
     """Return True if masks of parts and of wholes differ in meaning: then a splat's feature, their sum, has both."""
-    agreement = (scene.metadata.certificate.get("objects") or {}).get("level_agreement")
+    agreement = (scene.metadata.diagnostics.get("objects") or {}).get("level_agreement")
     return agreement is not None and agreement < LEVELS_AGREE
 
 

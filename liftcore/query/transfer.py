@@ -77,10 +77,10 @@ def transfer(lift: AnyLift, old: Splats, new: Splats, matrix: Any = None, progre
     if move is not None:
         facts["moved"] = {"scale": move.scale, "rotation": move.rotation.tolist()}
         facts["moved"] |= {"translation": move.translation.tolist()}
-    certificate = lift.diagnostics | {"transfer": facts}
-    if isinstance(plan := certificate.get("plan"), dict):
-        certificate["plan"] = plan | {"kernel": str(new.kernel)}
-    changes: dict[str, Any] = {"certificate": certificate, "splats": NO_FILE, "landmarks": landmarks_of(new)}
+    diagnostics = lift.diagnostics | {"transfer": facts}
+    if isinstance(plan := diagnostics.get("plan"), dict):
+        diagnostics["plan"] = plan | {"kernel": str(new.kernel)}
+    changes: dict[str, Any] = {"diagnostics": diagnostics, "splats": NO_FILE, "landmarks": landmarks_of(new)}
     changes |= {"origin": new.origin, "settings": lift.settings.model_copy(update={"kernel": str(new.kernel)})}
     world = new.world.known_or(lift.metadata.world if move is None else lift.metadata.world.transformed(move))
     changes |= {"world": world} | ({} if move is None else {"cameras": NO_FILE, "poses": ""})

@@ -22,7 +22,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError
 
 from liftcore.errors import InvalidInput, SplatliftError
-from liftcore.runtime.aliases import add_deprecated_properties, current_names, deprecated_getter
+from liftcore.runtime.aliases import add_deprecated_properties, current_names, deprecated_getter, with_old_names
 from liftcore.runtime.arguments import one_of
 from liftcore.runtime.one_line import one_line, value_text
 
@@ -74,6 +74,11 @@ class AliasedModel(BaseModel):
             SplatliftError: of the model's type of errors; an old and a new name have different values.
         """
         return current_names(values, cls.old_names, cls.error_type or InvalidInput) if cls.old_names else values
+
+    @classmethod
+    def with_old_names(cls, values: dict[str, Any]) -> dict[str, Any]:
+        """Return values of fields with each old name behind its new one, as replies have both."""
+        return with_old_names(cls.current_names(values), cls.old_names)
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:

@@ -1,1 +1,1 @@
-"""X: settings, accumulation of region weights, the closed form and its certificate."""
+"""X: settings, accumulation of region weights, the closed form and its diagnostics."""

@@ -64,7 +64,7 @@ class Aggregation:
 
     clusters: Tensor  # [P] i32, -1 = no cluster
     cluster_features: Tensor  # [K, F] like the features; zero rows of clusters without a feature
-    facts: dict[str, Any]  # for the certificate
+    facts: dict[str, Any]  # for the diagnostics
     unclustered_mask: Tensor  # [P] bool, splats with their own features
     kept_regions: tuple[np.ndarray | None, ...]  # [M_v] bool per view; None = no regions to filter
 

@@ -6,12 +6,13 @@ Its metadata are read without torch, so that a question to a file loads none.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, field_validator
 
 from liftcore.errors import InvalidSplats
 from liftcore.runtime.aliases import deprecated_names
+from liftcore.runtime.fields import AliasedModel
 from liftcore.runtime.one_line import one_line
 from liftcore.scene.origin import FILE_ORIGIN, Origin
 from liftcore.scene.views import composed
@@ -52,11 +53,12 @@ def landmarks_of(splats: Splats) -> tuple[Landmark, ...]:
     return tuple((row, x, y, z) for row, (x, y, z) in zip(rows, places, strict=True))
 
 
-class LiftMetadata(BaseModel):
+class LiftMetadata(AliasedModel):
     """What a lift remembers of how it was made."""
 
     model_config = ConfigDict(frozen=True)
 
+    old_names: ClassVar = {"certificate": "diagnostics"}
     format: str = FORMAT
     version: str
     settings: LiftSettings
@@ -71,7 +73,7 @@ class LiftMetadata(BaseModel):
     origin: Origin = FILE_ORIGIN  # of the splats (`Splats.origin`), and of the positions in ``.splat`` and ``.spz``
     world: WorldFrame = UNKNOWN  # of the splats: as their file, else that of the cameras says it, or somebody later
     landmarks: tuple[Landmark, ...] = ()  # where some splats lie, by which their rows are known; () in older lifts
-    certificate: dict[str, Any]
+    diagnostics: dict[str, Any]
     timings: dict[str, float]  # seconds a stage
 
     @field_validator("settings", mode="before")
@@ -79,7 +81,7 @@ class LiftMetadata(BaseModel):
     def _as_before_they_came(cls, told: Any) -> Any:
         """Settings that came after the lift have their own default, what lifts did before; not the dial's."""
         defaults = {name: field.default for name, field in LiftSettings.model_fields.items()}
-        return defaults | told if isinstance(told, dict) else told
+        return defaults | LiftSettings.current_names(told) if isinstance(told, dict) else told
 
 
 @deprecated_names(**OLD_TENSORS)
@@ -137,7 +139,7 @@ class Lift:
     @property
     def diagnostics(self) -> dict[str, Any]:
         """What the lift measured of itself (residual, bound, row sums, warnings, plan), as plain numbers."""
-        return self.metadata.certificate
+        return self.metadata.diagnostics
 
     @property
     def table(self) -> TableEncoder | None:
@@ -176,7 +178,7 @@ class Lift:
         changes = {
             "splats": NO_FILE,
             "landmarks": landmarks,
-            "certificate": self.diagnostics | {"cropped_from": whole},
+            "diagnostics": self.diagnostics | {"cropped_from": whole},
         }
         return replace(self, **columns, metadata=self.metadata.model_copy(update=changes))
 

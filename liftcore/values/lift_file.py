@@ -6,7 +6,7 @@ Post-Lifting Aggregation ``cluster`` [P] i32, -1 for splats in none, and ``clust
 were looked for ``object`` [P] i32, -1 for none, and ``object_views`` [N, 5] i32, and of the tree of objects, parts
 and groups ``node`` [P] i32, ``node_parents`` [T] i32, ``node_views`` [T, 5] i32, ``node_confidence`` [T] f32 and
 ``node_features`` [T, F] f16 (`Lift`); of packs with words their vectors, ``embeddings`` [n, F] f32. Its metadata
-hold settings, inputs with digests, the encoder, words, the certificate, timings and the version, as JSON. A lift too
+hold settings, inputs with digests, the encoder, words, the diagnostics, timings and the version, as JSON. A lift too
 large for one file is a folder of shards with the same tensors (`liftcore.io.shards`).
 """
 

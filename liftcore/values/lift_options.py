@@ -47,7 +47,7 @@ class LiftOptions(TypedDict, total=False):
     aggregation_sample: int
     aggregation_resolve: bool
     aggregation_channels: int
-    certificate_rays: int
+    diagnostic_rays: int
     seed: int
     smoothness: float | Literal["auto"]
     cg_steps: int

@@ -73,7 +73,7 @@ class LiftViews:
             origin=splats.origin,
             world=splats.world.known_or(self.cameras.world),
             landmarks=landmarks_of(splats),
-            certificate=diagnostics,
+            diagnostics=diagnostics,
             timings=timings,
         )
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Mapping
 from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
@@ -78,14 +78,14 @@ class Speed(StrEnum):
 
 _SPEEDS: dict[Speed, dict[str, Any]] = {
     Speed.EXACT: {},
-    Speed.BALANCED: {"stride": 2, "certificate_rays": 2_000},
+    Speed.BALANCED: {"stride": 2, "diagnostic_rays": 2_000},
     Speed.FAST: {
         "stride": 3,
         "robust_directions": 128,
         "view_cosine": 0.992,
         "coverage": 40,
         "transmittance_stop": 0.003,
-        "certificate_rays": 500,
+        "diagnostic_rays": 500,
     },
     Speed.DRAFT: {
         "stride": 4,
@@ -94,12 +94,12 @@ _SPEEDS: dict[Speed, dict[str, Any]] = {
         "view_cosine": 0.98,
         "coverage": 20,
         "transmittance_stop": 0.01,
-        "certificate_rays": 200,
+        "diagnostic_rays": 200,
     },
 }
 
 
-MOST_CERTIFICATE_RAYS = 1_000_000  # of a new lift: ten millions of one view took 8 GB
+MOST_DIAGNOSTIC_RAYS = 1_000_000  # of a new lift: ten millions of one view took 8 GB
 
 
 GROUPS = {  # of the settings, for people who read all of them
@@ -115,7 +115,7 @@ GROUPS = {  # of the settings, for people who read all of them
     ),
     "neighbours": ("smoothness",),
     "least squares": ("cg_steps", "damping", "cg_basis", "reference_channels"),
-    "the result, and where it is made": ("dtype", "certificate_rays", "seed", "device"),
+    "the result, and where it is made": ("dtype", "diagnostic_rays", "seed", "device"),
 }  # fmt: skip
 
 
@@ -123,6 +123,8 @@ class LiftSettings(Shown):
     """All that decides the result of a lift, and where it runs. Knobs left out take the preset's values."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+    old_names: ClassVar = {"certificate_rays": "diagnostic_rays"}
+    error_type: ClassVar = InvalidSettings
 
     preset: Preset = Field(
         Preset.DEFAULT,
@@ -260,12 +262,12 @@ class LiftSettings(Shown):
         "have most of their weight",
     )
     aggregation_channels: int = Field(50, ge=1, le=1_024, description="principal components that HDBSCAN sees")
-    certificate_rays: int = Field(
+    diagnostic_rays: int = Field(
         4_000,
         ge=0,
         le=10_000_000,
-        description="rays sampled for the certificate, a million at most",
-        json_schema_extra={"maximum": MOST_CERTIFICATE_RAYS},  # of a new lift
+        description="rays sampled for the diagnostics, a million at most",
+        json_schema_extra={"maximum": MOST_DIAGNOSTIC_RAYS},  # of a new lift
     )
     seed: int = Field(
         0,
@@ -305,7 +307,7 @@ class LiftSettings(Shown):
         0,
         ge=0,
         le=1_024,
-        description="let the certificate look for that optimum, in this many random projections of the channels: "
+        description="let the diagnostics search for that optimum, in this many random projections of the channels: "
         "up to 100 such steps for every 32",
     )
     kernel: Literal["auto", "3dgs", "2dgs", "dbs"] = Field(
@@ -322,6 +324,7 @@ class LiftSettings(Shown):
     def _fill_from_preset_and_speed(cls, values: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
         if not isinstance(values, dict):
             return handler(values)
+        values = cls.current_names(values)
         if "device" in values:
             values = values | {"device": device_name(values["device"])}
         preset, speed = values.get("preset", Preset.DEFAULT), values.get("speed", Speed.EXACT)
@@ -501,16 +504,17 @@ class LiftSettings(Shown):
         Raises:
             InvalidSettings: an unknown name or a value out of range.
         """
+        changes = cls.current_names(dict(others))
         if not isinstance(preset, cls):
-            return cls.of(preset=preset, **others)
-        if not others:
+            return cls.of(preset=preset, **changes)
+        if not changes:
             return preset
         chosen = {"preset": preset.preset, "speed": preset.speed}
         values, filled = preset.model_dump(), cls.of(**chosen).model_dump()
         given = preset.model_fields_set
         given = given if len(given) < len(values) else set()  # all of them: settings of a file
         own = {name: value for name, value in values.items() if name in given or value != filled[name]}
-        return cls.of(**chosen | own | dict(others))
+        return cls.of(**chosen | own | changes)
 
     @classmethod
     def hint_of_name(cls, name: str) -> str:
@@ -535,9 +539,9 @@ class LiftSettings(Shown):
             settings = made()
         except ValidationError as error:
             raise _told(error, cls.model_fields) from None
-        if settings.certificate_rays > MOST_CERTIFICATE_RAYS:  # here, not in the field: older lifts have more
-            expected, got = f"at most {MOST_CERTIFICATE_RAYS} rays", str(settings.certificate_rays)
-            raise InvalidSettings("certificate_rays", expected=expected, got=got)
+        if settings.diagnostic_rays > MOST_DIAGNOSTIC_RAYS:  # here, not in the field: older lifts have more
+            expected, got = f"at most {MOST_DIAGNOSTIC_RAYS} rays", str(settings.diagnostic_rays)
+            raise InvalidSettings("diagnostic_rays", expected=expected, got=got)
         return settings
 
 

@@ -244,7 +244,7 @@ def show(subject: DemoScene, url: str, out: Path, say: Callable[[str], None]) ->
         "channels": lift["channels"],
         "views": len(lift["views"]),
         "lift_seconds": took,
-        "certificate": lift["certificate"],
+        "diagnostics": lift["diagnostics"],
         "view": subject.views[0],
         "text_space": subject.text_space,
         "pictures": pictures,

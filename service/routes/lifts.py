@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 
+from liftcore import LiftSettings
 from liftcore.errors import NotFound
 from liftcore.files import in_camera_orientation
 from service import models
@@ -349,6 +350,7 @@ def shape_lift(lift: LiftRecord) -> models.LiftResult:
         "origin": (0.0, 0.0, 0.0),
         "world": {},
         **lift.metadata,
+        "settings": LiftSettings.with_old_names(lift.metadata["settings"]),
         **vars(lift),
         "links": links,
     }

@@ -119,7 +119,7 @@ class TradeoffRecord:
 
 # A result belongs to its job's owner: one statement, so that no result is without its job.
 FEATURES = "(SELECT json_group_array(asset) FROM (SELECT asset FROM job_features WHERE job = jobs.id ORDER BY place))"
-NAMES_OF_VIEWS = ("views_without_camera", "views_without_splats")  # in a certificate
+NAMES_OF_VIEWS = ("views_without_camera", "views_without_splats")  # in a diagnostics
 SHOWN_BYTES = 64 << 10  # of metadata; longer lists of views are given in pages
 LONG = ("views", "words")  # left out of long metadata
 VISIBLE = (
@@ -139,8 +139,8 @@ def order_of(metadata: Mapping[str, Any]) -> JobOrder:
     """
     files = (metadata["splats"], metadata["cameras"], *metadata["features"])
     splats, cameras, *features = [f"sha256:{file['sha256']}" for file in files]
-    settings, certificate = dict(metadata["settings"]), metadata.get("certificate")
-    plan = certificate.get("plan") if isinstance(certificate, Mapping) else None
+    settings, diagnostics = dict(metadata["settings"]), _by_current_names(metadata).get("diagnostics")
+    plan = diagnostics.get("plan") if isinstance(diagnostics, Mapping) else None
     if isinstance(plan, Mapping) and BY_HAND not in str(plan.get("rendering", BY_HAND)):
         settings["antialiased"] = "auto"  # the lift records the resolved value
     return JobOrder(splats, cameras, tuple(features), settings)
@@ -279,10 +279,11 @@ class LiftStore:
     def _insert(
         self, connection: sqlite3.Connection, job: str, result: FinishedLift, size: int, created: float
     ) -> None:
-        metadata, views = json.dumps(result.metadata), result.metadata["views"]
+        values = _by_current_names(result.metadata)
+        metadata, views = json.dumps(values), values["views"]
         if len(metadata) > SHOWN_BYTES:
-            certificate = _without(result.metadata["certificate"], *NAMES_OF_VIEWS)
-            metadata = json.dumps(_without(result.metadata, *LONG) | {"certificate": certificate})
+            diagnostics = _without(values["diagnostics"], *NAMES_OF_VIEWS)
+            metadata = json.dumps(_without(values, *LONG) | {"diagnostics": diagnostics})
         row = {
             "id": job,
             "bytes": size,
@@ -354,9 +355,14 @@ class LiftStore:
             LiftRecord,
             row,
             path=self._files.root / row["file"],
-            metadata=json.loads(row["metadata"]),
+            metadata=_by_current_names(json.loads(row["metadata"])),
             features=tuple(json.loads(row["features"])),
         )
+
+
+def _by_current_names(metadata: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the metadata of a lift, of 0.4 too, by today's names."""
+    return {"diagnostics" if name == "certificate" else name: value for name, value in metadata.items()}
 
 
 def _without(values: dict[str, Any], *names: str) -> dict[str, Any]:

@@ -102,8 +102,8 @@ def make_key(store: Store, scopes: str, **quota: int) -> tuple[str, str]:
 
 def finish(store: Store, content: bytes, views: Sequence[str] = ("v",)) -> None:
     """Claim the oldest job in line and end it with a lift."""
-    certificate = {"warnings": ["x"], "views_without_splats": list(views)}
-    metadata = {**METADATA, "certificate": certificate, "views": list(views)}
+    diagnostics = {"warnings": ["x"], "views_without_splats": list(views)}
+    metadata = {**METADATA, "diagnostics": diagnostics, "views": list(views)}
     claimed = store.jobs.claim()
     assert claimed is not None
     with store.files.draft(".safetensors") as draft:

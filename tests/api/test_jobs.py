@@ -208,7 +208,7 @@ def test_job_and_lift_keep_what_the_plan_warned_of(client: TestClient, uploaded:
     job = ended(client, client.post("/lift", json=order).headers["location"])
     assert job["state"] == "succeeded", job
     told = [line for line in job["plan"]["warnings"] if "no camera can see" in line]
-    assert told and set(told) <= set(client.get(job["links"]["lift"]).json()["certificate"]["warnings"])
+    assert told and set(told) <= set(client.get(job["links"]["lift"]).json()["diagnostics"]["warnings"])
     assert client.delete(f"{job['links']['self']}?with_lift=true").status_code == 204
 
 
@@ -227,7 +227,7 @@ def test_job_tells_of_every_stage_and_its_plan_comes_with_the_first_views(
     first, *_ = job["plan"].pop("summary")
     assert first.startswith(f"{3 * SPLATS_A_CLUSTER} splats (3dgs), ") and first.endswith("3 of 3 views")
     assert isinstance(job["plan"].pop("warnings"), list)  # what there is to say is of the machine
-    assert job["plan"] == lift["certificate"]["plan"]
+    assert job["plan"] == lift["diagnostics"]["plan"]
     assert (job["state"], job["attempt"], job["problem"]) == ("succeeded", 1, None)
     assert job["settings"]["preset"] == "row-sum" and job["settings"]["power"] == 1
     assert job["created"] <= job["started"] <= job["ended"]
@@ -301,7 +301,9 @@ def test_assets_say_what_is_in_them_and_their_names_alone(client: TestClient, up
 
 def test_lift_tells_how_far_to_trust_it(client: TestClient, lift: dict[str, Any], uploaded: Uploaded) -> None:
     assert (lift["count"], lift["channels"], lift["text_space"]) == (COUNT, CHANNELS, "tiny")
-    assert sorted(lift["views"]) == sorted(VIEWS) and lift["certificate"] and lift["timings"]
+    assert sorted(lift["views"]) == sorted(VIEWS) and lift["diagnostics"] and lift["timings"]
+    assert lift["certificate"] == lift["diagnostics"]  # by its old name, until version 1 ends
+    assert lift["settings"]["certificate_rays"] == lift["settings"]["diagnostic_rays"]
     assert (lift["splats"], lift["cameras"], lift["features"]) == (
         uploaded.splats, uploaded.cameras, [uploaded.features]
     )  # fmt: skip

@@ -237,8 +237,8 @@ def test_broken_lift_files_are_refused(client: TestClient, lift: dict[str, Any],
     short = {"total_weight": tensors["total_weight"][1:]}
     for type_ in (refused(features=endless), refused(**short), refused(**fewer), refused(**empty)):
         assert type_ == "/problems/invalid-lift"
-    more = '"certificate":{"x":"' + "y" * 70_000 + '",'
-    long = {"splatlift": metadata["splatlift"].replace('"certificate":{', more)}
+    more = '"diagnostics":{"x":"' + "y" * 70_000 + '",'
+    long = {"splatlift": metadata["splatlift"].replace('"diagnostics":{', more)}
     assert "metadata" in assert_problem(client.post("/lifts", content=save(tensors, long)))["expected"]
     endless_time = {"splatlift": metadata["splatlift"].replace('"timings":{', '"timings":{"x":1e999,')}
     assert "timings" in assert_problem(client.post("/lifts", content=save(tensors, endless_time)))["expected"]

@@ -534,7 +534,7 @@ def test_lift_of_very_many_views_tells_their_names_apart_in_pages(
         path = f"/lifts/{house.done}"
         told = house.ask("alice", "GET", path)
         assert (told.json()["views"], told.json()["view_count"]) == ([], 3000) and len(told.content) < 4000
-        assert told.json()["certificate"] == {"warnings": ["x"]}  # and no names of views in it
+        assert told.json()["diagnostics"] == {"warnings": ["x"]}  # and no names of views in it
         assert house.ask("alice", "GET", "/lifts").json()["lifts"] == [told.json()]
         numbers = {"width": 1, "height": 1, "fx": 1, "fy": 1, "cx": 1, "cy": 1, "viewmat": [[1.0]]}
         page = Frame({"views": [{"name": name, **numbers} for name in (lifted[7], "another")], "more": True})

@@ -55,7 +55,7 @@ def test_discs_are_lifted_and_answered_in_their_rows(client: TestClient, uploade
     warm_up(Kernel.GAUSSIAN_2D)  # compiles, where nobody has yet: that may take longer than `ended` waits
     asset = client.put("/assets/splats", content=discs()).json()
     assert asset["counts"]["kernel"] == "2dgs"
-    order = replace(uploaded, splats=asset["id"]).order(preset="row-sum", certificate_rays=0)
+    order = replace(uploaded, splats=asset["id"]).order(preset="row-sum", diagnostic_rays=0)
     job = ended(client, client.post("/lift", json=order).headers["location"])
     assert job["state"] == "succeeded", job
     asked = {"lift": job["id"], "text": "apple", "view": "middle", "threshold": 0.5}
@@ -102,7 +102,7 @@ def test_a_scene_in_map_coordinates_answers_in_them(client: TestClient, uploaded
         pose[:3, 3] += offset
         frame["transform_matrix"] = pose.tolist()
     cameras = put(client, AssetKind.CAMERAS, json.dumps(document).encode())
-    order = replace(uploaded, splats=splats, cameras=cameras).order(preset="row-sum", certificate_rays=0)
+    order = replace(uploaded, splats=splats, cameras=cameras).order(preset="row-sum", diagnostic_rays=0)
     job = ended(client, client.post("/lift", json=order).headers["location"])
     assert job["state"] == "succeeded", job
     answer = client.get("/query", params={"lift": job["id"], "text": "apple", "threshold": 0.5, "top": 3}).json()

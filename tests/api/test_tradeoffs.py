@@ -114,7 +114,7 @@ def test_room_for_the_exact_features_is_asked_for_beforehand(
 def test_real_tradeoff_is_judged_by_the_masks_of_its_order(
     client: TestClient, uploaded: Uploaded, judged: dict[str, Any]
 ) -> None:
-    order = uploaded.order(certificate_rays=0, preset="tikhonov") | {"budget_s": 10, "labels": judged}
+    order = uploaded.order(diagnostic_rays=0, preset="tikhonov") | {"budget_s": 10, "labels": judged}
     job = ended(client, client.post("/tradeoff", json=order).headers["location"])
     assert job["state"] == "succeeded", job
     assert job["parameters"] == {"budget_s": 10, "labels": judged}
@@ -123,7 +123,7 @@ def test_real_tradeoff_is_judged_by_the_masks_of_its_order(
     exact = found["runs"][0]
     assert exact["name"] == "exact" and exact["cosine"] == pytest.approx(1.0) and exact["mask_iou"] > 0.5
     assert exact["settings"]["preset"] == "tikhonov"  # where the dial starts
-    assert all(run["settings"]["certificate_rays"] == 0 for run in found["runs"])
+    assert all(run["settings"]["diagnostic_rays"] == 0 for run in found["runs"])
     assert (found["labelled_views"], found["labels"], found["choice"]["accuracy"]) == (1, judged, "mask_iou")
     assert found["choice"]["name"] in {run["name"] for run in found["runs"]}
     assert not found["choice"]["recommended"]  # by the one view that is held out
@@ -136,7 +136,7 @@ def test_real_tradeoff_is_judged_by_the_masks_of_its_order(
 
 
 def test_canceled_tradeoff_leaves_no_process_of_its_runs(client: TestClient, uploaded: Uploaded) -> None:
-    body = uploaded.order(certificate_rays=0) | {"budget_s": 600}
+    body = uploaded.order(diagnostic_rays=0) | {"budget_s": 600}
     job = client.post("/tradeoff", json=body).json()["id"]
     until(lambda: len(processes_of(job)) == 2)  # the job's process, and a run's
     client.post(f"/jobs/{job}/cancel")

@@ -106,7 +106,7 @@ def main() -> None:
     else:
         (splats, cameras), views = read_scene(folder), lc.read_features(folder / "regions.safetensors")
         for preset in options.presets:
-            lifted = lc.lift(splats, cameras, views, preset=preset, certificate_rays=0)
+            lifted = lc.lift(splats, cameras, views, preset=preset, diagnostic_rays=0)
             scene = Scene(lifted, splats, cameras, views)
             for level in range(3):
                 head = {"scene": folder.name, "features": f"regions {level}", "preset": preset}

@@ -105,7 +105,7 @@ def weights_of(
 
 
 def traced(splats: lc.Splats, camera: lc.Camera, walk: lc.CompositingParams) -> np.ndarray:
-    """A [H * W, P] by single rays, as the certificate takes it."""
+    """A [H * W, P] by single rays, as the diagnostics take it."""
     y, x = np.mgrid[: camera.height, : camera.width]
     pixels = torch.tensor(np.stack([x.ravel(), y.ravel()], axis=1), dtype=torch.int32)
     rows = CpuRaster(splats, threads=1).ray_rows(camera, pixels, walk)

@@ -90,7 +90,7 @@ def views_of(device: Device, shared: Path) -> Iterator[dict[str, Any]]:
 
 def beside_processor(files: Sequence[Path], device: Device) -> dict[str, Any]:
     """The same lift on both, over splats with total weight over a half. A ray at a cut-off may fall either way."""
-    settings = (lc.LiftSettings.of(certificate_rays=0, device=kind) for kind in ("cpu", device.kind))
+    settings = (lc.LiftSettings.of(diagnostic_rays=0, device=kind) for kind in ("cpu", device.kind))
     one, other = (lift_files(files[0], files[1], files[2:], each).to(CPU.place) for each in settings)
     counted = one.total_weight > 0.5
     first, second = one.features[counted].float(), other.features[counted].float()

@@ -50,7 +50,7 @@ def fill(data: Path, names: int, jobs: int) -> tuple[str, str]:
     lift = store.jobs.submit(SERVICE, order)[0]
     claimed = store.jobs.claim()
     assert claimed is not None
-    known = {"version": "0", "settings": {}, "encoder": "e", "text_space": "t", "certificate": {}, "timings": {}}
+    known = {"version": "0", "settings": {}, "encoder": "e", "text_space": "t", "diagnostics": {}, "timings": {}}
     with store.files.draft(".safetensors") as draft:
         draft.write_bytes(b"lift")
         store.lifts.finish(lift, claimed.attempt, FinishedLift(draft, "0" * 64, 1, 1, known | {"views": long}))

@@ -134,7 +134,7 @@ def rows_of(folder: Path, packs: list[str], every: list[int]) -> Iterator[dict[s
 
 def measured(scene: Scene, truth: Truth, owners: np.ndarray) -> dict[str, Any]:
     """The figures of one lift; owners [P] int, the part of each splat."""
-    facts = scene.metadata.certificate["objects"]
+    facts = scene.metadata.diagnostics["objects"]
     parts, clicks = best_nodes(scene, truth, owners), click_ious(scene, truth, owners)
     return {
         "nodes": facts["nodes"], "largest": facts["largest_share"], "agreement": facts["level_agreement"],
@@ -229,7 +229,7 @@ def compared(
             "level": level_scores(alone, words, counted),
             "node": node_scores(scene, words),
         }
-        facts = scene.metadata.certificate["objects"]
+        facts = scene.metadata.diagnostics["objects"]
         yield {"words": name, "agreement": facts["level_agreement"]} | {
             way: word_iou(scores, owners, counted) for way, scores in found.items()
         }

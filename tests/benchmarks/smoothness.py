@@ -232,7 +232,8 @@ def answers(truth: Truth, table: TableEncoder, lifted: lc.LiftResult) -> dict[st
     of_things = {thing: ask(scene, truth.words[thing], table) for thing in things_of(truth)}
     boxes = measure_boxes(scene, of_things, truth.objects.numpy())
     found = scene.segment(truth.words, encoder=table)
-    classes = np.array([0, *(1 + truth.words.index(named.word) for named in found.found)], np.int32)[found.values]
+    rows = [0, *(1 + truth.words.index(named.word) for named in found.named_words)]
+    classes = np.array(rows, np.int32)[found.values]
     shown = torch.stack(list(truth.held_out.values()))
     maps = [torch.from_numpy(value_map(scene, classes, view)).long() - 1 for view in truth.held_out]
     best = torch.where(shown < 0, NO_LABEL, torch.stack(maps))
@@ -334,7 +335,7 @@ def fidelity_rows(folder: Path, missing: Sequence[tuple[str, str]]) -> Iterator[
     for name, smoothness in missing:
         views = read_pack(folder, "grids", int(name.rsplit(" ", 1)[1]))
         strength = smoothness if smoothness == "auto" else float(smoothness)
-        result = lc.lift(splats, cameras, views, certificate_rays=0, smoothness=strength, progress=False).cpu()
+        result = lc.lift(splats, cameras, views, diagnostic_rays=0, smoothness=strength, progress=False).cpu()
         fidelity = float(torch.cat([cosines(result, view) for view in maps]).mean())
         chosen = result.diagnostics.get("smoothing", {}).get("smoothness", 0.0)
         head = {"table": "fidelity", "features": f"{name}, {len(views)} views", "name": name, "kind": smoothness}

@@ -44,7 +44,7 @@ def main() -> None:
             "processor s": seconds[speed],
             "times less": seconds["exact"] / seconds[speed],
             **cosine_figures(one.features, exact.features, exact.total_weight),
-            "expected of the views": one.metadata.certificate["plan"]["view_cosine"],
+            "expected of the views": one.metadata.diagnostics["plan"]["view_cosine"],
         }
         for speed, one in made.items()
     ]

@@ -51,8 +51,8 @@ class Truth:
     held_out: Mapping[str, Tensor]  # view -> [H, W] int, the class of each pixel, -1 for none
 
     def lift(self, views: Mapping[str, ViewFeatures], **settings: Any) -> lc.LiftResult:
-        """A lift of views onto the scene, without the certificate unless the settings ask for it."""
-        chosen: dict[str, Any] = {"certificate_rays": 0, **settings}
+        """A lift of views onto the scene, without the diagnostics unless the settings ask for it."""
+        chosen: dict[str, Any] = {"diagnostic_rays": 0, **settings}
         return lc.lift(self.raster.splats, self.cameras, views, **chosen).cpu()
 
     def opened(self, lifted: lc.LiftResult) -> Scene:

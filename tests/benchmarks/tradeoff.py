@@ -34,7 +34,7 @@ def measured(case: str, truth: Truth, views: Mapping[str, ViewFeatures]) -> dict
     lifted, judges = hold_out(list(views))
     seen, runs, judged = [(truth.cameras[view], views[view]) for view in judges], [], []
     for candidate in candidates_of({}):
-        settings = lc.LiftSettings.of(**{"certificate_rays": 0, **candidate.settings})
+        settings = lc.LiftSettings.of(**{"diagnostic_rays": 0, **candidate.settings})
         warm_up_lift(truth.raster.splats.kernel, CPU, settings)
         busy = time.process_time()
         made = lc.lift(truth.raster.splats, truth.cameras, {view: views[view] for view in lifted}, settings)

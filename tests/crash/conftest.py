@@ -25,7 +25,7 @@ from service.store.owners import SERVICE, Owner
 from service.store.store import Store
 from service.supervisor import Clock, JobLimits, Supervisor
 
-METADATA = {"views": [], "certificate": {}}  # all that the store asks of a lift's
+METADATA = {"views": [], "diagnostics": {}}  # all that the store asks of a lift's
 Supervising = Callable[..., AbstractContextManager[Supervisor]]
 
 

@@ -102,13 +102,13 @@ class ServiceProcess:
         return story.count('"state":"succeeded"')
 
     def digest(self, job: str) -> str:
-        """The digest of a lift's tensors and certificate: all that does not tell of time."""
+        """The digest of a lift's tensors and diagnostics: all that does not tell of time."""
         tensors = load(self.client.get(f"/lifts/{job}/features").content)
         total = hashlib.sha256()
         for name in sorted(tensors):
             total.update(f"{name} {tensors[name].dtype} {tensors[name].shape}".encode() + tensors[name].tobytes())
-        certificate = self.client.get(f"/lifts/{job}").json()["certificate"]
-        total.update(json.dumps(certificate, sort_keys=True).encode())
+        diagnostics = self.client.get(f"/lifts/{job}").json()["diagnostics"]
+        total.update(json.dumps(diagnostics, sort_keys=True).encode())
         return total.hexdigest()
 
 

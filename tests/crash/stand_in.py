@@ -34,7 +34,7 @@ def finish(order: dict[str, Any]) -> None:
     content = hashlib.sha256(json.dumps([order["splats"], order["settings"]]).encode()).digest()
     Path(order["output"]).write_bytes(content)
     names = {"encoder": "", "text_space": "none", "views": []}
-    metadata = {"version": "0", "settings": {}, "certificate": {}, "timings": {}, **names}
+    metadata = {"version": "0", "settings": {}, "diagnostics": {}, "timings": {}, **names}
     sha256 = hashlib.sha256(content).hexdigest()
     say(event="done", sha256=sha256, count=1, channels=1, metadata=metadata)
 

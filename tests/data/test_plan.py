@@ -33,16 +33,16 @@ def fine_maps(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 def certified(scene: Path, pack: Path, own: dict[str, Any]) -> dict[str, Any]:
-    """The certificate of a lift."""
-    settings = LiftSettings.of(**{"preset": "row-sum"} | own, certificate_rays=100, device="cpu")
-    return lift_files(scene / "point_cloud.ply", scene / "cameras.json", [pack], settings).metadata.certificate
+    """The diagnostics of a lift."""
+    settings = LiftSettings.of(**{"preset": "row-sum"} | own, diagnostic_rays=100, device="cpu")
+    return lift_files(scene / "point_cloud.ply", scene / "cameras.json", [pack], settings).metadata.diagnostics
 
 
 def told(scene: Path, pack: Path, own: dict[str, Any]) -> tuple[float, float]:
     """Bytes of W that the plan expects, and those of the entries that the lift made."""
-    certificate = certified(scene, pack, own)
-    plan = certificate["plan"]
-    return plan["memory"]["weights"], ENTRY_BYTES * certificate["weights_entries"]
+    diagnostics = certified(scene, pack, own)
+    plan = diagnostics["plan"]
+    return plan["memory"]["weights"], ENTRY_BYTES * diagnostics["weights_entries"]
 
 
 # The most that a plan may be above what is found: the more levels a view has, the fewer of its regions a splat meets.

@@ -87,7 +87,7 @@ def test_rays_are_as_full_as_the_training_measured(plush, cameras, raster):
 def test_lifted_cnn_features_render_like_those_of_unseen_photos(plush, cameras, raster):
     # Cells side by side have a cosine of 0.89, those of other things about 0.4: the right cells must be met, not
     # their mirror images.
-    settings = LiftSettings.of(preset="row-sum", certificate_rays=0, view_stride=12, stride=3)
+    settings = LiftSettings.of(preset="row-sum", diagnostic_rays=0, view_stride=12, stride=3)
     paths = [plush / name for name in ("point_cloud.ply", "cameras.json", "grids.safetensors")]
     features = lift_files(paths[0], paths[1], paths[2:], settings).features
     held_out, found = read_features(plush / "grids_test.safetensors"), []

@@ -17,7 +17,7 @@ from tests.api.tiny_scene import WORDS, make_scene
 from tests.backends import needs_triton
 
 pytestmark = needs_triton
-FEW: dict[str, Any] = {"certificate_rays": 6}  # as the interpreter traces one in a thirtieth of a second
+FEW: dict[str, Any] = {"diagnostic_rays": 6}  # as the interpreter traces one in a thirtieth of a second
 GRIDS: list[dict[str, Any]] = [{}, {"preset": "top-k"}, {"cg_steps": 1}, {"aggregation": True}, {"smoothness": 1}]
 MAPS: list[dict[str, Any]] = [{"preset": preset.value} for preset in Preset]
 MAPS += [{"loss": "huber"}, {"robust_steps": 2}, {"cg_steps": 1}, {"dtype": "float32"}, {"smoothness": 1}]

@@ -23,7 +23,7 @@ def test_agreement_is_the_same_at_any_length_of_the_vectors():
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1e-7, 1e15])
-def test_a_certificate_and_scores_are_the_same_at_any_length(scale):
+def test_diagnostics_and_scores_are_the_same_at_any_length(scale):
     views = [{f"v{k}": checkerboard(5 + k, 40, size) for k in range(2)} for size in (1.0, scale)]
     one, other = (lifted(own, preset="row-sum", reference_channels=4) for own in views)
     for key in ("beta", "bound", "reference"):
@@ -40,7 +40,7 @@ def test_least_squares_that_runs_away_is_told(damping, told):
 
 
 def numbers(told: object) -> list[float]:
-    """The numbers of a part of a certificate that have no unit."""
+    """The numbers of a part of diagnostics that have no unit."""
     if not isinstance(told, dict):
         return [told] if isinstance(told, float) else []
     return [
@@ -48,8 +48,8 @@ def numbers(told: object) -> list[float]:
     ]
 
 
-def without_plan(certificate: dict[str, object]) -> dict[str, object]:
-    return {key: value for key, value in certificate.items() if key != "plan"}
+def without_plan(diagnostics: dict[str, object]) -> dict[str, object]:
+    return {key: value for key, value in diagnostics.items() if key != "plan"}
 
 
 @pytest.mark.parametrize("size", [(1, 1), (5, 7), (12, 16), (50, 70)])
@@ -61,4 +61,4 @@ def test_the_nearest_reading_of_a_grid_takes_the_cell_under_the_pixel(size):
     as_regions = lifted({"v0": cells}, preset="row-sum", objects=False)  # as cells of a grid make none
     assert torch.equal(got.features, as_regions.features)
     # The plan's memory is an upper bound of each reading.
-    assert without_plan(got.metadata.certificate) == without_plan(as_regions.metadata.certificate)
+    assert without_plan(got.metadata.diagnostics) == without_plan(as_regions.metadata.diagnostics)

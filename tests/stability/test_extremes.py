@@ -70,7 +70,7 @@ def test_a_huge_image_equals_the_oracle_ray_by_ray():
         assert sums[y, x] == pytest.approx(1 - light, abs=WEIGHTS)
 
 
-def test_two_saturated_splats_weigh_the_same_in_the_lift_and_in_its_certificate():
+def test_two_saturated_splats_weigh_the_same_in_the_lift_and_in_its_diagnostics():
     # (1 - cap)^2 is the stop itself with the field's constants: every way to A must fall on the same side.
     splats, camera = splats_at([(0.0, 0.0, 2.0), (0.0, 0.0, 3.0)], log_scales=2.0, logits=1e4), camera_at_origin()
     lifted = weights_of(splats, camera, CompositingParams())[0]

@@ -48,7 +48,7 @@ def test_scene_is_lifted_inspected_and_queried(scene: Path, capsys: pytest.Captu
     assert document["settings"]["preset"] == "row-sum"
     assert document["seen_share"] == 1
     assert document["warnings"] == ["1 views have features but no camera and were skipped: lost"]
-    assert {"certificate", "timings", "out"} <= set(document)
+    assert {"diagnostics", "timings", "out"} <= set(document)
     features = load_lift(scene / "lift.safetensors").features
     assert features[0, 0] > 0.9
     assert features[1, 1] > 0.9
@@ -84,8 +84,8 @@ def test_scene_is_lifted_inspected_and_queried(scene: Path, capsys: pytest.Captu
     )
     status, out, err = run(capsys, "inspect", scene / "lift.safetensors", "--json")
     assert json.loads(out)["kind"] == "lift"
-    certificate, timings = run(capsys, *lift_arguments(scene, "--verbose"))[1].split("timings:\n")
-    assert "row_sum_mean: " in certificate
+    diagnostics, timings = run(capsys, *lift_arguments(scene, "--verbose"))[1].split("timings:\n")
+    assert "row_sum_mean: " in diagnostics
     stages = [line for line in timings.splitlines() if not line.startswith("warning: ")]
     assert stages and all(re.fullmatch(r"  [a-z]+: \d+\.\d{3} s", line) for line in stages)
     status, out, err = run(capsys, *question[:3])
@@ -144,7 +144,7 @@ def test_a_lift_takes_its_files_as_texts_and_its_packs_as_a_list(scene: Path) ->
 
 
 def test_settings_are_json_or_words() -> None:
-    pairs = pairs_of(["power=2", "lift_gain=0.8", "dtype=float32", "certificate_rays=0"])
+    pairs = pairs_of(["power=2", "lift_gain=0.8", "dtype=float32", "diagnostic_rays=0"])
     settings = LiftSettings.of(preset="row-sum", **pairs)
     assert pairs_of(["power=2", "power=2"]) == {"power": 2}
     assert (settings.power, settings.lift_gain, settings.dtype) == (2, 0.8, "float32")
@@ -152,9 +152,9 @@ def test_settings_are_json_or_words() -> None:
     for wrong, message in ((["=1"], "key=value"), (["damping=1", "damping=2"], "damping: expected one value")):
         with pytest.raises(InvalidSettings, match=message):
             pairs_of(wrong)
-    assert LiftSettings.model_validate({"certificate_rays": 5_000_000}).certificate_rays == 5_000_000  # older lifts'
-    with pytest.raises(InvalidSettings, match="certificate_rays: expected at most 1000000 rays, got 5000000"):
-        LiftSettings.of(certificate_rays=5_000_000)
+    assert LiftSettings.model_validate({"diagnostic_rays": 5_000_000}).diagnostic_rays == 5_000_000  # older lifts'
+    with pytest.raises(InvalidSettings, match="diagnostic_rays: expected at most 1000000 rays, got 5000000"):
+        LiftSettings.of(diagnostic_rays=5_000_000)
 
 
 def test_inspect_speaks_to_people_and_programs(
@@ -270,7 +270,7 @@ def test_plan_is_printed_alone_and_before_a_lift_and_kept_with_it(
     assert status == 0 and out.startswith(f"{summary}\n")
     made = load_lift(scene / "lift.safetensors").metadata
     assert (made.settings.speed, made.settings.stride, made.settings.view_cosine) == ("draft", 1, 0.98)
-    assert made.certificate["plan"]["memory_bytes"] == plan["memory_bytes"]
+    assert made.diagnostics["plan"]["memory_bytes"] == plan["memory_bytes"]
     status, out, err = run(capsys, *arguments)
     told, _, rest = out.partition(f"{scene / 'lift.safetensors'}: ")
     first, channels, memory, warning = told.splitlines()
@@ -280,8 +280,8 @@ def test_plan_is_printed_alone_and_before_a_lift_and_kept_with_it(
     status, out, err = run(capsys, *arguments, "--json", "--explain")
     assert (status, err, out.count("\n")) == (0, "", 1)
     document = json.loads(out)
-    assert document["warnings"][0] == little_memory and document["certificate"]["plan"]["channels"] == 3
-    assert little_memory not in document["certificate"]["warnings"]  # equal inputs give equal certificates
+    assert document["warnings"][0] == little_memory and document["diagnostics"]["plan"]["channels"] == 3
+    assert little_memory not in document["diagnostics"]["warnings"]  # equal inputs give equal diagnostics
 
 
 def test_what_the_plan_warned_of_is_said_once(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:

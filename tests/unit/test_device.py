@@ -1,4 +1,4 @@
-"""Which device a lift gets, what is said where there is none, and what the certificate tells of it."""
+"""Which device a lift gets, what is said where there is none, and what the diagnostics tells of it."""
 
 from __future__ import annotations
 
@@ -72,13 +72,13 @@ def test_facts_of_a_card_name_it_and_all_versions(card: pytest.MonkeyPatch) -> N
     assert interpreter.name.startswith("Triton's interpreter") and interpreter.free_bytes() is None
 
 
-def test_certificate_tells_the_device_that_lifted(tmp_path: Path) -> None:
+def test_diagnostics_name_the_device_that_lifted(tmp_path: Path) -> None:
     scene = write_scene(tmp_path, 3)
-    made = lift_files(scene[0], scene[1], [scene[2]], LiftSettings.of(device="cpu", certificate_rays=10))
-    told = made.metadata.certificate["device"]
+    made = lift_files(scene[0], scene[1], [scene[2]], LiftSettings.of(device="cpu", diagnostic_rays=10))
+    told = made.metadata.diagnostics["device"]
     assert (told["kind"], told["name"]) == ("cpu", processor())
     assert told["versions"]["torch"] == torch.__version__ and told["versions"].keys() == {"torch", "numba", "numpy"}
-    assert made.metadata.certificate["plan"]["device"] == "cpu"
+    assert made.metadata.diagnostics["plan"]["device"] == "cpu"
 
 
 @pytest.mark.parametrize(

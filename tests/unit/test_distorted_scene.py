@@ -61,7 +61,7 @@ def test_features_reach_the_splats_that_the_photo_shows(lens: str, grids: bool, 
     shares = share_of_own_quarter(made)
     assert len(shares) > 500
     assert float(shares.min()) > 0.9
-    assert any("distorted photos" in text for text in made.metadata.certificate["warnings"])
+    assert any("distorted photos" in text for text in made.metadata.diagnostics["warnings"])
     # The same maps taken for a pinhole's put the border elsewhere.
     document = json.loads((tmp_path / "transforms.json").read_text())
     plain = {key: value for key, value in document.items() if key not in LENSES[lens][0]}
@@ -69,7 +69,7 @@ def test_features_reach_the_splats_that_the_photo_shows(lens: str, grids: bool, 
     paths = tmp_path / "splats.ply", tmp_path / "transforms.json"
     ignored = lift_files(*paths, [tmp_path / "features.safetensors"], LiftSettings.of(preset="row-sum"))
     assert float(share_of_own_quarter(ignored).min()) < 0.5
-    assert not any("distorted photos" in text for text in ignored.metadata.certificate["warnings"])
+    assert not any("distorted photos" in text for text in ignored.metadata.diagnostics["warnings"])
 
 
 def is_lifted(camera: Camera) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Old public names: read in files, settings and calls with the new ones' values, and refused beside other values."""
 
 import json
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,9 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 import liftcore as lc
+from liftcore.cli import build_parser
+from liftcore.cli.lift import pairs_of, settings_of
+from liftcore.values.lift import LiftMetadata
 from liftcore.values.lift_file import FORMATS, OLD_TENSORS
 from liftcore.values.region_weights import OLD_TENSORS as OLD_WEIGHTS
 from tests.scenes import observed, write_scene
@@ -25,7 +29,7 @@ def lift(tmp_path_factory: pytest.TempPathFactory) -> lc.LiftResult:
     return lc.lift(lc.read_splats(splats), lc.read_cameras(cameras), views)
 
 
-def old_names(values: dict[str, Any], aliases: dict[str, str]) -> dict[str, Any]:
+def old_names(values: dict[str, Any], aliases: Mapping[str, str]) -> dict[str, Any]:
     """Return values with old names in place of new ones."""
     olds = {new: old for old, new in aliases.items()}
     return {olds.get(name, name): value for name, value in values.items()}
@@ -46,7 +50,8 @@ def test_lift_file_of_the_first_format_opens_with_the_same_values(lift: lc.LiftR
     lift.save(tmp_path / "new.safetensors")
     tensors, metadata = read_file(tmp_path / "new.safetensors")
     assert metadata["format"] == FORMATS[-1] and not OLD_TENSORS.keys() & tensors.keys()
-    metadata |= {"format": FORMATS[0]}
+    settings = old_names(metadata["settings"], lc.LiftSettings.old_names)
+    metadata = old_names(metadata, LiftMetadata.old_names) | {"format": FORMATS[0], "settings": settings}
     old = lc.load_lift(write_file(tmp_path / "old.safetensors", old_names(tensors, OLD_TENSORS), metadata))
     for name in OLD_TENSORS.values():
         assert torch.equal(getattr(old, name), getattr(lift, name))
@@ -82,6 +87,48 @@ def test_old_attributes_and_keywords_of_a_lift_are_deprecated(lift: lc.LiftResul
     with pytest.deprecated_call(match=f"{old} is now {new}"):
         result = lc.LiftResult(**old_names(columns, {old: new}))
     assert getattr(result, new) is getattr(lift, new)
+
+
+def settings_by_old_names(old: str, value: object) -> dict[str, Callable[[], lc.LiftSettings]]:
+    """Return settings with one old name, by the ways in which they come."""
+    text, parser, new = [f"{old}={value}"], build_parser(), lc.LiftSettings.old_names[old]
+    other = lc.LiftSettings.of().model_dump(mode="json")[new]
+    return {
+        "keyword": lambda: lc.LiftSettings.of(**{old: value}),
+        "json": lambda: lc.LiftSettings.of_json({old: value}),
+        "saved": lambda: lc.LiftSettings.model_validate_json(json.dumps({old: value})),
+        "set": lambda: lc.LiftSettings.of(**pairs_of(text)),
+        "option": lambda: settings_of(parser.parse_args(["lift", "s", "c", "f", "-o", "o", "--set", *text])),
+        "changed": lambda: lc.LiftSettings.chosen(lc.LiftSettings.of(**{new: other}), {old: value}),
+    }
+
+
+VALUES = {"certificate_rays": 7}  # of settings with an old name
+
+
+@pytest.mark.parametrize("way", settings_by_old_names("certificate_rays", 7))
+@pytest.mark.parametrize("old", lc.LiftSettings.old_names)
+def test_settings_are_read_by_old_names_and_written_by_new_ones(old: str, way: str) -> None:
+    new, value = lc.LiftSettings.old_names[old], VALUES[old]
+    settings = settings_by_old_names(old, value)[way]()
+    assert getattr(settings, new) == value and new in settings.model_fields_set
+    values = settings.model_dump(mode="json")
+    assert values[new] == value and old not in values
+    assert lc.LiftSettings.with_old_names(values)[old] == value
+    with pytest.deprecated_call(match=f"{old} is now {new}"):
+        assert getattr(settings, old) == value
+
+
+@pytest.mark.parametrize("old", lc.LiftSettings.old_names)
+def test_settings_with_both_names_and_other_values_are_refused(old: str) -> None:
+    new, value = lc.LiftSettings.old_names[old], VALUES[old]
+    default = lc.LiftSettings.of().model_dump(mode="json")[new]
+    assert getattr(lc.LiftSettings.of(**{old: value, new: value}), new) == value
+    for make in (lambda values: lc.LiftSettings.of(**values), lc.LiftSettings.of_json):
+        with pytest.raises(lc.InvalidSettings, match=f"{old} is the old name of {new}"):
+            make({old: value, new: default})
+    with pytest.raises(lc.InvalidSettings, match=f"{new}: expected one value"):
+        pairs_of([f"{old}={value}", f"{new}={default}"])
 
 
 def test_weights_file_of_the_first_format_opens(tmp_path: Path) -> None:

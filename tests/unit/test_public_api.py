@@ -216,7 +216,7 @@ def test_every_stage_is_told_in_order_and_the_plan_after_the_first_views(tmp_pat
     made = lift_files(splats, cameras, [pack], lc.LiftSettings.of(), progress=hear, on_plan=on_plan)
     [(plan, before)] = plans
     assert before == {"read": 1, "digest": 1, "compile": 1, "plan": 1, "geometry": 3}
-    assert plan.facts() == made.metadata.certificate["plan"]
+    assert plan.facts() == made.metadata.diagnostics["plan"]
     for stage in ("read", "digest", "compile", "plan", "certify"):
         assert [word for word in said if word[0] == stage] == [(stage, 0, 1, "steps"), (stage, 1, 1, "steps")]
     order = list(dict.fromkeys(stage for stage, *_ in said))

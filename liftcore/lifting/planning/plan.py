@@ -126,7 +126,7 @@ class Plan(PlannedScene):
     features_room: int | None  # bytes of this machine's memory that X may take today; None for no limit
     seconds: float | None  # estimate for the geometry of all views on this machine now; None for few views
     warnings: tuple[str, ...]  # of this machine, today
-    told: tuple[str, ...]  # warnings of what is lifted, which the certificate of the lift has too
+    told: tuple[str, ...]  # warnings of what is lifted, which the diagnostics of the lift has too
 
     def __repr__(self) -> str:
         views = f"{len(self.views)} of {self.there} views"
@@ -307,7 +307,7 @@ def _seconds(raster: Raster, views: LiftViews, names: Sequence[str], settings: L
         return None
     begin = time.perf_counter()
     middle = views.only([names[len(names) // 2]])
-    probe_settings = settings.model_copy(update={"certificate_rays": 0})
+    probe_settings = settings.model_copy(update={"diagnostic_rays": 0})
     weigh_views(raster, raster.splats.count, middle, probe_settings, silent, by_rows=False)
     return len(names) * (time.perf_counter() - begin)
 

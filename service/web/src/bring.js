@@ -231,7 +231,7 @@ export class Bring {
     try {
       const { components: { schemas } } = await json("/openapi.json");
       const { properties } = schemas.LiftRequest.properties.settings;
-      at("knobs").replaceChildren(...Object.entries(properties).filter(([name]) => !["speed"].includes(name)).map(([name, told]) => {
+      at("knobs").replaceChildren(...Object.entries(properties).filter(([name, schema]) => !schema.deprecated && !["speed"].includes(name)).map(([name, told]) => {
         const input = this.fields[name] = field(resolved(told, schemas));
         input.id = `knob-${name}`;
         return el("div", { className: "knob" }, el("label", { htmlFor: input.id }, name), input, el("small", {}, told.description || ""));

@@ -54,7 +54,7 @@ export class Look {
     this.layer = null;
     this.views = [];
     this.showLayer("rgb");
-    const clusters = lift.certificate?.clusters ?? lift.settings?.aggregation;
+    const clusters = lift.diagnostics?.clusters ?? lift.settings?.aggregation;
     at("layer-cluster").hidden = !clusters;
     at("layer-confidence").hidden = !lift.settings?.robust_steps;
     at("layer-photo").hidden = !lift.photos;

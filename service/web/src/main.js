@@ -370,7 +370,7 @@ async function preview(file, cameras) {
 async function warnings(known) {
   const { plan } = await json(`/jobs/${known.id}`).catch(() => ({}));
   if (known !== lift) return;
-  const told = [...new Set([...(plan?.warnings ?? []), ...(known.certificate?.warnings ?? [])])];
+  const told = [...new Set([...(plan?.warnings ?? []), ...(known.diagnostics?.warnings ?? [])])];
   at("warnings").hidden = !told.length;
   at("warnings").replaceChildren(...told.map(warning => el("li", {}, warning)));
 }

@@ -119,7 +119,7 @@ def assert_same_metadata(one: lc.LiftResult, other: lc.LiftResult) -> None:
     ],
 )
 def test_blocks_give_the_bits_of_a_lift_in_memory(scene: dict[str, Any], asked: dict[str, Any]) -> None:
-    settings = LiftSettings.of(certificate_rays=200, **asked)
+    settings = LiftSettings.of(diagnostic_rays=200, **asked)
     whole = lc.lift(scene["splats"], scene["cameras"], scene["views"], settings)
     assert whole.node_parents is not None and int((whole.node_parents >= 0).sum()) == 4  # the quarters, of two halves
     for engine in (Twice(1), Shuffled(2)):
@@ -270,7 +270,7 @@ def test_what_needs_all_rays_or_features_is_refused_before(
 
 @pytest.fixture(scope="module")
 def lift(scene: dict[str, Any]) -> lc.LiftResult:
-    return lc.lift(*scene.values(), preset="row-sum", certificate_rays=0)
+    return lc.lift(*scene.values(), preset="row-sum", diagnostic_rays=0)
 
 
 def test_shards_read_as_one_file(scene: dict[str, Any], lift: lc.LiftResult, tmp_path: Path) -> None:

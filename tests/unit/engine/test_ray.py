@@ -100,7 +100,7 @@ class Deadly(RayEngine):
 def test_workers_and_nodes_may_die(
     cluster: Any, stored: dict[str, Any], scene: dict[str, Any], tmp_path: Path
 ) -> None:
-    settings = LiftSettings.of(preset="default", certificate_rays=100)
+    settings = LiftSettings.of(preset="default", diagnostic_rays=100)
     expected = in_blocks(LocalEngine(1), stored, settings)
     folder = tmp_path / "killed"
     assert_same(in_blocks(Deadly("auto"), stored, settings, folder=folder), expected)

@@ -146,7 +146,7 @@ def test_cosines_count_splats_that_the_exact_run_saw():
 def order_of(folder: Path, **parts) -> RunSpec:
     paths = write_scene(folder, 2)
     scene = SceneFiles(paths[0], paths[1], (paths[2],), **parts)
-    return RunSpec(scene, {"certificate_rays": 0}, ("v0", "v1"), ("v2",), (), 1, folder, exact=True)
+    return RunSpec(scene, {"diagnostic_rays": 0}, ("v0", "v1"), ("v2",), (), 1, folder, exact=True)
 
 
 def test_a_run_is_judged_by_views_that_it_did_not_lift(tmp_path):
@@ -234,7 +234,7 @@ def test_chart_table_and_json_are_written(tmp_path):
 def test_command_compares_in_processes_of_their_own(tmp_path, capsys):
     paths = write_scene(tmp_path, 2)
     command = ["tradeoff", *map(str, paths), "--budget", "0.1", "-o", str(tmp_path / "out"), "--json"]
-    assert cli.main([*command, "--set", "certificate_rays=0", "--threads", "1"]) == 0
+    assert cli.main([*command, "--set", "diagnostic_rays=0", "--threads", "1"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert [run["name"] for run in document["runs"]] == ["exact"]
     assert "exact alone fitted the budget" in document["choice"]["why"] and not document["choice"]["recommended"]
@@ -242,7 +242,7 @@ def test_command_compares_in_processes_of_their_own(tmp_path, capsys):
     assert all(Path(file).is_file() for file in document["files"])
     assert np.isfinite(document["runs"][0]["wall_with_reading_ratio"])
     again = vars(cli.build_parser().parse_args(shlex.split(document["command"])[1:]))
-    given = vars(cli.build_parser().parse_args([*command, "--set", "certificate_rays=0", "--threads", "1"]))
+    given = vars(cli.build_parser().parse_args([*command, "--set", "diagnostic_rays=0", "--threads", "1"]))
     assert {key for key, value in given.items() if again[key] != value} == {"out", "json"}
 
 

@@ -33,9 +33,9 @@ DENSE = {
 def test_plan_says_what_region_weights_of_dense_maps_take(map_of: str, stride: int) -> None:
     (camera,) = room_cameras(1, WIDTH, HEIGHT)
     views = {camera.name: DENSE[map_of]}
-    made = lc.lift(room_splats(300), {camera.name: camera}, views, "row-sum", stride=stride, certificate_rays=0)
+    made = lc.lift(room_splats(300), {camera.name: camera}, views, "row-sum", stride=stride, diagnostic_rays=0)
     taken = 8 * made.diagnostics["weights_entries"]  # four bytes each for the region and the weight
-    assert 0.7 < made.metadata.certificate["plan"]["memory"]["weights"] / taken < 2.0
+    assert 0.7 < made.metadata.diagnostics["plan"]["memory"]["weights"] / taken < 2.0
 
 
 @pytest.mark.parametrize("threads", [1, 3])

@@ -53,11 +53,11 @@ def test_a_pilot_foresees_how_near_fewer_views_come(tmp_path, error):
     splats, cameras, pack = disagreeing(tmp_path / "scene", error)
     whole = lift_files(splats, cameras, [pack], LiftSettings.of(preset="tikhonov"))
     fewer = lift_files(splats, cameras, [pack], LiftSettings.of(preset="tikhonov", view_cosine=0.98))
-    expected = fewer.metadata.certificate["plan"]["view_cosine"]
+    expected = fewer.metadata.diagnostics["plan"]["view_cosine"]
     found = cosine_figures(fewer.features, whole.features, whole.total_weight)["cosine"]
     assert expected >= 0.98
     assert found == pytest.approx(expected, abs=0.02)
-    assert whole.metadata.certificate["plan"]["view_cosine"] is None
+    assert whole.metadata.diagnostics["plan"]["view_cosine"] is None
 
 
 def test_the_more_views_disagree_the_more_are_lifted(tmp_path):
@@ -128,7 +128,7 @@ def test_in_a_room_where_views_share_few_splats_a_pilot_is_right_too(tmp_path):
     whole = lift_files(*paths[:2], [paths[2]], LiftSettings.of())
     for wanted in (0.9, 0.97):
         fewer = lift_files(*paths[:2], [paths[2]], LiftSettings.of(view_cosine=wanted))
-        plan = fewer.metadata.certificate["plan"]
+        plan = fewer.metadata.diagnostics["plan"]
         found = cosine_figures(fewer.features, whole.features, whole.total_weight)["cosine"]
         assert found is not None
         assert plan["views_left_out"] > 0
@@ -141,7 +141,7 @@ def test_with_coverage_beside_it_a_cosine_takes_no_fewer_views_and_no_pilot_flie
     for coverage in (0, 12, 20, VIEWS - NOISE_VIEWS):
         made = lift_files(*paths[:2], [paths[2]], LiftSettings.of(view_cosine=0.95, coverage=coverage))
         counts.append(len(made.metadata.views))
-        expected.append(made.metadata.certificate["plan"]["view_cosine"])
+        expected.append(made.metadata.diagnostics["plan"]["view_cosine"])
     assert counts[0] < 12
     assert counts[1:] == [12, 20, VIEWS]
     assert expected[0] < expected[1] < expected[2]

@@ -113,7 +113,7 @@ def test_a_view_that_sees_nothing_is_spare():
 def test_a_lift_with_coverage_is_the_lift_of_the_chosen_views(tmp_path):
     paths = write_scene(tmp_path, 2)
     made = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(coverage=1, preset="row-sum"))
-    plan = made.metadata.certificate["plan"]
+    plan = made.metadata.diagnostics["plan"]
     assert len(made.metadata.views) == plan["views"] == 3 - plan["views_left_out"] < 3
     whole = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(preset="row-sum"))
     assert not torch.equal(made.features, whole.features)
@@ -124,7 +124,7 @@ def test_plan_and_lift_say_which_level_is_taken_alone_of_how_many():
     names = [f"v{k}" for k in range(3)]
     cameras = {name: random_camera(k, name=name) for k, name in enumerate(names)}
     scene = random_splats(3, 60), cameras, {name: random_regions(k, levels=4) for k, name in enumerate(names)}
-    settings = LiftSettings.of(preset="row-sum", levels=2, certificate_rays=0)
+    settings = LiftSettings.of(preset="row-sum", levels=2, diagnostic_rays=0)
     plan = lc.plan(*scene, settings)
     assert plan.facts()["levels"] == {"alone": 2, "of": 4}
     assert any("level 2 alone of 4" in line for line in plan.summary())

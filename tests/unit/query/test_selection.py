@@ -240,7 +240,7 @@ def test_word_of_a_part_takes_its_node_where_levels_disagree(
     }  # fmt: skip
     fields: dict[str, Any] = {name: torch.from_numpy(values.astype(np.int32)) for name, values in tree.items()}
     fields |= {"node_confidence": torch.ones(5), "node_features": torch.from_numpy(own).half()}
-    facts = {"certificate": {"objects": {"level_agreement": agreement}}}
+    facts = {"diagnostics": {"objects": {"level_agreement": agreement}}}
     told = lifted(scene, rows, metadata=scene.lift.metadata.model_copy(update=facts), **fields)
     found = ask(told, Query.of(("handle",), absent="keep"), table)
     assert (np.flatnonzero(found.selected).tolist() == list(range(60))) == by_node

@@ -370,7 +370,7 @@ def test_lifts_that_remember_names_as_a_mac_wrote_them_know_their_cameras(tmp_pa
         settings=LiftSettings.of(),
         views=views,
         poses=poses_of(known, "NFD"),
-        certificate={},
+        diagnostics={},
         timings={},
     )
     assert old.views == tuple(found) and has_poses(path, old)

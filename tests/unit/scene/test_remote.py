@@ -50,8 +50,8 @@ def read(base: str) -> tuple[Any, ...]:
 
 @pytest.mark.parametrize("name", ["one.safetensors", "many.shards"])
 def test_lift_of_inputs_elsewhere_is_saved_there_and_opened(elsewhere: str, name: str, tmp_path: Path) -> None:
-    lift = lc.lift(*read(elsewhere), certificate_rays=0)
-    here = lc.lift(*read(str(tmp_path)), certificate_rays=0)
+    lift = lc.lift(*read(elsewhere), diagnostic_rays=0)
+    here = lc.lift(*read(str(tmp_path)), diagnostic_rays=0)
     assert torch.equal(lift.features, here.features)
     for _ in range(2):  # over another of the same name, too
         lift.save(f"{elsewhere}/out/{name}")

@@ -240,7 +240,7 @@ def test_commands_follow_the_file_tell_it_and_take_a_setting_by_hand(
     assert scene.compositing.antialiased and params_of_renders(scene).antialiased
     found = inspect_file(out)
     assert found["settings"]["antialiased"] is True
-    assert "says so" in found["certificate"]["plan"]["rendering"]
+    assert "says so" in found["diagnostics"]["plan"]["rendering"]
     assert run(capsys, "lift", splats, cameras, packs, "-o", out, "--set", "antialiased=false")[0] == 0
     assert not Scene(out).compositing.antialiased
 

@@ -46,7 +46,7 @@ def clustering_of(labels: np.ndarray, count: int = K) -> Clustering:
 @settings(max_examples=25, deadline=None)
 def test_kept_regions_are_those_of_the_paper_pixel_by_pixel(tmp_path_factory, seed, iou):
     asked, splats = (
-        LiftSettings.of(aggregation=True, aggregation_iou=iou, certificate_rays=10),
+        LiftSettings.of(aggregation=True, aggregation_iou=iou, diagnostic_rays=10),
         random_splats(seed, P),
     )
     views = tuple(random_camera(seed + k, 21 + 4 * k, 17, name=f"v{k}") for k in range(2))
@@ -117,7 +117,7 @@ def write_scene(folder, kind: str):
     return paths, side
 
 
-KNOBS = {"preset": "tikhonov", "aggregation_cluster_size": 40, "certificate_rays": 10, "aggregation_iou": 0.2}
+KNOBS = {"preset": "tikhonov", "aggregation_cluster_size": 40, "diagnostic_rays": 10, "aggregation_iou": 0.2}
 
 
 @pytest.mark.parametrize("kind", ["regions", "grids"])
@@ -127,7 +127,7 @@ def test_a_lift_with_aggregation_has_one_feature_a_cluster_and_says_so(tmp_path,
     save_lift(result, tmp_path / "lift")
     opened = load_lift(tmp_path / "lift")
     assert opened.cluster is not None and opened.cluster_features is not None
-    facts = opened.metadata.certificate["aggregation"]
+    facts = opened.metadata.diagnostics["aggregation"]
     assert facts["clusters"] == opened.cluster_features.shape[0] >= 2
     assert ("kept_regions" in facts) == (kind == "regions")
     assert facts["filter"].startswith("iou" if kind == "regions" else "none")
@@ -165,7 +165,7 @@ def test_what_takes_no_cluster_is_solved_again_as_if_the_other_regions_had_never
     result = lift_files(
         splats, cameras, [features], LiftSettings.of(aggregation=True, aggregation_resolve=True, **knobs)
     )
-    facts = result.metadata.certificate["aggregation"]
+    facts = result.metadata.diagnostics["aggregation"]
     assert facts["kept_regions"] < facts["regions"] and facts["resolved"] > 0
     plain = lift_files(splats, cameras, [features], LiftSettings.of(aggregation=True, **knobs))
     whole = weights_of(splats, cameras, maps | {"v0": wrong}, plain.metadata.settings)
@@ -196,11 +196,11 @@ def test_what_takes_no_cluster_is_solved_again_as_if_the_other_regions_had_never
 
 def test_a_lift_without_clusters_is_the_lift_without_aggregation_and_says_so(tmp_path):
     (splats, cameras, features), _ = write_scene(tmp_path, "regions")
-    plain = lift_files(splats, cameras, [features], LiftSettings.of(certificate_rays=10))
-    asked = LiftSettings.of(aggregation=True, aggregation_clusters="hdbscan", certificate_rays=10)
+    plain = lift_files(splats, cameras, [features], LiftSettings.of(diagnostic_rays=10))
+    asked = LiftSettings.of(aggregation=True, aggregation_clusters="hdbscan", diagnostic_rays=10)
     none = lift_files(splats, cameras, [features], asked)
-    assert none.metadata.certificate["aggregation"]["clusters"] == 0
-    assert none.metadata.certificate["aggregation"]["changed"] == 0
+    assert none.metadata.diagnostics["aggregation"]["clusters"] == 0
+    assert none.metadata.diagnostics["aggregation"]["changed"] == 0
     assert torch.equal(plain.features, none.features)
     assert none.cluster is not None and bool((none.cluster == -1).all())
     save_lift(none, tmp_path / "none")
@@ -212,7 +212,7 @@ def test_a_lift_without_clusters_is_the_lift_without_aggregation_and_says_so(tmp
 
 def test_a_lift_whose_clusters_do_not_fit_is_refused(tmp_path):
     (splats, cameras, features), _ = write_scene(tmp_path, "regions")
-    plain = lift_files(splats, cameras, [features], LiftSettings.of(preset="row-sum", certificate_rays=10))
+    plain = lift_files(splats, cameras, [features], LiftSettings.of(preset="row-sum", diagnostic_rays=10))
     parts = {"cluster": torch.zeros(400, dtype=torch.int32), "cluster_features": torch.zeros(3, 6).half()}
     assert set(parts) == set(CLUSTER_TENSORS)
     for changed in (
@@ -234,7 +234,7 @@ def test_one_splat_is_aggregated_without_harm(tmp_path):
     write_pack(tmp_path / "f.safetensors", {"v0": random_regions(0, F=3)}, {"encoder": "random"})
     paths = tmp_path / "splats.ply", tmp_path / "cameras.json"
     for clusters, number in (("hdbscan", -1), ("touching", -1), ("graph", 0)):
-        asked = LiftSettings.of(aggregation=True, aggregation_clusters=clusters, certificate_rays=10)
+        asked = LiftSettings.of(aggregation=True, aggregation_clusters=clusters, diagnostic_rays=10)
         result = lift_files(*paths, [tmp_path / "f.safetensors"], asked)
         assert result.cluster is not None and result.cluster.tolist() == [number]
         assert bool(torch.isfinite(result.features).all())

@@ -65,11 +65,11 @@ def assert_same(one: LiftResult, other: LiftResult) -> None:
         first, second = getattr(one, name), getattr(other, name)
         assert first.dtype == second.dtype
         assert torch.equal(first.view(torch.uint8), second.view(torch.uint8)), name
-    assert one.metadata.certificate == other.metadata.certificate
+    assert one.metadata.diagnostics == other.metadata.diagnostics
 
 
 def lifted(scene: tuple[Path, Path, Path], settings: LiftSettings | None = None, **more: Any) -> LiftResult:
-    return lift_files(scene[0], scene[1], [scene[2]], settings or LiftSettings.of(certificate_rays=50), **more)
+    return lift_files(scene[0], scene[1], [scene[2]], settings or LiftSettings.of(diagnostic_rays=50), **more)
 
 
 def killed(scene: tuple[Path, Path, Path], stage: str, at: int, **more: Any) -> None:
@@ -148,7 +148,7 @@ def test_checkpoint_of_another_walk_or_other_splats_is_never_used(tmp_path: Path
 @pytest.mark.parametrize("grids", [False, True])
 def test_other_features_of_the_same_regions_walk_no_view_again(tmp_path: Path, walks: list[str], grids: bool) -> None:
     splats, cameras, features = write_scene(tmp_path, 8, grids)
-    checkpoint, settings = Checkpoint(tmp_path / "kept"), LiftSettings.of(certificate_rays=50)
+    checkpoint, settings = Checkpoint(tmp_path / "kept"), LiftSettings.of(diagnostic_rays=50)
     lifted((splats, cameras, features), settings, checkpoint=checkpoint)
     walks.clear()
     other = tmp_path / "other.safetensors"
@@ -236,7 +236,7 @@ def test_checkpoint_of_another_device_is_never_used(
     monkeypatch.setattr(Device, "facts", lambda _: facts)
     made = lifted(scene, LiftSettings.of(device="cpu"), checkpoint=checkpoint)
     assert len(walks) == 6
-    assert made.metadata.certificate["device"] == facts
+    assert made.metadata.diagnostics["device"] == facts
 
 
 @pytest.mark.parametrize("length", [0, 200])

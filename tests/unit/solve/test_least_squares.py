@@ -212,11 +212,11 @@ def test_a_lift_takes_no_step_unless_asked(tmp_path):
         said.append((stage, done, total, unit))
 
     plain = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(), progress=progress)
-    assert "refinement" not in plain.metadata.certificate
+    assert "refinement" not in plain.metadata.diagnostics
     assert not any(stage in ("refine", "rays") for stage, *_ in said)
     steps = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(cg_steps=3, damping=0.1), progress=progress)
-    told = steps.metadata.certificate["refinement"]
+    told = steps.metadata.diagnostics["refinement"]
     assert [word for word in said if word[0] == "refine"][-1] == ("refine", 3, 3, "steps")
     assert told["residuals"][-1] < told["residuals"][0]
-    assert steps.metadata.certificate["residual"] < plain.metadata.certificate["residual"]
+    assert steps.metadata.diagnostics["residual"] < plain.metadata.diagnostics["residual"]
     assert not torch.equal(steps.features, plain.features)

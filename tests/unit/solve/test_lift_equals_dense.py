@@ -115,7 +115,7 @@ def test_a_lift_equals_the_dense_definition(tmp_path, case, grids, seed):
     assert (error <= 1e-3 * np.linalg.norm(exact.X, axis=1) + 1e-7)[decided & (exact.D > 1e-6)].all()
     assert (decided & seen).sum() > 10
     assert np.abs(got.total_weight.numpy() - exact.total_weight)[decided].max() < 1e-3
-    assert got.metadata.certificate["rays"] == exact.rays
+    assert got.metadata.diagnostics["rays"] == exact.rays
 
 
 @pytest.mark.parametrize("preset", ["row-sum", "tikhonov"])
@@ -131,7 +131,7 @@ def same_bits(one: LiftResult, other: LiftResult) -> bool:
     """Whether all that two lifts found is equal to the bit."""
     names = [name for name in (*TENSORS, *CLUSTER_TENSORS) if getattr(one, name) is not None]
     same = all(torch.equal(getattr(one, name), getattr(other, name)) for name in names)
-    return same and one.metadata.certificate == other.metadata.certificate
+    return same and one.metadata.diagnostics == other.metadata.diagnostics
 
 
 @pytest.mark.parametrize(
@@ -171,7 +171,7 @@ def test_discs_written_with_three_scales_are_discs_where_the_settings_say_so(tmp
     scales = torch.cat([flat.log_scales, torch.full((flat.count, 1), -1.0)], dim=1)  # of no account
     write_splats(solid, Splats(flat.means, flat.quats, scales, flat.opacity_logits, sh=flat.sh))
     wanted, got = lifted((discs, cameras, features)), lifted((solid, cameras, features), kernel="2dgs")
-    assert got.metadata.certificate["plan"]["kernel"] == "2dgs"
+    assert got.metadata.diagnostics["plan"]["kernel"] == "2dgs"
     assert torch.equal(got.features, wanted.features)
     assert not torch.equal(lifted((solid, cameras, features)).features, wanted.features)
     save_lift(got, tmp_path / "made.safetensors")
@@ -227,7 +227,7 @@ def test_levels_lift_and_certify_as_the_maps_that_they_stand_for(tmp_path, level
     assert torch.equal(got.seen, other.seen)
     assert torch.allclose(got.features, other.features, atol=1e-5)
     assert torch.allclose(got.agreement, other.agreement, atol=1e-5)
-    ours, theirs = got.metadata.certificate, other.metadata.certificate
+    ours, theirs = got.metadata.diagnostics, other.metadata.diagnostics
     for name in ("rays", "rows", "row_sum_mean", "residual", "surrogate", "bound"):
         assert ours[name] == pytest.approx(theirs[name], rel=1e-4), name
 
@@ -250,7 +250,7 @@ def test_folders_before_the_names_of_views_change_no_bit(tmp_path):
     plain, made = lifted(paths), lifted((*paths[:2], rig))
     assert torch.equal(plain.features, made.features)
     assert made.metadata.views == plain.metadata.views == ("v0", "v1", "v2")
-    assert made.metadata.certificate["warnings"] == plain.metadata.certificate["warnings"]
+    assert made.metadata.diagnostics["warnings"] == plain.metadata.diagnostics["warnings"]
     save_lift(made, tmp_path / "rig.lift")
     regions = observed(3, 1)
     assert isinstance(regions, Regions)
@@ -267,6 +267,6 @@ def test_the_warning_of_skipped_views_tells_how_a_rig_is_named(tmp_path):
         record["img_name"] = name
     cameras.write_text(json.dumps(records))
     made = lifted((splats, cameras, repacked(features, {"v0": "0", "v1": "1"})))
-    assert (made.metadata.views, made.metadata.certificate["views_without_camera"]) == (("camA/1",), ["0"])
-    [warning] = [text for text in made.metadata.certificate["warnings"] if "skipped" in text]
+    assert (made.metadata.views, made.metadata.diagnostics["views_without_camera"]) == (("camA/1",), ["0"])
+    [warning] = [text for text in made.metadata.diagnostics["warnings"] if "skipped" in text]
     assert warning.endswith("cameras are named with their folders here, such as camA/1: name views like them")

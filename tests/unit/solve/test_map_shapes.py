@@ -59,11 +59,11 @@ def test_maps_that_may_be_crops_or_have_another_shape_are_told(
 
 def test_a_crop_is_told_by_the_lift_and_by_its_plan(tmp_path: Path) -> None:
     splats, cameras, _ = write_scene(tmp_path, 3)
-    pack, settings = tmp_path / "crops.safetensors", LiftSettings.of(certificate_rays=10)
+    pack, settings = tmp_path / "crops.safetensors", LiftSettings.of(diagnostic_rays=10)
     write_pack(pack, {"v0": grid(23, 31), "v1": grid(23, 23), "v2": grid(23, 23)}, {"encoder": "e"})
     [planned_for] = plan(*open_files(splats, cameras, [pack], settings), settings).told
     assert planned_for.startswith("2 of 3 views have maps of another aspect than their images (v1: 23x23 for 37x27)")
-    warnings = lift_files(splats, cameras, [pack], settings).metadata.certificate["warnings"]
+    warnings = lift_files(splats, cameras, [pack], settings).metadata.diagnostics["warnings"]
     assert warnings.count(planned_for) == 1
 
 

@@ -31,7 +31,7 @@ def found(scene: SmallScene, features: torch.Tensor, **chosen: int) -> dict:
 
 
 def measures_of(A: np.ndarray, X: np.ndarray, B: np.ndarray) -> ViewMeasures:
-    """The certificate's kernel on dense rows."""
+    """The kernel of the diagnostics on dense rows."""
     rows, splats = A.shape
     entries = np.tile(X.astype(np.float32), (rows, 1))
     starts = np.arange(rows + 1) * splats
@@ -77,14 +77,14 @@ def test_the_reference_finds_the_least_squares_loss(grids):
     assert told["converged"] and "not converged" not in told["message"]
 
 
-def test_the_certificate_shows_the_reference_only_when_asked(tmp_path):
+def test_diagnostics_show_the_reference_only_when_asked(tmp_path):
     paths = write_scene(tmp_path, 9)
-    plain = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(preset="row-sum")).metadata.certificate
+    plain = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(preset="row-sum")).metadata.diagnostics
     assert "reference" not in plain
     asked = LiftSettings.of(preset="row-sum", reference_channels=3)
-    told = lift_files(paths[0], paths[1], [paths[2]], asked).metadata.certificate["reference"]
+    told = lift_files(paths[0], paths[1], [paths[2]], asked).metadata.diagnostics["reference"]
     assert told["ratio"] >= 1.0
     assert told["beta"]["max"] + 1 == told["bound"]
     assert f"{told['ratio']:.3f}" in told["message"]
-    again = lift_files(paths[0], paths[1], [paths[2]], asked).metadata.certificate["reference"]
+    again = lift_files(paths[0], paths[1], [paths[2]], asked).metadata.diagnostics["reference"]
     assert told == again

@@ -28,7 +28,7 @@ LEVELS = "'rows' or 'composite' or a valid integer"
         ("levels", True, LEVELS),
         ("mass", 0, "greater than 0"),
         ("preset", "\ud800", "'default', 'row-sum', 'tikhonov', 'argmax', 'top-k', 'front-mass', 'centre' or 'mean'"),
-        ("certificate_rays", 1_000_001, "at most 1000000 rays"),
+        ("diagnostic_rays", 1_000_001, "at most 1000000 rays"),
         ("k", 65, "less than or equal to 64"),
     ],
 )
@@ -74,7 +74,7 @@ def test_published_schema_has_every_setting_and_what_a_new_lift_may_have() -> No
             if end in field:
                 LiftSettings.of_json({name: field[end]})
     with pytest.raises(InvalidSettings):
-        LiftSettings.of_json({"certificate_rays": fields["certificate_rays"]["maximum"] + 1})
+        LiftSettings.of_json({"diagnostic_rays": fields["diagnostic_rays"]["maximum"] + 1})
 
 
 def test_regions_are_kept_from_the_papers_tau_on() -> None:
@@ -93,7 +93,7 @@ def test_a_preset_only_fills_what_is_not_said(preset: Preset) -> None:
 @pytest.mark.parametrize("speed", Speed)
 def test_a_lift_from_before_a_setting_does_not_tell_what_the_dial_sets_today(speed: Speed) -> None:
     settings = LiftSettings.of(speed=speed)
-    made = LiftMetadata(version="1", settings=settings, views=("a",), certificate={}, timings={})
+    made = LiftMetadata(version="1", settings=settings, views=("a",), diagnostics={}, timings={})
     told = made.model_dump(mode="json")
     assert LiftMetadata.model_validate(told).settings == settings
     del told["settings"]["robust_directions"], told["settings"]["consensus"]

@@ -45,7 +45,7 @@ class Observed:
     def ious(self, **settings: Any) -> dict[str, float]:
         """IoU of each thing's mask in the held-out views, asked for by its word."""
         made = lc.lift(
-            self.made.splats, self.made.cameras, self.views, preset="default", certificate_rays=0, **settings
+            self.made.splats, self.made.cameras, self.views, preset="default", diagnostic_rays=0, **settings
         )
         scene = Scene(made, self.made.splats, self.made.cameras)
         scene.raster = self.raster

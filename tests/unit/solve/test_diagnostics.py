@@ -1,4 +1,4 @@
-"""The certificate against the definitions of the paper, on all rays of small scenes."""
+"""The diagnostics against the definitions of the paper, on all rays of small scenes."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ def dense_measures(X: np.ndarray, seed: int, cameras, gain: float, grids: bool) 
         residuals.append(((rows @ X - B) ** 2).sum(axis=1))
         surrogates.append((rows * squares).sum(axis=1))
         total = rows.sum(axis=1)
-        met = total > 0
-        share = rows[met] / total[met, None]
-        mu = (share * np.sqrt(squares[met])).sum(axis=1)
-        betas.append((share * squares[met]).sum(axis=1) / mu**2 - 1)
+        hit = total > 0
+        share = rows[hit] / total[hit, None]
+        mu = (share * np.sqrt(squares[hit])).sum(axis=1)
+        betas.append((share * squares[hit]).sum(axis=1) / mu**2 - 1)
     row_sums = np.concatenate(sums)
     return {
         "row_sum_mean": row_sums.mean(),
@@ -49,19 +49,19 @@ def dense_measures(X: np.ndarray, seed: int, cameras, gain: float, grids: bool) 
 
 @pytest.mark.parametrize("grids", [False, True])
 @pytest.mark.parametrize("preset", ["row-sum", "tikhonov"])
-def test_a_certificate_over_all_rays_equals_the_papers_definitions(tmp_path, preset, grids):
+def test_diagnostics_over_all_rays_equals_the_papers_definitions(tmp_path, preset, grids):
     paths = write_scene(tmp_path, 3, grids)
-    settings = LiftSettings.of(preset=preset, certificate_rays=ALL_RAYS, dtype="float32")
+    settings = LiftSettings.of(preset=preset, diagnostic_rays=ALL_RAYS, dtype="float32")
     result = lift_files(paths[0], paths[1], [paths[2]], settings)
     expected = dense_measures(result.features.double().numpy(), 3, read_cameras(paths[1]), settings.lift_gain, grids)
-    certificate = result.metadata.certificate | result.metadata.certificate["beta"]
+    diagnostics = result.metadata.diagnostics | result.metadata.diagnostics["beta"]
     for name, value in expected.items():
-        assert certificate[name] == pytest.approx(value, rel=1e-3, abs=1e-6), name
+        assert diagnostics[name] == pytest.approx(value, rel=1e-3, abs=1e-6), name
 
 
 def test_the_closed_form_minimises_the_surrogate(tmp_path):
     paths = write_scene(tmp_path, 4)
-    settings = LiftSettings.of(preset="row-sum", certificate_rays=ALL_RAYS, dtype="float32")
+    settings = LiftSettings.of(preset="row-sum", diagnostic_rays=ALL_RAYS, dtype="float32")
     X = lift_files(paths[0], paths[1], [paths[2]], settings).features.double().numpy()
     cameras = read_cameras(paths[1])
     least = dense_measures(X, 4, cameras, 1.0, grids=False)["surrogate"]
@@ -72,8 +72,8 @@ def test_the_closed_form_minimises_the_surrogate(tmp_path):
 
 def test_a_lift_without_sampled_rays_says_that_nothing_was_measured(tmp_path):
     paths = write_scene(tmp_path, 5)
-    certificate = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(certificate_rays=0)).metadata.certificate
-    assert certificate["rays"] == 0
-    assert certificate["residual"] is None
-    assert certificate["bound"] is None
-    assert 0 < certificate["seen_share"] <= 1
+    diagnostics = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(diagnostic_rays=0)).metadata.diagnostics
+    assert diagnostics["rays"] == 0
+    assert diagnostics["residual"] is None
+    assert diagnostics["bound"] is None
+    assert 0 < diagnostics["seen_share"] <= 1
