@@ -626,8 +626,10 @@ class CoveringRegion(Value):
 
 
 def page_fields() -> dict[str, Any]:
-    """What the page knows of a question: the JSON schema of each field that decides what is found."""
+    """Return the JSON schema of each field that decides the answer, with its old names, for the page."""
     fields = Query.model_json_schema()["properties"]
+    for old, new in Query.old_names.items():
+        fields[new].setdefault("old_names", []).append(old)
     return {name: fields[name] for name in Query.deciding()}
 
 

@@ -176,7 +176,7 @@ def test_selections_and_their_history_are_bounded(
         ).json()
     assert (last["step"], last["first"], last["last"]) == (4, 2, 4)
     assert client.patch(selection["links"]["self"], json={"step": 1}).status_code == 422
-    monkeypatch.setattr(module, "MOST", 1)
+    monkeypatch.setattr(module, "MAX_SELECTIONS", 1)
     refused = client.post(route, json={"name": "more"})
     assert (refused.status_code, refused.json()["type"]) == (422, "/problems/over-limit")
 
@@ -184,7 +184,7 @@ def test_selections_and_their_history_are_bounded(
 def test_selections_of_a_lift_take_no_more_bytes_than_its_splats_allow(
     client: TestClient, lift: dict[str, Any], route: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "MOST_BYTES", 0)
+    monkeypatch.setattr(module, "MAX_BYTES", 0)
     monkeypatch.setattr(module, "BYTES_A_SPLAT", 2)
     edits = begun(client, route)["links"]["edits"]
     while (reply := client.post(edits, json={"operation": "set"})).status_code == 200:

@@ -411,7 +411,7 @@ def test_everything_is_named_and_one_word_is_seen_alone(page: Browser) -> None:
     assert sorted(names) == ["apple", "book", "lamp"]
     legend = page.value("[...document.querySelectorAll('#legend button')].map(line => line.textContent)")
     lamp = next(place for place, line in enumerate(legend) if line.startswith("lamp")) + 1
-    colour = page.value(f"splatlift.names.found.found[{lamp - 1}].colour.join()")
+    colour = page.value(f"splatlift.names.found.named_words[{lamp - 1}].colour.join()")
     page.press(f"#legend li:nth-child({lamp}) button")
     assert page.value("[...document.querySelectorAll('#labels .label')].map(label => label.textContent)") == ["lamp"]
     lit = columns(page, colour)
@@ -522,16 +522,21 @@ def test_link_opens_question_layer_and_camera_again(page: Browser, served: Serve
     page.until(FOUND)
     assert page.value(WORDS) == ["apple", "lamp"] and page.value("splatlift.look.what") == "pca"
     assert page.value("splatlift.viewer.place3d") == pytest.approx(place, rel=1e-3, abs=1e-3)
-    rest = "instances=2&keep=largest&weigh=odd"
+    rest = "instances=2&keep=largest&weight_by=odd"
     page.open(f"{served.address}/?lift={served.lift}&view=right&text=apple&threshold=0.5&what=odd&show=odd&{rest}")
     page.until(READY)
     page.until(FOUND)
     assert page.value("[splatlift.look.view.name, splatlift.ask.now.cut]") == ["right", 0.5]
-    asked = dict(page.value("[...splatlift.ask.parameters(splatlift.ask.now)]"))
+    fields = dict(page.value("[...splatlift.ask.parameters(splatlift.ask.now)]"))
     given = {"threshold": "0.5", "instances": "2", "keep": "largest", "absent": "keep"}  # a cut holds all the same
-    assert asked == {"lift": served.lift, "text": "apple", **given}
-    assert "instances=2" in page.value("location.search") and "weigh" not in page.value("location.search")
+    assert fields == {"lift": served.lift, "text": "apple", **given}
+    assert "instances=2" in page.value("location.search") and "weight_by" not in page.value("location.search")
     assert page.value("[splatlift.look.what, splatlift.look.mode]") == ["rgb", "scene"]
+    page.open(f"{served.address}/?lift={served.lift}&text=apple&weigh=confidence")  # by the field's old name
+    page.until(READY)
+    page.until("splatlift.ask.now !== null && splatlift.ask.now !== undefined")
+    fields = dict(page.value("[...splatlift.ask.parameters(splatlift.ask.now)]"))
+    assert fields["weight_by"] == "confidence" and "weigh" not in fields
 
 
 def test_link_to_a_scene_that_is_gone_leaves_the_others_to_choose(page: Browser, served: Served) -> None:
@@ -608,10 +613,10 @@ def test_lines_to_take_away_ask_the_same(page: Browser) -> None:
     page.write("#but", "lamp")  # which was not asked
     page.press("#tab-take")
     assert "text=apple" in text_of(page, "#curl") and "negatives=book" in text_of(page, "#curl")
-    found: dict[str, Any] = {}
-    exec(text_of(page, "#python"), found)  # over HTTP, as this encoder is a table of the server
-    assert found["found"]["count"] == page.value("splatlift.ask.now.count") > 0
-    assert found["found"]["threshold"]["value"] == pytest.approx(page.value("splatlift.ask.now.cut"))
+    names: dict[str, Any] = {}
+    exec(text_of(page, "#python"), names)  # over HTTP, as this encoder is a table of the server
+    assert names["answer"]["count"] == page.value("splatlift.ask.now.count") > 0
+    assert names["answer"]["threshold"]["value"] == pytest.approx(page.value("splatlift.ask.now.cut"))
     addresses = ["object", "boxes", "mask", "scores", "coloured"]
     asked = f"{json.dumps(addresses)}.map(what => fetch(splatlift.take.address(what)).then(reply => reply.status))"
     assert page.value(f"Promise.all({asked})") == [200] * 5

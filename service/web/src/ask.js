@@ -1,5 +1,5 @@
 // The panel of asking: words and examples, each a question with a colour; what they found, and where to cut.
-import { at, count, el, percent, plural, tell } from "./dom.js";
+import { at, count, el, percent, plural, notify } from "./dom.js";
 import { countFrom, drawHistogram, histogram, passing } from "./histogram.js";
 import { COLOURS, rgb } from "./painter.js";
 import { asked, blank, linked, notation, read, search } from "./question.js";
@@ -40,9 +40,9 @@ export class Ask {
     this.lift = lift;
     naming.clear();
     this.known = new Map(); // of completions
-    this.here = [];
+    this.sceneWords = [];
     const wordless = Boolean(lift) && lift.text_space === "none" && !this.table;
-    if (lift && !wordless) this.askable("").then(({ here }) => { if (lift === this.lift) { this.here = here; this.advise(); } }).catch(() => {});
+    if (lift && !wordless) this.askable("").then(({ scene_words: sceneWords }) => { if (lift === this.lift) { this.sceneWords = sceneWords; this.advise(); } }).catch(() => {});
     at("words").disabled = at("but").disabled = wordless;
     at("words").placeholder = wordless ? "These features have no words: click a thing" : "What are you looking for?";
     this.reset(false);
@@ -87,7 +87,7 @@ export class Ask {
     if (!this.butTyped && String(texts) !== String(this.questions.map(({ text }) => text.join()))) at("but").value = ""; // it was of other words
     this.butTyped = false;
     if (!texts.length) return this.questions.length ? this.ask() : undefined;
-    if (texts.length > MOST) tell(`Only the first ${MOST} are asked at a time.`);
+    if (texts.length > MOST) notify(`Only the first ${MOST} are asked at a time.`);
     // New words are a new question, also after a click.
     this.questions = texts.slice(0, MOST).map((text, place) => fresh({ text: [text] }, place));
     this.active = 0;
@@ -101,7 +101,7 @@ export class Ask {
     } else if (this.now && this.now.like.length) {
       if (!this.now.like.includes(notation)) this.now.like.push(notation);
     } else {
-      if (less) return tell("First say what you look for; then shift-click what it is not.");
+      if (less) return notify("First say what you look for; then shift-click what it is not.");
       this.questions = [fresh({ like: [notation] }, 0)];
       this.active = 0;
       at("words").value = "";
@@ -178,7 +178,7 @@ export class Ask {
     this.show();
     this.changed();
     const wrong = anew.find(question => question.problem);
-    if (wrong && !wrong.problem.nearest) tell(words(wrong.problem), true);
+    if (wrong && !wrong.problem.nearest) notify(words(wrong.problem), true);
     await Promise.all(anew.map(question => this.things(question)));
   }
 
@@ -222,7 +222,7 @@ export class Ask {
         question.things = found.objects;
       } catch (problem) {
         question.things = [];
-        question.nothings = problem.expected ? `Things are not told apart here: ${problem.expected}.` : words(problem);
+        question.nothings = problem.expected ? `The objects cannot be separated here: ${problem.expected}.` : words(problem);
       }
     }
     if (!this.questions.includes(question)) return;
@@ -320,7 +320,7 @@ export class Ask {
       slider.step = (now.high - now.low) / 1000 || 0.001;
       slider.value = Number.isFinite(now.cut) ? now.cut : now.high;
     }
-    this.told();
+    this.describe();
     this.bars();
     this.list();
   }
@@ -358,12 +358,12 @@ export class Ask {
     at("advice").hidden = !lines.length;
     at("advice").replaceChildren(...lines);
     at("advice").classList.toggle("unsure", Boolean(now && unsure(now)));
-    at("here").hidden = Boolean(this.questions.length) || !this.here.length;
-    at("here-words").replaceChildren(...this.here.slice(0, HERE).map(word => button(spoken(word), () => this.word(word))));
+    at("here").hidden = Boolean(this.questions.length) || !this.sceneWords.length;
+    at("here-words").replaceChildren(...this.sceneWords.slice(0, HERE).map(word => button(spoken(word), () => this.word(word))));
   }
 
-  // What was found and what decided it, in words.
-  told() {
+  // The number of selected splats, and the reason for it.
+  describe() {
     const { now } = this;
     const answer = now.answer;
     at("answer").classList.toggle("unsure", unsure(now));
@@ -451,7 +451,7 @@ export const label = question => question.text.join(", ") || question.sets.map(o
 const quoted = question => (question.text.length ? `\u201c${question.text.join(", ")}\u201d` : "Such a thing");
 const measures = ({ low, high }) => ` ${low.map((value, axis) => (high[axis] - value).toPrecision(2)).join(" \u00d7 ")}`;
 
-const reason = ({ why }) => why.replace(/^(?:Whether )?(?:'.*?'|".*?") is not (?:there|sure): (.)/, (_, first) => first.toUpperCase())
+const reason = answer => answer.reason.replace(/^(?:Whether )?(?:'.*?'|".*?") is not (?:there|sure): (.)/, (_, first) => first.toUpperCase())
   .replace(/^Whether (?:'.*?'|".*?") is there is not sure: (.)/, (_, first) => first.toUpperCase()).replace(/reference words?/g, "other words");
 
 // It may be there, and other words compete for what was found.
@@ -465,7 +465,7 @@ function advice(question, ask) {
   const { answer, problem, text } = question;
   const lines = (answer?.wording || []).map(one => line(`\u201c${one.text}\u201d was asked as `, el("b", {}, one.word), "."));
   if (problem?.nearest) {
-    const near = problem.nearest.length ? problem.nearest : ask.here.slice(0, 5);
+    const near = problem.nearest.length ? problem.nearest : ask.sceneWords.slice(0, 5);
     lines.push(line(`\u201c${text.join(", ")}\u201d is not a word that can be asked here. `, near.length ? "Try " : "Try another word.",
       ...near.map(word => button(spoken(word), () => ask.word(word, question)))));
   }

@@ -1,7 +1,7 @@
 // Two sides with one camera: what was on the screen stays on the left, while the right goes on to another word, another
 // cut or another scene.
 import { answered, heated, label, linkedQuestions, painted } from "./ask.js";
-import { at, count, el, tell } from "./dom.js";
+import { at, count, el, notify } from "./dom.js";
 import { title } from "./lifts.js";
 import { inColours, linkedWords, namedSplats } from "./names.js";
 import { bytes, json, npy, words } from "./service.js";
@@ -39,10 +39,10 @@ export class Beside {
       viewer().pair(left);
       left.paint(painted(side.questions), { heat: side.heat, layer: side.layer, hide: this.link.has("hide") });
       this.scene = side.lift;
-      at("beside-said").replaceChildren(...told(side.questions, side.lift, side.also));
+      at("beside-said").replaceChildren(...summary(side.questions, side.lift, side.also));
     } catch (problem) {
       if (mine !== this.turn) return;
-      tell(words(problem), true);
+      notify(words(problem), true);
       this.end();
     }
   }
@@ -92,12 +92,12 @@ export class Beside {
   follow(questions, lift) {
     if (!this.link || !lift) return;
     const now = new URLSearchParams([...new URLSearchParams(this.now())].filter(([name]) => !SCREEN.includes(name)));
-    at("right-said").replaceChildren(...(String(now) === String(this.link) ? [el("span", {}, HINT)] : told(questions, lift)));
+    at("right-said").replaceChildren(...(String(now) === String(this.link) ? [el("span", {}, HINT)] : summary(questions, lift)));
   }
 }
 
 // The questions of a side with their colours, and its scene.
-function told(questions, lift, also) {
+function summary(questions, lift, also) {
   const asked = questions.map(question => el("span", { className: "asked", style: { "--mine": question.colour } }, el("span", { className: "swatch", "aria-hidden": "true" }),
     label(question), el("small", {}, question.answer ? ` ${count(question.count)}${Number.isFinite(question.cut) && !question.sets.length ? ` from ${question.cut.toFixed(3)}` : ""}` : "")));
   return [...asked, also && el("span", {}, also), el("small", {}, title(lift))].filter(Boolean);
@@ -108,7 +108,7 @@ async function layerOf(lift, link) {
   if (link.has("named")) {
     const [found, values] = await namedSplats(lift, linkedWords(link));
     const only = link.getAll("only");
-    const looked = value => !only.length || found.found.some(one => one.value === value && only.includes(one.word));
+    const looked = value => !only.length || found.named_words.some(one => one.value === value && only.includes(one.word));
     return { ...inColours(found, values, looked), name: "everything named" };
   }
   const what = link.get("what");

@@ -1,7 +1,7 @@
 // The panel of bringing: files by drag and drop, the settings of a lift from the schema, jobs as they run, and what
 // is here already.
 import { Chart } from "./chart.js";
-import { ago, at, count, el, plural, size, tell, twice } from "./dom.js";
+import { ago, at, count, el, plural, size, notify, twice } from "./dom.js";
 import { camerasOf, dropped, gathered, kindOf, named, remember, suffixes } from "./files.js";
 import { space } from "./lifts.js";
 import { bytes, events, json, patch, post, remove, upload, words } from "./service.js";
@@ -40,8 +40,8 @@ export class Bring {
     addEventListener("drop", event => {
       stop(event);
       document.body.classList.remove("dragging");
-      if (document.body.classList.contains("reader")) tell("Your key is for looking and asking: it brings no files.", true);
-      else if (event.dataTransfer.files.length) { this.raised(); dropped(event.dataTransfer).then(files => this.add(files)).catch(problem => tell(words(problem), true)); }
+      if (document.body.classList.contains("reader")) notify("Your key is for looking and asking: it brings no files.", true);
+      else if (event.dataTransfer.files.length) { this.raised(); dropped(event.dataTransfer).then(files => this.add(files)).catch(problem => notify(words(problem), true)); }
     });
     at("choose").addEventListener("click", () => at("files").click());
     at("files").addEventListener("change", () => { this.add([...at("files").files]); at("files").value = ""; });
@@ -180,7 +180,7 @@ export class Bring {
       await patch(`/lifts/${this.open()}`, { photos: one.asset.id });
       this.opened(this.open());
     } catch (problem) {
-      tell(words(problem), true);
+      notify(words(problem), true);
     }
   }
 
@@ -231,14 +231,14 @@ export class Bring {
     try {
       const { components: { schemas } } = await json("/openapi.json");
       const { properties } = schemas.LiftRequest.properties.settings;
-      at("knobs").replaceChildren(...Object.entries(properties).filter(([name, schema]) => !schema.deprecated && !["speed"].includes(name)).map(([name, told]) => {
-        const input = this.fields[name] = field(resolved(told, schemas));
+      at("knobs").replaceChildren(...Object.entries(properties).filter(([name, schema]) => !schema.deprecated && !["speed"].includes(name)).map(([name, schema]) => {
+        const input = this.fields[name] = field(resolved(schema, schemas));
         input.id = `knob-${name}`;
-        return el("div", { className: "knob" }, el("label", { htmlFor: input.id }, name), input, el("small", {}, told.description || ""));
+        return el("div", { className: "knob" }, el("label", { htmlFor: input.id }, name), input, el("small", {}, schema.description || ""));
       }));
     } catch (problem) {
       this.fields = null;
-      tell(words(problem), true);
+      notify(words(problem), true);
     }
   }
 
@@ -283,8 +283,8 @@ export class Bring {
     at("plan").hidden = false;
     at("plan").replaceChildren(el("li", {}, "Planning\u2026"));
     try {
-      const told = lines(await post("/lift/plan", body));
-      if (mine === this.plannedFor) at("plan").replaceChildren(...told);
+      const planLines = lines(await post("/lift/plan", body));
+      if (mine === this.plannedFor) at("plan").replaceChildren(...planLines);
     } catch (problem) {
       if (mine === this.plannedFor) at("plan").replaceChildren(el("li", { className: "bad" }, words(problem)));
     }
@@ -340,7 +340,7 @@ export class Bring {
       if (ordered && job.state === "succeeded" && job.kind === "lift") this.opened(job.id);
       else if (job.state === "succeeded") this.gone();
     } catch (problem) {
-      if (!end.signal.aborted && problem.status !== 401) tell(words(problem), true);
+      if (!end.signal.aborted && problem.status !== 401) notify(words(problem), true);
     } finally {
       this.followed.delete(job.id);
     }
@@ -355,15 +355,15 @@ export class Bring {
       for (const job of this.jobs) this.follow(job);
       await this.refreshAssets();
     } catch (problem) {
-      if (problem.status !== 401) tell(words(problem), true);
+      if (problem.status !== 401) notify(words(problem), true);
     }
   }
 
   async refreshAssets() {
     const { assets, next } = await json(`/assets?limit=${PAGE}`);
-    const told = JSON.stringify(assets);
-    if (told === this.toldAssets) return;
-    this.toldAssets = told;
+    const snapshot = JSON.stringify(assets);
+    if (snapshot === this.assetsSnapshot) return;
+    this.assetsSnapshot = snapshot;
     at("assets-count").textContent = assets.length ? `(${assets.length}${next ? "+" : ""})` : "(none)";
     at("assets").replaceChildren(...assets.map(asset => el("li", {},
       el("span", { className: "name" }, named(asset.id) ?? KINDS[asset.kind] ?? OTHERS[asset.kind] ?? asset.kind), el("span", { className: "state" }, `${said(asset)} \u00b7 ${size(asset.bytes)} \u00b7 ${ago(asset.created)}`),
@@ -373,13 +373,13 @@ export class Bring {
   }
 
   showJobs(anew = false) {
-    const told = JSON.stringify(this.jobs);
-    if (told === this.told && !anew) return; // buttons that ask once more stay
+    const snapshot = JSON.stringify(this.jobs);
+    if (snapshot === this.jobsSnapshot && !anew) return; // buttons that ask once more stay
     if (at("jobs").matches(":active")) { // a press that goes on would lose its button
       addEventListener("pointerup", () => setTimeout(() => this.showJobs(anew)), { once: true });
       return;
     }
-    this.told = told;
+    this.jobsSnapshot = snapshot;
     at("jobs-none").hidden = Boolean(this.jobs.length);
     at("jobs").replaceChildren(...this.jobs.map(job => this.job(job)));
   }
@@ -399,7 +399,7 @@ export class Bring {
     if (ENDED.includes(job.state) && job.ended) parts.push(el("span", { className: "state" }, `${job.started ? `took ${(job.ended - job.started).toFixed(1)} s, ` : ""}${ago(job.ended)}`));
     const actions = el("span", { className: "actions" });
     if (job.state === "succeeded" && job.kind === "lift") actions.append(el("button", { type: "button", on: { click: () => this.opened(job.id) } }, "Open"));
-    if (job.state === "succeeded" && job.kind === "tradeoff") actions.append(el("button", { type: "button", on: { click: () => this.chart.show(job.id).catch(problem => tell(words(problem), true)) } }, "Show chart"));
+    if (job.state === "succeeded" && job.kind === "tradeoff") actions.append(el("button", { type: "button", on: { click: () => this.chart.show(job.id).catch(problem => notify(words(problem), true)) } }, "Show chart"));
     if (["queued", "running"].includes(job.state)) actions.append(el("button", { type: "button", on: { click: () => this.cancel(job) } }, "Cancel"));
     if (ENDED.includes(job.state)) {
       const going = job.state !== "succeeded" ? "" : job.kind === "lift" ? "?with_lift=true" : "?with_tradeoff=true";
@@ -413,7 +413,7 @@ export class Bring {
       Object.assign(job, await post(`/jobs/${job.id}/cancel`));
       this.showJobs();
     } catch (problem) {
-      tell(words(problem), true);
+      notify(words(problem), true);
     }
   }
 }
@@ -433,21 +433,21 @@ function choice(group, value, title, why, checked) {
   return el("label", { className: "choice" }, el("input", { type: "radio", name: group, value, checked }), el("span", {}, el("b", {}, title), el("small", {}, why)));
 }
 
-const resolved = (told, schemas) => (told.$ref ? { ...schemas[told.$ref.split("/").at(-1)], ...told } : told);
+const resolved = (schema, schemas) => (schema.$ref ? { ...schemas[schema.$ref.split("/").at(-1)], ...schema } : schema);
 
-function field(told) {
-  const values = told.enum || (told.type === "boolean" ? ["true", "false"] : null);
-  const usual = told.default === undefined ? "" : String(told.default);
+function field(schema) {
+  const values = schema.enum || (schema.type === "boolean" ? ["true", "false"] : null);
+  const usual = schema.default === undefined ? "" : String(schema.default);
   if (values) return el("select", {}, new Option(`as the preset has it${usual ? ` (${usual})` : ""}`, ""), ...values.map(value => new Option(String(value), String(value))));
-  const number = told.type === "integer" || told.type === "number";
-  return el("input", { type: number ? "number" : "text", placeholder: usual, ...(number ? { step: told.type === "integer" ? "1" : "any" } : {}),
-    ...(told.minimum === undefined ? {} : { min: told.minimum }), ...(told.maximum === undefined ? {} : { max: told.maximum }) });
+  const number = schema.type === "integer" || schema.type === "number";
+  return el("input", { type: number ? "number" : "text", placeholder: usual, ...(number ? { step: schema.type === "integer" ? "1" : "any" } : {}),
+    ...(schema.minimum === undefined ? {} : { min: schema.minimum }), ...(schema.maximum === undefined ? {} : { max: schema.maximum }) });
 }
 
 // What the check found in a file.
 function said({ kind, counts = {} }) {
-  const told = { splats: ["splats", "kernel"], cameras: ["views"], features: ["views", "channels", "text_space"], photos: ["photos"] }[kind] || Object.keys(counts);
-  const parts = told.filter(name => ["number", "string"].includes(typeof counts[name])).map(name => {
+  const names = { splats: ["splats", "kernel"], cameras: ["views"], features: ["views", "channels", "text_space"], photos: ["photos"] }[kind] || Object.keys(counts);
+  const parts = names.filter(name => ["number", "string"].includes(typeof counts[name])).map(name => {
     if (typeof counts[name] === "string") return name === "text_space" ? space(counts) : counts[name];
     return plural(counts[name], name.replace(/s$/, "").replaceAll("_", " "));
   });

@@ -1,5 +1,5 @@
 // The chart of a comparison of settings, large: a point for each run, which opens its lift.
-import { at, count, el, plural, tell } from "./dom.js";
+import { at, count, el, plural, notify } from "./dom.js";
 import { json, post, save, words } from "./service.js";
 
 const SVG = "http://www.w3.org/2000/svg";
@@ -89,10 +89,10 @@ export class Chart {
       at("chart").close();
       if (here) return await this.opened(here.id);
       const { splats, cameras, features } = tradeoff;
-      tell(`Lifting with \u201c${run.name}\u201d: it opens when it is done.`);
+      notify(`Lifting with \u201c${run.name}\u201d: it opens when it is done.`);
       return await this.ordered(await post("/lift", { splats, cameras, features, settings: run.settings }), run.name);
     } catch (problem) {
-      return tell(words(problem), true);
+      return notify(words(problem), true);
     }
   }
 
@@ -100,7 +100,7 @@ export class Chart {
     try {
       await save(`/tradeoffs/${this.tradeoff.id}/chart`, "speed-against-accuracy.png", undefined, true);
     } catch (problem) {
-      tell(words(problem), true);
+      notify(words(problem), true);
     }
   }
 }

@@ -36,7 +36,7 @@ export function fill(select, options, chosen = select.value) {
 let quiet = 0;
 
 // A short word at the foot of the page, read aloud too.
-export function tell(text, bad = false) {
+export function notify(text, bad = false) {
   const toast = at("toast");
   toast.textContent = text;
   toast.classList.toggle("bad", bad);
@@ -48,9 +48,9 @@ export function tell(text, bad = false) {
 export async function copied(text) {
   try {
     await navigator.clipboard.writeText(text);
-    tell("Copied.");
+    notify("Copied.");
   } catch {
-    tell("This browser does not let the page copy: mark the text and copy it by hand.", true);
+    notify("This browser does not let the page copy: mark the text and copy it by hand.", true);
   }
 }
 
@@ -69,7 +69,7 @@ export function twice(label, action) {
     try {
       await action();
     } catch (problem) {
-      tell(problem.detail || problem.title || String(problem), true);
+      notify(problem.detail || problem.title || String(problem), true);
     }
   });
   return button;

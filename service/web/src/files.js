@@ -42,9 +42,9 @@ async function safetensors(file) {
   try {
     const length = Number(new DataView(await file.slice(0, 8).arrayBuffer()).getBigUint64(0, true));
     const { __metadata__: more, ...tensors } = JSON.parse(await file.slice(8, 8 + Math.min(length, HEADER)).text());
-    const told = more?.splatlift;
-    if (!told) return { kind: Object.keys(tensors).join() === "embeddings" ? "table" : "features" };
-    const { splats, cameras } = JSON.parse(told);
+    const metadata = more?.splatlift;
+    if (!metadata) return { kind: Object.keys(tensors).join() === "embeddings" ? "table" : "features" };
+    const { splats, cameras } = JSON.parse(metadata);
     const need = (kind, { sha256, path }) => ({ kind, id: `sha256:${sha256}`, name: path.split(/[\\/]/).at(-1) });
     return { kind: "lift", needs: [need("splats", splats), need("cameras", cameras)] };
   } catch {
@@ -137,11 +137,11 @@ async function zippedCameras(file) {
   return views.length || !documents.length ? views : camerasOfDocument(JSON.parse(new TextDecoder().decode(parts[documents[0]])));
 }
 
-function camerasOfDocument(told) {
-  if (Array.isArray(told)) return told.filter(one => one.rotation && one.position).map(one => view(one.rotation, one.position, one));
-  return (told.frames ?? []).map(one => {
+function camerasOfDocument(cameras) {
+  if (Array.isArray(cameras)) return cameras.filter(one => one.rotation && one.position).map(one => view(one.rotation, one.position, one));
+  return (cameras.frames ?? []).map(one => {
     const m = one.transform_matrix;
-    const { w, h, fl_x: fx, fl_y: fy } = { ...told, ...one };
+    const { w, h, fl_x: fx, fl_y: fy } = { ...cameras, ...one };
     return view(m.slice(0, 3).map(row => [row[0], -row[1], -row[2]]), m.slice(0, 3).map(row => row[3]), { width: w, height: h, fx, fy: fy ?? fx });
   }).filter(one => one.fx > 0);
 }

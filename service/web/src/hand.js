@@ -1,5 +1,5 @@
 // Correcting by hand: a brush and a box that add to a selection or take away, in 3D and in the photo's view.
-import { at, el, plural, tell } from "./dom.js";
+import { at, el, plural, notify } from "./dom.js";
 import { wholeOf } from "./things.js";
 import { call, json, patch, post, words } from "./service.js";
 
@@ -31,7 +31,7 @@ export class Hand {
     const group = (name, ...parts) => el("span", { className: "row", role: "group", ariaLabel: name }, ...parts);
     at("hand").append(this.name, group("Tool", ...Object.values(this.tools), size), group("What it does", ...this.sides),
       el("label", { title: "Also what lies behind" }, this.through, " through"),
-      group("By splats that touch", button("Grow", () => this.edit({ how: "grow" })), button("Shrink", () => this.edit({ how: "shrink" }))),
+      group("By splats that touch", button("Grow", () => this.edit({ operation: "grow" })), button("Shrink", () => this.edit({ operation: "shrink" }))),
       this.splitting, group("History", ...Object.values(this.steps)), button("Done", () => { this.take(null); at("hand").hidden = true; }));
     this.drawn = document.createElementNS(SVG, "svg");
     this.drawn.id = "stroke";
@@ -48,7 +48,7 @@ export class Hand {
     try {
       const found = await json(`/lifts/${this.ask.lift.id}/selections/${id}`);
       if (this.selection?.id === id) this.have(found);
-    } catch (problem) { tell(words(problem), true); }
+    } catch (problem) { notify(words(problem), true); }
   }
 
   have(selection) {
@@ -64,10 +64,10 @@ export class Hand {
     if (!now?.answer) return;
     const { lift, ...query } = this.ask.body(now);
     try {
-      this.have(await post(`/lifts/${lift}/selections`, { name: this.label(now).slice(0, 100), edit: { how: "set", query } }));
+      this.have(await post(`/lifts/${lift}/selections`, { name: this.label(now).slice(0, 100), edit: { operation: "set", query } }));
       this.take("brush");
       await this.ask.hold([`selection:${this.selection.id}`]);
-    } catch (problem) { tell(words(problem), true); }
+    } catch (problem) { notify(words(problem), true); }
   }
 
   get route() {
@@ -82,7 +82,7 @@ export class Hand {
       this.have(await action({ "If-Match": `"${this.selection.version}"` }));
       await this.ask.ask(this.ask.now);
     } catch (problem) {
-      tell(problem.status === 412 ? "Somebody else changed it meanwhile: this is what it is now." : words(problem), true);
+      notify(problem.status === 412 ? "Somebody else changed it meanwhile: this is what it is now." : words(problem), true);
       if (problem.status === 412) { this.selection = null; await this.follow(); await this.ask.ask(this.ask.now); }
     } finally {
       this.busy = false;
@@ -114,7 +114,7 @@ export class Hand {
       this.have(await patch(this.route, { name }));
       this.ask.show();
       this.ask.changed();
-    } catch (problem) { tell(words(problem), true); }
+    } catch (problem) { notify(words(problem), true); }
   }
 
   link(parameters) {
@@ -215,7 +215,7 @@ export class Hand {
     const [low, high] = [0, 1].map(end => [0, 1].map(axis => Math.max(0, Math[end ? "max" : "min"](first[axis], last[axis]) + end)));
     const corners = this.tool === "box" ? [low, high] : some.length > 1 ? some : [first, first];
     this.edit({
-      how: less ? "remove" : "add", area: `${view}:${this.tool === "box" ? "box" : "stroke"}:${corners.flat()}`,
+      operation: less ? "remove" : "add", area: `${view}:${this.tool === "box" ? "box" : "stroke"}:${corners.flat()}`,
       radius: Math.max(1, this.size * scale), through: this.through.checked, ...(camera && { camera }),
     });
   }

@@ -1,5 +1,5 @@
 // The list of lifts: names that people give, what to open, what to delete.
-import { ago, at, count, el, tell, twice } from "./dom.js";
+import { ago, at, count, el, notify, twice } from "./dom.js";
 import { named } from "./files.js";
 import { patch, remove, words } from "./service.js";
 
@@ -15,9 +15,9 @@ export class Lifts {
   }
 
   show(lifts, open) {
-    const told = JSON.stringify([lifts.map(({ id, name }) => [id, name]), open]);
-    if (told === this.told) return; // a name that is being written stays
-    this.told = told;
+    const snapshot = JSON.stringify([lifts.map(({ id, name }) => [id, name]), open]);
+    if (snapshot === this.snapshot) return; // a name that is being written stays
+    this.snapshot = snapshot;
     at("lifts-head").hidden = !lifts.length;
     at("lifts").replaceChildren(...lifts.map(lift => el("li", { className: lift.id === open ? "now" : "" },
       el("input", { type: "text", className: "name", value: lift.name || "", maxLength: 100, placeholder: "Give it a name", "aria-label": `Name of the lift of ${ago(lift.created)}`,
@@ -34,7 +34,7 @@ export class Lifts {
       Object.assign(lift, await patch(`/lifts/${lift.id}`, { name: name || null }));
       this.changed();
     } catch (problem) {
-      tell(words(problem), true);
+      notify(words(problem), true);
     }
   }
 }

@@ -1,6 +1,6 @@
 // The panel of looking: layers of colours in 3D and in the pictures of views, the list of views, and the pictures
 // themselves, which need no WebGL.
-import { at, el, fill, tell } from "./dom.js";
+import { at, el, fill, notify } from "./dom.js";
 import { edge } from "./masks.js";
 import { bytes, json, npy, picture, words } from "./service.js";
 
@@ -74,7 +74,7 @@ export class Look {
       }
       this.choices(this.view?.name);
     } catch (problem) {
-      tell(words(problem), true);
+      notify(words(problem), true);
     }
   }
 
@@ -131,7 +131,7 @@ export class Look {
       this.layer = this.colours.get(what);
       this.changed();
     } catch (problem) {
-      tell(words(problem), true);
+      notify(words(problem), true);
       this.choose("rgb");
     }
   }
@@ -155,16 +155,16 @@ export class Look {
     };
     const place = new URLSearchParams({ lift: this.lift.id, view: this.view.name });
     const over = this.what === "photo" ? this.view.photo && `/lifts/${this.lift.id}/photo?view=${encodeURIComponent(this.view.name)}`
-      : IN_VIEWS.includes(this.what) && this.what !== "rgb" ? `/render?${place}&what=${this.what}` : null;
+      : IN_VIEWS.includes(this.what) && this.what !== "rgb" ? `/render?${place}&channel=${this.what}` : null;
     at("layer-words").textContent = this.what === "photo" && !this.view.photo ? "There is no photo of this view."
       : this.mode === "view" && ![...IN_VIEWS, "photo"].includes(this.what) ? `${LAYERS[this.what]} It is seen in 3D alone.` : LAYERS[this.what];
     at("picture-box").classList.add("busy");
     try {
       const examples = this.examples?.() || [];
-      await Promise.all([shown("render", `/render?${place}&what=rgb`), shown("over", over), this.mask(mine), this.masks?.outline(this.view.name, examples)]);
+      await Promise.all([shown("render", `/render?${place}&channel=rgb`), shown("over", over), this.mask(mine), this.masks?.outline(this.view.name, examples)]);
       this.marks();
     } catch (problem) {
-      if (mine === this.turn) tell(words(problem), true);
+      if (mine === this.turn) notify(words(problem), true);
     }
     if (mine === this.turn) at("picture-box").classList.remove("busy");
     this.blend();

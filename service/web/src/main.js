@@ -2,7 +2,7 @@
 import { Ask, label, naming } from "./ask.js";
 import { Beside } from "./beside.js";
 import { Bring } from "./bring.js";
-import { at, count, el, fill, size, tell } from "./dom.js";
+import { at, count, el, fill, size, notify } from "./dom.js";
 import { Hand } from "./hand.js";
 import { Lifts, title } from "./lifts.js";
 import { Look, veiled } from "./look.js";
@@ -186,8 +186,8 @@ function tab(name) {
     button.tabIndex = chosen ? 0 : -1;
     at(`panel-${button.id.slice(4)}`).hidden = !chosen;
   }
-  if (name === "bring") { bring.refresh(); refreshLifts().catch(problem => problem.status !== 401 && tell(words(problem), true)); }
-  if (name === "name") names.tables().catch(problem => tell(words(problem), true));
+  if (name === "bring") { bring.refresh(); refreshLifts().catch(problem => problem.status !== 401 && notify(words(problem), true)); }
+  if (name === "name") names.tables().catch(problem => notify(words(problem), true));
   if (name === "take") take.show();
   repaint();
 }
@@ -217,7 +217,7 @@ async function refreshLifts() {
     beside.end();
     viewer?.clear();
     of(null);
-    tell("The scene that was open was deleted.");
+    notify("The scene that was open was deleted.");
   }
   if (!lift && !busy && known.length) open(known[0].id); // also the first one, when its job was followed here
   at("empty").hidden = Boolean(known.length || viewer?.draft);
@@ -240,8 +240,8 @@ async function open(id, fresh = false) {
     document.body.classList.remove("no-lifts");
     of(lift);
     at("mask").hidden = at("outline").hidden = true;
-    refreshLifts().catch(problem => tell(words(problem), true));
-    share.of(lift).catch(problem => tell(words(problem), true));
+    refreshLifts().catch(problem => notify(words(problem), true));
+    share.of(lift).catch(problem => notify(words(problem), true));
     if (fresh) tab("ask");
     viewer?.clear();
     at("stage").classList.remove("ready");
@@ -275,7 +275,7 @@ async function open(id, fresh = false) {
 // What belongs to a lift.
 function of(known) {
   ask.of(known);
-  for (const panel of [things, names, masks]) panel.of(known).catch(problem => tell(words(problem), true));
+  for (const panel of [things, names, masks]) panel.of(known).catch(problem => notify(words(problem), true));
 }
 
 // The camera of the link or of the first view; the service's picture of it is there before the splats are drawn.
@@ -370,9 +370,9 @@ async function preview(file, cameras) {
 async function warnings(known) {
   const { plan } = await json(`/jobs/${known.id}`).catch(() => ({}));
   if (known !== lift) return;
-  const told = [...new Set([...(plan?.warnings ?? []), ...(known.diagnostics?.warnings ?? [])])];
-  at("warnings").hidden = !told.length;
-  at("warnings").replaceChildren(...told.map(warning => el("li", {}, warning)));
+  const warnings = [...new Set([...(plan?.warnings ?? []), ...(known.diagnostics?.warnings ?? [])])];
+  at("warnings").hidden = !warnings.length;
+  at("warnings").replaceChildren(...warnings.map(warning => el("li", {}, warning)));
 }
 
 // What is said of the scene below it.
@@ -413,7 +413,7 @@ function pointing(canvas, built) {
   canvas.addEventListener("keydown", event => keyed(event, built));
 }
 
-const hit3d = (found, shift, alt) => (found ? hit(`splat:${found.splat}`, found.at, shift, alt) : tell("There is no splat there."));
+const hit3d = (found, shift, alt) => (found ? hit(`splat:${found.splat}`, found.at, shift, alt) : notify("There is no splat there."));
 
 // A click takes the thing there, another one its part, down to the smallest; one more or Alt what is like the place.
 // Shift takes several things, or less of what is like a place.

@@ -1,5 +1,5 @@
 // Masks of the feature packs, picked in the photo's view: the region under a click is an example to ask by.
-import { at, el, percent, tell } from "./dom.js";
+import { at, el, percent, notify } from "./dom.js";
 import { json, picture, words } from "./service.js";
 
 const REGION = /^region:(.+):(\d+):(\d+)$/;
@@ -36,11 +36,11 @@ export class Masks {
   async at(view, x, y, less) {
     try {
       const { regions } = await json(`/lifts/${this.lift.id}/regions?${new URLSearchParams({ view, x, y })}`);
-      if (!regions.length) return tell("No mask covers this place.");
+      if (!regions.length) return notify("No mask covers this place.");
       this.around = regions;
       return this.pick(regions[0].example, less);
     } catch (problem) {
-      return tell(problem.status === 404 ? "This view was not lifted, so it has no masks: take another." : words(problem), true);
+      return notify(problem.status === 404 ? "This view was not lifted, so it has no masks: take another." : words(problem), true);
     }
   }
 
@@ -75,7 +75,7 @@ export class Masks {
       context.putImageData(drawn, 0, 0);
       canvas.hidden = false;
     } catch (problem) {
-      tell(words(problem), true);
+      notify(words(problem), true);
     }
   }
 }

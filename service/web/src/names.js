@@ -1,5 +1,5 @@
 // The panel of naming: many words at once, every splat in the colour of its best one; and what a clicked thing is.
-import { at, count, el, fill, percent, plural, tell } from "./dom.js";
+import { at, count, el, fill, percent, plural, notify } from "./dom.js";
 import { bytes, json, npy, post, words } from "./service.js";
 
 const OWN = "own"; // the words of the form
@@ -60,7 +60,7 @@ export class Names {
     const asked = this.body();
     if (asked.words && !asked.words.length) {
       at("own-words").focus();
-      return tell("Type some words first, with commas between.");
+      return notify("Type some words first, with commas between.");
     }
     return this.name(asked);
   }
@@ -73,13 +73,13 @@ export class Names {
       const [found, values] = await namedSplats(this.lift, asked);
       if (mine !== this.turn) return;
       Object.assign(this, { asked, found, values, none: found.none });
-      this.only = new Set(found.found.filter(({ word }) => only.includes(word)).map(({ value }) => value));
-      this.middles = this.centres(values, found.found.length);
+      this.only = new Set(found.named_words.filter(({ word }) => only.includes(word)).map(({ value }) => value));
+      this.middles = this.centres(values, found.named_words.length);
       this.bring();
     } catch (problem) {
       if (mine !== this.turn) return;
       at("named").textContent = "";
-      tell(problem.argument === "words" && !asked.words ? "Its text encoder takes any word, so there is no list of them: type the words that may be here." : words(problem), true);
+      notify(problem.argument === "words" && !asked.words ? "Its text encoder takes any word, so there is no list of them: type the words that may be here." : words(problem), true);
       if (problem.argument === "words" && !asked.words) this.typing();
     } finally {
       if (mine === this.turn) at("stage").classList.remove("asking");
@@ -129,7 +129,7 @@ export class Names {
 
   // The words that are shown, with their colours.
   entries() {
-    return this.shown ? this.found.found.filter(({ value }) => this.is(value)).map(({ word, colour }) => [word, hex(colour)]) : [];
+    return this.shown ? this.found.named_words.filter(({ value }) => this.is(value)).map(({ word, colour }) => [word, hex(colour)]) : [];
   }
 
   // Where words stand, for their labels: points, which are boxes without a size.
@@ -137,14 +137,14 @@ export class Names {
     const spot = this.spot?.point && this.spot.words.length && !at("panel-name").hidden
       ? [{ low: this.spot.point, high: this.spot.point, colour: "#ffffff", name: this.spot.words[0].word, of: 1, strong: true }] : [];
     if (!this.shown) return spot;
-    const named = this.found.found.filter(({ value }) => this.is(value) && this.middles[value]).slice(0, SHOWN);
+    const named = this.found.named_words.filter(({ value }) => this.is(value) && this.middles[value]).slice(0, SHOWN);
     return [...spot, ...named.map(({ value, word, colour }) => ({ low: this.middles[value], high: this.middles[value], colour: hex(colour), name: word, of: 1, strong: this.only.has(value), named: value }))];
   }
 
   // The map of a view, and how its colours are shown over the view; null where there is none to show.
   map(view) {
-    if (!this.shown || this.found.found.length > COLOURS) return null; // of more words some share a colour
-    const known = new Map(this.found.found.map(({ value, colour }) => [colour.join(), value]));
+    if (!this.shown || this.found.named_words.length > COLOURS) return null; // of more words some share a colour
+    const known = new Map(this.found.named_words.map(({ value, colour }) => [colour.join(), value]));
     const paint = ({ data, width, height }) => {
       const out = new Uint8ClampedArray(data.length);
       for (let place = 0; place < data.length; place += 4) {
@@ -162,14 +162,14 @@ export class Names {
     this.spot = { example, point, words: [] };
     this.show();
     const asked = this.shown ? this.asked : this.body();
-    const told = asked.words && !asked.words.length ? {} : asked;
+    const vocabulary = asked.words && !asked.words.length ? {} : asked;
     try {
-      const answer = await post("/query/what", { lift: lift.id, example, ...told });
+      const answer = await post("/query/what", { lift: lift.id, example, ...vocabulary });
       if (this.spot?.example !== example) return;
       this.spot.words = answer.words;
     } catch (problem) {
       this.spot = null;
-      tell(words(problem), true);
+      notify(words(problem), true);
       if (problem.argument === "words") this.typing();
     }
     this.show();
@@ -191,15 +191,15 @@ export class Names {
     if (!this.shown) return;
     for (const word of this.asked.words ?? ["*"]) parameters.append("named", word);
     if (this.asked.table) parameters.set("table", this.asked.table);
-    for (const { value, word } of this.found.found) if (this.only.has(value)) parameters.append("only", word);
+    for (const { value, word } of this.found.named_words) if (this.only.has(value)) parameters.append("only", word);
   }
 
   show() {
     const { found, spot } = this;
     at("unname").hidden = !found;
     at("unname").textContent = this.shown ? "Show the scene's colours" : "Show the words again";
-    at("named").textContent = found ? `${plural(found.found.length, "word")} of ${count(found.words)} ${found.found.length === 1 ? "is" : "are"} here; ${percent(found.none / found.splats)} of the splats have none.` : "";
-    at("legend").replaceChildren(...(found ? [...found.found.map(named => line(named, this)), none(found)] : []));
+    at("named").textContent = found ? `${plural(found.named_words.length, "word")} of ${count(found.word_count)} ${found.named_words.length === 1 ? "is" : "are"} here; ${percent(found.none / found.splats)} of the splats have none.` : "";
+    at("legend").replaceChildren(...(found ? [...found.named_words.map(named => line(named, this)), none(found)] : []));
     at("what").hidden = !spot;
     if (!spot) return;
     at("what-of").textContent = spot.words.length ? `Most like \u201c${spot.words[0].word}\u201d` : "Looking\u2026";
@@ -222,7 +222,7 @@ export async function namedSplats(lift, asked) {
 
 // The layer of such splats; words that are not looked at have the colour of none.
 export function inColours(found, values, looked) {
-  const palette = [REST, ...found.found.map(({ value, colour }) => (looked(value) ? colour : REST))];
+  const palette = [REST, ...found.named_words.map(({ value, colour }) => (looked(value) ? colour : REST))];
   const colours = new Uint8Array(3 * values.length);
   values.forEach((value, row) => colours.set(palette[value], 3 * row));
   return { colours, cover: COVER };

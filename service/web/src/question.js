@@ -23,8 +23,8 @@ export function search(values) {
 
 // Several questions in one link, where fields that are no lists have a value for each of them.
 export function linked(questions) {
-  const told = questions.map(asked);
-  return Object.fromEntries(FIELDS.filter(([name]) => told.some(one => name in one))
+  const changes = questions.map(asked);
+  return Object.fromEntries(FIELDS.filter(([name]) => changes.some(fields => name in fields))
     .map(([name]) => [name, questions.flatMap(question => question[name] ?? "")]));
 }
 
@@ -32,8 +32,8 @@ export function linked(questions) {
 export function read(pairs, place) {
   const values = {};
   for (const [name, field] of FIELDS) {
-    const given = pairs.getAll(name);
-    const text = given[place] ?? given[0];
+    const texts = [name, ...(field.old_names || [])].map(key => pairs.getAll(key)).find(list => list.length) ?? []; // a link may be old
+    const text = texts[place] ?? texts[0];
     const number = text && parts(field).some(({ type }) => ["number", "integer"].includes(type)) ? Number(text) : NaN;
     if (isList(field) || text === undefined) continue;
     if (parts(field).some(part => part.enum?.includes(text))) values[name] = text;

@@ -64,7 +64,7 @@ export async function picture(path, body) {
   return image;
 }
 
-// All bytes of an answer, told of as they come.
+// All bytes of an answer, with the progress.
 export async function bytes(path, { body, progress = () => {} } = {}) {
   const reply = await call(path, body && { method: "POST", body });
   const total = Number(reply.headers.get("Content-Length")) || 0;
@@ -135,7 +135,7 @@ export function upload(kind, file, progress, cameras) {
     request.upload.onprogress = event => progress(event.loaded, event.total);
     request.onload = () => {
       let answer = { title: `No answer (${request.status})`, detail: "", status: request.status };
-      try { answer = JSON.parse(request.responseText); } catch { /* told as it is */ }
+      try { answer = JSON.parse(request.responseText); } catch { /* shown as it is */ }
       if (request.status === 401) refused();
       if (request.status < 300) resolve(answer); else reject(answer);
     };

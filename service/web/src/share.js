@@ -1,5 +1,5 @@
 // Whose key this is, what it may do, and links that let others look at a scene and ask it.
-import { at, copied, el, tell, twice } from "./dom.js";
+import { at, copied, el, notify, twice } from "./dom.js";
 import { json, post, remove, words } from "./service.js";
 
 const day = seconds => new Date(seconds * 1000).toLocaleDateString(undefined, { day: "numeric", month: "long", year: "numeric" });
@@ -7,7 +7,7 @@ const day = seconds => new Date(seconds * 1000).toLocaleDateString(undefined, { 
 export class Share {
   constructor() {
     this.lift = null;
-    at("share").addEventListener("submit", event => { event.preventDefault(); this.make().catch(problem => tell(words(problem), true)); });
+    at("share").addEventListener("submit", event => { event.preventDefault(); this.make().catch(problem => notify(words(problem), true)); });
     at("copy-share").addEventListener("click", () => copied(at("share-link").value));
   }
 

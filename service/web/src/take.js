@@ -1,5 +1,5 @@
 // The panel of taking away: files of the question on the screen, and the lines that ask it elsewhere.
-import { at, copied, el, tell } from "./dom.js";
+import { at, copied, el, notify } from "./dom.js";
 import { label } from "./ask.js";
 import { search } from "./question.js";
 import { keyOf, save, saveBlob, words } from "./service.js";
@@ -29,15 +29,15 @@ export class Take {
     const { questions, lift } = this.ask;
     const named = this.names.shown ? { of: "words", ...this.names.asked } : { of: "questions", questions: questions.filter(({ answer }) => answer).map(one => ({ ...this.ask.body(one), name: label(one).slice(0, 100) })) };
     const own = this.things.shown();
-    if (own.length > MOST && this.things.own.length) tell(`A ZIP has ${MOST} things of your own list: the first ones are in it.`);
+    if (own.length > MOST && this.things.own.length) notify(`A ZIP has ${MOST} things of your own list: the first ones are in it.`);
     const space = lift.text_space === "none" ? {} : { encoder: lift.text_space };
-    const body = { lift: lift.id, ...(things && this.things.own.length ? { of: "questions", questions: own.slice(0, MOST).map(one => ({ lift: lift.id, ...one, name: one.name.slice(0, 100) })) } : things ? { of: "things", ...space } : named) };
-    if (own.length <= MOST || !things) tell("Making the ZIP: masks of all views take a while.");
+    const body = { lift: lift.id, ...(things && this.things.own.length ? { of: "questions", questions: own.slice(0, MOST).map(one => ({ lift: lift.id, ...one, name: one.name.slice(0, 100) })) } : things ? { of: "objects", ...space } : named) };
+    if (own.length <= MOST || !things) notify("Making the ZIP: masks of all views take a while.");
     try {
-      await save("/query/export", "splats.zip", body).catch(problem => (problem.argument === "encoder" ? save("/query/export", "splats.zip", { lift: lift.id, of: "things" }) : Promise.reject(problem)));
-      tell("The ZIP is here.");
+      await save("/query/export", "splats.zip", body).catch(problem => (problem.argument === "encoder" ? save("/query/export", "splats.zip", { lift: lift.id, of: "objects" }) : Promise.reject(problem)));
+      notify("The ZIP is here.");
     } catch (problem) {
-      tell(words(problem), true);
+      notify(words(problem), true);
     }
   }
 
@@ -52,7 +52,7 @@ export class Take {
     try {
       await save(path || this.address(what), name.replaceAll(/[/\\:*?"<>|]/g, "-"), body, true);
     } catch (problem) {
-      tell(words(problem), true);
+      notify(words(problem), true);
     }
   }
 
@@ -65,7 +65,7 @@ export class Take {
     const { now, lift } = this.ask;
     const named = Boolean(lift && this.names.shown);
     const ready = named || Boolean(now?.answer && lift);
-    at("lift-file").replaceChildren(lift ? el("button", { type: "button", on: { click: () => save(`/lifts/${lift.id}/features`).catch(problem => tell(words(problem), true)) } },
+    at("lift-file").replaceChildren(lift ? el("button", { type: "button", on: { click: () => save(`/lifts/${lift.id}/features`).catch(problem => notify(words(problem), true)) } },
       `Lift file (${(lift.bytes / 1e6).toFixed(1)} MB)`) : "");
     at("take-none").hidden = ready;
     at("take-question").hidden = !ready;
@@ -77,14 +77,14 @@ export class Take {
     const key = keyOf() ? ' -H "Authorization: Bearer $KEY"' : "";
     if (named) {
       at("curl").textContent = `curl -fsS${key} ${address("segment")} \\\n  --json ${quote(JSON.stringify(this.named()))}`;
-      at("python").textContent = posted("segment", JSON.stringify(this.named(), null, 1), ['for word in found["found"]:', '    print(word["value"], word["word"], word["splats"])']);
+      at("python").textContent = posted("segment", JSON.stringify(this.named(), null, 1), ['for word in answer["named_words"]:', '    print(word["value"], word["word"], word["splats"])']);
       return;
     }
     const asked = this.ask.body(now);
     const terms = [...search(asked)].map(([name, value]) => ` \\\n  --data-urlencode ${quote(`${name}=${value}`)}`).join("");
     at("curl").textContent = `curl -fsSG${key} ${address()}${terms}`;
     at("python").textContent = local(now) ? ofFile(asked, now.answer.encoder)
-      : posted("", JSON.stringify(asked, null, 1), ['print(found["count"], found["why"], found["threshold"])']);
+      : posted("", JSON.stringify(asked, null, 1), ['print(answer["count"], answer["reason"], answer["threshold"])']);
   }
 }
 
@@ -96,16 +96,16 @@ const address = what => new URL(what ? `query/${what}` : "query", document.baseU
 function ofFile({ lift, ...asked }, encoder) {
   const query = `lc.Query(${Object.entries(asked).map(([name, value]) => `${name}=${JSON.stringify(value)}`).join(", ")})`;
   const more = encoder === "prompts" ? "" : `, encoder="${encoder}"`;
-  return ["import liftcore as lc", "", `scene = lc.Scene("lift-${lift}.safetensors")`, `found = scene.ask(${query}${more})`,
-    "print(found.count, found.why, found.threshold.explanation)"].join("\n");
+  return ["import liftcore as lc", "", `scene = lc.Scene("lift-${lift}.safetensors")`, `answer = scene.ask(${query}${more})`,
+    "print(answer.count, answer.reason, answer.threshold.explanation)"].join("\n");
 }
 
 // A question of the service in Python, from its body and what is printed of the answer.
 function posted(what, body, printed) {
   const key = keyOf();
-  return [...(key ? ["import os", ""] : []), "import httpx", "", `asked = ${body}`,
+  return [...(key ? ["import os", ""] : []), "import httpx", "", `question = ${body}`,
     ...(key ? [`headers = {"Authorization": f"Bearer {os.environ['KEY']}"}`] : []),
-    `found = httpx.post("${address(what)}", json=asked${key ? ", headers=headers" : ""}, timeout=600).raise_for_status().json()`, ...printed].join("\n");
+    `answer = httpx.post("${address(what)}", json=question${key ? ", headers=headers" : ""}, timeout=600).raise_for_status().json()`, ...printed].join("\n");
 }
 
 const quote = text => (/^[\w=.:,-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);

@@ -1,6 +1,6 @@
 // The things in the scene, which the lift found by masks alone, and their parts: a list before anything is asked, and
 // what a click takes.
-import { at, count, el, plural, tell, twice } from "./dom.js";
+import { at, count, el, plural, notify, twice } from "./dom.js";
 import { search } from "./question.js";
 import { json, patch, picture, post, remove, words } from "./service.js";
 
@@ -120,33 +120,33 @@ export class Things {
   async join() {
     const sets = [...this.held()];
     const named = this.found.find(thing => thing.name && sets.includes(term(thing)));
-    await this.make({ hidden: sets, before: sets, how: async add => [await add(named?.name ?? this.naming.get(sets[0]), sets)] });
+    await this.make({ hidden: sets, before: sets, create: async add => [await add(named?.name ?? this.naming.get(sets[0]), sets)] });
   }
 
   // What a selection leaves of the thing that it was begun from becomes another one.
   async split(selection) {
     const [from] = wholeOf(selection);
     const corrected = `selection:${selection.id}`;
-    await this.make({ hidden: [from], before: [corrected], then: corrected, step: selection.step, how: async add => {
+    await this.make({ hidden: [from], before: [corrected], then: corrected, step: selection.step, create: async add => {
       const rest = await add(`${this.naming.get(from)}, the rest`, [from]);
-      return [await post(`${this.route}/${rest.id}/edits`, { how: "remove", query: { sets: [corrected] } })];
+      return [await post(`${this.route}/${rest.id}/edits`, { operation: "remove", query: { sets: [corrected] } })];
     } });
   }
 
   // Things of one's own in place of others, which can be undone and redone. then: what is taken afterwards, if not
   // those; step: of the selection that they are made of.
   async make(change) {
-    const { hidden, before, how, then } = change;
+    const { hidden, before, create, then } = change;
     this.undone = null;
     try {
-      const made = await how((name, sets) => post(this.route, { name: name.slice(0, 100), edit: { how: "set", query: { sets } } }));
+      const made = await create((name, sets) => post(this.route, { name: name.slice(0, 100), edit: { operation: "set", query: { sets } } }));
       await this.conceal(hidden, true);
       const after = then ?? `selection:${made[0].id}`;
       const ids = made.map(({ id }) => id);
       this.last = { held: after, change, back: () => this.forget(ids).then(() => this.conceal(hidden, false)).then(() => this.hold(before)) };
       this.have(this.found, [...made, ...this.own]);
       this.hold([after]);
-    } catch (problem) { tell(words(problem), true); }
+    } catch (problem) { notify(words(problem), true); }
   }
 
   // Take the last of these back, or make it again, where what is asked is still what it left; whether there was one.
@@ -160,7 +160,7 @@ export class Things {
     }
     if (!last || String(this.held()) !== last.held) return false;
     this.last = null;
-    last.back().then(() => { this.undone = last.change; }).catch(problem => tell(words(problem), true));
+    last.back().then(() => { this.undone = last.change; }).catch(problem => notify(words(problem), true));
     return true;
   }
 
@@ -176,13 +176,13 @@ export class Things {
     this.undone = null;
     this.last = { held: String(left), change: null, back: () => this.restore(whole, hidden, before) };
     if (left.length < before.length) this.hold(left); else this.show();
-    tell(`\u201c${whole.name}\u201d is deleted. Ctrl+Z brings it back.`);
+    notify(`\u201c${whole.name}\u201d is deleted. Ctrl+Z brings it back.`);
   }
 
   // A selection that was deleted, begun from what it was begun from, with the splats that it had.
   async restore({ id, name, history, bits }, hidden, before) {
     const begun = begunFrom(history);
-    const splats = { how: "set", bits };
+    const splats = { operation: "set", bits };
     const made = await post(this.route, { name, edit: begun.length ? { how: "set", query: { sets: begun } } : splats });
     const whole = begun.length ? await post(`${this.route}/${made.id}/edits`, splats) : made;
     await this.conceal(hidden, true);
@@ -243,7 +243,7 @@ export class Things {
       this.take(chosen.set, more);
       return true;
     } catch (problem) {
-      tell(words(problem), true);
+      notify(words(problem), true);
       return true;
     }
   }
@@ -289,7 +289,7 @@ export class Things {
       Object.assign(thing, { hidden, ...("name" in change && { name }) });
       if (change.name === null) return await this.of(this.lift);
       this.have(this.found);
-    } catch (problem) { tell(words(problem), true); }
+    } catch (problem) { notify(words(problem), true); }
     return this.show();
   }
 }

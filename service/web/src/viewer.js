@@ -8,7 +8,7 @@ import { Painter } from "./painter.js";
 const ROW = 32; // bytes of a splat in a .splat file
 export const MOST = 2_000_000; // splats that are drawn; of larger scenes every n-th is
 const FLIGHT = 700; // ms
-const LOADING = 60_000; // ms that the unpacking of a scene may take before that is told
+const LOADING = 60_000; // ms that the unpacking of a scene may take before the page says so
 const SAMPLE = 200_000; // splats among which middles are looked for
 const OPAQUE = 40; // of 255: fainter splats are not what somebody points at
 const FEWEST = 10_000; // splats that are drawn while something moves, however slow the machine is
@@ -189,7 +189,7 @@ export class Viewer {
     return Boolean(this.mesh) && !this.asked && !this.flight && !this.resting && this.spark.display.numSplats === this.count && activeSplats > 0 && !sorting && !sortDirty && !dirty;
   }
 
-  // Once the card has drawn all that it was told to.
+  // Once the GPU has drawn all commands.
   async drawn() {
     const gl = this.renderer.getContext();
     const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);

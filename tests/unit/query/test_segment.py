@@ -221,7 +221,7 @@ def test_command_names_splats_and_examples(tiny_lift: Path, tmp_path: Path, caps
     assert cli.main(asked) == 0
     assert capsys.readouterr().out.startswith("splat:0: apple ")
     assert cli.main([*command, "--words", str(tmp_path / "words.txt")]) == 0
-    assert "2 of 2 words are there" in capsys.readouterr().out
+    assert "2 of 2 words" in capsys.readouterr().out
     for wrong in (["--labels", "l.png"], ["--words", str(tmp_path / "none.txt")], ["--example", "nothing"]):
         assert cli.main([*command, *wrong]) == 2
         assert capsys.readouterr().err.count("\n") == 1
