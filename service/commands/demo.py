@@ -188,7 +188,7 @@ class Finding:
     """Result of one phrase."""
 
     phrase: str
-    is_there: bool | None  # True if the scene has it; None: unknown or uncertain
+    present: bool | None  # the scene has it; None: unknown or uncertain
     reason: str  # how that is known
     object: str | None  # name of the object that the masks show most, if names are known
     splats: int  # selected
@@ -301,7 +301,7 @@ def _find(client: Client, lift: str, kind: str, phrase: str, subject: DemoScene,
     Image.fromarray(overlay).save(out / names["found"])
     return Finding(
         phrase=phrase,
-        is_there=answer["present"],
+        present=answer["present"],
         reason=answer["reason"],
         object=truth.name_of(masks) if truth else None,
         splats=answer["count"],
@@ -323,7 +323,7 @@ def _pixels(png: bytes) -> np.ndarray:
 
 def _lines(finding: Finding) -> list[str]:
     noun = f"the {finding.object}" if finding.object else "something"
-    if finding.is_there is False:
+    if finding.present is False:
         return [f'  "{finding.phrase}" finds nothing', f"      {finding.reason}"]
     bar = "no threshold" if finding.threshold is None else f"threshold {finding.threshold:.2f}"
     iou = "" if finding.iou is None else f", IoU {finding.iou:.2f} against the truth of views that were not lifted"
@@ -332,7 +332,7 @@ def _lines(finding: Finding) -> list[str]:
         f"      {finding.splats:,} splats, best score {finding.score:.2f}, {bar}, "
         f"{finding.query_ms:.0f} ms (mask {finding.mask_ms:.0f} ms){iou}",
     ]
-    if finding.is_there is None:
+    if finding.present is None:
         lines.append(f"      {finding.reason}")
     for number, item in enumerate(finding.objects, 1):
         place = ", ".join(f"{value:.2f}" for value in item["centre"])

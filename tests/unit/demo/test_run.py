@@ -21,7 +21,7 @@ def test_the_demo_finds_what_it_asks_for(tmp_path: Path, capsys: pytest.CaptureF
     report = json.loads(capsys.readouterr().out)
     assert (report["splats"], report["channels"], report["views"]) == (166_000, 512, 18)
     penguin, sofa = report["phrases"]
-    assert (penguin["object"], penguin["there"], sofa["there"], sofa["iou"]) == ("penguin", True, False, None)
+    assert (penguin["object"], penguin["present"], sofa["present"], sofa["iou"]) == ("penguin", True, False, None)
     assert penguin["iou"] > 0.8 and 0.2 < penguin["threshold"] < penguin["score"] < 0.4  # cosines as photos have them
     assert load_lift(Path(report["lift_file"])).features.shape[0] == report["splats"]
     found = [name for phrase in report["phrases"] for name in phrase["pictures"].values()]
