@@ -33,7 +33,7 @@ from tests.api import tiny_scene
 from tests.api.test_photo_zips import photos_zip
 from tests.benchmarks.base import machine
 from tests.benchmarks.soak import scene_files
-from tests.crash.service_process import ENDED, ROOT, processes_of
+from tests.crash.service_process import FINAL_STATES, ROOT, processes_of
 
 CLIENTS = 2  # that send at the same time
 WAITING_SECONDS = 3.0  # for an answer to a head that may promise more than comes
@@ -321,7 +321,7 @@ def lifted(client: httpx.Client) -> tuple[str, dict[str, Any]]:
 
 def until_ended(client: httpx.Client, job: str) -> dict[str, Any]:
     """The job once it has ended."""
-    while (found := client.get(f"/jobs/{job}").json())["state"] not in ENDED:
+    while (found := client.get(f"/jobs/{job}").json())["state"] not in FINAL_STATES:
         time.sleep(0.02)
     return found
 
@@ -373,7 +373,7 @@ class _Never(random.Random):
 
 def _cancel_all(client: httpx.Client) -> None:
     for job in client.get("/jobs").json()["jobs"]:
-        if job["state"] not in ENDED:
+        if job["state"] not in FINAL_STATES:
             client.post(f"/jobs/{job['id']}/cancel")
 
 

@@ -71,7 +71,7 @@ def insist(service: ServiceProcess, body: dict[str, Any], key: str) -> str:
     """Order a lift as a client does that was cut off: again with the same key, when the server is back."""
     job = service.order(body, key)
     while job is None:
-        if service.died():
+        if service.has_died():
             service.wait()
             service.start()
         job = service.order(body, key)
@@ -99,7 +99,7 @@ def _kill_jobs(
     figures = Counter[str](jobs=0, lost=0, doubled=0, digests_equal=0, resumed=0)
     begun = time.monotonic()
     reference = insist(service, body, "undisturbed")
-    service.ended(reference)
+    service.wait_until_ended(reference)
     whole = time.monotonic() - begun
     wanted = service.digest(reference)
     begun = time.monotonic()  # of the kills: the first lift may have compiled kernels
@@ -115,7 +115,7 @@ def _kill_jobs(
                 victims["server"] += 1
                 service.kill()
                 service.start()
-        succeeded = service.ended(job)["state"] == "succeeded"
+        succeeded = service.wait_until_ended(job)["state"] == "succeeded"
         figures["jobs"] += 1
         figures["lost"] += not succeeded or insist(service, body, key) != job
         figures["doubled"] += service.times_succeeded(job) > 1
@@ -148,7 +148,7 @@ def _at_point(point: str) -> str:
             service.start(*ANSWERS)
             job = service.order(body, "key", route)
             assert job is not None and first in (None, job)
-            state = service.ended(job)["state"]
+            state = service.wait_until_ended(job)["state"]
             jobs, times = len(service.client.get("/jobs").json()["jobs"]), service.times_succeeded(job)
             result = service.client.get(made.format(job)).status_code
     once = (state, jobs, times, result) == ("succeeded", 1, 1, 200)

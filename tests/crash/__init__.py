@@ -1,1 +1,1 @@
-"""What the service promises when processes die, stop, are canceled, or the disk is full."""
+"""Promises of the service when processes die, stop or are canceled, or the disk is full."""

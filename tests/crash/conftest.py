@@ -41,7 +41,7 @@ def order(store: Store, owner: Owner = SERVICE, **settings: Any) -> JobOrder:
 
 
 def labels(store: Store, owner: Owner = SERVICE) -> dict[str, Any]:
-    """What a trade-off of that order may be judged by: masks of one of its two views."""
+    """Return labels for a trade-off of that order: masks of one of its two views."""
     masks = asset_of(store, AssetKind.MASKS, {"names": ["v"], "classes": 1}, owner)
     table = asset_of(store, AssetKind.TABLE, {"words": ["apple"], "channels": 1}, owner)
     return {"masks": masks, "table": table, "classes": ["apple"]}
@@ -51,13 +51,13 @@ def asset_of(store: Store, kind: AssetKind, counts: dict[str, Any], owner: Owner
     """An asset whose content nobody looks at; its id."""
     with store.files.draft(".bin") as draft:
         draft.write_bytes(kind.encode())
-        checked = CheckedUpload(draft, kind, hashlib.sha256(kind.encode()).hexdigest(), ".bin", counts, [])
-        return store.assets.add(owner, checked)[0].id
+        upload = CheckedUpload(draft, kind, hashlib.sha256(kind.encode()).hexdigest(), ".bin", counts, [])
+        return store.assets.add(owner, upload)[0].id
 
 
-def often(**chosen: float) -> ServiceSettings:
+def often(**overrides: float) -> ServiceSettings:
     """Settings of a collector that looks all the time and spares nothing."""
-    return ServiceSettings.model_validate({"garbage_seconds": 0.02, "garbage_grace_seconds": 0.0, **chosen})
+    return ServiceSettings.model_validate({"garbage_seconds": 0.02, "garbage_grace_seconds": 0.0, **overrides})
 
 
 def until(condition: Callable[[], Any], seconds: float = 600.0) -> None:
@@ -89,7 +89,7 @@ def address_of(server: uvicorn.Server) -> tuple[str, int]:
     return server.servers[0].sockets[0].getsockname()
 
 
-def ended(store: Store, job: str) -> JobRecord:
+def wait_until_ended(store: Store, job: str) -> JobRecord:
     """The job, once it has ended."""
     until(lambda: store.jobs.get(SERVICE, job).state in ENDED)
     return store.jobs.get(SERVICE, job)
@@ -104,20 +104,20 @@ def state_of(pid: int) -> str:
 
 
 def alive(pid: int) -> bool:
-    """Whether a process runs."""
+    """Return True if a process runs."""
     return state_of(pid) not in ("Z", "X")
 
 
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[Store]:
-    opened = Store.open(tmp_path / "data")
-    yield opened
-    opened.close()
+    opened_store = Store.open(tmp_path / "data")
+    yield opened_store
+    opened_store.close()
 
 
 @contextmanager
 def supervised(store: Store, behaviour: str, *, clock: Clock = time.monotonic, **limits: Any) -> Iterator[Supervisor]:
-    """Run a supervisor whose children behave as told."""
+    """Run a supervisor whose children behave like the stand-in that is named."""
     supervisor = Supervisor(store, JobLimits(**limits), command=stand_in(behaviour), clock=clock)
     supervisor.start()
     try:

@@ -80,23 +80,23 @@ def standing_in(store: Store, behaviour: str, **settings: Any) -> Iterator[tuple
     """The application in this process with stand-ins for jobs and queries, and the body of an order that it takes."""
     from fastapi.testclient import TestClient  # which the server of the other tests has no use for
 
-    chosen = ServiceSettings.model_validate({"data": store.files.root, "disk_floor_bytes": 0, **settings})
-    runner = Supervisor(store, job_limits(chosen), command=stand_in(behaviour))
-    known = order(store)
-    body = {"splats": known.splats, "cameras": known.cameras, "features": list(known.features)}
-    app = create_app(chosen, store, runner, cast("QueryClient", NoQueries()))
+    options = ServiceSettings.model_validate({"data": store.files.root, "disk_floor_bytes": 0, **settings})
+    runner = Supervisor(store, job_limits(options), command=stand_in(behaviour))
+    job = order(store)
+    body = {"splats": job.splats, "cameras": job.cameras, "features": list(job.features)}
+    app = create_app(options, store, runner, cast("QueryClient", NoQueries()))
     with TestClient(app, "http://127.0.0.1", raise_server_exceptions=False) as client:
         yield client, body
 
 
 def arm(point: str) -> None:
     """Make this process kill itself when it comes to the point."""
-    owner, name, when = POINTS[point]
+    owner, name, moment = POINTS[point]
     method: Callable[..., Any] = getattr(owner, name)
 
-    def deadly(*given: Any, **named: Any) -> Any:
-        result = method(*given, **named) if when == "after" else None
-        if when == "before" or result is not None or name != "claim":  # an empty line is no claim
+    def deadly(*arguments: Any, **keywords: Any) -> Any:
+        result = method(*arguments, **keywords) if moment == "after" else None
+        if moment == "before" or result is not None or name != "claim":  # an empty line is no claim
             os.kill(os.getpid(), signal.SIGKILL)
         return result
 
@@ -109,13 +109,13 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("--behaviour", default="")
     parser.add_argument("--point", choices=POINTS)
-    given = parser.parse_args()
-    chosen = {"data": given.data, "checkpoint_seconds": 0.0, "garbage_grace_seconds": 0.0}
-    settings = ServiceSettings.model_validate(chosen)
+    options = parser.parse_args()
+    overrides = {"data": options.data, "checkpoint_seconds": 0.0, "garbage_grace_seconds": 0.0}
+    settings = ServiceSettings.model_validate(overrides)
     store = Store.open(settings.data)
-    if given.point:
-        arm(given.point)
-    command = stand_in(given.behaviour) if given.behaviour else CHILD
+    if options.point:
+        arm(options.point)
+    command = stand_in(options.behaviour) if options.behaviour else CHILD
     runner = Supervisor(store, job_limits(settings), command=command)
     app = create_app(settings, store, runner, cast("QueryClient", NoQueries()))
     listener = bind("127.0.0.1", 0)

@@ -21,7 +21,7 @@ from service.supervisor import MARK
 
 ROOT = Path(__file__).parents[2]
 PATIENCE_SECONDS = 1800.0  # of a machine that has other things to do: no promise is about time here
-ENDED = ("succeeded", "failed", "canceled")
+FINAL_STATES = ("succeeded", "failed", "canceled")
 
 
 class ServiceProcess:
@@ -63,8 +63,8 @@ class ServiceProcess:
         self._process.wait()
         self._process.stdout.close()
 
-    def died(self) -> bool:
-        """Whether it has; a request may also be cut off while it lives."""
+    def has_died(self) -> bool:
+        """Return True if it has died; a request may also be cut off while it lives."""
         assert self._process is not None
         return self._process.poll() is not None
 
@@ -88,16 +88,16 @@ class ServiceProcess:
         """The job as it is now."""
         return self.client.get(f"/jobs/{job}").json()
 
-    def ended(self, job: str) -> dict[str, Any]:
+    def wait_until_ended(self, job: str) -> dict[str, Any]:
         """The job once it has ended."""
         deadline = time.monotonic() + PATIENCE_SECONDS
-        while (found := self.job(job))["state"] not in ENDED:
-            assert time.monotonic() < deadline, found
+        while (job_document := self.job(job))["state"] not in FINAL_STATES:
+            assert time.monotonic() < deadline, job_document
             time.sleep(0.05)
-        return found
+        return job_document
 
     def times_succeeded(self, job: str) -> int:
-        """How often the job came to be succeeded, by its events."""
+        """Return the number of the job's events with the state succeeded."""
         story = self.client.get(f"/jobs/{job}/events").text
         return story.count('"state":"succeeded"')
 
@@ -114,12 +114,12 @@ class ServiceProcess:
 
 def processes_of(job: str) -> list[int]:
     """The processes that carry the mark of a job."""
-    found = []
+    processes = []
     for entry in Path("/proc").iterdir():
         with contextlib.suppress(OSError, ValueError):
             if f"{MARK}={job}".encode() in (entry / "environ").read_bytes().split(b"\0"):
-                found.append(int(entry.name))
-    return found
+                processes.append(int(entry.name))
+    return processes
 
 
 def template_of(server: int) -> int:
@@ -133,11 +133,11 @@ def template_of(server: int) -> int:
 
 def kill_processes_of(job: str) -> int:
     """SIGKILL them; how many there were."""
-    found = processes_of(job)
-    for pid in found:
+    processes = processes_of(job)
+    for pid in processes:
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
-    return len(found)
+    return len(processes)
 
 
 def usage(pid: int) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""Stands in for the process of a job: says what it is told to, without the seconds that a lift takes to begin.
+"""Stand-in for the process of a job: behaves as requested, without the seconds that a lift takes to begin.
 
     python stand_in.py BEHAVIOUR ORDER
 
@@ -28,8 +28,8 @@ def say(**message: Any) -> None:
 def finish(order: dict[str, Any]) -> None:
     if order["kind"] == "tradeoff":
         Path(order["output"]).write_bytes(b"a chart")
-        found = {"runs": [], "skipped": [], "choice": {}, "views": {}, "seconds": 0.0, **order["parameters"]}
-        say(event="done", document=found, page="a table")
+        document = {"runs": [], "skipped": [], "choice": {}, "views": {}, "seconds": 0.0, **order["parameters"]}
+        say(event="done", document=document, page="a table")
         return
     content = hashlib.sha256(json.dumps([order["splats"], order["settings"]]).encode()).digest()
     Path(order["output"]).write_bytes(content)
@@ -88,9 +88,9 @@ def stop_once(order: dict[str, Any]) -> None:
 
 
 def eat(order: dict[str, Any]) -> None:
-    eaten = []
+    blocks = []
     while True:
-        eaten.append(bytearray(os.urandom(1 << 20)) * 16)
+        blocks.append(bytearray(os.urandom(1 << 20)) * 16)
         time.sleep(0.02)
 
 
@@ -105,9 +105,9 @@ def feed(order: dict[str, Any]) -> None:
 
 def meet(order: dict[str, Any]) -> None:
     """Wait until another one of us runs."""
-    room = Path(order["work"]).parent  # work itself goes when its job ends, perhaps before the other one looked
-    (room / f"{os.getpid()}.met").touch()
-    while len(list(room.glob("*.met"))) < 2:
+    folder = Path(order["work"]).parent  # work itself goes when its job ends, perhaps before the other one looked
+    (folder / f"{os.getpid()}.met").touch()
+    while len(list(folder.glob("*.met"))) < 2:
         time.sleep(0.02)
     answer(order)
 

@@ -1,4 +1,4 @@
-"""What jobs promise while their processes die, freeze, overeat or are canceled."""
+"""Promises of jobs whose processes die, freeze, exceed their memory or are canceled."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from service.supervisor import LONGEST, JobProcess, Lease
 from service.tasks import lift_as_ordered
 from tests.scenes import look_at, random_splats
 
-from .conftest import Supervising, alive, ended, order, state_of, supervised, until
+from .conftest import Supervising, alive, order, state_of, supervised, until, wait_until_ended
 
 
 def submit(store: Store, **settings: Any) -> str:
@@ -60,7 +60,7 @@ def pids(store: Store, job: str) -> list[int]:
 
 
 @pytest.mark.parametrize(
-    ("behaviour", "limit", "state", "attempt", "told"),
+    ("behaviour", "limit", "state", "attempt", "problem"),
     [
         ("die", {}, JobState.FAILED, MAX_ATTEMPTS, "signal 9"),
         ("die_once", {}, JobState.SUCCEEDED, 2, None),
@@ -76,29 +76,29 @@ def test_job_has_three_attempts_and_one_within_its_limits(
     limit: dict[str, Any],
     state: JobState,
     attempt: int,
-    told: str | None,
+    problem: str | None,
 ) -> None:
     job = submit(store)
     with supervising(behaviour, **limit):
-        found = ended(store, job)
-    assert (found.state, found.attempt) == (state, attempt)
+        record = wait_until_ended(store, job)
+    assert (record.state, record.attempt) == (state, attempt)
     assert states(store, job) == ["queued", *["running", "queued"] * (attempt - 1), "running", state]
-    if told is None:
+    if problem is None:
         until(lambda: not store.files.work(job).exists())  # what it went on from is removed
     else:
-        assert found.problem is not None and found.problem["kind"] == ("over-limit" if limit else "crashed")
-        assert told in found.problem["expected"] + found.problem["got"]
+        assert record.problem is not None and record.problem["kind"] == ("over-limit" if limit else "crashed")
+        assert problem in record.problem["expected"] + record.problem["got"]
 
 
 class StoppedTime:
     """A clock that goes on while a process is stopped, and only then: on a busy machine nothing is late."""
 
-    def __init__(self, stopped: Callable[[], list[int]]) -> None:
-        self._stopped = stopped
+    def __init__(self, stopped_children: Callable[[], list[int]]) -> None:
+        self._stopped_children = stopped_children
         self._seconds = 0.0
 
     def __call__(self) -> float:
-        if any(state_of(pid) == "T" for pid in self._stopped()):
+        if any(state_of(pid) == "T" for pid in self._stopped_children()):
             self._seconds += 1.0
         return self._seconds
 
@@ -108,25 +108,25 @@ def test_child_that_is_stopped_past_its_lease_is_fenced(store: Store, supervisin
     with supervising("stop_once", clock=StoppedTime(lambda: pids(store, job)), lease_seconds=10.0):
         until(lambda: pids(store, job))
         stale = pids(store, job)[0]
-        found = ended(store, job)
+        record = wait_until_ended(store, job)
         assert not alive(stale)  # there is nothing left to continue
         with pytest.raises(ProcessLookupError):
             os.kill(stale, signal.SIGCONT)
-    assert (found.state, found.attempt) == (JobState.SUCCEEDED, 2)
+    assert (record.state, record.attempt) == (JobState.SUCCEEDED, 2)
     assert "silent" in log_of(store, job)
 
 
 class Watch:
     """A clock that a test sets, and a processor whose time it tells."""
 
-    now = spent = 0.0
+    now = cpu_seconds = 0.0
 
     def is_over(self, lease: Lease, *, after: float, computed: float = 0.0) -> bool:
-        """Whether the lease is over, looked at four times a second meanwhile."""
+        """Return True if the lease is over, polled four times a second."""
         for _ in range(int(after * 4)):
             self.now += 0.25
-            self.spent += computed / (after * 4)
-            if lease.over(lambda: self.spent):
+            self.cpu_seconds += computed / (after * 4)
+            if lease.over(lambda: self.cpu_seconds):
                 return True
         return False
 
@@ -140,12 +140,12 @@ def test_lease_ends_with_a_silence_in_which_nothing_was_computed() -> None:
     assert watch.is_over(lease, after=1)
     lease.renew()
     assert not watch.is_over(lease, after=300, computed=10.0)
-    watch.spent = 1.0  # what had taken the rest has ended
+    watch.cpu_seconds = 1.0  # what had taken the rest has ended
     assert not watch.is_over(lease, after=40, computed=5.0)
     assert watch.is_over(lease, after=60)
     lease.renew()
     watch.now += 3600  # as after a sleep of the server
-    assert not lease.over(lambda: watch.spent)
+    assert not lease.over(lambda: watch.cpu_seconds)
     assert not watch.is_over(lease, after=30) and watch.is_over(lease, after=1)
 
 
@@ -159,8 +159,8 @@ def test_plan_outlives_its_attempt_and_a_stale_attempt_tells_nothing(store: Stor
     store.jobs.advance(job, 1, {"stage": "old"})
     store.jobs.plan(job, 1, {"summary": ["old"]})
     store.jobs.log(job, 1, "old")
-    found = store.jobs.get(SERVICE, job)
-    assert (found.attempt, found.progress, found.plan) == (2, None, {"summary": []})
+    record = store.jobs.get(SERVICE, job)
+    assert (record.attempt, record.progress, record.plan) == (2, None, {"summary": []})
     assert "old" not in log_of(store, job)
 
 
@@ -181,7 +181,7 @@ def test_canceled_job_has_no_live_process(store: Store, supervising: Supervising
 def test_lifts_run_side_by_side_when_the_operator_says_so(store: Store, supervising: Supervising) -> None:
     jobs = [submit(store), submit(store)]
     with supervising("meet", parallel=2):
-        assert [ended(store, job).state for job in jobs] == [JobState.SUCCEEDED] * 2
+        assert [wait_until_ended(store, job).state for job in jobs] == [JobState.SUCCEEDED] * 2
 
 
 def test_job_interrupted_by_a_stop_goes_on_where_the_data_directory_is_next(tmp_path: Path) -> None:
@@ -193,8 +193,8 @@ def test_job_interrupted_by_a_stop_goes_on_where_the_data_directory_is_next(tmp_
         assert not any(alive(pid) for pid in pids(store, job))
     with closing(Store.open((tmp_path / "data").rename(tmp_path / "moved"))) as store:
         with supervised(store, "answer"):
-            found = ended(store, job)
-        assert (found.state, found.attempt) == (JobState.SUCCEEDED, 2)
+            record = wait_until_ended(store, job)
+        assert (record.state, record.attempt) == (JobState.SUCCEEDED, 2)
         path = store.lifts.get(SERVICE, job).path
         assert path.is_relative_to(tmp_path / "moved") and path.exists()
 
@@ -231,16 +231,16 @@ def test_job_process_and_what_it_started_end_with_their_server(occupation: str) 
 DEAF = """
 import os, pathlib
 
-def run(told):
-    pathlib.Path(told).write_text(str(os.getpid()))
+def run(output):
+    pathlib.Path(output).write_text(str(os.getpid()))
     sum(range(10**15))  # in one call of C
 """
 OUTLIVING = """
 import os, pathlib, time
 
-def run(told):
+def run(output):
     template = os.getppid()
-    pathlib.Path(told).write_text(str(template))
+    pathlib.Path(output).write_text(str(template))
     while os.getppid() == template:
         time.sleep(0.01)
     return {"event": "valid"}
@@ -249,22 +249,22 @@ def run(told):
 
 @contextlib.contextmanager
 def sandbox_of(content: str, folder: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
-    """A server whose sandboxed task is this module's, and the number that the task wrote."""
+    """Yield a server that runs this module's task in the sandbox, and the number that the task wrote."""
     (folder / "task.py").write_text(content)
-    told = folder / "told"
+    output = folder / "output"
     code = f"""if True:
         import pathlib, threading
         from service.sandbox import SandboxLimits, run_sandboxed
         limits = SandboxLimits(600, 8 << 30, threading.Event())
-        print(run_sandboxed("task.run", [{str(told)!r}], pathlib.Path({str(folder)!r}), limits).last["event"])
+        print(run_sandboxed("task.run", [{str(output)!r}], pathlib.Path({str(folder)!r}), limits).last["event"])
     """
-    found = {"PYTHONPATH": f"{folder}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
+    environment = {"PYTHONPATH": f"{folder}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
     with subprocess.Popen(
-        [sys.executable, "-c", code], env=os.environ | found, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", code], env=os.environ | environment, stdout=subprocess.PIPE, text=True
     ) as server:
         try:
-            until(lambda: told.exists() and told.read_text() != "")
-            yield server, int(told.read_text())
+            until(lambda: output.exists() and output.read_text() != "")
+            yield server, int(output.read_text())
         finally:
             server.kill()
 
@@ -288,25 +288,25 @@ def test_check_whose_template_is_killed_goes_on_and_is_heard(tmp_path: Path) -> 
         assert server.stdout is not None and server.stdout.read() == "valid\n"
 
 
-@pytest.mark.parametrize(("size", "most"), [(1 << 20, 1040 << 20), (1 << 40, 8 << 30)])
+@pytest.mark.parametrize(("size", "memory_bytes"), [(1 << 20, 1040 << 20), (1 << 40, 8 << 30)])
 def test_check_may_take_memory_by_the_size_of_its_upload(
-    size: int, most: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    size: int, memory_bytes: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def noted(module: str, given: list[str], scratch: Path, limits: sandbox.SandboxLimits) -> NoReturn:
+    def note_limits(module: str, arguments: list[str], scratch: Path, limits: sandbox.SandboxLimits) -> NoReturn:
         raise OSError(f"may take {limits.memory_bytes}")
 
     with (tmp_path / "upload").open("wb") as handle:
         handle.truncate(size)
-    monkeypatch.setattr(uploads, "run_sandboxed", noted)
-    with pytest.raises(OSError, match=f"may take {most}$"):
+    monkeypatch.setattr(uploads, "run_sandboxed", note_limits)
+    with pytest.raises(OSError, match=f"may take {memory_bytes}$"):
         uploads.check(
             AssetKind.SPLATS, tmp_path / "upload", tmp_path, sandbox.SandboxLimits(1.0, 8 << 30, threading.Event())
         )
 
 
 def claim(store: Store) -> str | None:
-    claimed = store.jobs.claim()
-    return None if claimed is None else claimed.id
+    job = store.jobs.claim()
+    return None if job is None else job.id
 
 
 def test_owners_take_turns_whoever_came_first_with_how_many(store: Store) -> None:
@@ -314,15 +314,15 @@ def test_owners_take_turns_whoever_came_first_with_how_many(store: Store) -> Non
     jobs = {}
     for owner, count in zip(owners, (4, 2, 1), strict=True):
         jobs |= {store.jobs.submit(owner, order(store, owner))[0]: f"{owner.key}{n}" for n in range(count)}
-    claimed = []
+    order_of_owners = []
     while (job := claim(store)) is not None:
-        claimed.append(jobs[job])
-        store.jobs.lose(job, 1, "to be claimed again") if claimed == ["a0"] else store.jobs.fail(job, 1, {})
-        if claimed == ["a0", "b0"]:  # who deletes what has ended does not come first for it
+        order_of_owners.append(jobs[job])
+        store.jobs.lose(job, 1, "to be claimed again") if order_of_owners == ["a0"] else store.jobs.fail(job, 1, {})
+        if order_of_owners == ["a0", "b0"]:  # who deletes what has ended does not come first for it
             for ended_job in store.jobs.all(owners[1]):
                 if ended_job.state is JobState.FAILED:
                     store.jobs.delete(owners[1], ended_job.id)
-    assert claimed == ["a0", "b0", "c0", "a0", "b1", "a1", "a2", "a3"]
+    assert order_of_owners == ["a0", "b0", "c0", "a0", "b1", "a1", "a2", "a3"]
 
 
 @pytest.mark.parametrize("expired", [True, False])
@@ -338,8 +338,8 @@ def test_queued_jobs_of_a_key_that_ended_are_canceled_with_a_reason(expired: boo
         store.keys.revoke(key.id)
         assert store.jobs.get(SERVICE, waiting).state is JobState.CANCELED  # at once, by whichever process
     assert claim(store) is None
-    found = store.jobs.get(SERVICE, waiting)
-    assert found.state is JobState.CANCELED and found.problem is not None and found.problem["argument"] == "key"
+    record = store.jobs.get(SERVICE, waiting)
+    assert record.state is JobState.CANCELED and record.problem is not None and record.problem["argument"] == "key"
     assert store.jobs.get(SERVICE, running).state is JobState.RUNNING  # what has begun goes on
 
 
@@ -355,23 +355,23 @@ class Slow(logging.StreamHandler[io.StringIO]):
 
 
 @pytest.fixture
-def logged() -> Iterator[io.StringIO]:
+def job_log() -> Iterator[io.StringIO]:
     """The server's log of what jobs print."""
-    written, logger = io.StringIO(), logging.getLogger("service.jobs.process")
-    handler = Slow(written)
+    stream, logger = io.StringIO(), logging.getLogger("service.jobs.process")
+    handler = Slow(stream)
     handler.setFormatter(JsonLines())
     logger.addHandler(handler)
-    yield written
+    yield stream
     logger.removeHandler(handler)
 
 
 def test_every_line_that_a_job_prints_is_a_record_with_its_job_and_request(
-    store: Store, supervising: Supervising, logged: io.StringIO, capfd: pytest.CaptureFixture[str]
+    store: Store, supervising: Supervising, job_log: io.StringIO, capfd: pytest.CaptureFixture[str]
 ) -> None:
     job = store.jobs.submit(SERVICE, replace(order(store), request_id="the-order"))[0]
     with supervising("print_much"):
-        ended(store, job)
-    records = [json.loads(line) for line in logged.getvalue().splitlines()]
+        wait_until_ended(store, job)
+    records = [json.loads(line) for line in job_log.getvalue().splitlines()]
     assert {(record["job"], record["request_id"], record["level"]) for record in records} == {
         (job, "the-order", "warning")
     }
@@ -385,15 +385,15 @@ def test_every_line_that_a_job_prints_is_a_record_with_its_job_and_request(
 
 def test_long_answer_is_heard_in_time_that_grows_with_its_length() -> None:
     """An answer of 48 MB: copied anew with each of its pieces it would be 17 GB."""
-    said = "import sys, time; sys.stdout.write('{\"said\": \"' + 'x' * (48 << 20) + '\"}\\n{\"sai')"
-    heard: list[dict[str, Any]] = []
-    begun = time.process_time()
-    with JobProcess([sys.executable, "-S", "-c", said], {}, "0" * 32) as process:
-        while not (ended := process.has_ended()) or not heard:
-            heard += process.listen(0 if ended else 0.2)
-        heard += process.listen(0)
-    assert [len(message["said"]) for message in heard] == [48 << 20]  # the half line at its end is none
-    assert time.process_time() - begun < 2.0
+    program = "import sys, time; sys.stdout.write('{\"said\": \"' + 'x' * (48 << 20) + '\"}\\n{\"sai')"
+    messages: list[dict[str, Any]] = []
+    start = time.process_time()
+    with JobProcess([sys.executable, "-S", "-c", program], {}, "0" * 32) as process:
+        while not (has_ended := process.has_ended()) or not messages:
+            messages += process.listen(0 if has_ended else 0.2)
+        messages += process.listen(0)
+    assert [len(message["said"]) for message in messages] == [48 << 20]  # the half line at its end is none
+    assert time.process_time() - start < 2.0
 
 
 # A job in blocks goes on from finished ones
@@ -401,7 +401,7 @@ def test_long_answer_is_heard_in_time_that_grows_with_its_length() -> None:
 
 ROOT = Path(__file__).parents[2]
 VIEWS = 20  # three blocks
-KILLED = """if True:
+KILLED_JOB = """if True:
     import io, json, os, signal, sys
     from service.job_child import Reporter
     from service.tasks import lift_as_ordered
@@ -437,18 +437,20 @@ def test_job_in_blocks_that_is_killed_goes_on_from_them(tmp_path: Path) -> None:
     order = order_of(tmp_path, preset="row-sum")
     (tmp_path / "work").mkdir()
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    died = subprocess.run([sys.executable, "-c", KILLED, json.dumps(order)], env=environment, check=False)
-    assert died.returncode == -signal.SIGKILL and not Path(order["output"]).exists()
-    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "work").rglob("view-*.safetensors")}
-    assert len(kept) >= 16
-    told = io.BytesIO()
-    ended = lift_as_ordered(order, Reporter(told))
-    assert {path: path.stat().st_mtime_ns for path in kept} == kept
-    stages = {json.loads(line).get("stage") for line in told.getvalue().splitlines()}
-    assert {"geometry", "solve", "save"} <= stages and ended["count"] == 2000
-    whole = lc.lift(lc.read_splats(order["splats"]), lc.read_cameras(order["cameras"]),
+    killed_process = subprocess.run(
+        [sys.executable, "-c", KILLED_JOB, json.dumps(order)], env=environment, check=False
+    )
+    assert killed_process.returncode == -signal.SIGKILL and not Path(order["output"]).exists()
+    blocks = {path: path.stat().st_mtime_ns for path in (tmp_path / "work").rglob("view-*.safetensors")}
+    assert len(blocks) >= 16
+    reports = io.BytesIO()
+    answer = lift_as_ordered(order, Reporter(reports))
+    assert {path: path.stat().st_mtime_ns for path in blocks} == blocks
+    stages = {json.loads(line).get("stage") for line in reports.getvalue().splitlines()}
+    assert {"geometry", "solve", "save"} <= stages and answer["count"] == 2000
+    expected = lc.lift(lc.read_splats(order["splats"]), lc.read_cameras(order["cameras"]),
                     lc.read_features(*order["features"]), preset="row-sum")  # fmt: skip
-    assert torch.equal(lc.load_lift(order["output"]).features, whole.features)
+    assert torch.equal(lc.load_lift(order["output"]).features, expected.features)
 
 
 def test_job_of_an_engine_is_lifted_in_blocks_by_the_default_too(tmp_path: Path) -> None:

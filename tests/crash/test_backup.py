@@ -1,4 +1,4 @@
-"""A backup has what the database knows, whole; what is damaged is told; and nobody else reads a data directory."""
+"""A backup is complete, damage is reported, and no other user can read a data directory."""
 
 from __future__ import annotations
 
@@ -20,43 +20,43 @@ from service.store.owners import SERVICE, Scope
 from service.store.recovery import back_up, restore, verify
 from service.store.store import Store
 
-from .conftest import Supervising, asset_of, ended, order, supervised, until
+from .conftest import Supervising, asset_of, order, supervised, until, wait_until_ended
 
 
 @pytest.fixture
-def filled(store: Store, supervising: Supervising) -> Store:
+def filled_store(store: Store, supervising: Supervising) -> Store:
     """A store that a server holds, with a lift and a key."""
     job = store.jobs.submit(SERVICE, order(store))[0]
     with supervising("answer"):
-        assert ended(store, job).state is JobState.SUCCEEDED
+        assert wait_until_ended(store, job).state is JobState.SUCCEEDED
     store.keys.create("a", frozenset({Scope.READ}), Quota())
     return store
 
 
 def files(data: Path) -> dict[str, bytes]:
-    found = (path for room in ("blobs", "lifts") for path in (data / room).rglob("*") if path.is_file())
-    return {str(path.relative_to(data)): path.read_bytes() for path in found}
+    paths = (path for folder in ("blobs", "lifts") for path in (data / folder).rglob("*") if path.is_file())
+    return {str(path.relative_to(data)): path.read_bytes() for path in paths}
 
 
 @pytest.mark.parametrize("links", [True, False])
 def test_backup_beside_a_server_is_restored_as_it_was(
-    filled: Store, tmp_path: Path, links: bool, monkeypatch: pytest.MonkeyPatch
+    filled_store: Store, tmp_path: Path, links: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse(*given: object) -> None:
+    def refuse(*arguments: object) -> None:
         raise OSError(18, "Invalid cross-device link")
 
     if not links:
         monkeypatch.setattr(os, "link", refuse)
-    assert back_up(filled.files.root, tmp_path / "backup") == 4
+    assert back_up(filled_store.files.root, tmp_path / "backup") == 4
     assert verify(tmp_path / "backup") == []
-    before, jobs = files(filled.files.root), filled.jobs.all(SERVICE)
-    asset_of(filled, AssetKind.MASKS, {})  # after it, and none of it
+    before, jobs = files(filled_store.files.root), filled_store.jobs.all(SERVICE)
+    asset_of(filled_store, AssetKind.MASKS, {})  # after it, and none of it
     assert restore(tmp_path / "backup", tmp_path / "again") == 4
-    again = Store.open(tmp_path / "again")  # which is refused where the database is older than the files
-    assert files(again.files.root) == before == files(tmp_path / "backup")
-    assert again.jobs.all(SERVICE) == jobs and again.keys.required()
+    restored = Store.open(tmp_path / "again")  # which is refused where the database is older than the files
+    assert files(restored.files.root) == before == files(tmp_path / "backup")
+    assert restored.jobs.all(SERVICE) == jobs and restored.keys.required()
     assert (tmp_path / "again" / KEYS_REQUIRED).exists()
-    again.close()
+    restored.close()
 
 
 def test_job_that_runs_during_a_backup_ends_in_the_restored(
@@ -68,25 +68,25 @@ def test_job_that_runs_during_a_backup_ends_in_the_restored(
         back_up(store.files.root, tmp_path / "backup")
     assert verify(tmp_path / "backup") == []
     restore(tmp_path / "backup", tmp_path / "again")
-    again = Store.open(tmp_path / "again")
-    with supervised(again, "answer"):
-        assert ended(again, job).state is JobState.SUCCEEDED
-    again.close()
+    restored = Store.open(tmp_path / "again")
+    with supervised(restored, "answer"):
+        assert wait_until_ended(restored, job).state is JobState.SUCCEEDED
+    restored.close()
 
 
 def test_asset_that_is_deleted_during_a_backup_is_no_loss(
-    filled: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    filled_store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asset, copy = asset_of(filled, AssetKind.MASKS, {}), recovery.copy_database
+    asset, copy = asset_of(filled_store, AssetKind.MASKS, {}), recovery.copy_database
 
     def copy_then_delete(source: Path, target: Path) -> None:
         copy(source, target)
-        if filled.assets.find(SERVICE, asset) is not None:
-            filled.assets.delete(SERVICE, asset)
+        if filled_store.assets.find(SERVICE, asset) is not None:
+            filled_store.assets.delete(SERVICE, asset)
 
     monkeypatch.setattr(recovery, "copy_database", copy_then_delete)
-    assert back_up(filled.files.root, tmp_path / "backup") == 4
-    assert verify(tmp_path / "backup") == [] and files(tmp_path / "backup") == files(filled.files.root)
+    assert back_up(filled_store.files.root, tmp_path / "backup") == 4
+    assert verify(tmp_path / "backup") == [] and files(tmp_path / "backup") == files(filled_store.files.root)
 
 
 def flip(path: Path) -> None:
@@ -105,33 +105,33 @@ def pipe(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("damage", "told"),
+    ("damage", "message"),
     [(flip, "other bytes"), (cut, "in place of"), (Path.unlink, "No such file"), (pipe, "no regular file")],
 )
-def test_damaged_file_is_told_and_not_restored(
-    damage: Callable[[Path], None], told: str, filled: Store, tmp_path: Path
+def test_damaged_file_is_reported_and_not_restored(
+    damage: Callable[[Path], None], message: str, filled_store: Store, tmp_path: Path
 ) -> None:
-    back_up(filled.files.root, tmp_path / "backup")
+    back_up(filled_store.files.root, tmp_path / "backup")
     (lift,) = (tmp_path / "backup" / "lifts").iterdir()
     content = lift.read_bytes()
     lift.unlink()  # it is the server's file too
     lift.write_bytes(content)
     damage(lift)
     (line,) = [line for line in verify(tmp_path / "backup") if line.startswith("lifts/")]
-    assert told in line
+    assert message in line
     with pytest.raises(Misconfigured, match="files as they were stored"):
         restore(tmp_path / "backup", tmp_path / "again")
     assert not (tmp_path / "again").exists() and not (tmp_path / ".again.part").exists()
 
 
-def test_backup_replaces_nothing_and_leaves_no_half_of_one(filled: Store, tmp_path: Path) -> None:
+def test_backup_replaces_nothing_and_leaves_no_half_of_one(filled_store: Store, tmp_path: Path) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "letter").write_text("to keep")
     with pytest.raises(Misconfigured, match="not there yet"):
-        back_up(filled.files.root, tmp_path / "full")
-    next((filled.files.root / "lifts").iterdir()).unlink()
+        back_up(filled_store.files.root, tmp_path / "full")
+    next((filled_store.files.root / "lifts").iterdir()).unlink()
     with pytest.raises(Misconfigured, match="1 lost"):
-        back_up(filled.files.root, tmp_path / "half")
+        back_up(filled_store.files.root, tmp_path / "half")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "full"]
 
 
@@ -148,17 +148,17 @@ def test_data_directory_is_its_owners_alone(tmp_path: Path) -> None:
 
 
 def test_commands_back_up_verify_and_restore(
-    filled: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    filled_store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    data, copy, again = (str(tmp_path / name) for name in ("data", "backup", "again"))
+    data, copy, restored = (str(tmp_path / name) for name in ("data", "backup", "again"))
     assert main(["store", "backup", copy, "--data", data]) == 0
     assert main(["store", "verify", "--data", data]) == 0
-    assert main(["store", "restore", copy, "--data", again]) == 0
-    assert main(["store", "restore", copy, "--data", again]) == 2  # it replaces nothing
-    said = capsys.readouterr()
-    assert "4 files" in said.out and "every file is as it was stored" in said.out and "move it away" in said.err
+    assert main(["store", "restore", copy, "--data", restored]) == 0
+    assert main(["store", "restore", copy, "--data", restored]) == 2  # it replaces nothing
+    output = capsys.readouterr()
+    assert "4 files" in output.out and "every file is as it was stored" in output.out and "move it away" in output.err
     (lift,) = (tmp_path / "again" / "lifts").iterdir()
     flip(lift)
-    assert main(["store", "verify", "--data", again, "--json"]) == 1
+    assert main(["store", "verify", "--data", restored, "--json"]) == 1
     (damage,) = json.loads(capsys.readouterr().out)["damage"]
     assert damage.startswith("lifts/")

@@ -27,7 +27,7 @@ from service.store.keys import any_key
 from service.store.owners import SERVICE
 from service.store.store import Store, collect
 
-from .conftest import ended, order, until
+from .conftest import order, until, wait_until_ended
 from .server import standing_in
 
 
@@ -75,16 +75,16 @@ def test_full_disk_is_507_and_the_service_lives(small_disk: Path) -> None:
         assert len(acknowledged) == replies.count(202)
         reply = client.post("/lift", json=body)
         assert reply.status_code == 202
-        assert ended(store, reply.json()["id"]).state == "succeeded"
-        assert {ended(store, job).state for job in acknowledged} <= {"succeeded", "failed"}
+        assert wait_until_ended(store, reply.json()["id"]).state == "succeeded"
+        assert {wait_until_ended(store, job).state for job in acknowledged} <= {"succeeded", "failed"}
 
 
 def test_upload_to_a_disk_that_may_only_be_read_is_503_with_its_reason(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with serving(tmp_path / "data") as (_, client, _):
-        refused = OSError(errno.EROFS, "Read-only file system", "/srv/data/tmp/1")
-        monkeypatch.setattr(Path, "open", Mock(side_effect=refused))
+        read_only = OSError(errno.EROFS, "Read-only file system", "/srv/data/tmp/1")
+        monkeypatch.setattr(Path, "open", Mock(side_effect=read_only))
         reply = client.put("/assets/cameras", content=b"{}")
         monkeypatch.undo()
         assert (reply.status_code, reply.json()["type"]) == (503, "/problems/not-ready")
@@ -94,16 +94,16 @@ def test_upload_to_a_disk_that_may_only_be_read_is_503_with_its_reason(
 def test_delete_works_on_a_full_disk_and_makes_room(small_disk: Path) -> None:
     with serving(small_disk / "data") as (store, client, body):
         job = client.post("/lift", json=body).json()["id"]
-        assert ended(store, job).state == "succeeded"
+        assert wait_until_ended(store, job).state == "succeeded"
         (small_disk / "data" / RESERVE).unlink()
         store.database.keep_reserve()
         fill(small_disk)
         while client.post("/lift", json=body).status_code == 202:  # what room there is in the database's own files
             pass
         for other in client.get("/jobs").json()["jobs"]:
-            gone = f"/jobs/{other['id']}"
+            deleted_job = f"/jobs/{other['id']}"
             if other["state"] not in ("succeeded", "failed", "canceled"):
-                assert client.post(f"{gone}/cancel").status_code in (200, 202, 507)
+                assert client.post(f"{deleted_job}/cancel").status_code in (200, 202, 507)
         assert client.delete(f"/jobs/{job}?with_lift=true").status_code == 204
         assert client.get(f"/jobs/{job}").status_code == 404 and not store.files.lift(job).exists()
 
@@ -119,10 +119,10 @@ def test_start_on_a_full_or_read_only_disk_is_one_line(
         fill(small_disk)
     else:
         subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
-    monkeypatch.setattr(serve, "server_of", lambda *given: pytest.fail("the server started"))
+    monkeypatch.setattr(serve, "server_of", lambda *arguments: pytest.fail("the server started"))
     assert main(["serve", "--data", str(small_disk / "data"), "--port", "0"]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("splatlift: data: expected") and said.count("\n") == 1
+    stderr = capsys.readouterr().err
+    assert stderr.startswith("splatlift: data: expected") and stderr.count("\n") == 1
 
 
 def malformed(path: Path) -> None:
@@ -145,7 +145,7 @@ def replaced(path: Path) -> None:
 
 
 @pytest.mark.parametrize("broken", [malformed, Path.unlink, replaced])
-def test_broken_database_is_told_by_readyz_and_takes_no_order(broken: Callable[[Path], None], tmp_path: Path) -> None:
+def test_readyz_reports_a_broken_database_that_takes_no_order(broken: Callable[[Path], None], tmp_path: Path) -> None:
     with serving(tmp_path / "data") as (store, client, body):
         assert client.get("/healthz").status_code == 200
         with store.database.read() as connection:  # what lies in the WAL alone would still be there
@@ -158,10 +158,12 @@ def test_broken_database_is_told_by_readyz_and_takes_no_order(broken: Callable[[
         ready = client.get("/readyz")
         assert ready.status_code == 503 and "database" in ready.json()["argument"]
         assert client.get("/healthz").status_code == 200
-        left = sqlite3.connect(tmp_path / "data" / DATABASE)
+        other_connection = sqlite3.connect(tmp_path / "data" / DATABASE)
         if broken is replaced:
-            assert left.execute("SELECT count(*) FROM jobs").fetchone()[0] == 0  # nothing goes to a stranger
-        left.close()
+            assert (
+                other_connection.execute("SELECT count(*) FROM jobs").fetchone()[0] == 0
+            )  # nothing goes to a stranger
+        other_connection.close()
 
 
 def test_readyz_tells_of_pages_that_somebody_overwrote(tmp_path: Path) -> None:
@@ -178,9 +180,9 @@ def test_another_database_in_its_place_costs_no_file(tmp_path: Path) -> None:
     store = Store.open(tmp_path)
     asset = store.assets.get(SERVICE, order(store).splats)
     replaced(tmp_path / DATABASE)
-    for look in (lambda: collect(store, time.time() + 1), lambda: store.assets.all(SERVICE)):
+    for read in (lambda: collect(store, time.time() + 1), lambda: store.assets.all(SERVICE)):
         with pytest.raises(sqlite3.OperationalError, match="in the place of the database"):
-            look()
+            read()
     assert asset.is_complete
     store.close()
 
@@ -188,10 +190,10 @@ def test_another_database_in_its_place_costs_no_file(tmp_path: Path) -> None:
 def test_other_process_that_opens_and_closes_the_database_costs_no_commit(tmp_path: Path) -> None:
     store = Store.open(tmp_path)
     before, wal = order(store), (tmp_path / f"{DATABASE}-wal").stat().st_ino
-    look = (
+    read = (
         "import sqlite3, sys; c = sqlite3.connect(sys.argv[1]); print(*c.execute('SELECT id FROM jobs')); c.close()"
     )
-    command = [sys.executable, "-c", look, str(tmp_path / DATABASE)]
+    command = [sys.executable, "-c", read, str(tmp_path / DATABASE)]
     subprocess.run(command, check=True)
     job = store.jobs.submit(SERVICE, before)[0]
     assert (tmp_path / f"{DATABASE}-wal").stat().st_ino == wal  # it would go with the last one that has it open
@@ -212,7 +214,7 @@ def test_lock_that_another_holds_for_long_is_503_with_retry_after(
         assert client.get("/jobs").status_code == 200  # who reads waits for nobody
         other.execute("ROLLBACK")
         other.close()
-        assert ended(store, client.post("/lift", json=body).json()["id"]).state == "succeeded"
+        assert wait_until_ended(store, client.post("/lift", json=body).json()["id"]).state == "succeeded"
 
 
 def test_write_that_cannot_be_committed_is_no_part_of_the_next(tmp_path: Path) -> None:
@@ -231,13 +233,13 @@ def test_write_that_cannot_be_committed_is_no_part_of_the_next(tmp_path: Path) -
 
 def test_file_that_is_no_database_is_a_misconfiguration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     malformed(tmp_path / DATABASE)
-    for look in (lambda: any_key(tmp_path / DATABASE), lambda: Store.open(tmp_path)):
+    for read in (lambda: any_key(tmp_path / DATABASE), lambda: Store.open(tmp_path)):
         with pytest.raises(Misconfigured, match="expected a database of this service"):
-            look()
+            read()
     for host in ("127.0.0.1", "0.0.0.0"):
         assert main(["serve", "--data", str(tmp_path), "--host", host, "--port", "0"]) == 2
-        said = capsys.readouterr().err
-        assert said.startswith("splatlift: data: expected a database") and said.count("\n") <= 2
+        stderr = capsys.readouterr().err
+        assert stderr.startswith("splatlift: data: expected a database") and stderr.count("\n") <= 2
 
 
 def test_directory_has_one_server_and_a_look_at_its_lock_keeps_none_from_starting(tmp_path: Path) -> None:
@@ -253,11 +255,11 @@ def test_directory_has_one_server_and_a_look_at_its_lock_keeps_none_from_startin
         timer.join()
 
 
-def test_too_few_files_for_the_connections_are_told_in_one_line(
+def test_too_few_files_for_the_connections_are_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(serve.resource, "getrlimit", lambda which: (256, 256))
+    monkeypatch.setattr(serve.resource, "getrlimit", lambda resource_id: (256, 256))
     assert main(["serve", "--data", str(tmp_path / "data"), "--port", "0"]) == 2
-    said = capsys.readouterr().err
-    assert "max_connections: expected at most 64" in said and "ulimit -n" in said and said.count("\n") == 1
+    stderr = capsys.readouterr().err
+    assert "max_connections: expected at most 64" in stderr and "ulimit -n" in stderr and stderr.count("\n") == 1
     assert not (tmp_path / "data").exists()

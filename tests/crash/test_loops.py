@@ -22,12 +22,12 @@ def test_acknowledged_job_survives_sigkill_of_the_server(point: str) -> None:
 
 def test_jobs_survive_kills_at_random_points_with_the_same_bits(tmp_path: Path) -> None:
     files = scene_files(tmp_path, views=8, splats=2_000, width=160)
-    found = kill_loop(files, kills=2, seconds=float("inf"))
-    assert (found["lost"], found["doubled"]) == (0, 0) and found["digests_equal"] == found["jobs"] > 0
+    outcome = kill_loop(files, kills=2, seconds=float("inf"))
+    assert (outcome["lost"], outcome["doubled"]) == (0, 0) and outcome["digests_equal"] == outcome["jobs"] > 0
 
 
 def test_nothing_leaks_over_jobs() -> None:
-    found = leak_loop(jobs=10)
-    assert found["growth"]["descriptors"] <= POOLED and found["growth"]["threads"] <= 1
-    assert found["growth"]["resident_kb"] < 8_192
-    assert found["left_over"] == []
+    outcome = leak_loop(jobs=10)
+    assert outcome["growth"]["descriptors"] <= POOLED and outcome["growth"]["threads"] <= 1
+    assert outcome["growth"]["resident_kb"] < 8_192
+    assert outcome["left_over"] == []

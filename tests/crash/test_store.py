@@ -25,7 +25,7 @@ from service.store.keys import Quota
 from service.store.owners import SERVICE, Owner, Scope
 from service.store.store import Collector, Store, collect, empty_quarantine
 
-from .conftest import Supervising, asset_of, ended, often, order, until
+from .conftest import Supervising, asset_of, often, order, until, wait_until_ended
 
 DAY = 86_400.0
 
@@ -34,10 +34,10 @@ DAY = 86_400.0
 def no_server(monkeypatch: pytest.MonkeyPatch) -> None:
     """A start that is not refused ends here, and not with the test run."""
 
-    def started(*given: object) -> None:
+    def fail(*arguments: object) -> None:
         raise AssertionError("the server started")
 
-    monkeypatch.setattr(serve, "server_of", started)
+    monkeypatch.setattr(serve, "server_of", fail)
 
 
 @pytest.fixture
@@ -53,12 +53,12 @@ def blobs(folder: Path) -> list[Path]:
     return [path for path in folder.rglob("blobs/*/*") if path.is_file()]
 
 
-def gone(data: Path) -> None:
+def remove_database(data: Path) -> None:
     (data / DATABASE).unlink()
 
 
 def gone_under_a_release_without_markers(data: Path) -> None:
-    gone(data)
+    remove_database(data)
     (data / markers.GENERATION).unlink()
 
 
@@ -68,7 +68,7 @@ def empty(data: Path) -> None:
 
 def without_its_wal(data: Path) -> None:
     """A copy of the main file of a server that runs: what it holds has not come from the WAL yet."""
-    gone(data)
+    remove_database(data)
     shutil.rmtree(data / "blobs")
     (data / markers.GENERATION).unlink()
     store = Store.open(data)
@@ -87,7 +87,7 @@ def older(data: Path) -> None:
     (data / "backup").replace(data / DATABASE)
 
 
-LOSSES = [gone, gone_under_a_release_without_markers, empty, without_its_wal, older]
+LOSSES = [remove_database, gone_under_a_release_without_markers, empty, without_its_wal, older]
 
 
 @pytest.mark.parametrize("lose", LOSSES)
@@ -99,9 +99,9 @@ def test_start_over_files_without_their_database_is_refused_in_one_line(
     assert before
     for _ in range(2):  # a refused start makes nothing that the next would take for a database
         assert main(["serve", "--data", str(data), "--port", "0"]) == 2
-        said = capsys.readouterr().err
-        assert said.startswith("splatlift: data: expected the database that the files beside it were stored with")
-        assert "splatlift store rebuild" in said and "serve --new" in said and said.count("\n") == 1
+        stderr = capsys.readouterr().err
+        assert stderr.startswith("splatlift: data: expected the database that the files beside it were stored with")
+        assert "splatlift store rebuild" in stderr and "serve --new" in stderr and stderr.count("\n") == 1
     assert (
         main(["keys", "create", "--name", "a", "--scopes", "read", "--data", str(data)]) == 2
     )  # makes no database either
@@ -109,8 +109,8 @@ def test_start_over_files_without_their_database_is_refused_in_one_line(
     assert blobs(data) == before
 
 
-def test_missing_database_is_told_beyond_loopback_too(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    gone(data)
+def test_missing_database_is_reported_beyond_loopback_too(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    remove_database(data)
     assert main(["serve", "--data", str(data), "--host", "0.0.0.0", "--port", "0"]) == 2
     assert "splatlift store rebuild" in capsys.readouterr().err
 
@@ -155,18 +155,18 @@ def test_first_start_and_one_over_a_directory_without_files_are_not_refused(tmp_
 
 
 def test_new_moves_the_files_to_quarantine_and_begins_an_empty_database(data: Path) -> None:
-    gone(data)
+    remove_database(data)
     (blob,) = blobs(data)
     store = Store.open(data, new=True)
     assert store.assets.all(SERVICE) == [] and blobs(data / "blobs") == []
-    (kept,) = blobs(data / "quarantine")
-    assert kept.relative_to(data / "quarantine").parts[1:] == blob.relative_to(data).parts
+    (quarantined_blob,) = blobs(data / "quarantine")
+    assert quarantined_blob.relative_to(data / "quarantine").parts[1:] == blob.relative_to(data).parts
     asset = asset_of(store, AssetKind.SPLATS, {})
     store.close()
     with pytest.raises(Misconfigured, match="the right one"):
         Store.open(data, new=True)
     store = Store.open(data)  # which was left as it is, and let go
-    assert [found.id for found in store.assets.all(SERVICE)] == [asset]
+    assert [record.id for record in store.assets.all(SERVICE)] == [asset]
     store.close()
 
 
@@ -197,18 +197,18 @@ def test_folder_that_somebody_removed_is_made_again(data: Path) -> None:
 
 def test_collector_moves_to_quarantine_and_removes_from_there_after_its_time(data: Path) -> None:
     store = Store.open(data)
-    lost = [store.files.blob("ab" * 32, ".ply"), store.files.lift("0" * 32), store.files.work("1" * 32) / "block"]
-    for path in lost:
+    orphans = [store.files.blob("ab" * 32, ".ply"), store.files.lift("0" * 32), store.files.work("1" * 32) / "block"]
+    for path in orphans:
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(path.name.encode())
         os.utime(path, (1.0, 1.0))
     os.utime(store.files.work("1" * 32), (1.0, 1.0))
     collector = Collector(store, often(quarantine_seconds=DAY))
     collector.start()
-    until(lambda: not any(path.exists() for path in lost))
+    until(lambda: not any(path.exists() for path in orphans))
     collector.stop()
-    moved = {path.name: path.read_bytes() for path in (data / "quarantine").rglob("*") if path.is_file()}
-    assert moved == {path.name: path.name.encode() for path in lost}
+    quarantined = {path.name: path.read_bytes() for path in (data / "quarantine").rglob("*") if path.is_file()}
+    assert quarantined == {path.name: path.name.encode() for path in orphans}
     (data / "quarantine" / "an-operator's own folder").mkdir()
     assert empty_quarantine(store.files, time.time() - DAY) == []
     assert empty_quarantine(store.files, time.time() + 2)
@@ -222,8 +222,8 @@ def test_quarantine_replaces_nothing(data: Path) -> None:
         path = store.files.lift("0" * 32)
         path.write_bytes(content)
         assert collect(store, time.time() + 1) == [path]
-    kept = sorted(path.read_bytes() for path in (data / "quarantine").rglob("*.safetensors"))
-    assert kept == [b"first", b"second"]
+    contents = sorted(path.read_bytes() for path in (data / "quarantine").rglob("*.safetensors"))
+    assert contents == [b"first", b"second"]
     store.close()
 
 
@@ -244,8 +244,8 @@ def test_marker_never_goes_back(data: Path) -> None:
 def test_marker_that_holds_no_number_is_one_line(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (data / markers.GENERATION).write_text("")
     assert main(["serve", "--data", str(data), "--port", "0"]) == 2
-    said = capsys.readouterr().err
-    assert "expected a whole number in the file 'generation'" in said and said.count("\n") == 1
+    stderr = capsys.readouterr().err
+    assert "expected a whole number in the file 'generation'" in stderr and stderr.count("\n") == 1
 
 
 # Of another release
@@ -307,9 +307,9 @@ def test_schema_that_breaks_off_leaves_nothing(tmp_path: Path, monkeypatch: pyte
     with pytest.raises(Misconfigured, match="already exists"):
         Store.open(tmp_path / "data")
     monkeypatch.undo()
-    left = sqlite3.connect(tmp_path / "data" / "service.sqlite")
-    assert left.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
-    left.close()
+    connection = sqlite3.connect(tmp_path / "data" / "service.sqlite")
+    assert connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
+    connection.close()
     Store.open(tmp_path / "data").close()
 
 
@@ -329,32 +329,32 @@ def old(path: Path) -> Path:
 
 
 def files(store: Store) -> set[str]:
-    found = (path for room in ("blobs", "lifts", "work", "tmp") for path in (store.files.root / room).rglob("*"))
-    return {str(path.relative_to(store.files.root)) for path in found if path.is_file()}
+    paths = (path for folder in ("blobs", "lifts", "work", "tmp") for path in (store.files.root / folder).rglob("*"))
+    return {str(path.relative_to(store.files.root)) for path in paths if path.is_file()}
 
 
 def test_what_a_crash_left_goes_and_what_is_needed_stays(store: Store, supervising: Supervising) -> None:
-    done, queued = (store.jobs.submit(SERVICE, order(store))[0] for _ in range(2))
+    finished_job, queued = (store.jobs.submit(SERVICE, order(store))[0] for _ in range(2))
     store.jobs.cancel(SERVICE, queued)
     with supervising("answer"):
-        ended(store, done)
+        wait_until_ended(store, finished_job)
     waiting = store.jobs.submit(SERVICE, order(store))[0]
-    needed = files(store) | {f"work/{waiting}/000000.safetensors"}
+    needed_files = files(store) | {f"work/{waiting}/000000.safetensors"}
     old(store.files.work(waiting) / "000000.safetensors")
     os.utime(store.files.work(waiting), (1.0, 1.0))
-    left = [
+    remains = [
         old(store.files.blob("ab" * 32, ".ply")),  # published, and the server died before its row
         old(store.files.lift("0" * 32)),
         old(store.files.root / "tmp" / "draft.splats"),
     ]
-    for job in (done, queued, "1" * 32):  # ended, canceled, deleted
+    for job in (finished_job, queued, "1" * 32):  # ended, canceled, deleted
         old(store.files.work(job) / "000000.safetensors")
-        left.append(old(store.files.work(job)))
-    assert set(collect(store, time.time() - HOUR)) == set(left)
-    assert files(store) == needed
+        remains.append(old(store.files.work(job)))
+    assert set(collect(store, time.time() - HOUR)) == set(remains)
+    assert files(store) == needed_files
     assert (
-        store.assets.get(SERVICE, store.jobs.get(SERVICE, done).splats).path.exists()
-        and store.files.lift(done).exists()
+        store.assets.get(SERVICE, store.jobs.get(SERVICE, finished_job).splats).path.exists()
+        and store.files.lift(finished_job).exists()
     )
 
 
@@ -363,9 +363,9 @@ def test_nothing_young_and_nothing_in_use_goes(store: Store) -> None:
     store.files.blob("cd" * 32, ".ply").write_bytes(b"of this minute")
     with store.files.draft(".splats") as draft, store.files.scratch() as scratch:
         part = draft.with_name(f".{draft.name}.1234.part")  # as a writer keeps it beside its draft
-        kept = [old(draft), old(part), old(scratch), store.files.blob("cd" * 32, ".ply")]
+        young = [old(draft), old(part), old(scratch), store.files.blob("cd" * 32, ".ply")]
         assert collect(store, time.time() - HOUR) == []
-        assert all(path.exists() for path in kept)
+        assert all(path.exists() for path in young)
     assert not draft.exists() and not part.exists() and not scratch.exists()
 
 
@@ -374,13 +374,13 @@ def make_ended(store: Store, ages: dict[str, float], owner: Owner = SERVICE) -> 
     jobs = {name: store.jobs.submit(owner, order(store, owner))[0] for name in ages}
     with store.database.write() as connection:
         for name, job in jobs.items():
-            ended = time.time() - ages[name]
-            connection.execute("UPDATE jobs SET state = 'canceled', ended = ? WHERE id = ?", (ended, job))
+            end_time = time.time() - ages[name]
+            connection.execute("UPDATE jobs SET state = 'canceled', ended = ? WHERE id = ?", (end_time, job))
     return jobs
 
 
 @pytest.mark.parametrize(
-    ("kept", "left"),
+    ("ages_of_kept", "expected_names"),
     [
         ({}, {"old", "older", "oldest", "another's"}),
         ({"keep_jobs_seconds": 2.5 * HOUR}, {"old", "another's"}),
@@ -390,12 +390,12 @@ def make_ended(store: Store, ages: dict[str, float], owner: Owner = SERVICE) -> 
     ],
 )
 def test_ended_jobs_beyond_the_bound_are_forgotten_and_results_never(
-    kept: dict[str, float], left: set[str], store: Store, supervising: Supervising
+    ages_of_kept: dict[str, float], expected_names: set[str], store: Store, supervising: Supervising
 ) -> None:
     lifted = store.jobs.submit(SERVICE, order(store))[0]
-    compared = store.jobs.submit(SERVICE, replace(order(store), kind=JobKind.TRADEOFF))[0]
+    tradeoff = store.jobs.submit(SERVICE, replace(order(store), kind=JobKind.TRADEOFF))[0]
     with supervising("answer"):
-        assert {ended(store, job).state for job in (lifted, compared)} == {"succeeded"}
+        assert {wait_until_ended(store, job).state for job in (lifted, tradeoff)} == {"succeeded"}
     with store.database.write() as connection:
         connection.execute("UPDATE jobs SET ended = 1, created = 1")
     jobs = make_ended(store, {"old": HOUR, "older": 3 * HOUR, "oldest": 4 * HOUR})
@@ -403,16 +403,16 @@ def test_ended_jobs_beyond_the_bound_are_forgotten_and_results_never(
     waiting = store.jobs.submit(SERVICE, order(store))[0]
     with store.database.write() as connection:
         connection.execute("UPDATE jobs SET created = 1 WHERE id = ?", (waiting,))
-    collector = Collector(store, often(**kept))
+    collector = Collector(store, often(**ages_of_kept))
     collector.start()
-    wanted = {lifted, compared, waiting} | {jobs[name] for name in left}
-    until(lambda: {job.id for job in store.jobs.all(SERVICE)} == wanted)
+    expected = {lifted, tradeoff, waiting} | {jobs[name] for name in expected_names}
+    until(lambda: {job.id for job in store.jobs.all(SERVICE)} == expected)
     collector.stop()
-    assert {job.id for job in store.jobs.all(SERVICE)} == wanted
-    assert store.lifts.get(SERVICE, lifted).path.exists() and store.tradeoffs.get(SERVICE, compared).chart
+    assert {job.id for job in store.jobs.all(SERVICE)} == expected
+    assert store.lifts.get(SERVICE, lifted).path.exists() and store.tradeoffs.get(SERVICE, tradeoff).chart
     with store.database.read() as connection:
         events = {row["job"] for row in connection.execute("SELECT DISTINCT job FROM job_events")}
-    assert events == wanted
+    assert events == expected
 
 
 def test_very_many_jobs_are_forgotten_a_few_at_a_time(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:

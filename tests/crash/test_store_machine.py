@@ -27,7 +27,7 @@ from service.store.store import Store, collect
 from .conftest import METADATA
 
 MAX_QUEUED = 3
-ROOMS = ("blobs", "lifts", "work", "tmp")
+FOLDERS = ("blobs", "lifts", "work", "tmp")
 OWNERS = {
     "": SERVICE,
     "a": Owner("a", sees_all=False),
@@ -67,7 +67,7 @@ class StoreMachine(RuleBasedStateMachine):
         self.folder = tempfile.TemporaryDirectory()
         self.store = Store.open(Path(self.folder.name))
         self.assets: dict[str, bytes] = {}
-        self.owned: dict[str, set[str]] = {}  # asset -> who has it
+        self.owners_of_assets: dict[str, set[str]] = {}  # asset -> who has it
         self.jobs: dict[str, Model] = {}
         self.turns: Counter[str] = Counter()  # of owners, since the start
 
@@ -79,113 +79,118 @@ class StoreMachine(RuleBasedStateMachine):
     def begin(self) -> Any:
         return multiple(*(self.put(kind, b"first", "a") for kind in AssetKind))
 
-    def sees(self, who: str, asset: str) -> bool:
-        return asset in self.assets and (OWNERS[who].sees_all or who in self.owned[asset])
+    def sees(self, owner_name: str, asset: str) -> bool:
+        return asset in self.assets and (OWNERS[owner_name].sees_all or owner_name in self.owners_of_assets[asset])
 
-    def put(self, kind: AssetKind, content: bytes, who: str) -> str:
+    def put(self, kind: AssetKind, content: bytes, owner_name: str) -> str:
         content = kind.encode() + content
         digest = hashlib.sha256(content).hexdigest()
         with self.store.files.draft(".bin") as draft:
             draft.write_bytes(content)
             upload = CheckedUpload(draft, kind, digest, ".bin", {}, [])
-            asset, new = self.store.assets.add(OWNERS[who], upload)
-        assert new == (who not in self.owned.get(asset.id, set()))
+            asset, new = self.store.assets.add(OWNERS[owner_name], upload)
+        assert new == (owner_name not in self.owners_of_assets.get(asset.id, set()))
         self.assets[asset.id] = content
-        self.owned.setdefault(asset.id, set()).add(who)
+        self.owners_of_assets.setdefault(asset.id, set()).add(owner_name)
         return asset.id
 
     @rule(
         target=contents,
         kind=st.sampled_from(AssetKind),
         content=st.just(b"first") | st.binary(max_size=2),
-        who=st.sampled_from([*OWNERS]),
+        owner_name=st.sampled_from([*OWNERS]),
     )
-    def upload(self, kind: AssetKind, content: bytes, who: str) -> str:
-        return self.put(kind, content, who)
+    def upload(self, kind: AssetKind, content: bytes, owner_name: str) -> str:
+        return self.put(kind, content, owner_name)
 
     @precondition(lambda self: len(self.assets) > 1)
-    @rule(asset=contents, who=st.sampled_from([*OWNERS]))
-    def delete_asset(self, asset: str, who: str) -> None:
-        used = [
+    @rule(asset=contents, owner_name=st.sampled_from([*OWNERS]))
+    def delete_asset(self, asset: str, owner_name: str) -> None:
+        users = [
             job
             for job, model in self.jobs.items()
-            if asset in (named for named, _ in model.order.assets()) and (OWNERS[who].sees_all or model.owner == who)
+            if asset in (asset_id for asset_id, _ in model.order.assets())
+            and (OWNERS[owner_name].sees_all or model.owner == owner_name)
         ]
-        seen, owner = self.store.assets, OWNERS[who]
-        if not self.sees(who, asset):
+        assets, owner = self.store.assets, OWNERS[owner_name]
+        if not self.sees(owner_name, asset):
             with pytest.raises(NotFound):
-                seen.delete(owner, asset)
-        elif used:
-            with pytest.raises(InUse) as refused:
-                seen.delete(owner, asset)
-            assert set(refused.value.hint.partition(": ")[2].split(", ")) <= set(used)
+                assets.delete(owner, asset)
+        elif users:
+            with pytest.raises(InUse) as error:
+                assets.delete(owner, asset)
+            assert set(error.value.hint.partition(": ")[2].split(", ")) <= set(users)
         else:
-            seen.delete(owner, asset)
-            self.owned[asset] -= set(OWNERS) if OWNERS[who].sees_all else {who}
-            if not self.owned[asset]:
-                del self.assets[asset], self.owned[asset]
+            assets.delete(owner, asset)
+            self.owners_of_assets[asset] -= set(OWNERS) if OWNERS[owner_name].sees_all else {owner_name}
+            if not self.owners_of_assets[asset]:
+                del self.assets[asset], self.owners_of_assets[asset]
 
     @rule(
         data=st.data(),
         key=st.none() | st.sampled_from(["a", "b"]),
         print_=st.sampled_from(["x", "x", "y"]),
         mistaken=st.sampled_from([False] * 9 + [True]),
-        who=st.sampled_from(["a", "a", *OWNERS]),
+        owner_name=st.sampled_from(["a", "a", *OWNERS]),
         kind=st.sampled_from(JobKind),
         labelled=st.booleans(),
     )
     def submit(
-        self, data: Any, key: str | None, print_: str, mistaken: bool, who: str, kind: JobKind, labelled: bool
+        self, data: Any, key: str | None, print_: str, mistaken: bool, owner_name: str, kind: JobKind, labelled: bool
     ) -> None:
-        chosen = []
-        wanted = [*AssetKind][:5] if labelled and kind is JobKind.TRADEOFF else [*AssetKind][:3]
-        for needed in wanted:
-            right = [asset for asset in sorted(self.assets) if self.assets[asset].startswith(needed.encode())]
-            chosen.append(data.draw(st.sampled_from(sorted(self.assets) if mistaken or not right else right)))
-        parameters = {"labels": {"masks": chosen[3], "table": chosen[4]}} if len(chosen) > 3 else {}
-        order = JobOrder(chosen[0], chosen[1], (chosen[2],), {}, key, print_, kind=kind, parameters=parameters)
-        known = [
+        assets = []
+        asset_kinds = [*AssetKind][:5] if labelled and kind is JobKind.TRADEOFF else [*AssetKind][:3]
+        for asset_kind in asset_kinds:
+            right = [asset for asset in sorted(self.assets) if self.assets[asset].startswith(asset_kind.encode())]
+            assets.append(data.draw(st.sampled_from(sorted(self.assets) if mistaken or not right else right)))
+        parameters = {"labels": {"masks": assets[3], "table": assets[4]}} if len(assets) > 3 else {}
+        order = JobOrder(assets[0], assets[1], (assets[2],), {}, key, print_, kind=kind, parameters=parameters)
+        earlier = [
             job
             for job, model in self.jobs.items()
-            if key is not None and (model.order.key, model.owner) == (key, who)
+            if key is not None and (model.order.key, model.owner) == (key, owner_name)
         ]
-        seen, owner = self.store.jobs, OWNERS[who]
-        kinds = [self.store.assets.get(SERVICE, asset).kind if self.sees(who, asset) else None for asset in chosen]
-        if known and self.jobs[known[0]].order.fingerprint != print_:
+        jobs, owner = self.store.jobs, OWNERS[owner_name]
+        kinds = [
+            self.store.assets.get(SERVICE, asset).kind if self.sees(owner_name, asset) else None for asset in assets
+        ]
+        if earlier and self.jobs[earlier[0]].order.fingerprint != print_:
             expected: type[Exception] | None = KeyReused
-        elif not known and sum(model.state == "queued" for model in self.jobs.values()) >= MAX_QUEUED:
+        elif not earlier and sum(model.state == "queued" for model in self.jobs.values()) >= MAX_QUEUED:
             expected = ServiceUnavailable
-        elif not known and kinds != wanted:
+        elif not earlier and kinds != asset_kinds:
             expected = NotFound
         else:
             expected = None
         if expected is not None:
             with pytest.raises(expected):
-                seen.submit(owner, order, max_queued=MAX_QUEUED)
+                jobs.submit(owner, order, max_queued=MAX_QUEUED)
             return
-        job, new = seen.submit(owner, order, max_queued=MAX_QUEUED)
-        assert new == (not known) and (new or job == known[0])
+        job, new = jobs.submit(owner, order, max_queued=MAX_QUEUED)
+        assert new == (not earlier) and (new or job == earlier[0])
         if new:
-            self.jobs[job] = Model(order, who)
-            for asset in chosen:
-                self.owned[asset].add(who)
+            self.jobs[job] = Model(order, owner_name)
+            for asset in assets:
+                self.owners_of_assets[asset].add(owner_name)
 
     @rule(target=attempts)
     def claim(self) -> tuple[str, int]:
-        claimed = self.store.jobs.claim()
+        claimed_job = self.store.jobs.claim()
         line = [job for job, model in self.jobs.items() if model.state == "queued"]
-        if claimed is None:
+        if claimed_job is None:
             assert not line
             return "0" * 32, 1
-        model = self.jobs[claimed.id]
-        assert claimed.id == next(job for job in line if self.jobs[job].owner == model.owner)  # its owner's oldest
+        model = self.jobs[claimed_job.id]
+        assert claimed_job.id == next(
+            job for job in line if self.jobs[job].owner == model.owner
+        )  # its owner's oldest
         running = Counter(job.owner for job in self.jobs.values() if job.state in ("running", "canceling"))
         waiting = [(running[self.jobs[job].owner], self.turns[self.jobs[job].owner]) for job in line]
         assert (running[model.owner], self.turns[model.owner]) == min(waiting)
         self.turns[model.owner] = max(self.turns.values(), default=0) + 1
         model.attempt += 1
         model.move("running")
-        return claimed.id, claimed.attempt
+        return claimed_job.id, claimed_job.attempt
 
     def owner(self, attempt: tuple[str, int]) -> Model | None:
         """The job when this attempt is its present one, however old the claim is."""
@@ -197,13 +202,13 @@ class StoreMachine(RuleBasedStateMachine):
     def finish(self, attempt: tuple[str, int], content: bytes) -> None:
         model = self.owner(attempt)
         if attempt[0] in self.jobs and self.jobs[attempt[0]].order.kind is JobKind.TRADEOFF:
-            done = self.store.tradeoffs.finish(*attempt, FinishedTradeoff({}, "", content))
+            is_finished = self.store.tradeoffs.finish(*attempt, FinishedTradeoff({}, "", content))
         else:
             with self.store.files.draft(".safetensors") as draft:
                 draft.write_bytes(content)
-                done = self.store.lifts.finish(*attempt, FinishedLift(draft, "0" * 64, 1, 1, METADATA))
-        assert done == (model is not None and model.state == "running")
-        if done and model is not None:
+                is_finished = self.store.lifts.finish(*attempt, FinishedLift(draft, "0" * 64, 1, 1, METADATA))
+        assert is_finished == (model is not None and model.state == "running")
+        if is_finished and model is not None:
             model.result = content
             model.move("succeeded")
 
@@ -228,9 +233,9 @@ class StoreMachine(RuleBasedStateMachine):
         model = self.owner(attempt)
         self.store.jobs.lose(*attempt, "why")
         if model is not None:
-            self.lost(model)
+            self.fail_or_requeue(model)
 
-    def lost(self, model: Model) -> None:
+    def fail_or_requeue(self, model: Model) -> None:
         if model.state == "canceling":
             model.move("canceled")
         else:
@@ -240,43 +245,43 @@ class StoreMachine(RuleBasedStateMachine):
     def advance(self, attempt: tuple[str, int]) -> None:
         self.store.jobs.advance(*attempt, {"done": 1})
 
-    def drawn(self, data: Any) -> str:
+    def draw_job(self, data: Any) -> str:
         """A job by its place in line: ids are random, so a choice among them would differ when a story is retold."""
         return [*self.jobs][data.draw(st.integers(0, len(self.jobs) - 1))]
 
     @precondition(lambda self: self.jobs)
-    @rule(data=st.data(), who=st.sampled_from([*OWNERS]))
-    def cancel(self, data: Any, who: str) -> None:
-        job = self.drawn(data)
+    @rule(data=st.data(), owner_name=st.sampled_from([*OWNERS]))
+    def cancel(self, data: Any, owner_name: str) -> None:
+        job = self.draw_job(data)
         model = self.jobs[job]
-        seen, owner = self.store.jobs, OWNERS[who]
-        if not OWNERS[who].sees_all and model.owner != who:
+        jobs, owner = self.store.jobs, OWNERS[owner_name]
+        if not OWNERS[owner_name].sees_all and model.owner != owner_name:
             with pytest.raises(NotFound):
-                seen.cancel(owner, job)
+                jobs.cancel(owner, job)
             return
         if model.state in ("succeeded", "failed"):
             with pytest.raises(Conflict):
-                seen.cancel(owner, job)
+                jobs.cancel(owner, job)
             return
-        assert seen.cancel(owner, job) == (model.state in ("queued", "running"))
+        assert jobs.cancel(owner, job) == (model.state in ("queued", "running"))
         if model.state in ("queued", "running"):
             model.move("canceled" if model.state == "queued" else "canceling")
 
     @precondition(lambda self: self.jobs)
-    @rule(data=st.data(), given_up=st.sets(st.sampled_from(JobKind)), who=st.sampled_from([*OWNERS]))
-    def delete_job(self, data: Any, given_up: set[JobKind], who: str) -> None:
-        job = self.drawn(data)
+    @rule(data=st.data(), given_up=st.sets(st.sampled_from(JobKind)), owner_name=st.sampled_from([*OWNERS]))
+    def delete_job(self, data: Any, given_up: set[JobKind], owner_name: str) -> None:
+        job = self.draw_job(data)
         model = self.jobs[job]
-        seen, owner = self.store.jobs, OWNERS[who]
-        if not OWNERS[who].sees_all and model.owner != who:
+        jobs, owner = self.store.jobs, OWNERS[owner_name]
+        if not OWNERS[owner_name].sees_all and model.owner != owner_name:
             with pytest.raises(NotFound):
-                seen.delete(owner, job, given_up=given_up)
+                jobs.delete(owner, job, given_up=given_up)
         elif model.state in ENDED and (model.result is None or model.order.kind in given_up):
-            seen.delete(owner, job, given_up=given_up)
+            jobs.delete(owner, job, given_up=given_up)
             del self.jobs[job]
         else:
             with pytest.raises(Conflict):
-                seen.delete(owner, job, given_up=given_up)
+                jobs.delete(owner, job, given_up=given_up)
 
     @rule()
     def collect(self) -> None:
@@ -303,8 +308,8 @@ class StoreMachine(RuleBasedStateMachine):
     @invariant()
     def agrees(self) -> None:
         assert {asset.id: asset.path.read_bytes() for asset in self.store.assets.all(SERVICE)} == self.assets
-        found = {job.id: (job.state, job.attempt) for job in self.store.jobs.all(SERVICE)}
-        assert found == {job: (JobState(model.state), model.attempt) for job, model in self.jobs.items()}
+        states = {job.id: (job.state, job.attempt) for job in self.store.jobs.all(SERVICE)}
+        assert states == {job: (JobState(model.state), model.attempt) for job, model in self.jobs.items()}
         lifts = {lift.id: lift.path.read_bytes() for lift in self.store.lifts.all(SERVICE)}
         assert lifts == self.results(JobKind.LIFT)
         for job, chart in self.results(JobKind.TRADEOFF).items():
@@ -313,35 +318,39 @@ class StoreMachine(RuleBasedStateMachine):
             events = self.store.jobs.events(SERVICE, job, 0)
             assert [event.data["state"] for event in events if event.kind is EventKind.STATE] == model.story
             assert model.story.count("succeeded") <= 1
-        for who in OWNERS:
-            self.sees_its_own(who)
-        files = [path for room in ROOMS for path in (self.store.files.root / room).rglob("*") if path.is_file()]
+        for owner_name in OWNERS:
+            self.sees_its_own(owner_name)
+        files = [path for folder in FOLDERS for path in (self.store.files.root / folder).rglob("*") if path.is_file()]
         assert len(files) == len(self.assets) + len(lifts)
 
     def results(self, kind: JobKind) -> dict[str, bytes]:
-        made = {job: model.result for job, model in self.jobs.items() if model.order.kind is kind}
-        return {job: content for job, content in made.items() if content is not None}
+        expected = {job: model.result for job, model in self.jobs.items() if model.order.kind is kind}
+        return {job: content for job, content in expected.items() if content is not None}
 
-    def sees_its_own(self, who: str) -> None:
-        seen, owner = self.store, OWNERS[who]
-        jobs = {job for job, model in self.jobs.items() if owner.sees_all or model.owner == who}
-        assert {asset.id for asset in seen.assets.all(owner)} == {
-            asset for asset in self.assets if self.sees(who, asset)
+    def sees_its_own(self, owner_name: str) -> None:
+        store_view, owner = self.store, OWNERS[owner_name]
+        jobs = {job for job, model in self.jobs.items() if owner.sees_all or model.owner == owner_name}
+        assert {asset.id for asset in store_view.assets.all(owner)} == {
+            asset for asset in self.assets if self.sees(owner_name, asset)
         }
-        assert {job.id for job in seen.jobs.all(owner)} == jobs
+        assert {job.id for job in store_view.jobs.all(owner)} == jobs
         lifts, tradeoffs = (self.results(kind) for kind in JobKind)
-        assert {lift.id for lift in seen.lifts.all(owner)} == jobs & lifts.keys()
+        assert {lift.id for lift in store_view.lifts.all(owner)} == jobs & lifts.keys()
         for job in self.jobs:
-            assert (seen.jobs.state(owner, job) is not None) == (job in jobs)
-            assert (seen.lifts.find(owner, job) is not None) == (job in jobs & lifts.keys())
+            assert (store_view.jobs.state(owner, job) is not None) == (job in jobs)
+            assert (store_view.lifts.find(owner, job) is not None) == (job in jobs & lifts.keys())
             if job not in jobs & tradeoffs.keys():
                 with pytest.raises(NotFound):
-                    seen.tradeoffs.get(owner, job)
-        stored = sum(len(content) for asset, content in self.assets.items() if who in self.owned[asset])
-        stored += sum(len(content) for job, content in lifts.items() if self.jobs[job].owner == who)
-        stored += sum(len(b"{}" + content) for job, content in tradeoffs.items() if self.jobs[job].owner == who)
+                    store_view.tradeoffs.get(owner, job)
+        stored = sum(
+            len(content) for asset, content in self.assets.items() if owner_name in self.owners_of_assets[asset]
+        )
+        stored += sum(len(content) for job, content in lifts.items() if self.jobs[job].owner == owner_name)
+        stored += sum(
+            len(b"{}" + content) for job, content in tradeoffs.items() if self.jobs[job].owner == owner_name
+        )
         with self.store.database.read() as connection:
-            assert stored_bytes(connection, OWNERS[who]) == stored
+            assert stored_bytes(connection, OWNERS[owner_name]) == stored
 
 
 TestStoreMachine = StoreMachine.TestCase

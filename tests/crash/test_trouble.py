@@ -22,9 +22,9 @@ from service.store.lifts import FinishedLift
 from service.store.owners import SERVICE
 from service.store.store import Store
 
-from .conftest import METADATA, Supervising, ended, order, until
+from .conftest import METADATA, Supervising, order, until, wait_until_ended
 
-Trouble = Callable[[Store], AbstractContextManager[None]]
+Fault = Callable[[Store], AbstractContextManager[None]]
 
 
 @pytest.fixture(autouse=True)
@@ -37,9 +37,9 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def store(impatient: None, tmp_path: Path) -> Iterator[Store]:
-    opened = Store.open(tmp_path / "data")
-    yield opened
-    opened.close()
+    opened_store = Store.open(tmp_path / "data")
+    yield opened_store
+    opened_store.close()
 
 
 @contextmanager
@@ -71,20 +71,20 @@ def no_files_left(store: Store) -> Iterator[None]:
     resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
-@pytest.mark.parametrize("trouble", [lock_held, read_only])
+@pytest.mark.parametrize("fault", [lock_held, read_only])
 def test_trouble_while_a_job_runs_ends_nothing(
-    trouble: Trouble, store: Store, supervising: Supervising, caplog: pytest.LogCaptureFixture
+    fault: Fault, store: Store, supervising: Supervising, caplog: pytest.LogCaptureFixture
 ) -> None:
     job = store.jobs.submit(SERVICE, order(store))[0]
     work = store.files.work(job)
     with supervising("obey"):
         until((work / "waiting").exists)
-        with trouble(store):
+        with fault(store):
             (work / "go on").mkdir()  # it speaks, answers and ends, and nothing of that can be noted
             until(lambda: "tells cannot be noted yet" in caplog.text and "the end of a job cannot" in caplog.text)
-        found = ended(store, job)
-    assert (found.state, found.attempt) == (JobState.SUCCEEDED, 1)
-    assert found.plan == {"summary": ["one splat"], "warnings": [], "splats": 1} and found.progress is not None
+        record = wait_until_ended(store, job)
+    assert (record.state, record.attempt) == (JobState.SUCCEEDED, 1)
+    assert record.plan == {"summary": ["one splat"], "warnings": [], "splats": 1} and record.progress is not None
     assert store.lifts.get(SERVICE, job).path.stat().st_size == store.lifts.get(SERVICE, job).bytes
 
 
@@ -96,8 +96,8 @@ def test_running_job_outlives_a_server_without_file_descriptors(store: Store, su
         with no_files_left(store):
             (work / "go on").mkdir()
             until(lambda: not (work / "waiting").exists())  # it has answered
-        found = ended(store, job)
-    assert (found.state, found.attempt - released(store, job)) == (JobState.SUCCEEDED, 1)
+        record = wait_until_ended(store, job)
+    assert (record.state, record.attempt - released(store, job)) == (JobState.SUCCEEDED, 1)
 
 
 def released(store: Store, job: str) -> int:
@@ -119,8 +119,8 @@ def test_attempt_that_the_server_cannot_begin_is_none(
     monkeypatch.setattr(DataDirectory, "scratch", troubled)
     job = store.jobs.submit(SERVICE, order(store))[0]
     with supervising("answer"):
-        found = ended(store, job)
-    assert (found.state, found.attempt) == (JobState.SUCCEEDED, MAX_ATTEMPTS + 2)
+        record = wait_until_ended(store, job)
+    assert (record.state, record.attempt) == (JobState.SUCCEEDED, MAX_ATTEMPTS + 2)
 
 
 def test_jobs_of_a_dead_server_go_back_in_line_once_that_can_be_noted(store: Store, supervising: Supervising) -> None:
@@ -129,7 +129,7 @@ def test_jobs_of_a_dead_server_go_back_in_line_once_that_can_be_noted(store: Sto
     with lock_held(store), supervising("answer"):
         assert store.jobs.get(SERVICE, job).state is JobState.RUNNING
     with supervising("answer"):
-        assert ended(store, job).state is JobState.SUCCEEDED
+        assert wait_until_ended(store, job).state is JobState.SUCCEEDED
 
 
 @pytest.mark.parametrize(
@@ -141,9 +141,9 @@ def test_job_that_finds_the_disk_full_is_tried_again_before_it_fails(
 ) -> None:
     job = store.jobs.submit(SERVICE, order(store))[0]
     with supervising(behaviour):
-        found = ended(store, job)
-    assert (found.state, found.attempt) == (state, attempt)
-    assert found.problem is None or found.problem["kind"] == "no-space"
+        record = wait_until_ended(store, job)
+    assert (record.state, record.attempt) == (state, attempt)
+    assert record.problem is None or record.problem["kind"] == "no-space"
 
 
 def test_lift_that_could_not_be_recorded_is_no_file_and_its_draft_is_kept(store: Store) -> None:
@@ -151,12 +151,12 @@ def test_lift_that_could_not_be_recorded_is_no_file_and_its_draft_is_kept(store:
     assert store.jobs.claim() is not None
     with store.files.draft(".safetensors") as draft:
         draft.write_bytes(b"made")
-        made = FinishedLift(draft, "0" * 64, 1, 1, METADATA)
+        lift = FinishedLift(draft, "0" * 64, 1, 1, METADATA)
         with store.database.write() as connection:
             connection.execute("ALTER TABLE lifts RENAME TO elsewhere")
         with pytest.raises(sqlite3.OperationalError):
-            store.lifts.finish(job, 1, made)
+            store.lifts.finish(job, 1, lift)
         assert draft.read_bytes() == b"made" and not store.files.lift(job).exists()
         with store.database.write() as connection:
             connection.execute("ALTER TABLE elsewhere RENAME TO lifts")
-        assert store.lifts.finish(job, 1, made)
+        assert store.lifts.finish(job, 1, lift)
