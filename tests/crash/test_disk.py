@@ -180,9 +180,9 @@ def test_another_database_in_its_place_costs_no_file(tmp_path: Path) -> None:
     store = Store.open(tmp_path)
     asset = store.assets.get(SERVICE, order(store).splats)
     replaced(tmp_path / DATABASE)
-    for read in (lambda: collect(store, time.time() + 1), lambda: store.assets.all(SERVICE)):
+    for access in (lambda: collect(store, time.time() + 1), lambda: store.assets.all(SERVICE)):
         with pytest.raises(sqlite3.OperationalError, match="in the place of the database"):
-            read()
+            access()
     assert asset.is_complete
     store.close()
 
@@ -190,10 +190,10 @@ def test_another_database_in_its_place_costs_no_file(tmp_path: Path) -> None:
 def test_other_process_that_opens_and_closes_the_database_costs_no_commit(tmp_path: Path) -> None:
     store = Store.open(tmp_path)
     before, wal = order(store), (tmp_path / f"{DATABASE}-wal").stat().st_ino
-    read = (
+    program = (
         "import sqlite3, sys; c = sqlite3.connect(sys.argv[1]); print(*c.execute('SELECT id FROM jobs')); c.close()"
     )
-    command = [sys.executable, "-c", read, str(tmp_path / DATABASE)]
+    command = [sys.executable, "-c", program, str(tmp_path / DATABASE)]
     subprocess.run(command, check=True)
     job = store.jobs.submit(SERVICE, before)[0]
     assert (tmp_path / f"{DATABASE}-wal").stat().st_ino == wal  # it would go with the last one that has it open
@@ -233,9 +233,9 @@ def test_write_that_cannot_be_committed_is_no_part_of_the_next(tmp_path: Path) -
 
 def test_file_that_is_no_database_is_a_misconfiguration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     malformed(tmp_path / DATABASE)
-    for read in (lambda: any_key(tmp_path / DATABASE), lambda: Store.open(tmp_path)):
+    for access in (lambda: any_key(tmp_path / DATABASE), lambda: Store.open(tmp_path)):
         with pytest.raises(Misconfigured, match="expected a database of this service"):
-            read()
+            access()
     for host in ("127.0.0.1", "0.0.0.0"):
         assert main(["serve", "--data", str(tmp_path), "--host", host, "--port", "0"]) == 2
         stderr = capsys.readouterr().err
