@@ -11,7 +11,7 @@ from liftcore.raster import check_splats_and_threads
 from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.splats import Splats
 from liftcore.solve.clusters import require_hdbscan
-from liftcore.values.lift_views import Given, LiftViews
+from liftcore.values.lift_views import LiftViews, ViewValues
 from liftcore.values.pack import Views, as_views
 from liftcore.values.settings import LiftSettings, Preset
 
@@ -30,13 +30,13 @@ class LiftInputs:
         cls,
         splats: Splats,
         cameras: Cameras | Mapping[str, Camera],
-        views: Given,
+        views: ViewValues,
         preset: Preset | str | LiftSettings,
         settings: Mapping[str, Any] = MappingProxyType({}),
         threads: int | None = None,
     ) -> LiftInputs:
         """Check the arguments of `liftcore.lift`, and raise as it does."""
-        lift_settings = LiftSettings.chosen(preset, settings)
+        lift_settings = LiftSettings.from_preset(preset, settings)
         splats = check_splats_and_threads(splats, threads)
         lift_settings, source_views = lift_settings.for_splats(splats), as_views(views)
         lifted = LiftViews.of(source_views, cameras, lift_settings)

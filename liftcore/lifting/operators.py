@@ -22,7 +22,7 @@ from liftcore.scene.cameras import Camera, Cameras
 from liftcore.scene.compositing import CompositingParams, check_antialiased
 from liftcore.scene.splats import Splats, shared_tensor
 from liftcore.values.lift_options import LiftOptions
-from liftcore.values.lift_views import Given
+from liftcore.values.lift_views import ViewValues
 from liftcore.values.region_weights import RegionWeights
 from liftcore.values.settings import LiftSettings, Preset
 
@@ -141,7 +141,7 @@ def _refuse_gradients(values: Tensor | np.ndarray) -> None:
 def region_weights(
     splats: Splats,
     cameras: Cameras | Mapping[str, Camera],
-    views: Given,
+    views: ViewValues,
     preset: Preset | str | LiftSettings = Preset.DEFAULT,
     *,
     reweight: bool = False,

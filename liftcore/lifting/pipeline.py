@@ -31,7 +31,7 @@ from liftcore.solve.diagnostics import ViewMeasures, certify, lift_warnings
 from liftcore.solve.objects import NodeVectors, RegionObjects, object_facts
 from liftcore.solve.reweight import reweighting_facts
 from liftcore.values.lift_options import LiftOptions
-from liftcore.values.lift_views import Given
+from liftcore.values.lift_views import ViewValues
 from liftcore.values.settings import LiftSettings, Preset
 
 log = logging.getLogger(__name__)
@@ -43,7 +43,7 @@ MIN_LEVEL_VIEWS = 6  # for separate levels: 4 views lost a word of a small scene
 def lift(
     splats: Splats,
     cameras: Cameras | Mapping[str, Camera],
-    views: Given,
+    views: ViewValues,
     preset: Preset | str | LiftSettings = Preset.DEFAULT,
     *,
     progress: Progress | bool | None = None,
@@ -258,7 +258,7 @@ def diagnose(
 def plan(
     splats: Splats,
     cameras: Cameras | Mapping[str, Camera],
-    views: Given,
+    views: ViewValues,
     preset: Preset | str | LiftSettings = Preset.DEFAULT,
     *,
     threads: int | None = None,

@@ -1,4 +1,4 @@
-"""What a camera's pinhole observes of a distorted photo or a panorama: maps, carried from the photo's pixels."""
+"""Maps of a distorted photo or a panorama, resampled to the pinhole of a camera."""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -13,12 +13,12 @@ from liftcore.scene.panorama import Face
 from liftcore.values.views import FeatureGrid, Regions, ViewFeatures
 
 BAND_VALUES = 1 << 22  # of a grid, carried at a time in float32
-BAND_PIXELS = 1 << 15  # whose rays are bent at a time: what that takes stays in the cache
+BAND_PIXELS = 1 << 15  # distorted at a time: their arrays fit in the cache
 KEPT_PINHOLES = 6  # whose labels' places are kept: mostly one lens took all photos, or all are panoramas
 
 
 def as_pinhole_sees(observation: ViewFeatures, camera: Camera) -> ViewFeatures:
-    """The observation of a camera's photo as one of its pinhole; itself where that is the photo's own.
+    """Return the observation of a camera's photo as one of its pinhole; itself where that is the photo's own.
 
     A pixel of the pinhole reads the label of the pixel of the photo that shows the same ray, so labels get the
     pinhole's size. A grid keeps the size of its cells, and each is read bilinearly where the ray of its centre
@@ -49,7 +49,7 @@ def photo_as_pinhole_sees(photo: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def _labels(labels: Tensor, camera: Camera) -> Tensor:
-    """[L, H, W] i32 of labels [L, h, w] of the photo."""
+    """Return [L, H, W] i32 of labels [L, h, w] of the photo."""
     places = _label_places(_pinhole(camera), labels.shape[1], labels.shape[2])
     return labels.flatten(1).index_select(1, places).reshape(labels.shape[0], camera.height, camera.width)
 
@@ -61,16 +61,16 @@ def _label_places(pinhole: "_Pinhole", height: int, width: int) -> Tensor:
     band = max(1, BAND_PIXELS // pinhole.width)
     columns = np.arange(pinhole.width) + 0.5
     for first in range(0, pinhole.height, band):
-        here = slice(first, first + band)
-        u, v = np.meshgrid(columns, np.arange(pinhole.height)[here] + 0.5)
+        band_rows = slice(first, first + band)
+        u, v = np.meshgrid(columns, np.arange(pinhole.height)[band_rows] + 0.5)
         x, y = _shares(u, v, pinhole)
-        rows, own = (y * height).astype(np.int64), (x * width).astype(np.int64)
-        places[here] = rows.clip(0, height - 1) * width + own.clip(0, width - 1)
+        rows, column_indices = (y * height).astype(np.int64), (x * width).astype(np.int64)
+        places[band_rows] = rows.clip(0, height - 1) * width + column_indices.clip(0, width - 1)
     return torch.from_numpy(places.ravel())
 
 
 def _grid(grid: Tensor, camera: Camera) -> Tensor:
-    """[rows, columns, F] of a grid [h, w, F] of the photo, of its dtype."""
+    """Return [rows, columns, F] of a grid [h, w, F] of the photo, of its dtype."""
     height, width, channels = grid.shape
     rows, columns = grid_sides(height, width, camera)
     centres = np.meshgrid(
@@ -85,15 +85,15 @@ def _grid(grid: Tensor, camera: Camera) -> Tensor:
     carried = torch.empty((*x.shape, channels), dtype=grid.dtype)
     band = max(1, BAND_VALUES // (x.shape[1] * channels))
     for first in range(0, x.shape[0], band):
-        here = slice(first, first + band)
-        total = torch.zeros((*x[here].shape, channels), dtype=torch.float32)
+        band_rows = slice(first, first + band)
+        total = torch.zeros((*x[band_rows].shape, channels), dtype=torch.float32)
         for row in (0, 1):
             for column in (0, 1):
                 share = (1 - np.abs(u - left - column)) * (1 - np.abs(v - top - row))
                 place = (top + row).clip(max=height - 1) * width + (left + column) % width
-                taken = cells[torch.from_numpy(place[here])].to(torch.float32)
-                total += taken * torch.from_numpy(share[here].astype(np.float32))[..., None]
-        carried[here] = total.to(grid.dtype)
+                features = cells[torch.from_numpy(place[band_rows])].to(torch.float32)
+                total += features * torch.from_numpy(share[band_rows].astype(np.float32))[..., None]
+        carried[band_rows] = total.to(grid.dtype)
     return carried
 
 
@@ -115,7 +115,7 @@ def _pinhole(camera: Camera) -> _Pinhole:
 
 
 def _shares(u: np.ndarray, v: np.ndarray, pinhole: _Pinhole) -> tuple[np.ndarray, np.ndarray]:
-    """Where on the photo the rays of places (u, v) of a pinhole lie, as shares of its sides."""
+    """Project places (u, v) of a pinhole to the photo, as shares of its sides."""
     photo = pinhole.photo
     x, y = photo.on_photo((u - pinhole.cx) / photo.fx, (v - pinhole.cy) / photo.fy)
     return x / photo.width, y / photo.height

@@ -1,4 +1,4 @@
-"""How the levels of a region map are taken: each as rows of its own, put together, or one alone.
+"""Levels of a region map: separate rows of each, a composite, or a single one.
 
 Composite regions are the distinct tuples of labels that pixels carry over the levels. Each becomes one row of a new
 codebook, the sum of the embeddings of its labels, normalised; an unlabelled level adds nothing. So a pixel reads one
@@ -20,15 +20,15 @@ Levels = Literal["rows", "composite"] | int
 
 
 def region_levels(regions: Regions) -> np.ndarray:
-    """[M] i8: the level that each codebook row is labelled on, the coarsest of several; -1 on none."""
-    found = np.full(regions.codebook.shape[0] + 1, NO_LABEL, np.int8)
+    """Return [M] i8: the level that each codebook row is labelled on, the coarsest of several; -1 on none."""
+    row_levels = np.full(regions.codebook.shape[0] + 1, NO_LABEL, np.int8)
     for level in reversed(range(regions.labels.shape[0])):
-        found[regions.labels[level].numpy().ravel()] = level  # no label is the place after the last row
-    return found[:-1]
+        row_levels[regions.labels[level].numpy().ravel()] = level  # no label is the place after the last row
+    return row_levels[:-1]
 
 
 def at_levels(features: ViewFeatures, levels: Levels, view: str) -> ViewFeatures:
-    """The features as ``levels`` takes them; a grid is its own level 0.
+    """Return the features as ``levels`` takes them; a grid is its own level 0.
 
     Args:
         levels: "rows" as they are, "composite" one region a distinct tuple of labels, a number that level alone.
@@ -52,7 +52,7 @@ def at_levels(features: ViewFeatures, levels: Levels, view: str) -> ViewFeatures
 
 
 def composite(regions: Regions, view: str) -> Regions:
-    """One level whose regions are the distinct tuples of labels, in the order of their labels.
+    """Return one level whose regions are the distinct tuples of labels, in the order of their labels.
 
     Raises:
         InvalidFeatures: their codebook would take more than COMPOSITE_BYTES.
@@ -102,12 +102,12 @@ def label_tuples(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _unit_sums(tuples: np.ndarray, codebook: torch.Tensor) -> torch.Tensor:
     """[n, F]: the unit sums of the embeddings of each tuple [L, n], zero where they cancel; the codebook's dtype."""
     largest = codebook.abs().amax().double().clamp_min(torch.finfo(torch.float64).tiny)  # squares cannot overflow
-    found = torch.empty(tuples.shape[1], codebook.shape[1], dtype=codebook.dtype)
-    for block in torch.arange(len(found)).split(max(1, BLOCK_FLOATS // codebook.shape[1])):
+    output = torch.empty(tuples.shape[1], codebook.shape[1], dtype=codebook.dtype)
+    for block in torch.arange(len(output)).split(max(1, BLOCK_FLOATS // codebook.shape[1])):
         sums = torch.zeros(len(block), codebook.shape[1], dtype=torch.float32)
         for level in torch.from_numpy(tuples.astype(np.int64))[:, block]:
             labelled = level != NO_LABEL
             sums[labelled] += (codebook[level[labelled]].double() / largest).float()
         norms = torch.linalg.vector_norm(sums.double(), dim=1, keepdim=True)
-        found[block] = (sums / norms.clamp_min(torch.finfo(torch.float32).tiny)).to(codebook.dtype)
-    return found
+        output[block] = (sums / norms.clamp_min(torch.finfo(torch.float32).tiny)).to(codebook.dtype)
+    return output

@@ -1,6 +1,6 @@
-"""What a lift gives: features on splats, what supports them, and how they were made.
+"""A lift: features on splats, their support, and the metadata of how they were made.
 
-Its metadata are read without torch, so that a question to a file loads none.
+Its metadata are read without torch, so that a query of a file does not load it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class InputFile(BaseModel):
-    """Where an input was, and what it was."""
+    """Path of an input, and its digest."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -47,14 +47,14 @@ DIGITS = 9  # of a coordinate
 
 
 def landmarks_of(splats: Splats) -> tuple[Landmark, ...]:
-    """The rows and positions of LANDMARKS splats, evenly spaced over the rows."""
+    """Return the rows and positions of LANDMARKS splats, evenly spaced over the rows."""
     rows = sorted({round(k * (splats.count - 1) / (LANDMARKS - 1)) for k in range(LANDMARKS)})
     places = [[float(f"{x:.{DIGITS}g}") for x in place] for place in splats.positions(rows).tolist()]
     return tuple((row, x, y, z) for row, (x, y, z) in zip(rows, places, strict=True))
 
 
 class LiftMetadata(AliasedModel):
-    """What a lift remembers of how it was made."""
+    """Settings, inputs and measurements of a lift."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -78,10 +78,10 @@ class LiftMetadata(AliasedModel):
 
     @field_validator("settings", mode="before")
     @classmethod
-    def _as_before_they_came(cls, told: Any) -> Any:
-        """Settings that came after the lift have their own default, what lifts did before; not the dial's."""
+    def _fill_older_defaults(cls, stored: Any) -> Any:
+        """Give settings that are newer than the lift their field's default, as lifts did before, not the level's."""
         defaults = {name: field.default for name, field in LiftSettings.model_fields.items()}
-        return defaults | LiftSettings.current_names(told) if isinstance(told, dict) else told
+        return defaults | LiftSettings.current_names(stored) if isinstance(stored, dict) else stored
 
 
 @deprecated_names(**OLD_TENSORS)
@@ -123,12 +123,12 @@ class Lift:
 
     def __repr__(self) -> str:
         splats, channels = self.features.shape
-        what = f"{splats} splats", f"{channels} channels from {len(self.views)} views"
-        return one_line(self, *what, f"preset={str(self.settings.preset)!r}", f"on {self.features.device}")
+        counts = f"{splats} splats", f"{channels} channels from {len(self.views)} views"
+        return one_line(self, *counts, f"preset={str(self.settings.preset)!r}", f"on {self.features.device}")
 
     @property
     def settings(self) -> LiftSettings:
-        """What the lift was made with."""
+        """Settings of the lift."""
         return self.metadata.settings
 
     @property
@@ -138,7 +138,7 @@ class Lift:
 
     @property
     def diagnostics(self) -> dict[str, Any]:
-        """What the lift measured of itself (residual, bound, row sums, warnings, plan), as plain numbers."""
+        """Measurements of the lift (residual, bound, row sums, warnings, plan), as plain numbers."""
         return self.metadata.diagnostics
 
     @property
@@ -151,7 +151,7 @@ class Lift:
         return len(self.features)
 
     def __getitem__(self, keep: Rows) -> Self:
-        """The lift of the splats that a mask [P], a slice or row numbers [n] choose, as ``splats[keep]`` has them.
+        """Return the lift of the splats of a mask [P], a slice or row numbers [n], as ``splats[keep]`` has them.
 
         All columns follow. Objects and clusters of which no splat is left go, and the others are numbered anew in
         their order. It remembers no file of splats, as a file's rows are others. Diagnostics stay those of the whole.
@@ -163,8 +163,8 @@ class Lift:
 
         rows = chosen_rows(keep, len(self)).to(self.features.device)
         names = ("features", "total_weight", "agreement", "seen", "confidence", "cluster", "object")
-        given = {name: getattr(self, name) for name in names}
-        columns = {name: column[rows] for name, column in given.items() if column is not None}
+        tensors = {name: getattr(self, name) for name in names}
+        columns = {name: column[rows] for name, column in tensors.items() if column is not None}
         for labels, table in (("cluster", "cluster_features"), ("object", "object_views")):
             if labels in columns and (values := getattr(self, table)) is not None:
                 columns[labels], columns[table] = renumbered(columns[labels], values)
@@ -172,13 +172,13 @@ class Lift:
             tree = {name: getattr(self, name) for name in NODE_TENSORS}
             columns |= cropped_tree(tree | {"node": self.node[rows]})
         places = {row: place for row, *place in self.metadata.landmarks}
-        numbered = enumerate(rows.tolist())
-        landmarks = tuple((new, *places[old]) for new, old in numbered if old in places)
-        whole = self.diagnostics.get("cropped_from", len(self))
+        row_numbers = enumerate(rows.tolist())
+        landmarks = tuple((new, *places[old]) for new, old in row_numbers if old in places)
+        full_count = self.diagnostics.get("cropped_from", len(self))
         changes = {
             "splats": NO_FILE,
             "landmarks": landmarks,
-            "diagnostics": self.diagnostics | {"cropped_from": whole},
+            "diagnostics": self.diagnostics | {"cropped_from": full_count},
         }
         return replace(self, **columns, metadata=self.metadata.model_copy(update=changes))
 
@@ -190,7 +190,7 @@ class Lift:
         rotation: Numbers | None = None,
         translation: Numbers | None = None,
     ) -> Self:
-        """The lift of splats that were moved alike (`Splats.transformed`), ``p' = scale R p + translation``.
+        """Return the lift of splats that were moved alike (`Splats.transformed`), ``p' = scale R p + translation``.
 
         Features, total weight and objects know no frame and stay. What it remembers of places moves along; it forgets
         the files of its splats and cameras, which are in the frame of before.
@@ -204,7 +204,7 @@ class Lift:
 
         move, metadata = Similarity.of(matrix, scale, rotation, translation), self.metadata
         rows, places = [row for row, *_ in metadata.landmarks], [place for _, *place in metadata.landmarks]
-        moved = move.points(np.array(places).reshape(-1, 3)).tolist()
+        positions = move.points(np.array(places).reshape(-1, 3)).tolist()
         changes = {
             "splats": NO_FILE,
             "cameras": NO_FILE,
@@ -212,13 +212,13 @@ class Lift:
             "origin": tuple(move.points(np.array([metadata.origin]))[0].tolist())
             if any(metadata.origin)
             else FILE_ORIGIN,
-            "landmarks": tuple((row, *place) for row, place in zip(rows, moved, strict=True)),
+            "landmarks": tuple((row, *place) for row, place in zip(rows, positions, strict=True)),
             "world": metadata.world.transformed(move),
         }
         return replace(self, metadata=metadata.model_copy(update=changes))
 
     def with_world(self, world: WorldFrame) -> Self:
-        """The lift with what is said of its frame; what ``world`` does not know stays as it is."""
+        """Return the lift with what is said of its frame; what ``world`` does not know stays as it is."""
         changes = {"world": world.known_or(self.metadata.world)}
         return replace(self, metadata=self.metadata.model_copy(update=changes))
 
@@ -249,7 +249,7 @@ class Lift:
             )  # fmt: skip
 
     def to(self, place: torch.device) -> Self:
-        """The same with its tensors there; where they are, if there is no room for them."""
+        """Return the same with its tensors there; where they are, if there is no room for them."""
         from liftcore.runtime.device import out_of_memory
 
         parts = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "metadata"}
@@ -264,7 +264,7 @@ class Lift:
             return self
 
     def cpu(self) -> Self:
-        """The same with its tensors on the CPU."""
+        """Return the same with its tensors on the CPU."""
         import torch
 
         return self.to(torch.device("cpu"))
@@ -274,35 +274,35 @@ def renumbered(labels: Tensor, table: Tensor) -> tuple[Tensor, Tensor]:
     """Labels [n] of rows of a table [K, ..], -1 for none, and the table without rows that no label names."""
     import torch
 
-    used, numbers = torch.unique(labels, return_inverse=True)
-    none = int((used < 0).sum())
-    return (numbers - none).clamp_min(-1).to(labels.dtype), table[used[none:].long()]
+    present, numbers = torch.unique(labels, return_inverse=True)
+    none = int((present < 0).sum())
+    return (numbers - none).clamp_min(-1).to(labels.dtype), table[present[none:].long()]
 
 
 def cropped_tree(tree: dict[str, Tensor]) -> dict[str, Tensor]:
-    """A tree without the nodes that no splat of its ``node`` [n] is left of."""
+    """Return a tree without the nodes that no splat of its ``node`` [n] is left of."""
     import torch
 
     node, parents = tree["node"], tree["node_parents"].long()
-    used = torch.zeros(len(parents) + 1, dtype=torch.bool, device=node.device)  # the last is of -1
+    present = torch.zeros(len(parents) + 1, dtype=torch.bool, device=node.device)  # the last is of -1
     above = torch.unique(node).long()
     while len(above := above[above >= 0]):
-        used[above] = True
+        present[above] = True
         above = parents[above]
-    numbers = torch.where(used, used.cumsum(0) - 1, -1).to(node.dtype)
-    kept = {name: part[used[:-1]] for name, part in tree.items() if name != "node"}
-    return kept | {"node": numbers[node.long()], "node_parents": numbers[parents[used[:-1]]]}
+    numbers = torch.where(present, present.cumsum(0) - 1, -1).to(node.dtype)
+    rows = {name: part[present[:-1]] for name, part in tree.items() if name != "node"}
+    return rows | {"node": numbers[node.long()], "node_parents": numbers[parents[present[:-1]]]}
 
 
 def _off_landmarks(landmarks: tuple[Landmark, ...], splats: Splats) -> int:
-    """How many of the splats lie elsewhere than landmarks say."""
+    """Count the splats that are not at their landmarks."""
     import numpy as np
 
     if not landmarks:
         return 0
     places = np.array([place for _, *place in landmarks])
     rows = np.array([row for row, *_ in landmarks])  # of a lift cropped by other means, perhaps beyond the last
-    found = splats.positions(rows.clip(max=splats.count - 1)).astype(np.float64)
+    positions = splats.positions(rows.clip(max=splats.count - 1)).astype(np.float64)
     low, high = np.quantile(places, (0.1, 0.9), axis=0)  # floaters decide nothing
     near = NEAR * float((high - low).max()) + float(np.spacing(np.float32(np.abs(places).max())))
-    return int((np.abs(found - places).max(axis=1) > near).sum())
+    return int((np.abs(positions - places).max(axis=1) > near).sum())

@@ -84,7 +84,7 @@ def save_lift(lift: Lift, path: Path | str) -> None:
 
 
 def tensors_of(lift: Lift) -> dict[str, Tensor]:
-    """The tensors of a lift by their names, in the order of its file."""
+    """Return the tensors of a lift by their names, in the order of its file."""
     return {name: getattr(lift, name) for name in ALL if getattr(lift, name) is not None}
 
 
@@ -104,7 +104,7 @@ def open_lift(path: Path | str) -> Lift:
 
 
 def read_lift(path: Path | str) -> tuple[dict[str, np.ndarray], str]:
-    """The same as mapped arrays by their names, and its metadata as JSON: without torch and pydantic.
+    """Return the same as mapped arrays by their names, and its metadata as JSON: without torch and pydantic.
 
     Raises:
         InvalidLift: as `open_lift` has it.
@@ -140,7 +140,7 @@ def _read_arrays(source: Path, path: Path | str) -> tuple[dict[str, np.ndarray],
 
 
 def parse_metadata(text: str, path: Path | str) -> LiftMetadata:
-    """The metadata of a lift file from its JSON.
+    """Return the metadata of a lift file from its JSON.
 
     Raises:
         InvalidLift: they are none.
@@ -189,15 +189,15 @@ def _check_shapes(arrays: dict[str, np.ndarray], path: Path | str) -> None:
         (CLUSTER_TENSORS, features.shape[1], features.dtype),
         (OBJECT_TENSORS, None, np.dtype(np.int32)),
     ):
-        one, table = (arrays.get(name) for name in pair)
-        if one is None and table is None:
+        column, table = (arrays.get(name) for name in pair)
+        if column is None and table is None:
             continue
-        if one is None or table is None:
+        if column is None or table is None:
             raise InvalidLift(str(path), expected=f"{pair[0]} and {pair[1]}, or neither", got="one of them")
-        fits = one.shape == rows and one.dtype == np.int32 and table.ndim == 2 and table.dtype == dtype
+        fits = column.shape == rows and column.dtype == np.int32 and table.ndim == 2 and table.dtype == dtype
         fits &= channels is None or table.shape[1] == channels
-        if not fits or int(one.min()) < -1 or int(one.max()) >= len(table):
-            got = f"{list(one.shape)} {one.dtype} and {list(table.shape)} {table.dtype}"
+        if not fits or int(column.min()) < -1 or int(column.max()) >= len(table):
+            got = f"{list(column.shape)} {column.dtype} and {list(table.shape)} {table.dtype}"
             raise InvalidLift(str(path), expected=f"a {pair[0]} of -1 or a row of {pair[1]} for each splat", got=got)
     _check_tree(arrays, path)
 
@@ -233,12 +233,12 @@ def _check_tree(arrays: dict[str, np.ndarray], path: Path | str) -> None:
 def input_files(
     splats: Path, cameras: Path, features: Sequence[Path], views: Collection[str] = ()
 ) -> list[InputFile]:
-    """The inputs of a lift with their digests: splats, cameras (as `camera_input` has them) and feature packs."""
+    """Return the inputs of a lift with their digests: splats, cameras (by `camera_input`) and feature packs."""
     return [input_file(splats), camera_input(cameras, views), *(input_file(pack) for pack in features)]
 
 
 def input_file(path: Path) -> InputFile:
-    """Where a file, or a SOG that is not bundled, is, and its digest.
+    """Return the path and the digest of a file, or of a SOG that is not bundled.
 
     Raises:
         OSError: it does not open, or is no regular file.
@@ -260,7 +260,7 @@ def input_file(path: Path) -> InputFile:
 
 
 def camera_input(path: Path, views: Collection[str] = ()) -> InputFile:
-    """Where cameras are, and the digest of their file or, of several, of the names and digests of all that are read.
+    """Return the path of cameras, and the digest of their file or, of several, of the names and digests of all read.
 
     Photos, features and lifts that lie in the same folder do not count: they may come and go.
 
@@ -270,11 +270,13 @@ def camera_input(path: Path, views: Collection[str] = ()) -> InputFile:
     from liftcore.io.cameras import camera_source
     from liftcore.values.lift import InputFile
 
-    given = Path(os.path.abspath(path))  # links stay: other files count beside them than where they lead
-    files = camera_source(given, views).files
-    if files == [given]:
-        return InputFile(path=str(given), sha256=sha256_of(given))
-    return InputFile(path=str(given), sha256=_digest_of_several(files, given if given.is_dir() else given.parent))
+    absolute = Path(os.path.abspath(path))  # links stay: other files count beside them than where they lead
+    files = camera_source(absolute, views).files
+    if files == [absolute]:
+        return InputFile(path=str(absolute), sha256=sha256_of(absolute))
+    return InputFile(
+        path=str(absolute), sha256=_digest_of_several(files, absolute if absolute.is_dir() else absolute.parent)
+    )
 
 
 def _digest_of_several(files: Sequence[Path], folder: Path) -> str:
@@ -284,28 +286,27 @@ def _digest_of_several(files: Sequence[Path], folder: Path) -> str:
     return total.hexdigest()
 
 
-def found_input(role: str, remembered: InputFile, metadata: LiftMetadata, lift: Path | None) -> Path | None:
-    """Where an input of a lift is: where it was, beside the lift under its name or another, or in the store that it
-    lies in; None if nowhere.
+def found_input(role: str, recorded: InputFile, metadata: LiftMetadata, lift: Path | None) -> Path | None:
+    """Find an input of a lift: at its recorded path, beside the lift, or in the lift's store; else None.
 
-    Cameras will do if those of the lifted views are what they were, whatever others there are.
+    Cameras match if those of the lifted views are unchanged, whatever other views there are.
 
     Args:
         role: splats, cameras or features. lift: the lift's file; None looks at the remembered path alone.
     """
-    path = Path(remembered.path)
-    places = [path] if lift is None else [path, *_beside(lift, path), *_in_store(lift, remembered.sha256)]
+    path = Path(recorded.path)
+    places = [path] if lift is None else [path, *_candidates_beside(lift, path), *_in_store(lift, recorded.sha256)]
     for place in places:
         if place.exists():
             with suppress(InvalidInput, OSError):
-                found = camera_input(place, metadata.views) if role == "cameras" else input_file(place)
-                if found.sha256 == remembered.sha256 or (role == "cameras" and has_poses(place, metadata)):
+                candidate = camera_input(place, metadata.views) if role == "cameras" else input_file(place)
+                if candidate.sha256 == recorded.sha256 or (role == "cameras" and has_poses(place, metadata)):
                     return place
     return None
 
 
-def _beside(lift: Path, path: Path) -> Iterator[Path]:
-    """Where an input may have moved to: under its name, with some of its folders; else any of its kind."""
+def _candidates_beside(lift: Path, path: Path) -> Iterator[Path]:
+    """Yield paths near the lift where an input may be: under its name, with some folders; else by its suffix."""
     folder, parts = Path(os.path.abspath(lift)).parent, path.parts[1:]
     for above in (folder, *folder.parents[:NEAR]):
         yield from (above.joinpath(*parts[-count:]) for count in range(1, min(len(parts), NEAR) + 1))
@@ -314,13 +315,13 @@ def _beside(lift: Path, path: Path) -> Iterator[Path]:
 
 
 def _in_store(lift: Path, sha256: str) -> Iterator[Path]:
-    """The places of an input beside ``lifts/ID.safetensors`` of a service: ``blobs/ab/abcd....ply``."""
+    """Yield the places of an input beside ``lifts/ID.safetensors`` of a service: ``blobs/ab/abcd....ply``."""
     if DIGEST.fullmatch(sha256):  # what another lift remembers may be no digest but a pattern
         yield from Path(os.path.abspath(lift)).parent.parent.glob(f"blobs/{sha256[:2]}/{sha256}.*")
 
 
 def has_poses(place: Path, metadata: LiftMetadata) -> bool:
-    """Whether a file or folder has the cameras of the lifted views as they were, whatever others it has.
+    """Return True if a file or folder has the cameras of the lifted views as they were, whatever others it has.
 
     Lifts from before poses were kept have none to compare: then it has not.
 
@@ -332,25 +333,25 @@ def has_poses(place: Path, metadata: LiftMetadata) -> bool:
     if not metadata.poses:
         return False
     cameras = read_cameras(place, choosing=False, views=metadata.views)
-    known = [cameras[view] for view in metadata.views if view in cameras]
-    if len(known) != len(metadata.views):
+    matches = [cameras[view] for view in metadata.views if view in cameras]
+    if len(matches) != len(metadata.views):
         return False
     # Lifts from before names were composed have the digest of those that a Mac gave.
-    return metadata.poses in (poses_of(known), poses_of(known, "NFD"))
+    return metadata.poses in (poses_of(matches), poses_of(matches, "NFD"))
 
 
 def poses_of(cameras: Sequence[Camera], form: Literal["NFC", "NFD"] = "NFC") -> str:
-    """A digest of what cameras see, in their order, with their names in a form of Unicode."""
+    """Return a digest of what cameras see, in their order, with their names in a form of Unicode."""
     total = hashlib.sha256()
     for camera in cameras:
         total.update(camera.viewmat.tobytes() + camera.K.tobytes())
-        seen = (unicodedata.normalize(form, camera.name), camera.width, camera.height, camera.lens)
-        total.update(repr(seen if camera.face is None else (*seen, camera.face)).encode())
+        description = (unicodedata.normalize(form, camera.name), camera.width, camera.height, camera.lens)
+        total.update(repr(description if camera.face is None else (*description, camera.face)).encode())
     return total.hexdigest()
 
 
 def sha256_of(path: Path) -> str:
-    """The digest of a file, in hexadecimal digits.
+    """Return the digest of a file, in hexadecimal digits.
 
     Raises:
         OSError: it does not open, or is no regular file.

@@ -13,7 +13,7 @@ from liftcore.values.pack import Views, as_views, pair
 from liftcore.values.settings import LiftSettings
 from liftcore.values.views import ViewFeatures
 
-Given = Mapping[str, ViewFeatures] | Iterable[tuple[str, ViewFeatures]]
+ViewValues = Mapping[str, ViewFeatures] | Iterable[tuple[str, ViewFeatures]]
 
 
 @dataclass(frozen=True)
@@ -26,19 +26,19 @@ class LiftViews:
     unpaired: list[str]  # views with features and no camera, which are skipped
 
     @classmethod
-    def of(cls, views: Given, cameras: Cameras | Mapping[str, Camera], settings: LiftSettings) -> "LiftViews":
+    def of(cls, views: ViewValues, cameras: Cameras | Mapping[str, Camera], settings: LiftSettings) -> "LiftViews":
         """Views paired with cameras by name, every ``view_stride``-th of them.
 
         Raises:
             InvalidFeatures: no view has a camera, or views are malformed.
             InvalidCameras: there is no camera.
         """
-        known = cameras if isinstance(cameras, Cameras) else Cameras(cameras)
-        features, unpaired = pair(as_views(views), known)
-        return cls(known, features, features.views[:: settings.view_stride], unpaired)
+        by_name = cameras if isinstance(cameras, Cameras) else Cameras(cameras)
+        features, unpaired = pair(as_views(views), by_name)
+        return cls(by_name, features, features.views[:: settings.view_stride], unpaired)
 
     def only(self, names: Iterable[str]) -> "LiftViews":
-        """Those of these names, in their order."""
+        """Return those of these names, in their order."""
         return replace(self, names=tuple(names))
 
     @property
@@ -50,17 +50,17 @@ class LiftViews:
         return len(self.names)
 
     def __getitem__(self, number: int) -> tuple[Camera, ViewFeatures]:
-        """The camera of the view of that number, and what it observes."""
+        """Return the camera of the view of that number, and what it observes."""
         return self.cameras[self.names[number]], self.features[self.names[number]]
 
     def __iter__(self) -> Iterator[tuple[Camera, ViewFeatures]]:
-        """The views, one in memory at a time."""
+        """Return the views, one in memory at a time."""
         return (self[number] for number in range(len(self)))
 
     def metadata(
         self, settings: LiftSettings, splats: Splats, diagnostics: dict[str, Any], timings: dict[str, float]
     ) -> LiftMetadata:
-        """What a lift of these views remembers, of whatever engine."""
+        """Return the metadata of a lift of these views, of any engine."""
         table = self.features.table
         return LiftMetadata(
             version=__version__,

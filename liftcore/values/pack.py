@@ -44,14 +44,14 @@ MAX_TENSORS = 2 * MAX_VIEWS + 1  # of a pack: labels and a codebook a view, and 
 
 @dataclass(frozen=True)
 class TensorSpec:
-    """What is known of a tensor before it is read."""
+    """Type and shape of a tensor, known before it is read."""
 
     dtype: str  # safetensors' name: "F16"
     shape: tuple[int, ...]
 
 
 class _Source(Protocol):
-    """Where one view is."""
+    """Source of one view."""
 
     @property
     def specs(self) -> Mapping[str, TensorSpec]: ...  # by part: labels and codebook, or grid
@@ -70,7 +70,7 @@ class Views(Mapping[str, ViewFeatures]):
     channels: int  # F
     encoder: str  # the 2D encoder as the packs tell it, "" when they do not
     text_space: str  # the text encoder that shares the space; "" unknown, "none" when there is none
-    normalised: bool | None  # whether codebook rows and grid cells are unit vectors; None when not told
+    normalised: bool | None  # whether codebook rows and grid cells are unit vectors; None: unknown
     _sources: Mapping[str, _Source] = field(repr=False)
     table: TableEncoder | None = None  # the packs' own words
     paths: tuple[Path, ...] = ()  # of the packs that it reads; () where views come from elsewhere
@@ -92,19 +92,19 @@ class Views(Mapping[str, ViewFeatures]):
         return view in self._sources
 
     def __getitem__(self, view: str) -> ViewFeatures:
-        found = self._find(view).read()
-        if found.codebook.shape[1] != self.channels:
-            got = f"{found.codebook.shape[1]} in {view!r}"
+        features = self._find(view).read()
+        if features.codebook.shape[1] != self.channels:
+            got = f"{features.codebook.shape[1]} in {view!r}"
             raise InvalidFeatures("features", expected=f"{self.channels} channels in every view", got=got)
         camera = self.seeing(view)
-        return found if camera is None else as_pinhole_sees(found, camera)
+        return features if camera is None else as_pinhole_sees(features, camera)
 
     def is_regions(self, view: str) -> bool:
-        """Whether the view is a region map; else it is a grid."""
+        """Return True if the view is a region map; else it is a grid."""
         return "labels" in self._find(view).specs
 
     def specs(self, view: str) -> dict[str, TensorSpec]:
-        """The tensors of a view by part (labels and codebook, or grid), from the header alone."""
+        """Return the tensors of a view by part (labels and codebook, or grid), from the header alone."""
         specs = dict(self._find(view).specs)
         camera = self.seeing(view)
         if camera is None or (camera.lens is None and camera.face is None):
@@ -122,7 +122,7 @@ class Views(Mapping[str, ViewFeatures]):
         return width, height
 
     def seen_by(self, views: Mapping[str, str], cameras: Mapping[str, Camera]) -> "Views":
-        """The views that ``views`` names for cameras, and no others, each as its camera sees it, under its name."""
+        """Return only the views that ``views`` names for cameras, each as its camera sees it, under its name."""
         sources = {name: self._find(view) for name, view in views.items()}
         seeing = {name: self._cameras.get(view, cameras[name]) for name, view in views.items()}
         return replace(self, _sources=sources, _cameras=seeing)
@@ -132,20 +132,20 @@ class Views(Mapping[str, ViewFeatures]):
         return replace(self, _sources={view: self._find(view) for view in views})
 
     def seeing(self, view: str) -> Camera | None:
-        """The camera whose pinhole sees the view; None of views that are not paired."""
+        """Return the camera whose pinhole sees the view; None of views that are not paired."""
         return self._cameras.get(composed(view))
 
     def _find(self, view: str) -> _Source:
-        found = self._sources.get(composed(view))
-        if found is None:
+        source = self._sources.get(composed(view))
+        if source is None:
             raise InvalidFeatures("view", expected="a view of the features", got=repr(view))
-        return found
+        return source
 
 
 def as_views(
     views: Mapping[str, ViewFeatures] | Iterable[tuple[str, ViewFeatures]], scratch: Path | None = None
 ) -> Views:
-    """What `lift` reads of any views: as they are, a mapping's when they are asked for, an iterator's from the disk.
+    """Convert any views for `lift`: `Views` as they are, a mapping's read lazily, an iterator's from the disk.
 
     An iterator is consumed once, a view at a time: each is written to a file that has no name any more once this
     returns, so a lift that reads views again never holds all of them.
@@ -166,8 +166,8 @@ def as_views(
         raise InvalidFeatures("features", expected="views by name, or pairs of a name and a view", got=got, hint=hint)
     if not isinstance(views, Mapping):
         return _spooled(views, scratch)
-    given = cast("Mapping[str, ViewFeatures]", views)
-    sources = {name: _MemoryView(given, key) for name, key in _composed_names(given).items()}
+    mapping = cast("Mapping[str, ViewFeatures]", views)
+    sources = {name: _MemoryView(mapping, key) for name, key in _composed_names(mapping).items()}
     if not sources:
         raise InvalidFeatures("features", expected="at least one view", got="none")
     if isinstance(views, dict):  # other mappings may read files: theirs are checked one by one
@@ -180,7 +180,7 @@ def read_features(*paths: str | Path) -> Views:
     """Open feature packs as one set of views; only headers are read.
 
     Raises:
-        InvalidInput: one lies elsewhere (`io.remote`), and does not come.
+        InvalidInput: one is a URL (`io.remote`) that cannot be read.
         InvalidFeatures: a file is no feature pack, a view is malformed or in two packs, or the packs do not
             share their channels and their encoder.
     """
@@ -200,18 +200,18 @@ def read_features(*paths: str | Path) -> Views:
     if not sources:
         raise InvalidFeatures("features", expected="at least one view", got=f"{len(packs)} packs without any")
     if len(channels) > 1:
-        (one, here), (other, there) = list(channels.items())[:2]
-        got = f"{one} in {here} and {other} in {there}"
+        (first_count, first_place), (second_count, second_place) = list(channels.items())[:2]
+        got = f"{first_count} in {first_place} and {second_count} in {second_place}"
         raise InvalidFeatures("features", expected="the same channels in every view", got=got)
-    normalised = {"true": True, "false": False}.get(_agreed(packs, "normalised").lower())
-    encoder, text_space = _agreed(packs, "encoder"), _agreed(packs, "text_space")
+    normalised = {"true": True, "false": False}.get(_shared_metadata(packs, "normalised").lower())
+    encoder, text_space = _shared_metadata(packs, "encoder"), _shared_metadata(packs, "text_space")
     table = _table(packs, next(iter(channels)))
-    told = (encoder, text_space, normalised, sources, table, tuple(pack.path for pack in packs))
-    return Views(next(iter(channels)), *told, level_names=_level_names(packs))
+    arguments = (encoder, text_space, normalised, sources, table, tuple(pack.path for pack in packs))
+    return Views(next(iter(channels)), *arguments, level_names=_level_names(packs))
 
 
 def pair(views: Views, cameras: Mapping[str, Camera]) -> tuple[Views, list[str]]:
-    """The views that have a camera, named like it, and the names of those that have none, to be skipped and told.
+    """Return the views that have a camera, named like it, and the names of views without one, to skip with a warning.
 
     A panorama's view is one of each of its faces; a view that is named like a face is a map of the face itself.
 
@@ -223,10 +223,10 @@ def pair(views: Views, cameras: Mapping[str, Camera]) -> tuple[Views, list[str]]
         if camera.face is not None:
             faces.setdefault(camera.face.photo, []).append(name)
     names = require_pairs(views.views, {*cameras, *faces})
-    seen = {face: view for view, name in names.items() for face in faces.get(name, [])}
-    own = {name: view for view, name in names.items() if name not in faces}
-    seeing = {**cameras, **{name: cameras[name].replace(face=None) for name in own}}
-    return views.seen_by(seen | own, seeing), [view for view in views if view not in names]
+    face_views = {face: view for view, name in names.items() for face in faces.get(name, [])}
+    camera_views = {name: view for view, name in names.items() if name not in faces}
+    paired_cameras = {**cameras, **{name: cameras[name].replace(face=None) for name in camera_views}}
+    return views.seen_by(face_views | camera_views, paired_cameras), [view for view in views if view not in names]
 
 
 def write_pack(
@@ -238,15 +238,15 @@ def write_pack(
 ) -> None:
     """Write views as a feature pack, whole or not at all.
 
-    ``views`` may read its views when they are asked for: each is asked for twice, once for its shape and once for
-    its bytes, and forgotten in between. Labels are stored as int16 where the codebook allows.
+    ``views`` may read its views lazily: each is read twice, once for its shape and once for
+    its bytes, and not kept in between. Labels are stored as int16 where the codebook allows.
 
     Args:
         path: the file to write.
         views: view name -> what it observes.
         metadata: ``encoder``, ``text_space``, ``normalised`` ("true" or "false"), ``levels`` (a JSON list of their
             names) and what else to keep.
-        progress: told about the stages "check" and "pack", in views.
+        progress: called in the stages "check" and "pack", in views.
         table: words of the pack's own, of as many channels.
 
     Raises:
@@ -259,8 +259,8 @@ def write_pack(
     with whole_file(path) as handle:
         if table is None:
             return _write(handle, views, metadata, progress)
-        own = {TABLE: torch.from_numpy(table.embeddings).half()}
-        _write(handle, views, {**metadata, "words": json.dumps(table.words)}, progress, own)
+        extra_tensors = {TABLE: torch.from_numpy(table.embeddings).half()}
+        _write(handle, views, {**metadata, "words": json.dumps(table.words)}, progress, extra_tensors)
 
 
 def _write(
@@ -268,33 +268,33 @@ def _write(
     views: Mapping[str, ViewFeatures],
     metadata: Mapping[str, str],
     progress: Progress,
-    others: Mapping[str, Tensor] = MappingProxyType({}),
+    extra_tensors: Mapping[str, Tensor] = MappingProxyType({}),
 ) -> None:
-    specs = [(name, one.dtype, tuple(one.shape)) for name, one in others.items()]
+    specs = [(name, value.dtype, tuple(value.shape)) for name, value in extra_tensors.items()]
 
-    def checked() -> Iterator[tuple[str, ViewFeatures]]:
-        for done, (view, features) in enumerate(views.items(), start=1):
+    def iterate_reported() -> Iterator[tuple[str, ViewFeatures]]:
+        for count, (view, features) in enumerate(views.items(), start=1):
             yield view, features
-            specs.extend((f"{view}/{part}", one.dtype, tuple(one.shape)) for part, one in _parts(features))
-            progress("check", done, len(views), "views")
+            specs.extend((f"{view}/{part}", value.dtype, tuple(value.shape)) for part, value in _parts(features))
+            progress("check", count, len(views), "views")
 
-    _check_channels(checked())
+    _check_channels(iterate_reported())
     header, offsets = safetensors_header(specs, metadata)
     if len(header) > MAX_HEADER_BYTES:
         raise InvalidFeatures("views", expected="fewer views in a pack", got=str(len(views)))
     handle.write(header)
-    for name, tensor in others.items():
+    for name, tensor in extra_tensors.items():
         handle.seek(len(header) + offsets[name])
         handle.write(tensor_bytes(tensor))
-    for done, (view, features) in enumerate(views.items(), start=1):
+    for count, (view, features) in enumerate(views.items(), start=1):
         for part, tensor in _parts(features):
             handle.seek(len(header) + offsets[f"{view}/{part}"])
             handle.write(tensor_bytes(tensor))
-        progress("pack", done, len(views), "views")
+        progress("pack", count, len(views), "views")
 
 
 def _parts(features: ViewFeatures) -> Iterator[tuple[str, Tensor]]:
-    """The tensors of a view as they are stored."""
+    """Yield the tensors of a view as they are stored."""
     if isinstance(features, Regions):
         narrow = len(features.codebook) <= LARGEST_I16
         yield "labels", features.labels.to(torch.int16 if narrow else torch.int32)
@@ -341,19 +341,19 @@ def _spooled(pairs: Iterable[tuple[str, ViewFeatures]], scratch: Path | None) ->
 
 def _composed_names(names: Iterable[Any]) -> dict[str, str]:
     """Composed name (NFC) -> the name as it came."""
-    found: dict[str, str] = {}
+    originals: dict[str, str] = {}
     for name in names:
         if not isinstance(name, str):
             expected, got = "names that are texts, as of cameras", f"{type(name).__name__} {name!r}"[:80]
             raise InvalidFeatures("features", expected=expected, got=got)
-        if found.setdefault(composed(name), name) != name:
-            got = f"{name!a} and {found[composed(name)]!a}, which are one name in other forms of Unicode"
+        if originals.setdefault(composed(name), name) != name:
+            got = f"{name!a} and {originals[composed(name)]!a}, which are one name in other forms of Unicode"
             raise InvalidFeatures("features", expected="each view once", got=got[:200])
-    return found
+    return originals
 
 
 def _in_callers_modes(values: Iterable[Any]) -> Iterator[Any]:
-    """The values, each made as if there were no library around the iterator."""
+    """Yield the values, each made as if there were no library around the iterator."""
     with callers_modes():
         rest = iter(values)
     end = object()
@@ -374,16 +374,18 @@ class _MemoryView:
 
     @property
     def specs(self) -> Mapping[str, TensorSpec]:
-        return {part: TensorSpec(TYPES[str(one.dtype)], tuple(one.shape)) for part, one in _parts(self.read())}
+        return {
+            part: TensorSpec(TYPES[str(tensor.dtype)], tuple(tensor.shape)) for part, tensor in _parts(self.read())
+        }
 
     def read(self) -> ViewFeatures:
         with callers_modes():
-            found = self.views[self.name]
-        if isinstance(found, Regions | FeatureGrid):
-            return found.cpu()
+            features = self.views[self.name]
+        if isinstance(features, Regions | FeatureGrid):
+            return features.cpu()
         hint = "make FeatureGrid(map [h, w, F]) or Regions(labels [L, h, w], codebook [M, F]) of arrays"
         raise InvalidFeatures(
-            f"view {self.name!r}", expected="Regions or FeatureGrid", got=type(found).__name__, hint=hint
+            f"view {self.name!r}", expected="Regions or FeatureGrid", got=type(features).__name__, hint=hint
         )
 
 
@@ -433,8 +435,8 @@ def _open(path: Path) -> _PackFile:
     try:
         handle: Any = safe_open(str(path), framework="pt")
         if len(names := handle.keys()) > MAX_TENSORS:
-            most = f"at most {MAX_VIEWS} views, of two tensors each"
-            raise InvalidFeatures(str(path), expected=most, got=f"{len(names)} tensors", hint=FEWER_VIEWS)
+            limit = f"at most {MAX_VIEWS} views, of two tensors each"
+            raise InvalidFeatures(str(path), expected=limit, got=f"{len(names)} tensors", hint=FEWER_VIEWS)
         slices = {name: handle.get_slice(name) for name in names}
         specs = {name: TensorSpec(part.get_dtype(), _axes(name, part.get_shape())) for name, part in slices.items()}
         return _PackFile(path, handle, specs, handle.metadata() or {})
@@ -444,9 +446,9 @@ def _open(path: Path) -> _PackFile:
 
 
 def _axes(name: str, shape: Sequence[int]) -> tuple[int, ...]:
-    """The shape of a tensor of a pack without axes of length 1 before its own, which values do without too."""
-    most = {"labels": 3, "grid": 3, "codebook": 2}.get(name.rpartition("/")[2], len(shape))
-    extra = max(len(shape) - most, 0)
+    """Return the shape of a tensor of a pack without axes of length 1 before its own, which values do without too."""
+    dimensions = {"labels": 3, "grid": 3, "codebook": 2}.get(name.rpartition("/")[2], len(shape))
+    extra = max(len(shape) - dimensions, 0)
     return tuple(shape[extra:]) if all(side == 1 for side in shape[:extra]) else tuple(shape)
 
 
@@ -471,19 +473,19 @@ def _check_specs(stored: _Stored) -> int:
         raise InvalidFeatures(stored.where, expected="labels with a codebook, or a grid", got=" with ".join(specs))
     axes = {"grid": "h w F", "codebook": "M F", "labels": "L h w"}
     for part, spec in specs.items():
-        wanted = "h w" if part == "labels" and len(spec.shape) == 2 else axes[part]
+        expected_axes = "h w" if part == "labels" and len(spec.shape) == 2 else axes[part]
         types = LABEL_TYPES if part == "labels" else FEATURE_TYPES
-        fits = len(spec.shape) == len(wanted.split()) and all(spec.shape) and spec.dtype in types
+        fits = len(spec.shape) == len(expected_axes.split()) and all(spec.shape) and spec.dtype in types
         if not fits or (part != "labels" and spec.shape[-1] > MAX_CHANNELS):
-            expected = f"{' or '.join(types)} [{wanted.replace(' ', ', ')}], no side empty"
+            expected = f"{' or '.join(types)} [{expected_axes.replace(' ', ', ')}], no side empty"
             got = f"{spec.dtype} {list(spec.shape)}"
             raise InvalidFeatures(f"{stored.where} {part}", expected=expected, got=got)
     return specs["grid" if "grid" in specs else "codebook"].shape[-1]
 
 
 def _table(packs: Sequence[_PackFile], channels: int) -> TableEncoder | None:
-    """The words that the packs bring, the same in all that bring some."""
-    found: dict[Path, TableEncoder] = {}
+    """Return the words that the packs bring, the same in all that bring some."""
+    tables: dict[Path, TableEncoder] = {}
     for pack in packs:
         if TABLE not in pack.specs:
             continue
@@ -491,25 +493,29 @@ def _table(packs: Sequence[_PackFile], channels: int) -> TableEncoder | None:
             raise InvalidFeatures(f"{pack.path} {TABLE}", expected="F16 or F32", got=pack.specs[TABLE].dtype)
         try:
             rows = pack.handle.get_tensor(TABLE).numpy()
-            found[pack.path] = TableEncoder.of(f"words of {pack.path.name}", pack.metadata.get("words", "null"), rows)
+            tables[pack.path] = TableEncoder.of(
+                f"words of {pack.path.name}", pack.metadata.get("words", "null"), rows
+            )
         except InvalidTable as error:
             argument = f"{pack.path} {TABLE}"
             raise InvalidFeatures(argument, expected=error.expected, got=error.got, hint=error.hint) from None
-        if found[pack.path].channels != channels:
-            expected, got = f"{channels} channels, as its views have", str(found[pack.path].channels)
+        if tables[pack.path].channels != channels:
+            expected, got = f"{channels} channels, as its views have", str(tables[pack.path].channels)
             raise InvalidFeatures(f"{pack.path} {TABLE}", expected=expected, got=got)
-    first = next(iter(found), None)
-    for path, table in found.items():
-        if first and not (table.words == found[first].words and (table.embeddings == found[first].embeddings).all()):
+    first = next(iter(tables), None)
+    for path, table in tables.items():
+        if first and not (
+            table.words == tables[first].words and (table.embeddings == tables[first].embeddings).all()
+        ):
             hint = "write the masks of all views into one pack"
             raise InvalidFeatures(
                 "features", expected="one table in all packs", got=f"two in {first} and {path}", hint=hint
             )
-    return found[first] if first else None
+    return tables[first] if first else None
 
 
 def _level_names(packs: Sequence[_PackFile]) -> tuple[str, ...]:
-    """The names of levels that all packs have; () where they have none, differ, or are no list of texts in print."""
+    """Return the names of levels that all packs have; () if they have none, differ, or are no printable texts."""
     texts = {pack.metadata.get("levels", "") for pack in packs}
     text = texts.pop() if len(texts) == 1 else ""
     try:
@@ -521,11 +527,11 @@ def _level_names(packs: Sequence[_PackFile]) -> tuple[str, ...]:
     return tuple(names) if are_texts else ()
 
 
-def _agreed(packs: Sequence[_PackFile], key: str) -> str:
+def _shared_metadata(packs: Sequence[_PackFile], key: str) -> str:
     values = {pack.metadata.get(key, ""): pack.path for pack in packs}
-    told = {value: path for value, path in values.items() if value}
-    if len(told) > 1:
-        got = " and ".join(f"{value[:80]!r} in {path}" for value, path in told.items())
+    paths = {value: path for value, path in values.items() if value}
+    if len(paths) > 1:
+        got = " and ".join(f"{value[:80]!r} in {path}" for value, path in paths.items())
         hint = "features of different spaces cannot make one lift"
         raise InvalidFeatures("features", expected=f"one {key} in all packs", got=got, hint=hint)
-    return next(iter(told), "")
+    return next(iter(paths), "")

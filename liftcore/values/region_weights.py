@@ -73,25 +73,25 @@ class RegionWeights:
 
     @property
     def device(self) -> torch.device:
-        """Where it lies."""
+        """Device of the tensors."""
         return self.region.device
 
     def tensors(self) -> dict[str, Tensor]:
-        """Its tensors by name."""
+        """Return its tensors by name."""
         return {field.name: getattr(self, field.name) for field in fields(self) if field.name != "views"}
 
     def cpu(self) -> Self:
-        """The same on the CPU: all of it at once into pinned memory, as other copies wait for each part."""
+        """Return the same on the CPU: all of it at once into pinned memory, as other copies wait for each part."""
         if not self.region.is_cuda:
             return self
-        made = {}
+        copies = {}
         for name, part in self.tensors().items():
-            made[name] = torch.empty(part.shape, dtype=part.dtype, pin_memory=True).copy_(part, non_blocking=True)
+            copies[name] = torch.empty(part.shape, dtype=part.dtype, pin_memory=True).copy_(part, non_blocking=True)
         torch.cuda.current_stream(self.device).synchronize()
-        return replace(self, **made)
+        return replace(self, **copies)
 
     def in_files(self) -> Self:
-        """The same in mapped files, of which only the pages at work are in memory.
+        """Return the same in mapped files, of which only the pages at work are in memory.
 
         Raises:
             Unavailable: the disk has no room.
@@ -118,7 +118,7 @@ class RegionWeights:
         return row_blocks(self.indptr.diff().cpu().numpy(), rows, entries)
 
     def take(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Where some rows [B] i64 begin among their entries [B + 1] i64, and where these lie in W [nnz'] i64."""
+        """Return the starts [B + 1] i64 of rows [B] i64 among their entries, and their indices in W [nnz'] i64."""
         begins = self.indptr[rows]
         starts = from_zero(self.indptr[rows + 1] - begins)
         total = int(starts[-1])
@@ -132,19 +132,19 @@ class RegionWeights:
         begin, end = torch.searchsorted(self.splats, bounds).tolist()
         met_begin, met_end = torch.searchsorted(self.total_weight_splats, bounds).tolist()
         starts = self.indptr[begin : end + 1]
-        own = slice(int(starts[0]), int(starts[-1]))
+        entries = slice(int(starts[0]), int(starts[-1]))
         return replace(
             self,
             splats=self.splats[begin:end] - first,
-            indptr=starts - own.start,
-            region=self.region[own].clone(),
-            weight=self.weight[own].clone(),
+            indptr=starts - entries.start,
+            region=self.region[entries].clone(),
+            weight=self.weight[entries].clone(),
             total_weight_splats=self.total_weight_splats[met_begin:met_end] - first,
             total_weight=self.total_weight[met_begin:met_end].clone(),
         )
 
     def runs(self, starts: Tensor, region: Tensor) -> tuple[Tensor, Tensor]:
-        """The runs of some rows, a run being the entries of one view in a row.
+        """Return the runs of some rows, a run being the entries of one view in a row.
 
         Args:
             starts: [B + 1] i64, where the rows begin. region: [n] i32, of their entries.
@@ -153,10 +153,10 @@ class RegionWeights:
             Where runs begin among the entries [R + 1] i64, and the row of each [R] i64.
         """
         view = torch.searchsorted(self.offsets[1:], region, right=True)
-        begun = torch.ones_like(view, dtype=torch.bool)
-        torch.not_equal(view[1:], view[:-1], out=begun[1:])
-        begun[starts[:-1][starts.diff() > 0]] = True
-        firsts = torch.nonzero(begun)[:, 0]
+        is_start = torch.ones_like(view, dtype=torch.bool)
+        torch.not_equal(view[1:], view[:-1], out=is_start[1:])
+        is_start[starts[:-1][starts.diff() > 0]] = True
+        firsts = torch.nonzero(is_start)[:, 0]
         return torch.cat([firsts, starts[-1:]]), torch.searchsorted(starts, firsts, right=True) - 1
 
     def matrix(self, splats: int) -> csr_array:
@@ -170,19 +170,19 @@ class RegionWeights:
             raise InvalidInput("splats", expected="a number of splats", got=repr(splats)[:80], hint=hint)
         if self.splats.numel() and int(self.splats[-1]) >= splats:
             raise InvalidInput("splats", expected=f"{int(self.splats[-1]) + 1} or more", got=str(splats))
-        own, lengths = self.cpu(), np.zeros(splats, np.int64)
-        lengths[own.splats.numpy()] = np.diff(own.indptr.numpy())
+        host, lengths = self.cpu(), np.zeros(splats, np.int64)
+        lengths[host.splats.numpy()] = np.diff(host.indptr.numpy())
         indptr = np.concatenate([[0], np.cumsum(lengths)])
-        return csr_array((own.weight.numpy(), own.region.numpy(), indptr), shape=(splats, int(own.offsets[-1])))
+        return csr_array((host.weight.numpy(), host.region.numpy(), indptr), shape=(splats, int(host.offsets[-1])))
 
-    def save(self, path: Path | str, others: Mapping[str, Tensor] | None = None) -> None:
+    def save(self, path: Path | str, extra_tensors: Mapping[str, Tensor] | None = None) -> None:
         """Write one safetensors file, whole or not at all: its tensors by name, and ``views`` in the metadata.
 
         Args:
             others: tensors that lie beside, under names of their own.
         """
         metadata = {"format": FORMAT, "views": json.dumps(self.views)}
-        write_tensors(Path(path), self.tensors() | dict(others or {}), metadata)
+        write_tensors(Path(path), self.tensors() | dict(extra_tensors or {}), metadata)
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
@@ -195,7 +195,7 @@ class RegionWeights:
 
     @classmethod
     def load_with_others(cls, path: Path | str) -> tuple[Self, dict[str, Tensor]]:
-        """`load`, and the tensors that lie beside."""
+        """Load the weights and the other tensors of the file."""
         names, hint = [field.name for field in fields(cls) if field.name != "views"], "save it anew"
         try:
             arrays, metadata = map_tensors(Path(path))
@@ -205,9 +205,9 @@ class RegionWeights:
         if metadata.get("format") not in (FORMAT, OLD_FORMAT) or not set(names) <= arrays.keys():
             raise InvalidInput("weights", expected=f"a file of {FORMAT}", got="another safetensors file", hint=hint)
         tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
-        others = {name: tensor for name, tensor in tensors.items() if name not in names}
-        own = {name: tensors[name] for name in names}
-        return cls(**own, views=tuple(json.loads(metadata["views"]))), others
+        extra_tensors = {name: tensor for name, tensor in tensors.items() if name not in names}
+        stored = {name: tensors[name] for name in names}
+        return cls(**stored, views=tuple(json.loads(metadata["views"]))), extra_tensors
 
 
 def one_view(
@@ -255,13 +255,13 @@ def _stacked(parts: Sequence[RegionWeights], splats: int, threads: int | None) -
         total_weight.index_add_(0, part.total_weight_splats.to(place), part.total_weight.to(place).double())
     indptr = from_zero(lengths)
     total = int(indptr[-1])
-    made = []
+    columns = []
     for dtype in (torch.int32, torch.float32):
         if place.type == "cpu":
-            made.append(zeros((total,), dtype, name="weights", in_file=8 * total > MEMORY_LIMIT))
+            columns.append(zeros((total,), dtype, name="weights", in_file=8 * total > MEMORY_LIMIT))
         else:
-            made.append(torch.empty(total, dtype=dtype, device=place))
-    region, weight = made
+            columns.append(torch.empty(total, dtype=dtype, device=place))
+    region, weight = columns
 
     def fill(first: int, last: int) -> None:
         cursors = indptr[first:last].clone()
@@ -271,25 +271,27 @@ def _stacked(parts: Sequence[RegionWeights], splats: int, threads: int | None) -
             if begin == end:
                 continue
             rows, starts = part.splats[begin:end].to(place) - first, part.indptr[begin : end + 1]
-            own = slice(int(starts[0]), int(starts[-1]))
-            starts = starts.to(place) - own.start
+            entries = slice(int(starts[0]), int(starts[-1]))
+            starts = starts.to(place) - entries.start
             at, lengths = cursors.index_select(0, rows), starts.diff()
-            to = torch.repeat_interleave(at - starts[:-1], lengths, output_size=own.stop - own.start)
+            to = torch.repeat_interleave(at - starts[:-1], lengths, output_size=entries.stop - entries.start)
             to += torch.arange(to.shape[0], device=place)
-            region.scatter_(0, to, part.region[own].to(place) + base)
-            weight.scatter_(0, to, part.weight[own].to(place))
+            region.scatter_(0, to, part.region[entries].to(place) + base)
+            weight.scatter_(0, to, part.weight[entries].to(place))
             cursors.index_add_(0, rows, lengths)
 
     ranges = [(0, splats)]  # on a card, which takes longer to be asked for a piece than to move it
     if place.type == "cpu":
         ranges = row_blocks(lengths.numpy(), max(splats, 1), max(1 << 20, total >> 5))  # each asks every view
     run_each(fill, ranges, threads)
-    met = torch.nonzero(total_weight)[:, 0]
-    own = [part.offsets[1:] + base for part, base in zip(parts, bases, strict=False)]
-    offsets = torch.cat([torch.zeros(1, dtype=torch.int64), *own])
+    hit_rows = torch.nonzero(total_weight)[:, 0]
+    ends = [part.offsets[1:] + base for part, base in zip(parts, bases, strict=False)]
+    offsets = torch.cat([torch.zeros(1, dtype=torch.int64), *ends])
     names = tuple(name for part in parts for name in part.views)
-    every = torch.arange(splats, dtype=torch.int32, device=place)
-    return RegionWeights(every, indptr, region, weight, met.int(), total_weight[met].float(), offsets, names)
+    splat_rows = torch.arange(splats, dtype=torch.int32, device=place)
+    return RegionWeights(
+        splat_rows, indptr, region, weight, hit_rows.int(), total_weight[hit_rows].float(), offsets, names
+    )
 
 
 def row_blocks(lengths: np.ndarray, rows: int, entries: int) -> list[tuple[int, int]]:
@@ -311,11 +313,11 @@ def run_each(work: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], thr
     What several of them write must not overlap. The first error of any is raised.
     """
     with ThreadPoolExecutor(threads or cores()) as pool:
-        list(pool.map(lambda own: work(*own), arguments))
+        list(pool.map(lambda call: work(*call), arguments))
 
 
 def from_zero(lengths: Tensor) -> Tensor:
-    """[n] -> [n + 1], their sums from the left, from nought."""
+    """Return [n] -> [n + 1], their sums from the left, from nought."""
     return torch.cat([lengths.new_zeros(1), lengths.cumsum(0)])
 
 

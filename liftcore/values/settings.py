@@ -36,7 +36,7 @@ if TYPE_CHECKING:  # it loads torch
 TIKHONOV_GAIN = 1.2  # lambda of the paper's Tikhonov Guidance (App. Tikhonov, lambda sweep)
 VISIBLE_WEIGHT = 0.05  # a splat that weighs less at its centre is hidden there, or hardly there at all
 NO_MASKS = "grids, or maps without a label"
-_SHOWN = 80  # characters of a wrong value in an error
+_MAX_TEXT = 80  # characters of a wrong value in an error
 DIRECTIONS = 256  # that lose nothing on masks; 128 cost .0025 of mask IoU where views are few (docs/results.md)
 NEAREST = 3  # settings that are named where one is unknown
 
@@ -68,7 +68,7 @@ _PRESETS: dict[Preset, dict[str, Any]] = {
 
 
 class Speed(StrEnum):
-    """Where the dial between speed and accuracy stands."""
+    """Level of the trade-off between speed and accuracy."""
 
     EXACT = "exact"  # every pixel of every view
     BALANCED = "balanced"
@@ -339,39 +339,45 @@ class LiftSettings(Shown):
     @model_validator(mode="after")
     def _resolves_whole_regions(self) -> Self:
         if self.aggregation_resolve and self.levels == "composite":
-            told = "other levels than composite, which cut to pieces the regions that aggregation_resolve drops"
-            raise PydanticCustomError("whole_regions", "{expected}", {"expected": told})
+            requirement = (
+                "other levels than composite, which cut to pieces the regions that aggregation_resolve drops"
+            )
+            raise PydanticCustomError("whole_regions", "{expected}", {"expected": requirement})
         if self.aggregation_resolve and self.aggregation_clusters == "graph":
-            told = "aggregation_clusters=hdbscan beside aggregation_resolve: masks that make clusters are all kept"
-            raise PydanticCustomError("whole_regions", "{expected}", {"expected": told})
+            requirement = (
+                "aggregation_clusters=hdbscan beside aggregation_resolve: masks that make clusters are all kept"
+            )
+            raise PydanticCustomError("whole_regions", "{expected}", {"expected": requirement})
         if self.aggregation_resolve and self.smoothness:
             expected = "smoothness=0 beside aggregation_resolve, whose features know no neighbours"
             raise PydanticCustomError("whole_regions", "{expected}", {"expected": expected})
         if self.loss == "huber" and self.cg_steps:
-            told = "cg_steps=0 beside loss=huber: such steps go towards the least squares"
-            raise PydanticCustomError("one_loss", "{expected}", {"expected": told})
+            requirement = "cg_steps=0 beside loss=huber: such steps go towards the least squares"
+            raise PydanticCustomError("one_loss", "{expected}", {"expected": requirement})
         if (self.reliability or self.consensus or self.aggregation_guard) and not self.robust_steps:
-            told = "robust_steps of 1 or more beside reliability, consensus and aggregation_guard, which need a step"
-            raise PydanticCustomError("whole_regions", "{expected}", {"expected": told})
+            requirement = (
+                "robust_steps of 1 or more beside reliability, consensus and aggregation_guard, which need a step"
+            )
+            raise PydanticCustomError("whole_regions", "{expected}", {"expected": requirement})
         return self
 
     def __repr__(self) -> str:
-        own = self.model_dump(mode="json", include=self.model_fields_set - {"preset", "speed"})
-        named = {"preset": str(self.preset), "speed": str(self.speed), **own}
-        return one_line(self, *(f"{name}={value!r}" for name, value in named.items()))
+        overrides = self.model_dump(mode="json", include=self.model_fields_set - {"preset", "speed"})
+        arguments = {"preset": str(self.preset), "speed": str(self.speed), **overrides}
+        return one_line(self, *(f"{name}={value!r}" for name, value in arguments.items()))
 
     @property
     def lift_params(self) -> CompositingParams:
-        """How rays meet splats while lifting, at every pixel."""
+        """Compositing of a lift, at every pixel."""
         return self._compositing(self.lift_gain)
 
     @property
     def render_params(self) -> CompositingParams:
-        """How rays meet splats when attention maps and masks are rendered."""
+        """Compositing of rendered attention maps and masks."""
         return self._compositing(self.render_gain)
 
     def for_splats(self, splats: Splats) -> Self:
-        """The same with ``antialiased`` as true or false: what auto means for these splats.
+        """Return the same with ``antialiased`` as true or false: what auto means for these splats.
 
         Raises:
             InvalidSettings: it is true, and the splats are no 3D Gaussians.
@@ -399,36 +405,36 @@ class LiftSettings(Shown):
 
     @property
     def weighting(self) -> Weighting:
-        """What counts as a weight while lifting."""
+        """Definition of a weight while lifting."""
         return Weighting(self.power, self.selection, self.k, self.mass, self.weight_floor)
 
     @property
     def clusters_by_masks(self) -> bool:
-        """Whether masks, where there are any, make the clusters of the aggregation; then no region is dropped."""
-        chosen = self.aggregation_clusters == "auto" and not self.aggregation_resolve
-        return self.aggregation and (chosen or self.aggregation_clusters == "graph")
+        """True if masks, where there are any, make the clusters of the aggregation; then no region is dropped."""
+        auto_clusters = self.aggregation_clusters == "auto" and not self.aggregation_resolve
+        return self.aggregation and (auto_clusters or self.aggregation_clusters == "graph")
 
     @property
     def weighs_rows(self) -> bool:
-        """Whether each row of a codebook needs weights of its own: what reads them counts no tuples of rows."""
-        named = self.robust_steps or self.loss == "huber" or self.aggregation_resolve or self.objects is True
-        return bool(named or self.clusters_by_masks)
+        """True if each row of a codebook needs weights of its own: what reads them counts no tuples of rows."""
+        by_settings = self.robust_steps or self.loss == "huber" or self.aggregation_resolve or self.objects is True
+        return bool(by_settings or self.clusters_by_masks)
 
     def finds_objects(self, masks: bool) -> bool:
-        """Whether objects are looked for, where views have masks or not.
+        """Return True if objects are looked for, where views have masks or not.
 
         Raises:
             InvalidSettings: objects, or clusters that masks make, are asked for, and no view has masks.
         """
         graph = self.aggregation and self.aggregation_clusters == "graph"
-        for name, asked in (("objects", self.objects is True), ("aggregation_clusters", graph)):
-            if asked and not masks:
+        for name, requested in (("objects", self.objects is True), ("aggregation_clusters", graph)):
+            if requested and not masks:
                 expected = "views with masks: objects are what masks of several views keep together"
                 raise InvalidSettings(name, expected=expected, got=NO_MASKS, hint="take auto")
         return masks and bool(self.objects or self.clusters_by_masks)
 
     def asks_consensus(self, masks: bool) -> bool:
-        """Whether masks are compared with one another, where views have masks or not.
+        """Return True if masks are compared with one another, where views have masks or not.
 
         Raises:
             InvalidSettings: consensus is asked for, and no view has masks.
@@ -447,15 +453,15 @@ class LiftSettings(Shown):
         Raises:
             InvalidSettings: least squares, smoothness, or an aggregation by HDBSCAN.
         """
-        asked = [name for name in ("cg_steps", "reference_channels", "smoothness") if getattr(self, name)]
+        requested = [name for name in ("cg_steps", "reference_channels", "smoothness") if getattr(self, name)]
         if self.aggregation and not self.clusters_by_masks:
-            asked += [name for name in ("aggregation_clusters", "aggregation_resolve") if getattr(self, name)]
-        whole = [f"{name}={getattr(self, name)}" for name in asked]
+            requested += [name for name in ("aggregation_clusters", "aggregation_resolve") if getattr(self, name)]
+        unsupported = [f"{name}={getattr(self, name)}" for name in requested]
         if self.aggregation and self.clusters_by_masks and not masks:
-            whole.append(f"aggregation_clusters={self.aggregation_clusters} of grids")
-        if whole:
-            changes = [f"{name}=0" for name in asked if name in ("cg_steps", "reference_channels", "smoothness")]
-            if len(changes) < len(whole):
+            unsupported.append(f"aggregation_clusters={self.aggregation_clusters} of grids")
+        if unsupported:
+            changes = [f"{name}=0" for name in requested if name in ("cg_steps", "reference_channels", "smoothness")]
+            if len(changes) < len(unsupported):
                 changes.append("aggregation=false, or aggregation_clusters=graph where views have masks")
             strength = 1 if self.smoothness == "auto" else self.smoothness
             after = f", then smooth the lift by `splatlift refine LIFT --smoothness {strength:g}`" if strength else ""
@@ -463,7 +469,7 @@ class LiftSettings(Shown):
                 "engine",
                 expected="settings that work on blocks of splats: least squares need all rays, smoothness and "
                 "clusters by HDBSCAN all features in one place",
-                got=", ".join(whole),
+                got=", ".join(unsupported),
                 hint=f"set {' and '.join(changes)}{after}; or lift without an engine",
             )
 
@@ -473,7 +479,7 @@ class LiftSettings(Shown):
 
     @staticmethod
     def groups() -> Mapping[str, tuple[str, ...]]:
-        """The names of all settings by what they are about, as the command line's help lists them."""
+        """Return the names of all settings by what they are about, as the command line's help lists them."""
         return GROUPS
 
     @classmethod
@@ -483,7 +489,7 @@ class LiftSettings(Shown):
         Raises:
             InvalidSettings: an unknown name or a value out of range.
         """
-        return cls._checked(lambda: cls(**values))
+        return cls._build_checked(lambda: cls(**values))
 
     @classmethod
     def or_default(cls, settings: Self | None) -> Self:
@@ -498,8 +504,8 @@ class LiftSettings(Shown):
         return cls.of() if settings is None else settings
 
     @classmethod
-    def chosen(cls, preset: Preset | str | Self, others: Mapping[str, Any]) -> Self:
-        """A preset by its name, or settings as they are, with others in place of some.
+    def from_preset(cls, preset: Preset | str | Self, changes: Mapping[str, Any]) -> Self:
+        """Return a preset by its name, or settings as they are, with others in place of some.
 
         Raises:
             InvalidSettings: an unknown name or a value out of range.
@@ -509,16 +515,16 @@ class LiftSettings(Shown):
             return cls.of(preset=preset, **changes)
         if not changes:
             return preset
-        chosen = {"preset": preset.preset, "speed": preset.speed}
-        values, filled = preset.model_dump(), cls.of(**chosen).model_dump()
-        given = preset.model_fields_set
-        given = given if len(given) < len(values) else set()  # all of them: settings of a file
-        own = {name: value for name, value in values.items() if name in given or value != filled[name]}
-        return cls.of(**chosen | own | changes)
+        base = {"preset": preset.preset, "speed": preset.speed}
+        values, defaults = preset.model_dump(), cls.of(**base).model_dump()
+        explicit = preset.model_fields_set
+        explicit = explicit if len(explicit) < len(values) else set()  # all of them: settings of a file
+        overrides = {name: value for name, value in values.items() if name in explicit or value != defaults[name]}
+        return cls.of(**base | overrides | changes)
 
     @classmethod
     def hint_of_name(cls, name: str) -> str:
-        """A hint that names the settings most like one that is not there."""
+        """Return a hint that names the settings most like one that is not there."""
         return nearest(name.replace("-", "_"), cls.model_fields, 3)
 
     @classmethod
@@ -528,38 +534,40 @@ class LiftSettings(Shown):
         Raises:
             InvalidSettings: an unknown name, or a value of another type or out of range.
         """
-        whole = {name: int(value) if _is_whole(value) else value for name, value in values.items()}
-        text = json.dumps(whole, ensure_ascii=False).encode("utf-8", "replace")  # half a surrogate pair is no setting
-        return cls._checked(lambda: cls.model_validate_json(text, strict=True))
+        normalised = {name: int(value) if _is_whole(value) else value for name, value in values.items()}
+        text = json.dumps(normalised, ensure_ascii=False).encode(
+            "utf-8", "replace"
+        )  # half a surrogate pair is no setting
+        return cls._build_checked(lambda: cls.model_validate_json(text, strict=True))
 
     @classmethod
-    def _checked(cls, made: Callable[[], Self]) -> Self:
-        """The settings that are made, or what is wrong with them in the project's own words."""
+    def _build_checked(cls, build: Callable[[], Self]) -> Self:
+        """Return the settings that are made, or what is wrong with them in the project's own words."""
         try:
-            settings = made()
+            settings = build()
         except ValidationError as error:
-            raise _told(error, cls.model_fields) from None
+            raise _settings_error(error, cls.model_fields) from None
         if settings.diagnostic_rays > MOST_DIAGNOSTIC_RAYS:  # here, not in the field: older lifts have more
             expected, got = f"at most {MOST_DIAGNOSTIC_RAYS} rays", str(settings.diagnostic_rays)
             raise InvalidSettings("diagnostic_rays", expected=expected, got=got)
         return settings
 
 
-def _told(error: ValidationError, known: Iterable[str]) -> InvalidSettings:
-    """The first thing that is wrong, with all that its setting may be."""
-    first, *others = error.errors()
+def _settings_error(error: ValidationError, known_names: Iterable[str]) -> InvalidSettings:
+    """Return the first thing that is wrong, with all that its setting may be."""
+    first, *remaining = error.errors()
     name, branches = "settings", [first]
     if first["loc"]:
-        name = str(first["loc"][0])[:_SHOWN]
-        branches += [other for other in others if other["loc"][:1] == first["loc"][:1]]
+        name = str(first["loc"][0])[:_MAX_TEXT]
+        branches += [other for other in remaining if other["loc"][:1] == first["loc"][:1]]
     if first["type"] == "extra_forbidden":
-        names = list(known)
+        names = list(known_names)
         expected, hint = f"one of {', '.join(names)}", nearest(name, names, NEAREST)
         return InvalidSettings(name, expected=expected, got="an unknown setting", hint=hint)
     expected = " or ".join(branch["msg"].removeprefix("Input should be ") for branch in branches)
-    return InvalidSettings(name, expected=expected, got=repr(first["input"])[:_SHOWN])
+    return InvalidSettings(name, expected=expected, got=repr(first["input"])[:_MAX_TEXT])
 
 
 def _is_whole(value: Any) -> bool:
-    """Whether JSON means a whole number, which some write as 2.0."""
+    """Return True if JSON means a whole number, which some write as 2.0."""
     return isinstance(value, float) and value.is_integer()

@@ -1,4 +1,4 @@
-"""What one view observes: ``B = S E`` with a codebook E [M, F] and a sparse reading S [rays, M].
+"""Observation of one view: ``B = S E`` with a codebook E [M, F] and a sparse reading S [rays, M].
 
 S is never built. A region map says for every pixel which codebook row each level reads; a feature grid is
 read by bilinear interpolation, four rows a pixel.
@@ -92,24 +92,24 @@ class Regions:
             InvalidFeatures: masks that are no booleans, of another number than the vectors, or in which two of a
                 level overlap; or as the constructor has it.
         """
-        named = f"{where} masks".strip()
+        argument = f"{where} masks".strip()
         try:
             tensors = [mask for mask in masks if isinstance(mask, Tensor)] if isinstance(masks, Sequence) else []
             planes = (torch.stack(tensors) if tensors else shared_tensor(masks)).cpu()
         except (TypeError, ValueError, RuntimeError) as error:
             got = f"{type(masks).__name__} ({str(error)[:80]})"
-            raise InvalidFeatures(named, expected="booleans [M, H, W]", got=got) from None
+            raise InvalidFeatures(argument, expected="booleans [M, H, W]", got=got) from None
         planes = planes[:, 0] if planes.ndim == 4 and planes.shape[1] == 1 else without_unit_axes(planes, 3)
         if planes.ndim != 3 or planes.dtype != torch.bool or not planes.numel():
             hint = "masks of numbers are booleans by masks > 0.5" if planes.dtype != torch.bool else ""
             expected = "booleans [M, H, W], at least one mask and no side empty"
-            raise InvalidFeatures(named, expected=expected, got=_kind(planes), hint=hint)
+            raise InvalidFeatures(argument, expected=expected, got=_kind(planes), hint=hint)
         codebook = _features(vectors, "M, F", f"{where} vectors".strip())
         if len(codebook) != len(planes):
             expected, got = f"{len(codebook)} masks, one a vector", f"{len(planes)} of shape {list(planes.shape[1:])}"
-            raise InvalidFeatures(named, expected=expected, got=got, hint="row k of the vectors is of mask k")
+            raise InvalidFeatures(argument, expected=expected, got=got, hint="row k of the vectors is of mask k")
         planes = planes.numpy()
-        labels = label_levels(list(planes), named) if levels is None else _levels_of(planes, levels, where)
+        labels = label_levels(list(planes), argument) if levels is None else _levels_of(planes, levels, where)
         return cls.unchecked(torch.from_numpy(labels).to(codebook.device), codebook)
 
     def __repr__(self) -> str:
@@ -117,16 +117,16 @@ class Regions:
         return one_line(self, f"{sizes} {_dtype_name(self.codebook)}", f"on {self.codebook.device}")
 
     def cpu(self) -> Self:
-        """The same with its tensors on the CPU."""
+        """Return the same with its tensors on the CPU."""
         return self.unchecked(self.labels.cpu(), self.codebook.cpu())
 
     @classmethod
     def unchecked(cls, labels: Tensor, codebook: Tensor) -> Self:
         """Regions of tensors that are right by how they were made."""
-        made = object.__new__(cls)
-        object.__setattr__(made, "labels", labels)
-        object.__setattr__(made, "codebook", codebook)
-        return made
+        instance = object.__new__(cls)
+        object.__setattr__(instance, "labels", labels)
+        object.__setattr__(instance, "codebook", codebook)
+        return instance
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -150,22 +150,22 @@ class FeatureGrid:
 
     def __init__(self, grid: Array, *, where: str = "") -> None:
         where = f"{where} grid".strip()
-        found = _features(grid, "h, w, F", where)
-        object.__setattr__(self, "grid", found)
+        cells = _features(grid, "h, w, F", where)
+        object.__setattr__(self, "grid", cells)
 
     def __repr__(self) -> str:
         return one_line(self, f"{list(self.grid.shape)} {_dtype_name(self.grid)}", f"on {self.grid.device}")
 
     def cpu(self) -> Self:
-        """The same with its tensor on the CPU."""
+        """Return the same with its tensor on the CPU."""
         return self.unchecked(self.grid.cpu())
 
     @classmethod
     def unchecked(cls, grid: Tensor) -> Self:
-        """A grid of a tensor that is right by how it was made."""
-        made = object.__new__(cls)
-        object.__setattr__(made, "grid", grid)
-        return made
+        """Return a grid of a tensor that is right by how it was made."""
+        instance = object.__new__(cls)
+        object.__setattr__(instance, "grid", grid)
+        return instance
 
     @property
     def codebook(self) -> Tensor:
@@ -176,8 +176,8 @@ class FeatureGrid:
 ViewFeatures = Regions | FeatureGrid
 
 
-def label_levels(masks: Sequence[np.ndarray], where: str) -> np.ndarray:
-    """[L, h, w] i32: label k where mask k is, -1 for none; an empty mask has no label.
+def label_levels(masks: Sequence[np.ndarray], location: str) -> np.ndarray:
+    """Return [L, h, w] i32: label k where mask k is, -1 for none; an empty mask has no label.
 
     The largest mask comes first, of equals the one that was given first, and each goes to the first level on which
     none of its pixels is taken. No pixel of any mask is lost, and what lies alone is on level 0. A lift that takes
@@ -193,31 +193,31 @@ def label_levels(masks: Sequence[np.ndarray], where: str) -> np.ndarray:
     # Space for all levels that there may be: pages of those that are never written take no memory.
     labels = np.empty((min(MAX_LEVELS, len(masks)), *masks[0].shape), np.int32)
     labels[0] = NO_LABEL
-    used = 1
+    level_count = 1
     for number in sorted(range(len(masks)), key=lambda number: -areas[number]):
         if not areas[number]:
             break
         inside, windows = masks[number][boxes[number]], labels[:, *boxes[number]]
-        level = next((k for k in range(used) if not ((windows[k] != NO_LABEL) & inside).any()), used)
+        level = next((k for k in range(level_count) if not ((windows[k] != NO_LABEL) & inside).any()), level_count)
         if level == MAX_LEVELS:
             depth = np.zeros(masks[0].shape, np.int32)
             for mask in masks:
                 depth += mask
             raise InvalidFeatures(
-                where,
+                location,
                 expected=f"masks that lie on {MAX_LEVELS} levels without overlap",
                 got=f"{len(masks)} masks, up to {depth.max()} of them over one pixel",
                 hint="leave out those that are nearly the same, as SamAutomaticMaskGenerator does by box_nms_thresh",
             )
-        if level == used:
+        if level == level_count:
             labels[level] = NO_LABEL
-            used += 1
+            level_count += 1
         windows[level][inside] = number
-    return labels[:used]
+    return labels[:level_count]
 
 
 def _extent(mask: np.ndarray) -> tuple[tuple[slice, slice], int]:
-    """The rows and columns between which a mask's pixels lie, and how many it has."""
+    """Return the rows and columns between which a mask's pixels lie, and how many it has."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
         return (slice(0), slice(0)), 0
@@ -225,26 +225,29 @@ def _extent(mask: np.ndarray) -> tuple[tuple[slice, slice], int]:
     return box, int(np.count_nonzero(mask[box]))
 
 
-def _levels_of(masks: np.ndarray, levels: Sequence[int], where: str) -> np.ndarray:
-    """[L, h, w] i32 of masks [M, h, w] bool on the levels that the caller names."""
-    named, expected = f"{where} levels".strip(), f"{len(masks)} whole numbers in 0..{MAX_LEVELS - 1}, one a mask"
+def _levels_of(masks: np.ndarray, levels: Sequence[int], location: str) -> np.ndarray:
+    """Return [L, h, w] i32 of masks [M, h, w] bool on the levels that the caller names."""
+    argument, expected = (
+        f"{location} levels".strip(),
+        f"{len(masks)} whole numbers in 0..{MAX_LEVELS - 1}, one a mask",
+    )
     numbers = np.asarray(levels)
     if numbers.shape != masks.shape[:1] or numbers.dtype.kind not in "iu":
-        raise InvalidFeatures(named, expected=expected, got=repr(levels)[:80])
+        raise InvalidFeatures(argument, expected=expected, got=repr(levels)[:80])
     if not 0 <= int(numbers.min()) <= int(numbers.max()) < MAX_LEVELS:
-        raise InvalidFeatures(named, expected=expected, got=f"{int(numbers.min())}..{int(numbers.max())}")
+        raise InvalidFeatures(argument, expected=expected, got=f"{int(numbers.min())}..{int(numbers.max())}")
     labels = np.full((int(numbers.max()) + 1, *masks.shape[1:]), NO_LABEL, np.int32)
     for number, level in enumerate(numbers.tolist()):
-        own = labels[level][masks[number]]
-        if (own != NO_LABEL).any():
-            got = f"mask {number} over mask {int(own.max())} on level {level}"
+        label = labels[level][masks[number]]
+        if (label != NO_LABEL).any():
+            got = f"mask {number} over mask {int(label.max())} on level {level}"
             hint = "leave levels out, and each overlap gets a level of its own"
-            raise InvalidFeatures(named, expected="masks of a level that do not overlap", got=got, hint=hint)
+            raise InvalidFeatures(argument, expected="masks of a level that do not overlap", got=got, hint=hint)
         labels[level][masks[number]] = number
     return labels
 
 
-def check_finite(values: Tensor, where: str) -> None:
+def check_finite(values: Tensor, location: str) -> None:
     """Refuse NaN, infinity, and what no encoder gives and whose squares would be infinite.
 
     Raises:
@@ -255,49 +258,49 @@ def check_finite(values: Tensor, where: str) -> None:
     if not (float(low) >= -LARGEST and float(high) <= LARGEST):  # in float64: float16 would take the bound for inf
         bad = int((~(values.float().abs() <= LARGEST)).sum())
         got = f"{bad} of {values.numel()} that are NaN, infinite or larger"
-        raise InvalidFeatures(where, expected=f"finite values within +-{LARGEST:g}", got=got)
+        raise InvalidFeatures(location, expected=f"finite values within +-{LARGEST:g}", got=got)
 
 
-def _features(values: object, axes: str, where: str) -> Tensor:
-    """[.., F] f16 or f32, contiguous and finite."""
+def _features(values: object, axes: str, location: str) -> Tensor:
+    """Return [.., F] f16 or f32, contiguous and finite."""
     try:
-        found = shared_tensor(values)
+        tensor = shared_tensor(values)
     except (TypeError, ValueError):
-        raise InvalidFeatures(where, expected=f"floats [{axes}]", got=type(values).__name__) from None
-    found = without_unit_axes(found, len(axes.split()))
-    fits = found.ndim == len(axes.split()) and found.numel() and found.dtype in FLOATS
-    if not fits or found.shape[-1] > MAX_CHANNELS:
+        raise InvalidFeatures(location, expected=f"floats [{axes}]", got=type(values).__name__) from None
+    tensor = without_unit_axes(tensor, len(axes.split()))
+    fits = tensor.ndim == len(axes.split()) and tensor.numel() and tensor.dtype in FLOATS
+    if not fits or tensor.shape[-1] > MAX_CHANNELS:
         hint = f"at most {MAX_CHANNELS} channels, no side empty"
-        raise InvalidFeatures(where, expected=f"floats [{axes}]", got=_kind(found), hint=hint)
-    found = found if found.dtype in (torch.float16, torch.float32) else found.float()
-    check_finite(found, where)
-    return found.contiguous()
+        raise InvalidFeatures(location, expected=f"floats [{axes}]", got=_kind(tensor), hint=hint)
+    tensor = tensor if tensor.dtype in (torch.float16, torch.float32) else tensor.float()
+    check_finite(tensor, location)
+    return tensor.contiguous()
 
 
-def _labels(values: object, rows: int, where: str) -> Tensor:
-    """[L, h, w] i32, contiguous, each -1 or below ``rows``."""
+def _labels(values: object, rows: int, location: str) -> Tensor:
+    """Return [L, h, w] i32, contiguous, each -1 or below ``rows``."""
     try:
-        found = shared_tensor(values)
+        tensor = shared_tensor(values)
     except (TypeError, ValueError):
-        raise InvalidFeatures(where, expected="integers [L, h, w]", got=type(values).__name__) from None
-    found = without_unit_axes(found.to(torch.int64) if found.dtype in WIDENED else found, 3)
-    if found.ndim == 3 and found.shape[-1] == 1 < len(found):  # [h, w, 1]: no photo is a pixel wide
-        found = found[..., 0]
-    if found.ndim not in (2, 3) or not found.numel() or found.dtype not in INTEGERS:
-        hint = PLANES if found.dtype == torch.bool else ""
-        raise InvalidFeatures(where, expected="integers [L, h, w], no side empty", got=_kind(found), hint=hint)
-    if found.ndim == 3 and len(found) > MOST_LEVELS:
+        raise InvalidFeatures(location, expected="integers [L, h, w]", got=type(values).__name__) from None
+    tensor = without_unit_axes(tensor.to(torch.int64) if tensor.dtype in WIDENED else tensor, 3)
+    if tensor.ndim == 3 and tensor.shape[-1] == 1 < len(tensor):  # [h, w, 1]: no photo is a pixel wide
+        tensor = tensor[..., 0]
+    if tensor.ndim not in (2, 3) or not tensor.numel() or tensor.dtype not in INTEGERS:
+        hint = PLANES if tensor.dtype == torch.bool else ""
+        raise InvalidFeatures(location, expected="integers [L, h, w], no side empty", got=_kind(tensor), hint=hint)
+    if tensor.ndim == 3 and len(tensor) > MOST_LEVELS:
         hint = "put maps whose labels do not overlap together, or lift some of them"
-        raise InvalidFeatures(where, expected=f"at most {MOST_LEVELS} levels", got=_kind(found), hint=hint)
-    low, high = (int(value) for value in torch.aminmax(found))
-    if found.ndim == 3 and len(found) == rows > 2 and (low, high) == (0, 1):  # would be of the first two rows alone
-        got = f"{_kind(found)} of zeros and ones, a plane for each of the {rows} rows"
-        raise InvalidFeatures(where, expected="integers [L, h, w] of rows", got=got, hint=PLANES)
+        raise InvalidFeatures(location, expected=f"at most {MOST_LEVELS} levels", got=_kind(tensor), hint=hint)
+    low, high = (int(value) for value in torch.aminmax(tensor))
+    if tensor.ndim == 3 and len(tensor) == rows > 2 and (low, high) == (0, 1):  # would be of the first two rows alone
+        got = f"{_kind(tensor)} of zeros and ones, a plane for each of the {rows} rows"
+        raise InvalidFeatures(location, expected="integers [L, h, w] of rows", got=got, hint=PLANES)
     if low < NO_LABEL or high >= rows:
         expected = f"rows of its codebook (0..{rows - 1}) or {NO_LABEL} for none"
         got = f"the label {low if low < NO_LABEL else high}"
-        raise InvalidFeatures(where, expected=expected, got=got)
-    return found.to(torch.int32).reshape(-1, *found.shape[-2:]).contiguous()
+        raise InvalidFeatures(location, expected=expected, got=got)
+    return tensor.to(torch.int32).reshape(-1, *tensor.shape[-2:]).contiguous()
 
 
 def _kind(tensor: Tensor) -> str:

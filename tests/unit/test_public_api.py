@@ -503,10 +503,12 @@ def test_every_public_value_is_shown_in_a_line_that_says_its_size(scene):
 
 def test_what_a_caller_set_stays_when_a_call_names_another_speed_or_preset() -> None:
     settings = lc.LiftSettings.of(speed="fast", stride=3, preset="default")
-    assert lc.LiftSettings.chosen(settings, {"speed": "balanced"}) == lc.LiftSettings.of(speed="balanced", stride=3)
+    assert lc.LiftSettings.from_preset(settings, {"speed": "balanced"}) == lc.LiftSettings.of(
+        speed="balanced", stride=3
+    )
     fast = lc.LiftSettings.of(speed="fast")
     same = lc.LiftSettings.of(speed="fast", stride=fast.stride)  # the speed's own value, but asked for
-    assert lc.LiftSettings.chosen(same, {"speed": "exact"}).stride == fast.stride
-    assert lc.LiftSettings.chosen(fast, {"speed": "exact"}) == lc.LiftSettings.of(speed="exact")
+    assert lc.LiftSettings.from_preset(same, {"speed": "exact"}).stride == fast.stride
+    assert lc.LiftSettings.from_preset(fast, {"speed": "exact"}) == lc.LiftSettings.of(speed="exact")
     loaded = lc.LiftSettings.model_validate_json(same.model_dump_json())
     assert loaded == same
