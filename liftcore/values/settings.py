@@ -510,7 +510,7 @@ class LiftSettings(Shown):
         Raises:
             InvalidSettings: an unknown name or a value out of range.
         """
-        changes = cls.current_names(dict(others))
+        changes = cls.current_names(dict(changes))
         if not isinstance(preset, cls):
             return cls.of(preset=preset, **changes)
         if not changes:
