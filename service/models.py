@@ -365,7 +365,7 @@ class LiftResult(BaseModel):
     )
     world: WorldFrame = Field(description="which way is up and how long a scene unit is, as far as it is known")
     diagnostics: dict[str, Any] = Field(description="what the lift measured of itself, and its warnings")
-    diagnostics = old_field("diagnostics", dict[str, Any])
+    certificate = old_field("diagnostics", dict[str, Any])
     timings: dict[str, float] = Field(description="seconds a stage")
     created: Seconds
     created_at = iso_of("created")
