@@ -99,7 +99,7 @@ def settings_by_old_names(old: str, value: object) -> dict[str, Callable[[], lc.
         "saved": lambda: lc.LiftSettings.model_validate_json(json.dumps({old: value})),
         "set": lambda: lc.LiftSettings.of(**pairs_of(text)),
         "option": lambda: settings_of(parser.parse_args(["lift", "s", "c", "f", "-o", "o", "--set", *text])),
-        "changed": lambda: lc.LiftSettings.chosen(lc.LiftSettings.of(**{new: other}), {old: value}),
+        "changed": lambda: lc.LiftSettings.from_preset(lc.LiftSettings.of(**{new: other}), {old: value}),
     }
 
 
