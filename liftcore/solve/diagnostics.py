@@ -215,7 +215,7 @@ def lift_warnings(
         message = f"{len(without_camera)} views have features but no camera and were skipped"
         warnings.append(f"{message}: {_first_names(without_camera)}{_folders_of(views)}")
     if empty:
-        message = f"{len(empty)} of {len(views)} views hit no splat: {_first_names(empty)}"
+        message = f"{len(empty)} of {len(views)} views meet no splat: {_first_names(empty)}"
         warnings.append(message + (f"; {POSES}" if len(empty) > MOSTLY * len(views) else ""))
     unseen, faint = int((sums == 0).sum()), int(((sums > 0) & (sums < FAINT)).sum())
     if unseen == len(sums):

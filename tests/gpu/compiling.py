@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 H100 = 90
-OTHERS = (75, 80, 89)  # the oldest, an A100 and Ada: what a lift of 3DGS launches most is compiled for them too
+OTHER_CARDS = (75, 80, 89)  # the oldest, an A100 and Ada: what a lift of 3DGS launches most is compiled for them too
 _compile: Any = triton.compile
 _specialised: Any = libtriton.native_specialize_impl
 _CARD = Device("cuda", torch.device("cpu"))
@@ -59,20 +59,20 @@ class Launch:
     @property
     def constants(self) -> dict[str, Any]:
         """Those that it was given."""
-        named = zip(self.kernel.params, self.arguments, strict=True)
-        return {param.name: value for param, (_, value) in named if param.is_constexpr}
+        pairs = zip(self.kernel.params, self.arguments, strict=True)
+        return {param.name: value for param, (_, value) in pairs if param.is_constexpr}
 
 
 def as_launched(kernel: Any, arguments: tuple[object, ...], warps: int, constants: dict[str, object]) -> Launch:
     """The launch as Triton's own launcher would see it."""
-    found = []
+    types = []
     for number, param in enumerate(kernel.params):
         if param.is_constexpr:
-            found.append(("constexpr", constants[param.name]))
+            types.append(("constexpr", constants[param.name]))
             continue
         hints = not param.do_not_specialize, not param.do_not_specialize_on_alignment
-        found.append(tuple(_specialised(BaseBackend, arguments[number], param.is_const, *hints)))
-    return Launch(kernel, tuple(found), warps)
+        types.append(tuple(_specialised(BaseBackend, arguments[number], param.is_const, *hints)))
+    return Launch(kernel, tuple(types), warps)
 
 
 def compiled(launch: Launch, capability: int) -> dict[str, Any]:
@@ -100,42 +100,42 @@ def _stack(machine_code: bytes) -> int:
         file.write(machine_code)
         file.flush()
         tool = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
-        told = subprocess.run([tool, "-res-usage", file.name], capture_output=True, text=True, check=True).stdout
-    return int(re.findall(r"STACK:(\d+)", told)[0])
+        report = subprocess.run([tool, "-res-usage", file.name], capture_output=True, text=True, check=True).stdout
+    return int(re.findall(r"STACK:(\d+)", report)[0])
 
 
 def launches_of(work: Callable[[], None]) -> dict[Launch, None]:
     """What the work launches, each once."""
-    found: dict[Launch, None] = {}
+    launches: dict[Launch, None] = {}
 
     def note(kernel: Any, programs: int, *arguments: Any, warps: int = launching.WARPS, **constants: object) -> None:
         if programs:
-            found[as_launched(kernel, arguments, warps, constants)] = None
+            launches[as_launched(kernel, arguments, warps, constants)] = None
         for argument in arguments:  # what nothing wrote would be nought, and nothing be summed up
             if isinstance(argument, torch.Tensor) and argument.dtype == torch.float32:
                 argument.fill_(1.0)
         if kernel is cut:  # a span for each splat, in the first tile
-            named = dict(zip(signature(kernel.fn).parameters, arguments, strict=False))
+            by_name = dict(zip(signature(kernel.fn).parameters, arguments, strict=False))
             for name, value in (("rows", 0), ("firsts", 0), ("counts", 1)):
-                named[name].fill_(value)
+                by_name[name].fill_(value)
 
     modules: list[Any] = [render, tiles, weights]
     for module in modules:
         module.launch = note
     work()
-    return found
+    return launches
 
 
-def _views(kernel: Kernel, walk: CompositingParams, weighting: Weighting) -> None:
+def _views(kernel: Kernel, params: CompositingParams, weighting: Weighting) -> None:
     """A lift's questions about two views that have no size in common; of grids for 3DGS alone."""
     splats = random_splats(3, kernel=kernel)
     gpu = raster.GpuRaster(splats, torch.device("cpu"))
     for width, height in ((32, 16), (161, 95)):
         camera = random_camera(3, width, height)
         for observation in (random_regions(3), random_grid(3))[: 2 if kernel is Kernel.GAUSSIAN_3D else 1]:
-            gpu.region_weights(camera, observation, walk, weighting)
-        gpu.ray_rows(camera, torch.zeros(1, 2, dtype=torch.int32), walk)
-        gpu.ray_rows(camera, torch.zeros(17, 2, dtype=torch.int32), walk)
+            gpu.region_weights(camera, observation, params, weighting)
+        gpu.ray_rows(camera, torch.zeros(1, 2, dtype=torch.int32), params)
+        gpu.ray_rows(camera, torch.zeros(17, 2, dtype=torch.int32), params)
 
 
 def _every_product() -> None:
@@ -152,23 +152,23 @@ def _every_product() -> None:
 def main() -> None:
     """The kernels of lifts of every kind of splat and all others on an H100, and some of them on more cards."""
     raster.check_device = lambda _device: None
-    every: dict[Launch, None] = {}
+    launches: dict[Launch, None] = {}
     for kernel in Kernel:
-        how = (
+        case = (
             (CompositingParams(opacity_logit_scale=1.2), TOP)
             if kernel is Kernel.GAUSSIAN_3D
             else (CompositingParams(), Weighting())
         )
-        warm = launches_of(partial(warm_up, kernel, _CARD, *how))
-        lift = launches_of(partial(_views, kernel, *how))
+        warm = launches_of(partial(warm_up, kernel, _CARD, *case))
+        lift = launches_of(partial(_views, kernel, *case))
         later = sorted({launch.name for launch in lift if launch not in warm})
         print(json.dumps({"kernel": str(kernel), "launches": len(lift), "compiled_in_the_lift": later}), flush=True)
-        every |= lift
-    every |= launches_of(_every_product)
+        launches |= lift
+    launches |= launches_of(_every_product)
     names = ("_weigh", "_add_runs", "_trace", "_cut")
-    everywhere = [next(launch for launch in every if launch.name == name) for name in names]
-    for launch in every:
-        for card in (H100, *OTHERS) if launch in everywhere else (H100,):
+    everywhere = [next(launch for launch in launches if launch.name == name) for name in names]
+    for launch in launches:
+        for card in (H100, *OTHER_CARDS) if launch in everywhere else (H100,):
             print(json.dumps(compiled(launch, card)), flush=True)
 
 

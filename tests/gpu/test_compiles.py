@@ -23,13 +23,14 @@ SHARED_MEMORY = 64 * 1024  # bytes a block: what cards of 2018 have, later ones 
 @pytest.fixture(scope="module")
 def reports() -> list[dict]:
     """What ``tests.gpu.compiling`` prints."""
-    own = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
-    done = subprocess.run(
+    environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
+    process = subprocess.run(
         [sys.executable, "-m", "tests.gpu.compiling"],
-        cwd=ROOT, env=own | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=900, check=False,
+        cwd=ROOT, env=environment | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=900,
+        check=False,
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-4000:]
-    return [json.loads(line) for line in done.stdout.splitlines()]
+    assert process.returncode == 0, process.stderr[-4000:]
+    return [json.loads(line) for line in process.stdout.splitlines()]
 
 
 @pytest.fixture(scope="module")

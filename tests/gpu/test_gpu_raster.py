@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from liftcore.scene.cameras import Camera
 
 pytestmark = [needs_triton, pytest.mark.usefixtures("every_kernel")]
-WALK = CompositingParams(opacity_logit_scale=1.2)
+PARAMS = CompositingParams(opacity_logit_scale=1.2)
 
 
 FULL = RuntimeError("Triton Error [CUDA]: out of memory")  # the driver's word for it
@@ -38,19 +38,19 @@ def as_parts(weights: RegionWeights) -> list[torch.Tensor]:
 def top_two(raster: GpuRaster, camera: Camera) -> list[torch.Tensor]:
     """Region weights in two walks, of a scene of 16 splats."""
     choice = Weighting(1, Selection.TOP_K, count=2)
-    return as_parts(raster.region_weights(camera, random_grid(8), WALK, choice))
+    return as_parts(raster.region_weights(camera, random_grid(8), PARAMS, choice))
 
 
 def every_product(raster: GpuRaster, camera: Camera) -> list[torch.Tensor]:
     """One of each."""
     image = torch.rand(camera.height, camera.width, 2, generator=torch.Generator().manual_seed(0))
     pixels = torch.tensor([[16, 35], [0, 0], [10, 20], [1, 0]], dtype=torch.int32)
-    rows = raster.ray_rows(camera, pixels, WALK)
+    rows = raster.ray_rows(camera, pixels, PARAMS)
     labels = torch.arange(16, dtype=torch.int32) - 1
     return [
-        *top_two(raster, camera), *as_parts(raster.region_weights(camera, random_regions(8), WALK, Weighting(2))),
-        rows.indptr, rows.splats, rows.weights, raster.row_sums(camera, WALK),
-        raster.adjoint(camera, image, WALK), raster.strongest_labels(camera, labels, WALK),
+        *top_two(raster, camera), *as_parts(raster.region_weights(camera, random_regions(8), PARAMS, Weighting(2))),
+        rows.indptr, rows.splats, rows.weights, raster.row_sums(camera, PARAMS),
+        raster.adjoint(camera, image, PARAMS), raster.strongest_labels(camera, labels, PARAMS),
     ]  # fmt: skip
 
 
@@ -61,11 +61,11 @@ def test_no_bit_depends_on_the_size_of_blocks(monkeypatch, kernel):
     products = every_product if kernel is Kernel.GAUSSIAN_3D else top_two
     monkeypatch.setattr("liftcore.raster.gpu.tiles.UNIT", 1)
     monkeypatch.setattr("liftcore.raster.gpu.weights.RUN", 3)
-    whole = products(gpu_raster(splats), camera)
+    expected = products(gpu_raster(splats), camera)
     tight = gpu_raster(splats, block=1)
-    for first, second in zip(whole, products(tight, camera), strict=True):
+    for first, second in zip(expected, products(tight, camera), strict=True):
         assert first.numel() and torch.equal(first, second)
-    frame = tight._frame(camera, WALK)
+    frame = tight._frame(camera, PARAMS)
     assert frame.bands == [(0, 1), (1, 2), (2, 3)]
     assert [len(frame.tile_runs(frame.lists_of(band))) for band in frame.bands] == [2, 2, 2]
 
@@ -73,7 +73,7 @@ def test_no_bit_depends_on_the_size_of_blocks(monkeypatch, kernel):
 def test_memory_that_runs_out_halves_the_block(monkeypatch):
     """A card with less room than asked for: the same answer from smaller blocks."""
     splats, camera = random_splats(8, 24), random_camera(8, 20, 36)
-    whole = gpu_raster(splats).row_sums(camera, WALK)
+    expected = gpu_raster(splats).row_sums(camera, PARAMS)
     tries = []
 
     def crowded(*arguments: Any) -> Frame:
@@ -83,27 +83,28 @@ def test_memory_that_runs_out_halves_the_block(monkeypatch):
         return Frame(*arguments)
 
     monkeypatch.setattr("liftcore.raster.gpu.raster.Frame", crowded)
-    assert torch.equal(gpu_raster(splats, block=1 << 20).row_sums(camera, WALK), whole)
+    assert torch.equal(gpu_raster(splats, block=1 << 20).row_sums(camera, PARAMS), expected)
     assert tries == [1 << 20, 1 << 19, 1 << 18]
 
 
 def test_depth_ties_keep_the_order_of_the_file():
     splats, camera = random_splats(2, 20), random_camera(2, 20, 20)
-    alike = replace(splats, means=torch.zeros(20, 3), opacity_logits=torch.linspace(-2, 1, 20))
+    coincident = replace(splats, means=torch.zeros(20, 3), opacity_logits=torch.linspace(-2, 1, 20))
     pixel = torch.tensor([[10, 10]], dtype=torch.int32)
-    ours, theirs = (
-        raster.ray_rows(camera, pixel, CompositingParams()) for raster in (gpu_raster(alike), CpuRaster(alike))
+    actual, expected = (
+        raster.ray_rows(camera, pixel, CompositingParams())
+        for raster in (gpu_raster(coincident), CpuRaster(coincident))
     )
-    assert ours.splats.numel() > 2
-    assert torch.equal(ours.splats, theirs.splats)
-    assert torch.equal(ours.splats, torch.sort(ours.splats).values)
+    assert actual.splats.numel() > 2
+    assert torch.equal(actual.splats, expected.splats)
+    assert torch.equal(actual.splats, torch.sort(actual.splats).values)
 
 
 def test_a_view_that_sees_nothing_gives_empty_products():
     splats, camera = random_splats(1, 5), random_camera(1, 20, 18)
     away = replace(camera, viewmat=np.diag([-1.0, 1.0, -1.0, 1.0]) @ camera.viewmat)
     raster = gpu_raster(splats)
-    weights = raster.region_weights(away, random_regions(1), WALK, Weighting(1, Selection.TOP_K))
+    weights = raster.region_weights(away, random_regions(1), PARAMS, Weighting(1, Selection.TOP_K))
     assert [part.numel() for part in as_parts(weights)] == [0, 1, 0, 0, 0, 0, 2]
     assert not raster.row_sums(away, CompositingParams()).any()
     assert not raster.adjoint(away, torch.ones(18, 20, 2), CompositingParams()).any()
@@ -112,28 +113,28 @@ def test_a_view_that_sees_nothing_gives_empty_products():
     assert rows.indptr.tolist() == [0, 0, 0]
 
 
-def test_more_levels_than_one_key_holds_are_told_apart():
+def test_more_levels_than_one_key_holds_are_distinguished():
     """Nine levels of 200 rows make 2e20 tuples."""
     splats, camera = random_splats(3, 20), random_camera(3, 20, 17)
     regions = random_regions(3, levels=9, rows=200)
-    ours, theirs = (
+    actual, expected = (
         raster.region_weights(camera, regions, CompositingParams(), Weighting())
         for raster in (gpu_raster(splats), CpuRaster(splats, threads=1))
     )
-    assert torch.equal(ours.region, theirs.region)
-    assert torch.allclose(ours.weight, theirs.weight, rtol=1e-4)
+    assert torch.equal(actual.region, expected.region)
+    assert torch.allclose(actual.weight, expected.weight, rtol=1e-4)
 
 
 @pytest.mark.parametrize("error", [torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB."), FULL])
-def test_memory_that_runs_out_for_good_is_told_in_words(monkeypatch, error):
+def test_memory_that_runs_out_for_good_is_an_error_in_words(monkeypatch, error):
     def full(*_arguments: object) -> None:
         raise error
 
     raster = gpu_raster(random_splats(0, 4))
     monkeypatch.setattr("liftcore.raster.gpu.raster.Frame", full)
-    with pytest.raises(Unavailable, match="projected splats and tile lists of a view") as caught:
+    with pytest.raises(Unavailable, match="projected splats and tile lists of a view") as raised:
         raster.row_sums(random_camera(0), CompositingParams())
-    assert caught.value.got == str(error) and caught.value.hint
+    assert raised.value.got == str(error) and raised.value.hint
     monkeypatch.setattr("liftcore.raster.gpu.raster.Frame", lambda *_: broken())
     with pytest.raises(RuntimeError, match="illegal"):  # what is no lack of memory is not told as one
         raster.row_sums(random_camera(0), CompositingParams())
@@ -154,16 +155,16 @@ def test_without_a_card_or_the_interpreter_the_backend_says_so():
             except Exception as error:
                 print(type(error).__name__, error)
     """
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", code], env={"PATH": "", "HOME": "/nonexistent", "PYTHONPATH": ":".join(sys.path)},
         capture_output=True, text=True, timeout=300, check=True,
     )  # fmt: skip
-    lines = done.stdout.splitlines()
+    lines = process.stdout.splitlines()
     assert lines and all(line.startswith("Unavailable device: expected a CUDA device") for line in lines)
 
 
 def test_nothing_else_loads_triton():
     modules = "liftcore.lifting.pipeline, liftcore.raster.cpu.raster, liftcore.cli"
     code = f"import sys, {modules}; print('triton' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True)
-    assert done.stdout.strip() == "False"
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True)
+    assert process.stdout.strip() == "False"

@@ -43,53 +43,58 @@ def paths(tmp_path: Path) -> list[Path]:
     return paths
 
 
-def lifted(paths: list[Path], views: Any = None, **how: Any) -> lc.LiftResult:
+def lifted(paths: list[Path], views: Any = None, **options: Any) -> lc.LiftResult:
     # Of views in files an engine's plan traces 2,000 rays, which takes the interpreter minutes.
-    given = dict(lc.read_features(paths[2])) if "engine" in how else lc.read_features(paths[2])
-    views = given if views is None else views
-    chosen: dict[str, Any] = ({"preset": "row-sum"} if "engine" in how else {}) | FEW | how
-    return lc.lift(lc.read_splats(paths[0]), lc.read_cameras(paths[1]), views, **chosen)
+    features = dict(lc.read_features(paths[2])) if "engine" in options else lc.read_features(paths[2])
+    views = features if views is None else views
+    settings: dict[str, Any] = ({"preset": "row-sum"} if "engine" in options else {}) | FEW | options
+    return lc.lift(lc.read_splats(paths[0]), lc.read_cameras(paths[1]), views, **settings)
 
 
 @pytest.mark.parametrize(
-    ("grids", "how"), CASES, ids=[f"{number} {' '.join(how)}" for number, (_, how) in enumerate(CASES)]
+    ("grids", "options"), CASES, ids=[f"{number} {' '.join(how)}" for number, (_, how) in enumerate(CASES)]
 )
-def test_a_lift_on_a_card_is_the_processors(paths: list[Path], grids: bool, how: dict[str, Any]) -> None:
+def test_a_lift_on_a_card_is_the_processors(paths: list[Path], grids: bool, options: dict[str, Any]) -> None:
     views = None
     if grids:
         draw = torch.Generator().manual_seed(0)
         views = {name: lc.FeatureGrid(torch.randn(6, 8, 8, generator=draw)) for name in lc.read_cameras(paths[1])}
-    ours, theirs = (lifted(paths, views, device=device, **how) for device in ("cpu", "cuda"))
-    assert theirs.features.is_cuda or "engine" in how, "results stay where the work was; an engine's lie in files"
-    theirs = theirs.cpu()
+    on_cpu, on_gpu = (lifted(paths, views, device=device, **options) for device in ("cpu", "cuda"))
+    assert on_gpu.features.is_cuda or "engine" in options, "results stay where the work was; an engine's lie in files"
+    on_gpu = on_gpu.cpu()
     for name in ("features", "total_weight", "agreement"):
-        one, other = getattr(ours, name).float(), getattr(theirs, name).float()
-        assert torch.allclose(one, other, rtol=2e-3, atol=2e-3), name
-    assert torch.equal(ours.seen, theirs.seen)
+        left, right = getattr(on_cpu, name).float(), getattr(on_gpu, name).float()
+        assert torch.allclose(left, right, rtol=2e-3, atol=2e-3), name
+    assert torch.equal(on_cpu.seen, on_gpu.seen)
 
 
 def test_what_follows_a_lift_takes_it_from_the_card(paths: list[Path], tmp_path: Path) -> None:
-    made = lifted(paths, objects=True, device="cuda")
+    result = lifted(paths, objects=True, device="cuda")
     splats, cameras = lc.read_splats(paths[0]), lc.read_cameras(paths[1])
     vectors = torch.from_numpy(lc.open_encoder(f"table:{paths[3]}").encode(list(WORDS)))
-    answer = made.query("apple", encoder=f"table:{paths[3]}", splats=splats)
+    answer = result.query("apple", encoder=f"table:{paths[3]}", splats=splats)
     assert answer.splats.nonzero()[:, 0].tolist() == list(range(20))
-    for given in (vectors[0], vectors[0].to("cuda")):
-        assert torch.equal(made.query(given).splats, answer.splats)
-    assert made.segment(WORDS, vectors, splats).labels.tolist() == [number // 20 for number in range(60)]
-    assert len(made.objects(splats, WORDS, vectors.to("cuda")).objects) == 3
-    image = lc.render(splats, cameras["middle"], made.features, device="cuda")
+    for views in (vectors[0], vectors[0].to("cuda")):
+        assert torch.equal(result.query(views).splats, answer.splats)
+    assert result.segment(WORDS, vectors, splats).labels.tolist() == [number // 20 for number in range(60)]
+    assert len(result.objects(splats, WORDS, vectors.to("cuda")).objects) == 3
+    image = lc.render(splats, cameras["middle"], result.features, device="cuda")
     assert image.shape == (24, 32, 8)
     lc.region_weights(splats, cameras, lc.read_features(paths[2]), device="cuda").matrix(splats.count)
-    made.save(tmp_path / "made.safetensors")
-    assert torch.equal(lc.load_lift(tmp_path / "made.safetensors").features, made.cpu().features)
+    result.save(tmp_path / "made.safetensors")
+    assert torch.equal(lc.load_lift(tmp_path / "made.safetensors").features, result.cpu().features)
 
 
 def test_tensors_of_a_card_come_in(paths: list[Path]) -> None:
     """As a training loop has them: splats, cameras, maps and values."""
-    kept, views, camera = lc.read_splats(paths[0]), lc.read_features(paths[2]), lc.read_cameras(paths[1])["middle"]
+    splats_on_cpu, views, camera = (
+        lc.read_splats(paths[0]),
+        lc.read_features(paths[2]),
+        lc.read_cameras(paths[1])["middle"],
+    )
     means, quats, scales, logits = (
-        part.to("cuda") for part in (kept.means, kept.quats, kept.log_scales, kept.opacity_logits)
+        part.to("cuda")
+        for part in (splats_on_cpu.means, splats_on_cpu.quats, splats_on_cpu.log_scales, splats_on_cpu.opacity_logits)
     )
     splats = lc.Splats(means, quats, scales, logits)
     pose, K = (torch.tensor(matrix).to("cuda") for matrix in (camera.viewmat, camera.K))
@@ -101,23 +106,23 @@ def test_tensors_of_a_card_come_in(paths: list[Path]) -> None:
     # A plan traces all rays of so small a view, which takes the interpreter a minute.
     corner, few = lc.Camera(pose, K, 6, 4), lc.Regions(regions.labels[:4, :6], regions.codebook)
     for device in ("cpu", "cuda"):
-        whole = lc.lift(kept, cameras, {"middle": views["middle"]}, device=device, **FEW).cpu()
-        made = lc.lift(splats, cameras, {"middle": regions}, device=device, **FEW)
-        assert torch.equal(made.cpu().features, whole.features)
+        expected = lc.lift(splats_on_cpu, cameras, {"middle": views["middle"]}, device=device, **FEW).cpu()
+        result = lc.lift(splats, cameras, {"middle": regions}, device=device, **FEW)
+        assert torch.equal(result.cpu().features, expected.features)
         assert lc.lift(splats, cameras, iter([("middle", grid)]), device=device, **FEW).seen.any()
         assert lc.lift(splats, cameras, {"middle": grid}, "default", device=device, **FEW).seen.any()
         ones = lc.render(splats, cameras["middle"], torch.ones(60).to("cuda"), device=device)
-        assert torch.equal(ones, lc.render(kept, camera, torch.ones(60), device=device))
+        assert torch.equal(ones, lc.render(splats_on_cpu, camera, torch.ones(60), device=device))
         lc.region_weights(splats, cameras, {"middle": regions}, device=device)
         assert lc.plan(splats, {"middle": corner}, {"middle": few}, device=device).views == ("middle",)
     assert lc.plan_photos(splats, cameras).order
-    assert made.segment(WORDS, torch.eye(3, 8).to("cuda"), splats).labels.max() >= 0
-    found = made.query(torch.eye(8)[0].to("cuda"), splats=splats)
-    assert splats.means[found.splats].shape[1] == 3
+    assert result.segment(WORDS, torch.eye(3, 8).to("cuda"), splats).labels.max() >= 0
+    answer = result.query(torch.eye(8)[0].to("cuda"), splats=splats)
+    assert splats.means[answer.splats].shape[1] == 3
 
 
 def test_weights_that_no_card_can_stack_are_stacked_here(paths: list[Path], monkeypatch) -> None:
-    whole, stack = lifted(paths, device="cuda").cpu(), weights._stacked
+    expected, stack = lifted(paths, device="cuda").cpu(), weights._stacked
 
     def crowded(parts: Any, *rest: Any) -> Any:
         if parts[0].region.is_cuda:
@@ -125,13 +130,13 @@ def test_weights_that_no_card_can_stack_are_stacked_here(paths: list[Path], monk
         return stack(parts, *rest)
 
     monkeypatch.setattr(weights, "_stacked", crowded)
-    assert torch.allclose(lifted(paths, device="cuda").cpu().features.float(), whole.features.float(), atol=1e-3)
+    assert torch.allclose(lifted(paths, device="cuda").cpu().features.float(), expected.features.float(), atol=1e-3)
 
 
 def test_a_run_of_a_tradeoff_is_judged_off_the_card(paths: list[Path], tmp_path: Path) -> None:
-    scene, judged = SceneFiles(paths[0], paths[1], (paths[2],)), []
+    scene, devices = SceneFiles(paths[0], paths[1], (paths[2],)), []
     for device in ("cpu", "cuda"):
         settings = FEW | {"preset": "row-sum", "device": device}
         run = RunSpec(scene, settings, ("left", "right"), ("middle",), (), 1, tmp_path, exact=True)
-        judged.append(measure_run(run)["accuracies"]["centred_cosine"])
-    assert judged[0] == pytest.approx(judged[1], abs=1e-3) and len(judged[0]) == 1
+        devices.append(measure_run(run)["accuracies"]["centred_cosine"])
+    assert devices[0] == pytest.approx(devices[1], abs=1e-3) and len(devices[0]) == 1

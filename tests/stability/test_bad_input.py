@@ -47,13 +47,13 @@ def files(folder: Path) -> dict[str, int]:
 
 
 def assert_refused(capsys: pytest.CaptureFixture[str], folder: Path, arguments: list[str], words: str = "") -> None:
-    for more in ([], ["--json"]):
+    for extra in ([], ["--json"]):
         before = files(folder)
-        status = cli.main([*arguments, *more])
+        status = cli.main([*arguments, *extra])
         captured = capsys.readouterr()
         assert status == 2, captured.err
         # What is wrong with features may show when their view is read, after the plan was printed for people.
-        assert not captured.out or (captured.out.startswith("plan: ") and not more)
+        assert not captured.out or (captured.out.startswith("plan: ") and not extra)
         assert captured.err.count("\n") == 1
         assert words in captured.err
         assert files(folder) == before
@@ -95,8 +95,8 @@ def test_settings_that_no_lift_has_are_refused(scene: Path, capsys) -> None:
 
 
 def test_an_output_that_is_an_input_and_a_pack_given_twice_are_refused(scene: Path, capsys) -> None:
-    for same in ("splats.ply", "cameras.json", "pack.safetensors", "./pack.safetensors"):
-        assert_refused(capsys, scene, [*LIFT[:5], same], "another file than the inputs")
+    for path in ("splats.ply", "cameras.json", "pack.safetensors", "./pack.safetensors"):
+        assert_refused(capsys, scene, [*LIFT[:5], path], "another file than the inputs")
     assert_refused(capsys, scene, [*LIFT[:4], "pack.safetensors", *LIFT[4:]], "each view in one pack")
 
 
@@ -112,10 +112,10 @@ def test_an_output_in_a_locked_folder_is_refused_before_the_work(scene: Path) ->
     giving_up = "import ctypes, os, sys; os.geteuid() or ctypes.CDLL(None).prctl(24, 1, 0, 0, 0)"
     command = [sys.executable, "-c", f"{giving_up}; os.execv(sys.executable, [sys.executable, *sys.argv[1:]])"]
     arguments = ["-m", "liftcore.cli", *LIFT[:5], "locked/lift.safetensors"]
-    done = subprocess.run([*command, *arguments], cwd=scene, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (2, ""), done.stderr
-    assert done.stderr.count("\n") == 1
-    assert "can be written" in done.stderr
+    process = subprocess.run([*command, *arguments], cwd=scene, capture_output=True, text=True, check=False)
+    assert (process.returncode, process.stdout) == (2, ""), process.stderr
+    assert process.stderr.count("\n") == 1
+    assert "can be written" in process.stderr
     assert files(scene) == before
 
 
@@ -125,11 +125,11 @@ def test_a_folder_of_the_output_that_is_missing_is_made(scene: Path, capsys) -> 
     assert json.loads(captured.out)["splats"] == 20
     assert captured.out.count("\n") == 1
     assert captured.err == ""
-    made = scene / "new" / "folder" / "lift.safetensors"
+    output = scene / "new" / "folder" / "lift.safetensors"
     umask = os.umask(0)
     os.umask(umask)
-    assert stat.S_IMODE(made.stat().st_mode) == 0o666 & ~umask
-    assert [path.name for path in made.parent.iterdir()] == [made.name]
+    assert stat.S_IMODE(output.stat().st_mode) == 0o666 & ~umask
+    assert [path.name for path in output.parent.iterdir()] == [output.name]
 
 
 def test_broken_questions_are_refused(scene: Path, capsys) -> None:
@@ -148,15 +148,15 @@ def test_broken_questions_are_refused(scene: Path, capsys) -> None:
 
 def test_a_lift_answers_from_any_folder_until_its_splats_move(scene: Path, capsys, monkeypatch) -> None:
     assert cli.main(LIFT) == 0
-    elsewhere = scene / "elsewhere"
-    elsewhere.mkdir()
-    monkeypatch.chdir(elsewhere)
+    other_folder = scene / "elsewhere"
+    other_folder.mkdir()
+    monkeypatch.chdir(other_folder)
     ask = ["query", "../lift.safetensors", "cat", "--table", "../table", "--view", "v0", "--mask", "m.png", "--json"]
     capsys.readouterr()
     assert cli.main(ask) == 0
     assert json.loads(capsys.readouterr().out)["view"]["name"] == "v0"
-    (scene / "splats.ply").rename(elsewhere / "moved.bin")
-    (elsewhere / "m.png").unlink()
+    (scene / "splats.ply").rename(other_folder / "moved.bin")
+    (other_folder / "m.png").unlink()
     assert_refused(capsys, scene, ask[:-1], "nothing there")
 
 

@@ -25,26 +25,26 @@ def test_agreement_is_the_same_at_any_length_of_the_vectors():
 @pytest.mark.parametrize("scale", [1e-30, 1e-7, 1e15])
 def test_diagnostics_and_scores_are_the_same_at_any_length(scale):
     views = [{f"v{k}": checkerboard(5 + k, 40, size) for k in range(2)} for size in (1.0, scale)]
-    one, other = (lifted(own, preset="row-sum", reference_channels=4) for own in views)
+    first, second = (lifted(own, preset="row-sum", reference_channels=4) for own in views)
     for key in ("beta", "bound", "reference"):
-        assert numbers(other.diagnostics[key]) == pytest.approx(numbers(one.diagnostics[key]), rel=2e-3, abs=1e-3)
-    question = one.features[one.seen][:1].numpy()
-    assert torch.allclose(other.query(question).scores, one.query(question).scores, atol=1e-5)
+        assert numbers(second.diagnostics[key]) == pytest.approx(numbers(first.diagnostics[key]), rel=2e-3, abs=1e-3)
+    question = first.features[first.seen][:1].numpy()
+    assert torch.allclose(second.query(question).scores, first.query(question).scores, atol=1e-5)
 
 
-@pytest.mark.parametrize(("damping", "told"), [(0.0, True), (1.0, False)])
-def test_least_squares_that_runs_away_is_told(damping, told):
+@pytest.mark.parametrize(("damping", "is_warned"), [(0.0, True), (1.0, False)])
+def test_least_squares_that_runs_away_gives_a_warning(damping, is_warned):
     got = lifted({f"v{k}": checkerboard(5 + k, 40) for k in range(3)}, preset="row-sum", cg_steps=20, damping=damping)
-    warned = [text for text in got.diagnostics["warnings"] if "times as long as any input" in text]
-    assert bool(warned) == told
+    warnings = [text for text in got.diagnostics["warnings"] if "times as long as any input" in text]
+    assert bool(warnings) == is_warned
 
 
-def numbers(told: object) -> list[float]:
+def numbers(facts: object) -> list[float]:
     """The numbers of a part of diagnostics that have no unit."""
-    if not isinstance(told, dict):
-        return [told] if isinstance(told, float) else []
+    if not isinstance(facts, dict):
+        return [facts] if isinstance(facts, float) else []
     return [
-        n for name, part in told.items() if name not in ("residual", "optimum", "gradient") for n in numbers(part)
+        n for name, part in facts.items() if name not in ("residual", "optimum", "gradient") for n in numbers(part)
     ]
 
 

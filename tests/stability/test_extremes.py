@@ -21,9 +21,9 @@ pytestmark = pytest.mark.usefixtures("every_kernel")
 DISC, BETA = Kernel.GAUSSIAN_2D, Kernel.BETA
 
 
-def assert_equals_the_oracle(splats: Splats, camera: Camera, walk: CompositingParams | None = None) -> np.ndarray:
+def assert_equals_the_oracle(splats: Splats, camera: Camera, params: CompositingParams | None = None) -> np.ndarray:
     """Every weight of every ray, by both ways to A, squared too, total weight and the row sums; the oracle's A."""
-    got = compare(splats, camera, walk)
+    got = compare(splats, camera, params)
     assert got.finite
     assert got.error < WEIGHTS
     return got.A
@@ -48,9 +48,11 @@ def test_sums_over_a_million_rays_are_those_of_float64():
         total += float(alpha.sum())
         squares += float((alpha * alpha).sum())
     raster, region = CpuRaster(splats), Regions(torch.zeros(1, 1, 1, dtype=torch.int32), torch.ones(1, 1))
-    plain, squared = (raster.region_weights(camera, region, CompositingParams(), Weighting(n)) for n in (1, 2))
+    weights, squared = (raster.region_weights(camera, region, CompositingParams(), Weighting(n)) for n in (1, 2))
     adjoint = raster.adjoint(camera, torch.ones(side, side, 1), CompositingParams())
-    assert [float(plain.weight[0]), float(plain.total_weight[0]), float(adjoint[0, 0])] == pytest.approx(3 * [total])
+    assert [float(weights.weight[0]), float(weights.total_weight[0]), float(adjoint[0, 0])] == pytest.approx(
+        3 * [total]
+    )
     assert float(squared.weight[0]) == pytest.approx(squares)
 
 
@@ -62,12 +64,12 @@ def test_a_huge_image_equals_the_oracle_ray_by_ray():
     assert np.isfinite(sums).all()
     gaussians = [projected_gaussian(splats, j, camera)[:2] for j in range(splats.count)]
     for x, y in ((2_000, 1_500), (2_150, 1_480), (1_700, 1_700), (2_300, 1_300), (0, 0), (3_999, 2_999)):
-        light = 1.0
+        transmittance = 1.0
         for mean, conic in gaussians:
             d = np.array([x + 0.5, y + 0.5]) - mean
             alpha = math.exp(-0.5 * d @ conic @ d) / (1 + math.exp(-1.0))
-            light *= 1 - (alpha if alpha >= ALPHA_FLOOR else 0.0)
-        assert sums[y, x] == pytest.approx(1 - light, abs=WEIGHTS)
+            transmittance *= 1 - (alpha if alpha >= ALPHA_FLOOR else 0.0)
+        assert sums[y, x] == pytest.approx(1 - transmittance, abs=WEIGHTS)
 
 
 def test_two_saturated_splats_weigh_the_same_in_the_lift_and_in_its_diagnostics():
@@ -99,9 +101,9 @@ def test_a_ray_that_has_stopped_takes_nothing_of_the_discs_behind():
 def test_hairs_askew_keep_their_digits_far_from_their_middle(thinness):
     # Along pixel centres, two columns a row, and 0.8 of the thin scale beside them: from pixel to pixel s changes
     # by up to a million, and here it is small.
-    angle, beside = math.atan2(1.0, 2.0), 0.8 * thinness
+    angle, offset = math.atan2(1.0, 2.0), 0.8 * thinness
     splats = splats_at(
-        [(-beside * math.sin(angle), beside * math.cos(angle), 2.0)],
+        [(-offset * math.sin(angle), offset * math.cos(angle), 2.0)],
         log_scales=[2.0, math.log(thinness), 0.0],
         quats=(math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2)),
         kernel=DISC,

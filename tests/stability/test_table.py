@@ -13,10 +13,10 @@ ROWS = [(extreme, kernel) for extreme in EXTREMES for kernel in extreme.kernels]
 
 @pytest.mark.parametrize(("extreme", "kernel"), ROWS, ids=[f"{row.name}-{kernel}" for row, kernel in ROWS])
 def test_extreme_is_survived_with_the_stated_error(extreme: Extreme, kernel: Kernel) -> None:
-    found = extreme.measure(kernel)
-    assert found.holds
-    assert found.error is None or found.error <= extreme.bound
-    assert extreme.told in " ".join(found.told)
+    measured = extreme.measure(kernel)
+    assert measured.holds
+    assert measured.error is None or measured.error <= extreme.bound
+    assert extreme.told in " ".join(measured.told)
 
 
 def test_a_row_says_what_was_measured() -> None:

@@ -390,7 +390,7 @@ def test_warnings_of_a_lift_are_logged_once_where_nobody_shows_the_plan(scene, c
     _, splats, cameras, views = scene
     turned = {name: lc.FeatureGrid(torch.ones(64, 4, 3)) for name in views}
     made = lc.lift(splats, cameras, turned, preset="row-sum")
-    assert any("see that they are [rows, columns]" in warning for warning in made.diagnostics["warnings"])
+    assert any("check that they are [rows, columns]" in warning for warning in made.diagnostics["warnings"])
     assert [record.getMessage() for record in caplog.records].count(made.diagnostics["warnings"][-1]) == 1
     assert {record.getMessage() for record in caplog.records} >= set(made.diagnostics["warnings"])
     caplog.clear()

@@ -49,9 +49,9 @@ class Twice(LocalEngine):
     def run(self, work: Any, job: Any, pieces: int) -> Iterator[int]:
         with ThreadPoolExecutor(2) as pool:
             for piece in range(pieces):
-                both = [pool.submit(work, job, piece, self.threads) for _ in range(2)]
-                for done in both:
-                    done.result()
+                futures = [pool.submit(work, job, piece, self.threads) for _ in range(2)]
+                for completed in futures:
+                    completed.result()
                 yield piece
 
 
@@ -66,8 +66,10 @@ def halves_and_quarters(camera: lc.Camera, rng: np.random.Generator) -> np.ndarr
     along, centre = rays @ pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]
     x, y, _ = np.moveaxis(centre - along * (centre[2] / along[..., 2:]), -1, 0)
     labels = np.stack([x > 0, 2 + (x > 0) + 2 * (y > 0)])
-    others = np.stack([rng.integers(-1, 2, u.shape), rng.choice([-1, 2, 3, 4, 5], u.shape)])  # of the same level
-    return np.where(rng.random(labels.shape) < 0.05, others, labels).astype(np.int32)
+    right_labels = np.stack(
+        [rng.integers(-1, 2, u.shape), rng.choice([-1, 2, 3, 4, 5], u.shape)]
+    )  # of the same level
+    return np.where(rng.random(labels.shape) < 0.05, right_labels, labels).astype(np.int32)
 
 
 @pytest.fixture(scope="module")
@@ -89,60 +91,62 @@ def scene() -> dict[str, Any]:
     return {"splats": splats, "cameras": lc.Cameras(cameras), "views": views}
 
 
-def in_blocks(engine: Any, scene: dict[str, Any], settings: LiftSettings, **more: Any) -> lc.LiftResult:
-    inputs, timings = LiftInputs.of(**scene, preset=settings), Timings(more.pop("progress", None))
-    with steps_in_blocks(engine, inputs, timings, **{"rows": ROWS, "selected": 1000, **more}) as steps:
+def in_blocks(engine: Any, scene: dict[str, Any], settings: LiftSettings, **keywords: Any) -> lc.LiftResult:
+    inputs, timings = LiftInputs.of(**scene, preset=settings), Timings(keywords.pop("progress", None))
+    with steps_in_blocks(engine, inputs, timings, **{"rows": ROWS, "selected": 1000, **keywords}) as steps:
         return pipeline.run(steps, inputs, timings, lambda _: None)
 
 
-def assert_same(one: lc.LiftResult, other: lc.LiftResult) -> None:
+def assert_same(left: lc.LiftResult, right: lc.LiftResult) -> None:
     for name in ALL:
-        first, second = getattr(one, name), getattr(other, name)
+        first, second = getattr(left, name), getattr(right, name)
         assert (first is None) == (second is None), name
         if first is not None:
             assert (first.dtype, first.shape) == (second.dtype, second.shape), name
             assert first.numpy().tobytes() == second.numpy().tobytes(), name
 
 
-def assert_same_metadata(one: lc.LiftResult, other: lc.LiftResult) -> None:
+def assert_same_metadata(left: lc.LiftResult, right: lc.LiftResult) -> None:
     """Compare all that lifts remember, the plan too; but for the seconds."""
-    first, second = (lift.metadata.model_dump(exclude={"timings"}) for lift in (one, other))
+    first, second = (lift.metadata.model_dump(exclude={"timings"}) for lift in (left, right))
     assert first == second
 
 
 @pytest.mark.parametrize(
-    "asked",
+    "overrides",
     [
         {"preset": "row-sum", "objects": True},
         {"preset": "default", "robust_steps": 2, "loss": "huber"},
         {"preset": "default", "aggregation": True, "dtype": "float32"},
     ],
 )
-def test_blocks_give_the_bits_of_a_lift_in_memory(scene: dict[str, Any], asked: dict[str, Any]) -> None:
-    settings = LiftSettings.of(diagnostic_rays=200, **asked)
-    whole = lc.lift(scene["splats"], scene["cameras"], scene["views"], settings)
-    assert whole.node_parents is not None and int((whole.node_parents >= 0).sum()) == 4  # the quarters, of two halves
+def test_blocks_give_the_bits_of_a_lift_in_memory(scene: dict[str, Any], overrides: dict[str, Any]) -> None:
+    settings = LiftSettings.of(diagnostic_rays=200, **overrides)
+    expected = lc.lift(scene["splats"], scene["cameras"], scene["views"], settings)
+    assert (
+        expected.node_parents is not None and int((expected.node_parents >= 0).sum()) == 4
+    )  # the quarters, of two halves
     for engine in (Twice(1), Shuffled(2)):
-        found = in_blocks(engine, scene, settings)
-        assert_same(found, whole)
-        assert_same_metadata(found, whole)
+        result = in_blocks(engine, scene, settings)
+        assert_same(result, expected)
+        assert_same_metadata(result, expected)
     if settings.aggregation:
-        assert found.cluster is not None and int(found.cluster.max()) >= 0
-        assert 0 < found.diagnostics["aggregation"]["changed"] < 1
+        assert result.cluster is not None and int(result.cluster.max()) >= 0
+        assert 0 < result.diagnostics["aggregation"]["changed"] < 1
 
 
 def test_worker_holds_the_splats_that_its_views_see(scene: dict[str, Any], tmp_path: Path) -> None:
-    told: list[tuple[int, int]] = []
+    counts: list[tuple[int, int]] = []
 
     class Watching(LocalEngine):
         def run(self, work: Any, job: Any, pieces: int) -> Iterator[int]:
             cameras = [job.cameras[name] for name in job.names[:2]]
             splats, ids = blocks.visible_splats(job, cameras, 1)
-            told.append((splats.count, len(ids)))
+            counts.append((splats.count, len(ids)))
             yield from super().run(work, job, pieces)
 
     in_blocks(Watching(1), scene, LiftSettings.of(preset="tikhonov"), folder=tmp_path)
-    assert 0 < told[0][0] == told[0][1] < 0.9 * COUNT
+    assert 0 < counts[0][0] == counts[0][1] < 0.9 * COUNT
 
 
 def test_lift_goes_on_from_the_pieces_in_its_folder(scene: dict[str, Any], tmp_path: Path) -> None:
@@ -150,23 +154,23 @@ def test_lift_goes_on_from_the_pieces_in_its_folder(scene: dict[str, Any], tmp_p
     stored = {**scene, "views": lc.read_features(tmp_path / "pack.safetensors")}
     folder, settings = tmp_path / "work", LiftSettings.of(preset="tikhonov")
 
-    def stop(stage: str, done: int, total: int, unit: str) -> None:
-        if (stage, done) == ("solve", 1):
+    def stop(stage: str, completed: int, total: int, unit: str) -> None:
+        if (stage, completed) == ("solve", 1):
             raise InterruptedError
 
     with pytest.raises(InterruptedError):
         in_blocks(LocalEngine(1), stored, settings, folder=folder, progress=stop)
-    written = {path: path.stat().st_mtime_ns for path in folder.rglob("*-0000?.safetensors")}
-    assert len(written) >= VIEWS + 3
-    draft = next(iter(written)).with_name(".columns-00001.safetensors.0123abcd.part")
+    write_times = {path: path.stat().st_mtime_ns for path in folder.rglob("*-0000?.safetensors")}
+    assert len(write_times) >= VIEWS + 3
+    draft = next(iter(write_times)).with_name(".columns-00001.safetensors.0123abcd.part")
     draft.touch()  # of a worker that was killed
-    found = in_blocks(LocalEngine(1), stored, settings, folder=folder)
-    assert {path: path.stat().st_mtime_ns for path in written} == written
-    assert found.metadata.text_space == "words" and not draft.exists()
-    assert_same(found, in_blocks(LocalEngine(1), scene, settings))
+    result = in_blocks(LocalEngine(1), stored, settings, folder=folder)
+    assert {path: path.stat().st_mtime_ns for path in write_times} == write_times
+    assert result.metadata.text_space == "words" and not draft.exists()
+    assert_same(result, in_blocks(LocalEngine(1), scene, settings))
     settings = LiftSettings.of(preset="row-sum")
-    other = in_blocks(LocalEngine(1), stored, settings, folder=folder)  # pieces of another lift
-    assert_same(other, in_blocks(LocalEngine(1), scene, settings))
+    second = in_blocks(LocalEngine(1), stored, settings, folder=folder)  # pieces of another lift
+    assert_same(second, in_blocks(LocalEngine(1), scene, settings))
 
 
 def test_folder_that_is_full_or_that_workers_do_not_see_is_named(scene: dict[str, Any], tmp_path: Path) -> None:
@@ -174,36 +178,39 @@ def test_folder_that_is_full_or_that_workers_do_not_see_is_named(scene: dict[str
         def run(self, work: Any, job: Any, pieces: int) -> Iterator[int]:
             raise OSError(errno.ENOSPC, "No space left on device")
 
-    class Elsewhere(LocalEngine):
+    class RemoteEngine(LocalEngine):
         def run(self, work: Any, job: Any, pieces: int) -> Iterator[int]:
             (job.folder / blocks.SCENE).unlink()
             return super().run(work, job, pieces)
 
-    for engine, message in ((Full(1), "room for blocks in .*No space left"), (Elsewhere(1), "under one path.*scene")):
+    for engine, message in (
+        (Full(1), "room for blocks in .*No space left"),
+        (RemoteEngine(1), "under one path.*scene"),
+    ):
         with pytest.raises(lc.Unavailable, match=message):
             in_blocks(engine, scene, LiftSettings.of(preset="row-sum"), folder=tmp_path)
 
 
-def test_folder_without_room_for_the_blocks_is_told_before_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folder_without_room_for_the_blocks_is_refused_before_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
     cameras = {name: look_at(name, np.array([0, 0, -4.0]), 32, 24, 30.0) for name in ("v0", "v1", "v2")}
     plans = list[Plan]()
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1))
-    found = lc.lift(
+    result = lc.lift(
         random_splats(3, 300), cameras, few_views(1), "row-sum", engine=LocalEngine(1), on_plan=plans.append
     )
     assert any("GiB of disk: give a checkpoint folder" in warning for warning in plans[0].warnings)
-    assert not any("of disk" in warning for warning in found.diagnostics["warnings"])  # of this machine, today
+    assert not any("of disk" in warning for warning in result.diagnostics["warnings"])  # of this machine, today
 
 
 def test_plan_in_blocks_is_of_a_worker_and_asks_this_machine_for_no_room(
     scene: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = pipeline.plan(**scene, preset="row-sum")
+    expected = pipeline.plan(**scene, preset="row-sum")
     monkeypatch.setattr("liftcore.lifting.planning.plan.free_memory", lambda: 1)
     with pytest.raises(lc.Unavailable, match="memory"):
         pipeline.plan(**scene, preset="row-sum")
     worker = pipeline.plan(**scene, preset="row-sum", in_blocks=True)
-    assert worker.views == whole.views and worker.memory["weights"] < whole.memory["weights"]
+    assert worker.views == expected.views and worker.memory["weights"] < expected.memory["weights"]
     assert worker.in_files == 0
 
 
@@ -222,8 +229,8 @@ def test_features_in_the_place_of_others_are_lifted(tmp_path: Path) -> None:
         write_pack(pack, few_views(seed, "cam/"), {})
         expected = lc.lift(splats, cameras, few_views(seed, "cam/"), "row-sum")
         for views in (few_views(seed), few_views(seed, "cam/"), lc.read_features(pack)):  # named without folders too
-            found = lc.lift(splats, cameras, views, "row-sum", engine=LocalEngine(1), checkpoint=tmp_path / "work")
-            assert_same(found, expected)
+            result = lc.lift(splats, cameras, views, "row-sum", engine=LocalEngine(1), checkpoint=tmp_path / "work")
+            assert_same(result, expected)
     maps = Path("/proc/self/maps")  # Linux
     assert not maps.exists() or "scene.safetensors" not in maps.read_text()  # X alone stays mapped
 
@@ -233,25 +240,25 @@ def test_other_engines_go_on_from_the_pieces_of_each_stage(scene: dict[str, Any]
     write_pack(tmp_path / "pack.safetensors", scene["views"], {})
     stored = {**scene, "views": lc.read_features(tmp_path / "pack.safetensors")}
     folder, settings = tmp_path / "work", LiftSettings.of(preset="default")
-    stopped = []
+    stopped_stages = []
     for number, stage in enumerate(("geometry", "gather", "objects", "consensus", "robust", "solve")):
 
-        def stop(name: str, done: int, total: int, unit: str, at: str = stage) -> None:
-            if name == at and done >= 1:
-                stopped.append(at)
+        def stop(name: str, completed: int, total: int, unit: str, at: str = stage) -> None:
+            if name == at and completed >= 1:
+                stopped_stages.append(at)
                 raise InterruptedError
 
         with pytest.raises(InterruptedError):
             in_blocks((LocalEngine(1), Shuffled(2))[number % 2], stored, settings, folder=folder, progress=stop)
-    assert stopped == ["geometry", "gather", "objects", "consensus", "robust", "solve"]
-    found = in_blocks(Shuffled(2), stored, settings, folder=folder)
-    whole = lc.lift(**scene, preset=settings)
-    assert_same(found, whole)
-    assert found.diagnostics["reweighting"] == whole.diagnostics["reweighting"]
+    assert stopped_stages == ["geometry", "gather", "objects", "consensus", "robust", "solve"]
+    result = in_blocks(Shuffled(2), stored, settings, folder=folder)
+    expected = lc.lift(**scene, preset=settings)
+    assert_same(result, expected)
+    assert result.diagnostics["reweighting"] == expected.diagnostics["reweighting"]
 
 
 @pytest.mark.parametrize(
-    ("asked", "got"),
+    ("overrides", "got"),
     [
         ({"aggregation": True, "aggregation_clusters": "hdbscan"}, "aggregation_clusters=hdbscan"),
         ({"cg_steps": 2}, "cg_steps=2"),
@@ -259,10 +266,10 @@ def test_other_engines_go_on_from_the_pieces_of_each_stage(scene: dict[str, Any]
     ],
 )
 def test_what_needs_all_rays_or_features_is_refused_before(
-    scene: dict[str, Any], asked: dict[str, Any], got: str
+    scene: dict[str, Any], overrides: dict[str, Any], got: str
 ) -> None:
     with pytest.raises(lc.InvalidSettings, match=f"engine: expected settings that work on blocks.*got {got}; set"):
-        lc.lift(*scene.values(), engine=LocalEngine(), **asked)
+        lc.lift(*scene.values(), engine=LocalEngine(), **overrides)
     grids = {name: view for name, view in scene["views"].items() if isinstance(view, lc.FeatureGrid)}
     with pytest.raises(lc.InvalidSettings, match="aggregation_clusters=auto of grids; set"):
         lc.lift(scene["splats"], scene["cameras"], grids, aggregation=True, engine=LocalEngine())

@@ -42,34 +42,34 @@ def loopback_alone() -> Iterator[None]:
     """
     system = ctypes.CDLL(None, use_errno=True)
     with Path("/proc/thread-self/ns/net").open() as before:
-        own = system.unshare(NEW_NETWORK) == 0
-        if own:
+        has_namespace = system.unshare(NEW_NETWORK) == 0
+        if has_namespace:
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
                 fcntl.ioctl(any_socket, SET_FLAGS, struct.pack("16sh14x", b"lo", IS_UP))
         try:
             yield
         finally:
-            assert not own or system.setns(before.fileno(), NEW_NETWORK) == 0
+            assert not has_namespace or system.setns(before.fileno(), NEW_NETWORK) == 0
 
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
     """Two nodes of one core each, which ask for a token; a third for tests that take one away."""
     with loopback_alone():
-        yield from started()
+        yield from running_cluster()
 
 
-def started() -> Iterator[Any]:
+def running_cluster() -> Iterator[Any]:
     os.environ["RAY_AUTH_MODE"], os.environ["RAY_AUTH_TOKEN"] = "token", secrets.token_hex(16)  # read at the import
     ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'splatlift[ray]'")
     Cluster = import_module("ray.cluster_utils").Cluster
     node = {"num_cpus": 1, "object_store_memory": 80_000_000}
-    made = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
-    made.add_node(**node)
-    ray.init(address=made.address, log_to_driver=False, configure_logging=False)
-    yield made
+    cluster = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
+    cluster.add_node(**node)
+    ray.init(address=cluster.address, log_to_driver=False, configure_logging=False)
+    yield cluster
     ray.shutdown()
-    made.shutdown()
+    cluster.shutdown()
     for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN"):
         del os.environ[name]
 
@@ -86,9 +86,9 @@ class Deadly(RayEngine):
 
     def run(self, work: Any, job: Any, pieces: int) -> Iterator[int]:
         def deadly(job: Any, piece: int, threads: int | None) -> None:
-            died = job.folder / f"{work.__name__}-{piece}.died"
-            if piece == 1 and not died.exists():
-                died.touch()
+            mark = job.folder / f"{work.__name__}-{piece}.died"
+            if piece == 1 and not mark.exists():
+                mark.touch()
                 os.kill(os.getpid(), signal.SIGKILL)
             work(job, piece, threads)
 
@@ -108,16 +108,16 @@ def test_workers_and_nodes_may_die(
     assert sorted(path.name for path in folder.rglob("*.died")) == [f"{step}-1.died" for step in steps]
     third = cluster.add_node(num_cpus=1, object_store_memory=80_000_000)
 
-    def remove(stage: str, done: int, total: int, unit: str) -> None:
+    def remove(stage: str, completed: int, total: int, unit: str) -> None:
         if stage == "geometry" and third in cluster.list_all_nodes():
             cluster.remove_node(third, allow_graceful=False)
 
     assert_same(in_blocks(RayEngine("auto"), scene, settings, progress=remove), expected)  # values, not files
     with pytest.raises(lc.InvalidFeatures, match="channels"):  # as the piece says it
         in_blocks(RayEngine("auto"), {**stored, "views": _broken(stored["views"])}, settings)
-    with pytest.raises(OSError, match="No space") as found:  # with its number, by which a full disk is known
+    with pytest.raises(OSError, match="No space") as raised:  # with its number, by which a full disk is known
         list(RayEngine("auto").run(_full, cast("Any", SimpleNamespace(settings=settings)), 1))
-    assert found.value.errno == errno.ENOSPC
+    assert raised.value.errno == errno.ENOSPC
 
 
 def _full(job: Any, piece: int, threads: int | None) -> None:

@@ -33,18 +33,18 @@ DENSE = {
 def test_plan_says_what_region_weights_of_dense_maps_take(map_of: str, stride: int) -> None:
     (camera,) = room_cameras(1, WIDTH, HEIGHT)
     views = {camera.name: DENSE[map_of]}
-    made = lc.lift(room_splats(300), {camera.name: camera}, views, "row-sum", stride=stride, diagnostic_rays=0)
-    taken = 8 * made.diagnostics["weights_entries"]  # four bytes each for the region and the weight
-    assert 0.7 < made.metadata.diagnostics["plan"]["memory"]["weights"] / taken < 2.0
+    result = lc.lift(room_splats(300), {camera.name: camera}, views, "row-sum", stride=stride, diagnostic_rays=0)
+    entry_bytes = 8 * result.diagnostics["weights_entries"]  # four bytes each for the region and the weight
+    assert 0.7 < result.metadata.diagnostics["plan"]["memory"]["weights"] / entry_bytes < 2.0
 
 
 @pytest.mark.parametrize("threads", [1, 3])
 def test_merging_in_parts_changes_no_bit(monkeypatch: pytest.MonkeyPatch, threads: int) -> None:
     camera, splats = random_camera(1), random_splats(3, 60)
     request = camera, random_regions(1), CompositingParams(), Weighting()
-    whole = CpuRaster(splats, threads=1).region_weights(*request)
+    expected = CpuRaster(splats, threads=1).region_weights(*request)
     monkeypatch.setattr(weights, "RANGE_ENTRIES", 50)
     parts = CpuRaster(splats, threads).region_weights(*request)
-    assert whole.region.shape[0] > 100
-    for name, tensor in whole.tensors().items():
+    assert expected.region.shape[0] > 100
+    for name, tensor in expected.tensors().items():
         assert torch.equal(tensor, parts.tensors()[name]), name

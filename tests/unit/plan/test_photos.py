@@ -28,33 +28,33 @@ def test_order_and_shares_are_those_of_the_dense_definition():
     total_weight = np.stack(
         [dense_view(splats, camera, CompositingParams()).A.sum(axis=0) for camera in cameras.values()]
     )
-    weight, seen = (
+    weight, weighted = (
         total_weight.sum(axis=0),
         total_weight >= np.maximum(VISIBLE_SHARE * total_weight.max(axis=0), 1e-12),
     )
-    order, looks, shares = [], np.zeros(splats.count), []
+    order, hits, shares = [], np.zeros(splats.count), []
     while len(order) < 9:
-        gains = seen @ (weight / 2 ** (looks + 1))
+        gains = weighted @ (weight / 2 ** (hits + 1))
         gains[order] = -1.0
         order.append(int(np.argmax(gains)))
-        looks += seen[order[-1]]
-        shares.append([weight[looks >= times].sum() / weight.sum() for times in (1, 2)])
+        hits += weighted[order[-1]]
+        shares.append([weight[hits >= times].sum() / weight.sum() for times in (1, 2)])
     plan = lc.plan_photos(splats, cameras, threads=1)
     assert plan.order == tuple(f"v{k}" for k in order) != tuple(cameras)
     assert [row.photos for row in plan.shown] == [4, 8, 9]
-    found = [[row.once, row.twice] for row in plan.shown]
-    assert np.allclose(found, [shares[3], shares[7], shares[8]], atol=1e-6)
+    shares_of_plan = [[row.once, row.twice] for row in plan.shown]
+    assert np.allclose(shares_of_plan, [shares[3], shares[7], shares[8]], atol=1e-6)
     assert 0.5 < plan.shown[0].twice < plan.shown[0].once <= plan.shown[-1].once
-    again = lc.plan_photos(splats, cameras, threads=2)
-    assert (again.order, again.spare, again.seen_share) == (plan.order, plan.spare, plan.seen_share)
+    threaded = lc.plan_photos(splats, cameras, threads=2)
+    assert (threaded.order, threaded.spare, threaded.seen_share) == (plan.order, plan.spare, plan.seen_share)
 
 
 def test_photos_that_repeat_others_or_see_nothing_are_named_last():
-    splats, one = random_splats(3, 60), random_camera(0, 34, 26)
-    away = one.replace(viewmat=np.diag([1.0, 1.0, 1.0, 1.0]) + np.eye(4, k=3) * 1e4, name="away")
-    same = [one.replace(name=f"same{k:02}") for k in range(WELL_COVERED + 2)]
-    plan = lc.plan_photos(splats, Cameras((away, *same)))
-    assert plan.order == (*(camera.name for camera in same), "away")
+    splats, first_camera = random_splats(3, 60), random_camera(0, 34, 26)
+    away = first_camera.replace(viewmat=np.diag([1.0, 1.0, 1.0, 1.0]) + np.eye(4, k=3) * 1e4, name="away")
+    copies = [first_camera.replace(name=f"same{k:02}") for k in range(WELL_COVERED + 2)]
+    plan = lc.plan_photos(splats, Cameras((away, *copies)))
+    assert plan.order == (*(camera.name for camera in copies), "away")
     assert plan.spare == ("same08", "same09", "away")
     assert any("8 before them do not show" in line and "away" in line for line in plan.lines(verbose=True))
 
@@ -62,10 +62,10 @@ def test_photos_that_repeat_others_or_see_nothing_are_named_last():
 def test_command_without_features_tells_what_to_encode_first(tmp_path, capsys):
     paths = write_scene(tmp_path, 2)
     assert cli.main(["plan", *map(str, paths[:2]), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
+    reply = json.loads(capsys.readouterr().out)
     plan = lc.plan_photos(lc.read_splats(paths[0]), lc.read_cameras(paths[1]))
-    assert told["order"] == list(plan.order) and told["photos"] == 3
-    assert told["shown"][0]["once"] == pytest.approx(plan.shown[0].once) and told["shown"][0]["seconds"] > 0
+    assert reply["order"] == list(plan.order) and reply["photos"] == 3
+    assert reply["shown"][0]["once"] == pytest.approx(plan.shown[0].once) and reply["shown"][0]["seconds"] > 0
     assert cli.main(["plan", *map(str, paths[:2])]) == 0
     assert f"encode first: {', '.join(plan.order)}" in capsys.readouterr().out
 
@@ -76,15 +76,15 @@ def test_smoothness_changes_no_share_and_the_plan_says_so(smoothness, tmp_path, 
     plan = lc.plan_photos(lc.read_splats(paths[0]), lc.read_cameras(paths[1]))
     arguments = ["plan", *map(str, paths[:2]), "--set", f"smoothness={smoothness}"]
     assert cli.main([*arguments, "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["order"] == list(plan.order)
-    assert [row["twice"] for row in told["shown"]] == pytest.approx([row.twice for row in plan.shown])
+    reply = json.loads(capsys.readouterr().out)
+    assert reply["order"] == list(plan.order)
+    assert [row["twice"] for row in reply["shown"]] == pytest.approx([row.twice for row in plan.shown])
     assert cli.main(arguments) == 0
     assert ("smoothness adds no look" in capsys.readouterr().out) == (smoothness != "0")
 
 
-def test_splats_that_no_photo_sees_are_told():
+def test_splats_that_no_photo_sees_give_a_warning():
     splats = random_splats(3, 60)
     far = replace(splats, means=splats.means + torch.tensor([0.0, 0.0, 1e4]))
-    (told,) = lc.plan_photos(far, cameras_of(4)).warnings
-    assert "no camera can see 100.0% of the splats" in told
+    (warning,) = lc.plan_photos(far, cameras_of(4)).warnings
+    assert "no camera can see 100.0% of the splats" in warning

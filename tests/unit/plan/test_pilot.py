@@ -40,7 +40,7 @@ def disagreeing(folder, error: float, gap: bool = False, labelled: bool = True):
     errors = torch.randn(VIEWS, CHANNELS, generator=generator)
     errors *= error / CHANNELS**0.5
     cameras = [centred(camera) for camera in ring(VIEWS)]
-    observed = {camera.name: Regions(labels, truth + one) for camera, one in zip(cameras, errors, strict=True)}
+    observed = {camera.name: Regions(labels, truth + offset) for camera, offset in zip(cameras, errors, strict=True)}
     paths = folder / "splats.ply", folder / "cameras.json", folder / "features.safetensors"
     write_splats(paths[0], random_splats(1, 80, 0.4))
     write_inria_cameras(Cameras(tuple(cameras)), paths[1])
@@ -51,13 +51,13 @@ def disagreeing(folder, error: float, gap: bool = False, labelled: bool = True):
 @pytest.mark.parametrize("error", [0.3, 1.0, 2.0])
 def test_a_pilot_foresees_how_near_fewer_views_come(tmp_path, error):
     splats, cameras, pack = disagreeing(tmp_path / "scene", error)
-    whole = lift_files(splats, cameras, [pack], LiftSettings.of(preset="tikhonov"))
-    fewer = lift_files(splats, cameras, [pack], LiftSettings.of(preset="tikhonov", view_cosine=0.98))
-    expected = fewer.metadata.diagnostics["plan"]["view_cosine"]
-    found = cosine_figures(fewer.features, whole.features, whole.total_weight)["cosine"]
+    full = lift_files(splats, cameras, [pack], LiftSettings.of(preset="tikhonov"))
+    reduced = lift_files(splats, cameras, [pack], LiftSettings.of(preset="tikhonov", view_cosine=0.98))
+    expected = reduced.metadata.diagnostics["plan"]["view_cosine"]
+    figures = cosine_figures(reduced.features, full.features, full.total_weight)["cosine"]
     assert expected >= 0.98
-    assert found == pytest.approx(expected, abs=0.02)
-    assert whole.metadata.diagnostics["plan"]["view_cosine"] is None
+    assert figures == pytest.approx(expected, abs=0.02)
+    assert full.metadata.diagnostics["plan"]["view_cosine"] is None
 
 
 def test_the_more_views_disagree_the_more_are_lifted(tmp_path):
@@ -77,24 +77,24 @@ def pilot_of(areas: list[list[float]], errors: list[float], weights: list[float]
 
 def test_cosines_are_those_of_the_variance_and_of_the_splats_that_views_show():
     views, variance = 20, 2.0
-    pilot = pilot_of([[1.0]] * views, [variance / (variance + views)], [1.0])
+    estimate = pilot_of([[1.0]] * views, [variance / (variance + views)], [1.0])
     among = variance / (1 + variance / views)
-    for count, cosine in enumerate(pilot.cosines(range(views)), start=1):
+    for count, cosine in enumerate(estimate.cosines(range(views)), start=1):
         assert 1 / cosine**2 - 1 == pytest.approx(among * (1 / count - 1 / views), abs=1e-9)
-    shown = pilot_of([[1.0, 0.0], [0.0, 1.0]], [0.0, 0.0], [3.0, 1.0])  # total weight weighs splats
-    assert list(shown.cosines([0, 1])) == pytest.approx([0.75, 1.0])
-    assert list(shown.cosines([1, 0])) == pytest.approx([0.25, 1.0])
+    partly_visible = pilot_of([[1.0, 0.0], [0.0, 1.0]], [0.0, 0.0], [3.0, 1.0])  # total weight weighs splats
+    assert list(partly_visible.cosines([0, 1])) == pytest.approx([0.75, 1.0])
+    assert list(partly_visible.cosines([1, 0])) == pytest.approx([0.25, 1.0])
     assert pilot_of([[1.0]] * 100, [1.0], [1.0]).views_for(0.9, range(100)) == (81, pytest.approx(0.9))  # all error
 
 
 def test_the_fewest_views_that_come_to_the_cosine_are_taken_but_never_fewer_than_told():
-    pilot = pilot_of([[1.0]] * 40, [0.05], [1.0])
-    cosines = list(pilot.cosines(range(40)))
-    count, expected = pilot.views_for(0.99, range(40))
+    estimate = pilot_of([[1.0]] * 40, [0.05], [1.0])
+    cosines = list(estimate.cosines(range(40)))
+    count, expected = estimate.views_for(0.99, range(40))
     assert cosines[count - 2] < 0.99 <= cosines[count - 1] == expected
-    assert pilot.views_for(0.99, range(40), least=count + 7) == (count + 7, cosines[count + 6])
-    assert pilot.views_for(1e-200, range(40)) == (1, cosines[0])
-    assert pilot.views_for(0.999_999_999_999, range(40))[0] == 40
+    assert estimate.views_for(0.99, range(40), least=count + 7) == (count + 7, cosines[count + 6])
+    assert estimate.views_for(1e-200, range(40)) == (1, cosines[0])
+    assert estimate.views_for(0.999_999_999_999, range(40))[0] == 40
 
 
 def test_rays_without_labels_are_no_disagreement(tmp_path):
@@ -108,40 +108,40 @@ def test_rays_without_labels_are_no_disagreement(tmp_path):
 
 def test_a_pilot_that_learns_nothing_expects_nothing_but_errors(tmp_path):
     splats, cameras, pack = disagreeing(tmp_path / "scene", 0.5, labelled=False)
-    pilot = flown(splats, cameras, pack)
-    assert (pilot.errors == 1).all()
-    assert pilot.views_for(0.9, range(VIEWS))[0] > 0.7 * VIEWS
+    estimate = flown(splats, cameras, pack)
+    assert (estimate.errors == 1).all()
+    assert estimate.views_for(0.9, range(VIEWS))[0] > 0.7 * VIEWS
 
 
 def test_where_no_ray_meets_a_splat_all_views_are_taken_and_nothing_is_expected_of_them(tmp_path):
     _, cameras, pack = disagreeing(tmp_path / "scene", 0.5)
     away = random_splats(1, 80, 0.01)
     write_splats(tmp_path / "away.ply", replace(away, means=away.means + 1e4))
-    pilot = flown(tmp_path / "away.ply", cameras, pack)
-    assert not pilot.areas.any()
-    assert pilot.views_for(0.9, range(VIEWS)) == (VIEWS, 0.0)
+    estimate = flown(tmp_path / "away.ply", cameras, pack)
+    assert not estimate.areas.any()
+    assert estimate.views_for(0.9, range(VIEWS)) == (VIEWS, 0.0)
 
 
 def test_in_a_room_where_views_share_few_splats_a_pilot_is_right_too(tmp_path):
     write_room(tmp_path, Room(splats=6_000, views=72, size=(160, 120), channels=32))
     paths = tmp_path / "point_cloud.ply", tmp_path / "cameras.json", tmp_path / "features.safetensors"
-    whole = lift_files(*paths[:2], [paths[2]], LiftSettings.of())
-    for wanted in (0.9, 0.97):
-        fewer = lift_files(*paths[:2], [paths[2]], LiftSettings.of(view_cosine=wanted))
-        plan = fewer.metadata.diagnostics["plan"]
-        found = cosine_figures(fewer.features, whole.features, whole.total_weight)["cosine"]
-        assert found is not None
+    full = lift_files(*paths[:2], [paths[2]], LiftSettings.of())
+    for target in (0.9, 0.97):
+        reduced = lift_files(*paths[:2], [paths[2]], LiftSettings.of(view_cosine=target))
+        plan = reduced.metadata.diagnostics["plan"]
+        figures = cosine_figures(reduced.features, full.features, full.total_weight)["cosine"]
+        assert figures is not None
         assert plan["views_left_out"] > 0
-        assert 0.4 < (1 - found) / (1 - plan["view_cosine"]) < 1.2
+        assert 0.4 < (1 - figures) / (1 - plan["view_cosine"]) < 1.2
 
 
 def test_with_coverage_beside_it_a_cosine_takes_no_fewer_views_and_no_pilot_flies_for_few(tmp_path):
     paths = disagreeing(tmp_path / "scene", 0.3)
     counts, expected = [], []
     for coverage in (0, 12, 20, VIEWS - NOISE_VIEWS):
-        made = lift_files(*paths[:2], [paths[2]], LiftSettings.of(view_cosine=0.95, coverage=coverage))
-        counts.append(len(made.metadata.views))
-        expected.append(made.metadata.diagnostics["plan"]["view_cosine"])
+        result = lift_files(*paths[:2], [paths[2]], LiftSettings.of(view_cosine=0.95, coverage=coverage))
+        counts.append(len(result.metadata.views))
+        expected.append(result.metadata.diagnostics["plan"]["view_cosine"])
     assert counts[0] < 12
     assert counts[1:] == [12, 20, VIEWS]
     assert expected[0] < expected[1] < expected[2]
@@ -157,13 +157,13 @@ def test_few_views_are_all_taken(tmp_path):
 def flown(splats, cameras, pack, threads=1) -> ViewNoiseEstimate:
     settings = LiftSettings.of()
     scene, views, packs = open_files(splats, cameras, [pack], settings)
-    found = LiftViews.of(packs, views, settings)
-    seen = visibility(scene, [found.camera(k) for k in range(len(found.names))], settings.lift_params)
-    return estimate_view_noise(CpuRaster(scene, threads), found, settings, seen)
+    lift_views = LiftViews.of(packs, views, settings)
+    visible = visibility(scene, [lift_views.camera(k) for k in range(len(lift_views.names))], settings.lift_params)
+    return estimate_view_noise(CpuRaster(scene, threads), lift_views, settings, visible)
 
 
 def test_a_pilot_repeats_on_any_number_of_threads(tmp_path):
     paths = disagreeing(tmp_path / "scene", 1.0)
-    one, two = flown(*paths), flown(*paths, threads=2)
-    assert (one.errors == two.errors).all()
-    assert (one.weights == two.weights).all()
+    first, second = flown(*paths), flown(*paths, threads=2)
+    assert (first.errors == second.errors).all()
+    assert (first.weights == second.weights).all()

@@ -42,68 +42,72 @@ def seen_as(in_view: list[list[int]]) -> Visibility:
 @pytest.mark.usefixtures("every_kernel")
 def test_whatever_a_view_blends_is_in_its_field(kernel):
     splats, cameras = random_splats(3, 60, spread=2.0, kernel=kernel), [random_camera(k) for k in range(4)]
-    seen = visibility(splats, cameras, CompositingParams())
+    visible = visibility(splats, cameras, CompositingParams())
     raster = CpuRaster(splats, threads=1)
     for k, camera in enumerate(cameras):
-        met = raster.region_weights(
+        hit = raster.region_weights(
             camera, random_regions(k), CompositingParams(), Weighting()
         ).total_weight_splats.numpy()
-        assert met.size
-        assert seen.in_view[k][met].all()
-    assert not seen.in_view.all()
-    assert seen.seen_share == seen.in_view.any(axis=0).mean()
+        assert hit.size
+        assert visible.in_view[k][hit].all()
+    assert not visible.in_view.all()
+    assert visible.seen_share == visible.in_view.any(axis=0).mean()
 
 
 def test_chosen_views_look_from_all_sides():
-    seen = visibility(random_splats(0, 80, 0.3), ring(24), CompositingParams())
-    order = list(view_order(seen))
-    chosen = sorted(order[: count_covering_views(seen, order, 6)])
-    gaps = np.diff([*chosen, chosen[0] + 24])
-    assert len(chosen) == 6
+    visible = visibility(random_splats(0, 80, 0.3), ring(24), CompositingParams())
+    order = list(view_order(visible))
+    selection = sorted(order[: count_covering_views(visible, order, 6)])
+    gaps = np.diff([*selection, selection[0] + 24])
+    assert len(selection) == 6
     assert gaps.max() <= 8  # of 24; the first six in order would leave one of 19
 
 
 def test_views_are_added_until_each_splat_is_shown_often_enough_and_the_choice_repeats():
-    seen = visibility(random_splats(1, 80, 1.0), [random_camera(k) for k in range(12)], CompositingParams())
-    order = list(view_order(seen))
-    assert order == list(view_order(seen))
-    shown = seen.in_view[:, seen.in_view.any(axis=0)]
+    visible = visibility(random_splats(1, 80, 1.0), [random_camera(k) for k in range(12)], CompositingParams())
+    order = list(view_order(visible))
+    assert order == list(view_order(visible))
+    in_view_rows = visible.in_view[:, visible.in_view.any(axis=0)]
     for times in (1, 3, 5):
-        count = count_covering_views(seen, order, times)
-        assert shown[order[:count]].sum(axis=0).mean() >= times > shown[order[: count - 1]].sum(axis=0).mean()
-    assert count_covering_views(seen, order, 0) == 1
-    assert count_covering_views(seen, order, 1_000) == 12
+        count = count_covering_views(visible, order, times)
+        assert (
+            in_view_rows[order[:count]].sum(axis=0).mean()
+            >= times
+            > in_view_rows[order[: count - 1]].sum(axis=0).mean()
+        )
+    assert count_covering_views(visible, order, 0) == 1
+    assert count_covering_views(visible, order, 1_000) == 12
 
 
 def test_looking_at_gains_lazily_finds_the_order_of_looking_at_all():
-    seen = visibility(random_splats(2, 120, 0.8), [random_camera(k) for k in range(14)], CompositingParams())
-    shares = seen.areas / seen.areas.sum(axis=0).clip(min=1e-30)
-    sides = [side_of(centre - seen.means) for centre in seen.centres]
-    held, every = np.zeros((shares.shape[1], SIDES)), np.arange(shares.shape[1])
-    left, order = list(range(14)), []
-    while left:
-        before = {view: held[every, sides[view]] for view in left}
-        gains = [float((np.sqrt(before[view] + shares[view]) - np.sqrt(before[view])).sum()) for view in left]
-        best = left.pop(int(np.argmax(gains)))
-        held[every, sides[best]] += shares[best]
+    visible = visibility(random_splats(2, 120, 0.8), [random_camera(k) for k in range(14)], CompositingParams())
+    shares = visible.areas / visible.areas.sum(axis=0).clip(min=1e-30)
+    sides = [side_of(centre - visible.means) for centre in visible.centres]
+    accumulated, splat_indices = np.zeros((shares.shape[1], SIDES)), np.arange(shares.shape[1])
+    remaining, order = list(range(14)), []
+    while remaining:
+        before = {view: accumulated[splat_indices, sides[view]] for view in remaining}
+        gains = [float((np.sqrt(before[view] + shares[view]) - np.sqrt(before[view])).sum()) for view in remaining]
+        best = remaining.pop(int(np.argmax(gains)))
+        accumulated[splat_indices, sides[best]] += shares[best]
         order.append(best)
-    assert list(view_order(seen)) == order
+    assert list(view_order(visible)) == order
 
 
 def test_some_views_alone_are_what_they_were_among_all():
-    seen = visibility(random_splats(4, 60, 1.0), [random_camera(k) for k in range(5)], CompositingParams())
-    some = seen.of([3, 1])
-    again = visibility(random_splats(4, 60, 1.0), [random_camera(k) for k in (3, 1)], CompositingParams())
-    assert all(np.array_equal(getattr(some, name), getattr(again, name)) for name in ("areas", "centres", "means"))
+    visible = visibility(random_splats(4, 60, 1.0), [random_camera(k) for k in range(5)], CompositingParams())
+    subset = visible.of([3, 1])
+    single = visibility(random_splats(4, 60, 1.0), [random_camera(k) for k in (3, 1)], CompositingParams())
+    assert all(np.array_equal(getattr(subset, name), getattr(single, name)) for name in ("areas", "centres", "means"))
 
 
 def test_views_that_add_nothing_can_be_left_out_together():
-    alike, own = [[1, 1, 0]] * (WELL_COVERED + 3), [[0, 1, 1]]
-    spare = spare_views(seen_as(alike + own))
+    copies, distinct = [[1, 1, 0]] * (WELL_COVERED + 3), [[0, 1, 1]]
+    spare = spare_views(seen_as(copies + distinct))
     assert WELL_COVERED + 3 not in spare  # it alone shows the third splat
     stay = [k for k in range(WELL_COVERED + 4) if k not in spare]
     assert spare
-    assert np.array(alike + own)[stay].sum(axis=0)[0] >= WELL_COVERED
+    assert np.array(copies + distinct)[stay].sum(axis=0)[0] >= WELL_COVERED
 
 
 def test_a_view_that_sees_nothing_is_spare():
@@ -112,12 +116,12 @@ def test_a_view_that_sees_nothing_is_spare():
 
 def test_a_lift_with_coverage_is_the_lift_of_the_chosen_views(tmp_path):
     paths = write_scene(tmp_path, 2)
-    made = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(coverage=1, preset="row-sum"))
-    plan = made.metadata.diagnostics["plan"]
-    assert len(made.metadata.views) == plan["views"] == 3 - plan["views_left_out"] < 3
-    whole = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(preset="row-sum"))
-    assert not torch.equal(made.features, whole.features)
-    assert bool((made.total_weight <= whole.total_weight + 1e-4).all())
+    result = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(coverage=1, preset="row-sum"))
+    plan = result.metadata.diagnostics["plan"]
+    assert len(result.metadata.views) == plan["views"] == 3 - plan["views_left_out"] < 3
+    full = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(preset="row-sum"))
+    assert not torch.equal(result.features, full.features)
+    assert bool((result.total_weight <= full.total_weight + 1e-4).all())
 
 
 def test_plan_and_lift_say_which_level_is_taken_alone_of_how_many():

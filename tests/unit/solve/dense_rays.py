@@ -16,11 +16,11 @@ from liftcore.values.views import ViewFeatures
 from tests.scenes import random_camera, random_grid, random_regions, random_splats
 
 
-def dense_view(raster: CpuRaster, camera: Camera, walk: CompositingParams) -> np.ndarray:
+def dense_view(raster: CpuRaster, camera: Camera, params: CompositingParams) -> np.ndarray:
     """A [H * W, P] f64 as the raster traces it."""
     y, x = np.mgrid[: camera.height, : camera.width]
     pixels = torch.tensor(np.stack([x.ravel(), y.ravel()], axis=1), dtype=torch.int32)
-    rows = raster.ray_rows(camera, pixels, walk)
+    rows = raster.ray_rows(camera, pixels, params)
     A = np.zeros((len(pixels), raster.splats.count))
     A[np.repeat(np.arange(len(A)), np.diff(rows.indptr.numpy())), rows.splats.numpy()] = rows.weights.numpy()
     return A
@@ -30,26 +30,26 @@ class SmallScene:
     """Three views of a random scene: the operator, and A [rows, P] and B [rows, F] of the same rays."""
 
     def __init__(self, seed: int, grids: bool = False, observations: Sequence[ViewFeatures] | None = None) -> None:
-        self.walk, self.splats = CompositingParams(), random_splats(seed, 25)
+        self.params, self.splats = CompositingParams(), random_splats(seed, 25)
         self.views = [random_camera(seed + k, 22 + 3 * k, 17 + 2 * k, name=f"v{k}") for k in range(3)]
-        made = [random_grid(seed + k) if grids else random_regions(seed + k) for k in range(3)]
-        self.observations = list(observations or made)
+        random_maps = [random_grid(seed + k) if grids else random_regions(seed + k) for k in range(3)]
+        self.observations = list(observations or random_maps)
         self.raster = CpuRaster(self.splats, threads=2)
-        parts = [self._rows(view, seen) for view, seen in zip(self.views, self.observations, strict=True)]
+        parts = [self._rows(view, view_map) for view, view_map in zip(self.views, self.observations, strict=True)]
         self.A, self.B = (np.concatenate(part) for part in zip(*parts, strict=True))
         self.row_sums = self.A.sum(axis=0)
-        self.seen = self.row_sums > 0
-        safe = np.where(self.seen, self.row_sums, 1.0)
+        self.has_weight = self.row_sums > 0
+        safe = np.where(self.has_weight, self.row_sums, 1.0)
         self.closed_form = torch.tensor(self.A.T @ self.B / safe[:, None], dtype=torch.float32)
         self.codebooks = [observation.codebook for observation in self.observations]
 
     def _rows(self, view: Camera, observation: ViewFeatures) -> tuple[np.ndarray, np.ndarray]:
         S, ray = reading_matrix(observation, view.width, view.height)
-        return dense_view(self.raster, view, self.walk)[ray], S @ observation.codebook.double().numpy()
+        return dense_view(self.raster, view, self.params)[ray], S @ observation.codebook.double().numpy()
 
     def rays(self, threads: int = 2) -> AllRays:
         raster = CpuRaster(self.splats, threads)
-        return AllRays(raster, self.splats.count, self.views, self.observations.__getitem__, self.walk)
+        return AllRays(raster, self.splats.count, self.views, self.observations.__getitem__, self.params)
 
     def damped(self, damping: float) -> np.ndarray:
         """X [P, F] f64 of the damped normal equations, by a dense solver; where singular, the shortest step."""

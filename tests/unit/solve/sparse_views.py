@@ -27,8 +27,8 @@ def random_view(seed: int, regions: int, splats: int, share: float = 0.4) -> Reg
     rng = np.random.default_rng(seed)
     view = np.zeros((splats, regions))
     for splat in np.flatnonzero(rng.random(splats) < share):
-        own = rng.choice(regions, rng.integers(1, min(6, regions) + 1), replace=False)
-        view[splat, own] = rng.uniform(0.01, 1, own.size)
+        row_regions = rng.choice(regions, rng.integers(1, min(6, regions) + 1), replace=False)
+        view[splat, row_regions] = rng.uniform(0.01, 1, row_regions.size)
     return of_dense(view)
 
 

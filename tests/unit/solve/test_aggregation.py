@@ -45,7 +45,7 @@ def clustering_of(labels: np.ndarray, count: int = K) -> Clustering:
 @given(st.integers(0, 2**20), st.sampled_from([0.1, 0.3, 0.6]))
 @settings(max_examples=25, deadline=None)
 def test_kept_regions_are_those_of_the_paper_pixel_by_pixel(tmp_path_factory, seed, iou):
-    asked, splats = (
+    lift_settings, splats = (
         LiftSettings.of(aggregation=True, aggregation_iou=iou, diagnostic_rays=10),
         random_splats(seed, P),
     )
@@ -54,11 +54,11 @@ def test_kept_regions_are_those_of_the_paper_pixel_by_pixel(tmp_path_factory, se
     path = tmp_path_factory.mktemp("pack") / "features.safetensors"
     write_pack(path, maps, {"encoder": "random"})
     labels = np.random.default_rng(seed).integers(-1, K, P)
-    lifted = LiftViews.of(read_features(path), Cameras(views), asked)
-    kept = filter_regions(clustering_of(labels), 6, ReferenceRaster(splats), lifted, asked, silent)
+    lifted = LiftViews.of(read_features(path), Cameras(views), lift_settings)
+    kept_masks = filter_regions(clustering_of(labels), 6, ReferenceRaster(splats), lifted, lift_settings, silent)
 
     onehot = np.array([[float(label == k) for k in range(-1, K)] for label in labels])
-    A = dense_view(splats, views[0], asked.render_params).A
+    A = dense_view(splats, views[0], lift_settings.render_params).A
     # A ray that splats fill by less than half shows no cluster, whatever little it meets.
     kappa = np.where(A.sum(axis=1) < 0.5, -1, (A @ onehot).argmax(axis=1) - 1).reshape(17, 21)
     sums, counts, present = np.zeros((K, 6)), np.zeros(K, int), 0
@@ -73,9 +73,9 @@ def test_kept_regions_are_those_of_the_paper_pixel_by_pixel(tmp_path_factory, se
             if (mask & footprint).sum() / (mask | footprint).sum() >= iou:
                 sums[majority] += vector
                 counts[majority] += 1
-    assert kept.regions == present
-    assert kept.counts.tolist() == counts.tolist()
-    assert np.abs(kept.sums - sums).max() < 1e-6
+    assert kept_masks.regions == present
+    assert kept_masks.counts.tolist() == counts.tolist()
+    assert np.abs(kept_masks.sums - sums).max() < 1e-6
 
 
 def test_clusters_of_grids_take_the_mean_of_their_splats_weighted_by_evidence():
@@ -125,16 +125,16 @@ def test_a_lift_with_aggregation_has_one_feature_a_cluster_and_says_so(tmp_path,
     (splats, cameras, features), side = write_scene(tmp_path, kind)
     result = lift_files(splats, cameras, [features], LiftSettings.of(aggregation=True, **KNOBS))
     save_lift(result, tmp_path / "lift")
-    opened = load_lift(tmp_path / "lift")
-    assert opened.cluster is not None and opened.cluster_features is not None
-    facts = opened.metadata.diagnostics["aggregation"]
-    assert facts["clusters"] == opened.cluster_features.shape[0] >= 2
+    stored = load_lift(tmp_path / "lift")
+    assert stored.cluster is not None and stored.cluster_features is not None
+    facts = stored.metadata.diagnostics["aggregation"]
+    assert facts["clusters"] == stored.cluster_features.shape[0] >= 2
     assert ("kept_regions" in facts) == (kind == "regions")
     assert facts["filter"].startswith("iou" if kind == "regions" else "none")
-    taken = (opened.cluster >= 0) & (opened.cluster_features != 0).any(dim=1)[opened.cluster.long()]
-    assert facts["changed"] == pytest.approx(float(taken.float().mean())) and facts["changed"] > 0.3
-    assert torch.equal(opened.features[taken], opened.cluster_features[opened.cluster[taken].long()])
-    agree = opened.features[taken].float()[:, :2].argmax(dim=1) == side[taken]
+    assigned = (stored.cluster >= 0) & (stored.cluster_features != 0).any(dim=1)[stored.cluster.long()]
+    assert facts["changed"] == pytest.approx(float(assigned.float().mean())) and facts["changed"] > 0.3
+    assert torch.equal(stored.features[assigned], stored.cluster_features[stored.cluster[assigned].long()])
+    agree = stored.features[assigned].float()[:, :2].argmax(dim=1) == side[assigned]
     assert float(agree.float().mean()) > 0.95
 
 
@@ -167,62 +167,62 @@ def test_what_takes_no_cluster_is_solved_again_as_if_the_other_regions_had_never
     )
     facts = result.metadata.diagnostics["aggregation"]
     assert facts["kept_regions"] < facts["regions"] and facts["resolved"] > 0
-    plain = lift_files(splats, cameras, [features], LiftSettings.of(aggregation=True, **knobs))
-    whole = weights_of(splats, cameras, maps | {"v0": wrong}, plain.metadata.settings)
+    baseline = lift_files(splats, cameras, [features], LiftSettings.of(aggregation=True, **knobs))
+    weights = weights_of(splats, cameras, maps | {"v0": wrong}, baseline.metadata.settings)
 
     settings, raster = LiftSettings.of(aggregation=True, **knobs), CpuRaster(read_splats(splats))
     lifted = LiftViews.of(read_features(features), read_cameras(cameras), settings)
     assert result.cluster is not None and result.cluster_features is not None
     clustering = clustering_of(result.cluster.numpy(), result.cluster_features.shape[0])
-    kept = filter_regions(clustering, 6, raster, lifted, settings, silent).masks
+    kept_masks = filter_regions(clustering, 6, raster, lifted, settings, silent).masks
     for name, observation in (maps | {"v0": wrong}).items():
-        if name in kept and isinstance(observation, Regions):
-            dropped = torch.from_numpy(~kept[name])
-            observation.labels[(observation.labels >= 0) & dropped[observation.labels.clamp_min(0).long()]] = -1
+        if name in kept_masks and isinstance(observation, Regions):
+            excluded = torch.from_numpy(~kept_masks[name])
+            observation.labels[(observation.labels >= 0) & excluded[observation.labels.clamp_min(0).long()]] = -1
             maps[name] = observation
     write_pack(tmp_path / "kept.safetensors", maps, {"encoder": "random"})
     without = lift_files(
         splats, cameras, [tmp_path / "kept.safetensors"], LiftSettings.of(**(knobs | {"aggregation_iou": 0.75}))
     )
-    own = ~(result.cluster_features != 0).any(dim=1)[result.cluster.long()] | (result.cluster < 0)
-    share = weights_of(splats, cameras, maps, plain.metadata.settings) / np.maximum(whole, 1e-30)
-    most = torch.from_numpy(share >= least)
-    again, not_again = own & without.seen & most, own & without.seen & ~most
-    assert not_again.any() == (least > 0)
-    assert torch.equal(result.features[not_again], plain.features[not_again])
-    assert facts["resolved"] == pytest.approx(float(again.float().mean()))
-    assert torch.allclose(result.features[again], without.features[again], atol=1e-6)
+    unclustered = ~(result.cluster_features != 0).any(dim=1)[result.cluster.long()] | (result.cluster < 0)
+    share = weights_of(splats, cameras, maps, baseline.metadata.settings) / np.maximum(weights, 1e-30)
+    has_most = torch.from_numpy(share >= least)
+    solved_again, not_solved = unclustered & without.seen & has_most, unclustered & without.seen & ~has_most
+    assert not_solved.any() == (least > 0)
+    assert torch.equal(result.features[not_solved], baseline.features[not_solved])
+    assert facts["resolved"] == pytest.approx(float(solved_again.float().mean()))
+    assert torch.allclose(result.features[solved_again], without.features[solved_again], atol=1e-6)
 
 
 def test_a_lift_without_clusters_is_the_lift_without_aggregation_and_says_so(tmp_path):
     (splats, cameras, features), _ = write_scene(tmp_path, "regions")
-    plain = lift_files(splats, cameras, [features], LiftSettings.of(diagnostic_rays=10))
-    asked = LiftSettings.of(aggregation=True, aggregation_clusters="hdbscan", diagnostic_rays=10)
-    none = lift_files(splats, cameras, [features], asked)
+    baseline = lift_files(splats, cameras, [features], LiftSettings.of(diagnostic_rays=10))
+    settings = LiftSettings.of(aggregation=True, aggregation_clusters="hdbscan", diagnostic_rays=10)
+    none = lift_files(splats, cameras, [features], settings)
     assert none.metadata.diagnostics["aggregation"]["clusters"] == 0
     assert none.metadata.diagnostics["aggregation"]["changed"] == 0
-    assert torch.equal(plain.features, none.features)
+    assert torch.equal(baseline.features, none.features)
     assert none.cluster is not None and bool((none.cluster == -1).all())
     save_lift(none, tmp_path / "none")
     means = load_lift(tmp_path / "none").cluster_features
     assert means is not None and means.shape == (0, 6)
-    save_lift(plain, tmp_path / "plain")
+    save_lift(baseline, tmp_path / "plain")
     assert load_lift(tmp_path / "plain").cluster is None
 
 
 def test_a_lift_whose_clusters_do_not_fit_is_refused(tmp_path):
     (splats, cameras, features), _ = write_scene(tmp_path, "regions")
-    plain = lift_files(splats, cameras, [features], LiftSettings.of(preset="row-sum", diagnostic_rays=10))
+    baseline = lift_files(splats, cameras, [features], LiftSettings.of(preset="row-sum", diagnostic_rays=10))
     parts = {"cluster": torch.zeros(400, dtype=torch.int32), "cluster_features": torch.zeros(3, 6).half()}
     assert set(parts) == set(CLUSTER_TENSORS)
-    for changed in (
+    for overrides in (
         {"cluster": torch.full((400,), 3, dtype=torch.int32)},
         {"cluster": torch.full((400,), -2, dtype=torch.int32)},
         {"cluster": torch.zeros(399, dtype=torch.int32)},
         {"cluster": torch.zeros(400, dtype=torch.int64)},
         {"cluster_features": torch.zeros(3, 5, dtype=torch.float16)},
     ):
-        save_lift(replace(plain, **parts | changed), tmp_path / "lift")
+        save_lift(replace(baseline, **parts | overrides), tmp_path / "lift")
         with pytest.raises(InvalidLift):
             load_lift(tmp_path / "lift")
 
@@ -234,7 +234,7 @@ def test_one_splat_is_aggregated_without_harm(tmp_path):
     write_pack(tmp_path / "f.safetensors", {"v0": random_regions(0, F=3)}, {"encoder": "random"})
     paths = tmp_path / "splats.ply", tmp_path / "cameras.json"
     for clusters, number in (("hdbscan", -1), ("touching", -1), ("graph", 0)):
-        asked = LiftSettings.of(aggregation=True, aggregation_clusters=clusters, diagnostic_rays=10)
-        result = lift_files(*paths, [tmp_path / "f.safetensors"], asked)
+        settings = LiftSettings.of(aggregation=True, aggregation_clusters=clusters, diagnostic_rays=10)
+        result = lift_files(*paths, [tmp_path / "f.safetensors"], settings)
         assert result.cluster is not None and result.cluster.tolist() == [number]
         assert bool(torch.isfinite(result.features).all())

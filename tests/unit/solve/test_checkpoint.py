@@ -29,74 +29,74 @@ from tests.scenes import observed, write_scene
 pytestmark = pytest.mark.slow
 
 
-class Killed(Exception):
+class ProcessKilled(Exception):
     """Stands for what ends a process between two calls."""
 
 
 @pytest.fixture
-def walks(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def rasterized_views(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The views that were really walked."""
-    walked: list[str] = []
-    walk = CpuRaster.region_weights
+    rasterized: list[str] = []
+    rasterize = CpuRaster.region_weights
 
-    def counted(self: CpuRaster, camera: Any, *rest: Any, **named: Any) -> Any:
+    def recording(self: CpuRaster, camera: Any, *rest: Any, **keywords: Any) -> Any:
         if camera.name != "warm-up":
-            walked.append(camera.name)
-        return walk(self, camera, *rest, **named)
+            rasterized.append(camera.name)
+        return rasterize(self, camera, *rest, **keywords)
 
-    monkeypatch.setattr(CpuRaster, "region_weights", counted)
+    monkeypatch.setattr(CpuRaster, "region_weights", recording)
     monkeypatch.setattr(
         "liftcore.lifting.in_memory.contradictions", lambda *_: []
     )  # which may look at some views, coarsely
     monkeypatch.setattr("liftcore.lifting.pipeline.choose_device", lambda _: CPU)  # on machines with a card too
-    return walked
+    return rasterized
 
 
 def killing(stage: str, at: int) -> Callable[..., None]:
-    def progress(now: str, done: int, total: int, unit: str) -> None:
-        if (now, done) == (stage, at):
-            raise Killed
+    def progress(now: str, completed: int, total: int, unit: str) -> None:
+        if (now, completed) == (stage, at):
+            raise ProcessKilled
 
     return progress
 
 
-def assert_same(one: LiftResult, other: LiftResult) -> None:
+def assert_same(left: LiftResult, right: LiftResult) -> None:
     for name in TENSORS:
-        first, second = getattr(one, name), getattr(other, name)
+        first, second = getattr(left, name), getattr(right, name)
         assert first.dtype == second.dtype
         assert torch.equal(first.view(torch.uint8), second.view(torch.uint8)), name
-    assert one.metadata.diagnostics == other.metadata.diagnostics
+    assert left.metadata.diagnostics == right.metadata.diagnostics
 
 
-def lifted(scene: tuple[Path, Path, Path], settings: LiftSettings | None = None, **more: Any) -> LiftResult:
-    return lift_files(scene[0], scene[1], [scene[2]], settings or LiftSettings.of(diagnostic_rays=50), **more)
+def lifted(scene: tuple[Path, Path, Path], settings: LiftSettings | None = None, **keywords: Any) -> LiftResult:
+    return lift_files(scene[0], scene[1], [scene[2]], settings or LiftSettings.of(diagnostic_rays=50), **keywords)
 
 
-def killed(scene: tuple[Path, Path, Path], stage: str, at: int, **more: Any) -> None:
+def kill_lift(scene: tuple[Path, Path, Path], stage: str, at: int, **keywords: Any) -> None:
     """A lift that ends after so many steps of a stage."""
-    with pytest.raises(Killed):
-        lifted(scene, progress=killing(stage, at), **more)
+    with pytest.raises(ProcessKilled):
+        lifted(scene, progress=killing(stage, at), **keywords)
 
 
 @pytest.mark.parametrize("grids", [False, True])
 @pytest.mark.parametrize("kills", [(2,), (1, 1, 2)])
 def test_killed_lift_goes_on_from_its_last_view_to_the_same_bits(
-    tmp_path: Path, walks: list[str], grids: bool, kills: tuple[int, ...]
+    tmp_path: Path, rasterized_views: list[str], grids: bool, kills: tuple[int, ...]
 ) -> None:
     scene = write_scene(tmp_path, 3, grids)
-    whole = lifted(scene, threads=1)
-    walks.clear()
+    uninterrupted = lifted(scene, threads=1)
+    rasterized_views.clear()
     checkpoint = Checkpoint(tmp_path / "kept", seconds=0)
     for at in kills:
-        killed(scene, "geometry", at, threads=1, checkpoint=checkpoint)
-    again = lifted(scene, threads=1, checkpoint=checkpoint)
-    assert walks == ["v0", "v1", "v2"]  # none twice
-    assert_same(whole, again)
+        kill_lift(scene, "geometry", at, threads=1, checkpoint=checkpoint)
+    resumed = lifted(scene, threads=1, checkpoint=checkpoint)
+    assert rasterized_views == ["v0", "v1", "v2"]  # none twice
+    assert_same(uninterrupted, resumed)
 
 
 @pytest.mark.parametrize("blank", [("v1",), ("v0", "v1", "v2")])
 def test_views_that_meet_no_label_are_kept_and_not_walked_again(
-    tmp_path: Path, walks: list[str], blank: tuple[str, ...]
+    tmp_path: Path, rasterized_views: list[str], blank: tuple[str, ...]
 ) -> None:
     splats, cameras, _ = write_scene(tmp_path, 3)
     features = tmp_path / "blank.safetensors"
@@ -107,101 +107,113 @@ def test_views_that_meet_no_label_are_kept_and_not_walked_again(
         views[name] = replace(regions, labels=torch.full_like(regions.labels, NO_LABEL))
     write_pack(features, views, {"encoder": "random"})
     scene, checkpoint = (splats, cameras, features), Checkpoint(tmp_path / "kept", seconds=0)
-    whole = lifted(scene, threads=1)
-    walks.clear()
+    uninterrupted = lifted(scene, threads=1)
+    rasterized_views.clear()
     for at in (1, 2):
-        killed(scene, "geometry", at, threads=1, checkpoint=checkpoint)
-    again = lifted(scene, threads=1, checkpoint=checkpoint)
-    assert walks == ["v0", "v1", "v2"]
-    assert_same(whole, again)
+        kill_lift(scene, "geometry", at, threads=1, checkpoint=checkpoint)
+    resumed = lifted(scene, threads=1, checkpoint=checkpoint)
+    assert rasterized_views == ["v0", "v1", "v2"]
+    assert_same(uninterrupted, resumed)
 
 
-def test_lift_killed_beside_views_in_work_walks_them_again_to_the_same_bits(tmp_path: Path, walks: list[str]) -> None:
+def test_lift_killed_beside_views_in_work_walks_them_again_to_the_same_bits(
+    tmp_path: Path, rasterized_views: list[str]
+) -> None:
     scene = write_scene(tmp_path, 3)
-    whole = lifted(scene, threads=2)
-    walks.clear()
+    uninterrupted = lifted(scene, threads=2)
+    rasterized_views.clear()
     checkpoint = Checkpoint(tmp_path / "kept", seconds=0)
-    killed(scene, "geometry", 1, threads=2, checkpoint=checkpoint)
-    again = lifted(scene, threads=2, checkpoint=checkpoint)
-    assert walks.count("v0") == 1
-    assert {"v1", "v2"} <= set(walks)
-    assert_same(whole, again)
+    kill_lift(scene, "geometry", 1, threads=2, checkpoint=checkpoint)
+    resumed = lifted(scene, threads=2, checkpoint=checkpoint)
+    assert rasterized_views.count("v0") == 1
+    assert {"v1", "v2"} <= set(rasterized_views)
+    assert_same(uninterrupted, resumed)
 
 
-def test_lift_killed_while_it_solves_walks_no_view_again(tmp_path: Path, walks: list[str]) -> None:
+def test_lift_killed_while_it_solves_walks_no_view_again(tmp_path: Path, rasterized_views: list[str]) -> None:
     scene, checkpoint = write_scene(tmp_path, 4), Checkpoint(tmp_path / "kept")
-    killed(scene, "solve", 1, checkpoint=checkpoint)
-    again = lifted(scene, checkpoint=checkpoint)
-    assert sorted(walks) == ["v0", "v1", "v2"]
-    assert_same(lifted(scene), again)
+    kill_lift(scene, "solve", 1, checkpoint=checkpoint)
+    resumed = lifted(scene, checkpoint=checkpoint)
+    assert sorted(rasterized_views) == ["v0", "v1", "v2"]
+    assert_same(lifted(scene), resumed)
 
 
-def test_checkpoint_of_another_walk_or_other_splats_is_never_used(tmp_path: Path, walks: list[str]) -> None:
+def test_checkpoint_of_another_walk_or_other_splats_is_never_used(
+    tmp_path: Path, rasterized_views: list[str]
+) -> None:
     scene = write_scene(tmp_path, 5)
     checkpoint = Checkpoint(tmp_path / "kept", seconds=0)
     lifted(scene, LiftSettings.of(preset="row-sum"), checkpoint=checkpoint)
-    other = lifted(scene, LiftSettings.of(preset="tikhonov"), checkpoint=checkpoint)
-    assert len(walks) == 6
-    assert_same(lifted(scene, LiftSettings.of(preset="tikhonov")), other)
+    second = lifted(scene, LiftSettings.of(preset="tikhonov"), checkpoint=checkpoint)
+    assert len(rasterized_views) == 6
+    assert_same(lifted(scene, LiftSettings.of(preset="tikhonov")), second)
 
 
 @pytest.mark.parametrize("grids", [False, True])
-def test_other_features_of_the_same_regions_walk_no_view_again(tmp_path: Path, walks: list[str], grids: bool) -> None:
+def test_other_features_of_the_same_regions_walk_no_view_again(
+    tmp_path: Path, rasterized_views: list[str], grids: bool
+) -> None:
     splats, cameras, features = write_scene(tmp_path, 8, grids)
     checkpoint, settings = Checkpoint(tmp_path / "kept"), LiftSettings.of(diagnostic_rays=50)
     lifted((splats, cameras, features), settings, checkpoint=checkpoint)
-    walks.clear()
-    other = tmp_path / "other.safetensors"
-    write_pack(other, {name: _other_encoder(seen) for name, seen in _views(cameras, 8, grids)}, {"encoder": "other"})
+    rasterized_views.clear()
+    second = tmp_path / "other.safetensors"
+    write_pack(
+        second,
+        {name: _other_encoder(observation) for name, observation in _views(cameras, 8, grids)},
+        {"encoder": "other"},
+    )
     stored = settings.model_copy(update={"dtype": "float32"})
-    again = lifted((splats, cameras, other), stored, checkpoint=checkpoint)
-    assert walks == []
-    assert again.features.shape[1] == 5
-    assert_same(lifted((splats, cameras, other), stored), again)
+    resumed = lifted((splats, cameras, second), stored, checkpoint=checkpoint)
+    assert rasterized_views == []
+    assert resumed.features.shape[1] == 5
+    assert_same(lifted((splats, cameras, second), stored), resumed)
 
 
-@pytest.mark.parametrize("changed", ["pose", "focal", "labels", "codebook", "stride", "power", "pixels"])
-def test_an_answer_is_to_one_question_alone(changed: str) -> None:
-    look = _look()
-    camera, regions = look.camera, look.observation
+@pytest.mark.parametrize("field", ["pose", "focal", "labels", "codebook", "stride", "power", "pixels"])
+def test_an_answer_is_to_one_question_alone(field: str) -> None:
+    request = view_request()
+    camera, regions = request.camera, request.observation
     assert isinstance(regions, Regions)
     pose = camera.viewmat.copy()
     pose[0, 3] += 1e-9
     labels = regions.labels.clone()
     labels[0, 1, 2] += 1
-    other = {
-        "pose": replace(look, camera=replace(camera, viewmat=pose)),
-        "focal": replace(look, camera=camera.replace(fx=camera.fx + 1e-9)),
-        "labels": replace(look, observation=replace(regions, labels=labels)),
-        "codebook": replace(look, observation=replace(regions, codebook=torch.zeros(4, 2))),
-        "stride": replace(look, params=CompositingParams(stride=2)),
-        "power": replace(look, weighting=Weighting(power=2)),
-        "pixels": replace(look, pixels=look.pixels + 1),
-    }[changed]
-    assert request_digest(other, "") != request_digest(look, "")
+    second = {
+        "pose": replace(request, camera=replace(camera, viewmat=pose)),
+        "focal": replace(request, camera=camera.replace(fx=camera.fx + 1e-9)),
+        "labels": replace(request, observation=replace(regions, labels=labels)),
+        "codebook": replace(request, observation=replace(regions, codebook=torch.zeros(4, 2))),
+        "stride": replace(request, params=CompositingParams(stride=2)),
+        "power": replace(request, weighting=Weighting(power=2)),
+        "pixels": replace(request, pixels=request.pixels + 1),
+    }[field]
+    assert request_digest(second, "") != request_digest(request, "")
     features = replace(regions, codebook=torch.ones_like(regions.codebook))
-    assert request_digest(replace(look, observation=features), "") == request_digest(look, "")
+    assert request_digest(replace(request, observation=features), "") == request_digest(request, "")
 
 
 def test_regions_and_cells_of_the_same_size_are_other_questions() -> None:
-    look = _look()
-    assert request_digest(replace(look, observation=FeatureGrid(torch.zeros(1, 3, 2))), "") != request_digest(
-        look, ""
+    request = view_request()
+    assert request_digest(replace(request, observation=FeatureGrid(torch.zeros(1, 3, 2))), "") != request_digest(
+        request, ""
     )
 
 
 def test_files_that_are_no_answers_stay_in_the_folder(tmp_path: Path) -> None:
     scene, checkpoint = write_scene(tmp_path, 9), Checkpoint(tmp_path / "kept", seconds=0)
     checkpoint.folder.mkdir()
-    kept = [checkpoint.folder / name for name in ("thesis.tex", "000001.safetensors.bak", "scene.safetensors")]
+    foreign_files = [
+        checkpoint.folder / name for name in ("thesis.tex", "000001.safetensors.bak", "scene.safetensors")
+    ]
     stale = [
         checkpoint.folder / name
         for name in ("000007.safetensors", f"{'0a' * 32}.safetensors", f".{'0a' * 32}.safetensors.0123abcd.part")
     ]
-    for path in [*kept, *stale]:
+    for path in [*foreign_files, *stale]:
         path.write_bytes(b"words")
     lifted(scene, checkpoint=checkpoint)
-    assert all(path.read_bytes() == b"words" for path in kept)
+    assert all(path.read_bytes() == b"words" for path in foreign_files)
     assert not any(path.exists() for path in stale)
 
 
@@ -210,49 +222,49 @@ def _views(cameras: Path, seed: int, grids: bool) -> list[tuple[str, Regions | F
     return [(camera.name, observed(seed, k, grids=grids)) for k, camera in enumerate(read_cameras(cameras).values())]
 
 
-def _other_encoder(seen: Regions | FeatureGrid) -> Regions | FeatureGrid:
+def _other_encoder(observation: Regions | FeatureGrid) -> Regions | FeatureGrid:
     """The same regions or cells with features of 5 channels."""
-    drawn = torch.randn(*seen.codebook.shape[:1], 5, generator=torch.Generator().manual_seed(0))
-    if isinstance(seen, Regions):
-        return replace(seen, codebook=drawn)
-    return FeatureGrid(drawn.reshape(*seen.grid.shape[:2], 5))
+    codebook = torch.randn(*observation.codebook.shape[:1], 5, generator=torch.Generator().manual_seed(0))
+    if isinstance(observation, Regions):
+        return replace(observation, codebook=codebook)
+    return FeatureGrid(codebook.reshape(*observation.grid.shape[:2], 5))
 
 
-def _look() -> ViewRequest:
+def view_request() -> ViewRequest:
     camera = Camera.pinhole("v", 8, 6, 9.0, 9.0, 4.0, 3.0, np.eye(4))
     regions = Regions(torch.zeros(1, 6, 8, dtype=torch.int32), torch.zeros(3, 2))
     return ViewRequest(camera, regions, CompositingParams(), Weighting(), torch.zeros(2, 2, dtype=torch.int32))
 
 
 def test_checkpoint_of_another_device_is_never_used(
-    tmp_path: Path, walks: list[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, rasterized_views: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = write_scene(tmp_path, 5)
     checkpoint = Checkpoint(tmp_path / "kept", seconds=0)
     for _ in range(2):
         lifted(scene, LiftSettings.of(device="cpu"), checkpoint=checkpoint)
-        assert len(walks) == 3
+        assert len(rasterized_views) == 3
     facts = {**CPU.facts(), "name": "another"}
     monkeypatch.setattr(Device, "facts", lambda _: facts)
-    made = lifted(scene, LiftSettings.of(device="cpu"), checkpoint=checkpoint)
-    assert len(walks) == 6
-    assert made.metadata.diagnostics["device"] == facts
+    result = lifted(scene, LiftSettings.of(device="cpu"), checkpoint=checkpoint)
+    assert len(rasterized_views) == 6
+    assert result.metadata.diagnostics["device"] == facts
 
 
 @pytest.mark.parametrize("length", [0, 200])
-def test_file_that_is_not_whole_is_walked_again(tmp_path: Path, walks: list[str], length: int) -> None:
+def test_file_that_is_not_whole_is_walked_again(tmp_path: Path, rasterized_views: list[str], length: int) -> None:
     scene = write_scene(tmp_path, 6)
     checkpoint = Checkpoint(tmp_path / "kept", seconds=0)
-    whole = lifted(scene, checkpoint=checkpoint)
+    uninterrupted = lifted(scene, checkpoint=checkpoint)
     blocks = sorted(checkpoint.folder.iterdir())
     blocks[1].write_bytes(blocks[1].read_bytes()[:length])
-    walks.clear()
-    assert_same(whole, lifted(scene, checkpoint=checkpoint))
-    assert len(walks) == 1
+    rasterized_views.clear()
+    assert_same(uninterrupted, lifted(scene, checkpoint=checkpoint))
+    assert len(rasterized_views) == 1
 
 
 def test_lift_without_room_for_its_checkpoint_goes_on(tmp_path: Path) -> None:
     scene = write_scene(tmp_path, 7)
     (tmp_path / "file").write_bytes(b"")
-    nowhere = Checkpoint(tmp_path / "file" / "kept", seconds=0)
-    assert_same(lifted(scene), lifted(scene, checkpoint=nowhere))
+    full_checkpoint = Checkpoint(tmp_path / "file" / "kept", seconds=0)
+    assert_same(lifted(scene), lifted(scene, checkpoint=full_checkpoint))

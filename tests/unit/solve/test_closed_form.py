@@ -18,8 +18,8 @@ from liftcore.solve.closed_form import Solution, solve
 from liftcore.values.region_weights import RegionWeights, stacked
 from tests.unit.solve.sparse_views import codebook_of, defined, of_dense, random_view
 
-HERE = torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
-DEVICES = [CPU, Device("cuda", HERE)]
+PLACE = torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
+DEVICES = [CPU, Device("cuda", PLACE)]
 SPLATS = 700
 every_device = pytest.mark.parametrize("device", DEVICES, ids=["cpu", "device"])
 
@@ -30,13 +30,13 @@ def scene(channels: int = 33, unit: bool = False) -> tuple[list[RegionWeights], 
     return views, [torch.nn.functional.normalize(book, dim=1).half() for book in books] if unit else books
 
 
-def solved(views, books, dtype=torch.float32, **how) -> Solution:
-    return solve(stacked(views, SPLATS), codebook_of(books), dtype, **how)
+def solved(views, books, dtype=torch.float32, **options) -> Solution:
+    return solve(stacked(views, SPLATS), codebook_of(books), dtype, **options)
 
 
-def assert_same_bits(one: Solution, other: Solution) -> None:
-    assert torch.equal(one.features, other.features)
-    assert torch.equal(one.agreement, other.agreement)
+def assert_same_bits(first: Solution, second: Solution) -> None:
+    assert torch.equal(first.features, second.features)
+    assert torch.equal(first.agreement, second.agreement)
 
 
 @every_device
@@ -45,25 +45,25 @@ def assert_same_bits(one: Solution, other: Solution) -> None:
 def test_features_and_agreement_equal_their_definition(device, channels, unit):
     views, books = scene(channels, unit)
     expected, sums = defined(views, books, SPLATS)
-    made = solved(views, books, device=device)
-    np.testing.assert_allclose(made.features.numpy(), expected, rtol=1e-5, atol=1e-6)
+    solution = solved(views, books, device=device)
+    np.testing.assert_allclose(solution.features.numpy(), expected, rtol=1e-5, atol=1e-6)
     units = [torch.nn.functional.normalize(book.double(), dim=1) for book in books]
     lengths = np.linalg.norm(defined(views, units, SPLATS)[0], axis=1)
-    np.testing.assert_allclose(made.agreement.numpy(), lengths, atol=1e-3 if unit else 1e-6)
+    np.testing.assert_allclose(solution.agreement.numpy(), lengths, atol=1e-3 if unit else 1e-6)
     unseen = torch.from_numpy(sums == 0)
-    assert unseen.any() and not made.features[unseen].any() and not made.agreement[unseen].any()
+    assert unseen.any() and not solution.features[unseen].any() and not solution.agreement[unseen].any()
     halves = solved(views, books, torch.float16, device=device).features
     assert halves.dtype == torch.float16
-    torch.testing.assert_close(halves.float(), made.features, rtol=2**-10, atol=2**-24)
+    torch.testing.assert_close(halves.float(), solution.features, rtol=2**-10, atol=2**-24)
 
 
 def test_neither_threads_nor_order_nor_files_change_a_bit():
     views, books = scene()
-    whole = solved(views, books, threads=1)
+    expected = solved(views, books, threads=1)
     means = torch.rand(SPLATS, 3, generator=torch.manual_seed(0))
-    assert_same_bits(whole, solved(views, books, threads=5))
-    assert_same_bits(whole, solved(views, books, threads=2, means=means, memory=0))
-    assert_same_bits(whole, solved([view.in_files() for view in views], books, means=means))
+    assert_same_bits(expected, solved(views, books, threads=5))
+    assert_same_bits(expected, solved(views, books, threads=2, means=means, memory=0))
+    assert_same_bits(expected, solved([view.in_files() for view in views], books, means=means))
 
 
 @every_device
@@ -71,64 +71,64 @@ def test_neither_threads_nor_order_nor_files_change_a_bit():
 def test_what_float16_cannot_hold_is_float32(device, size):
     views, books = scene(4)
     large = [size * book.clamp(-1, 1) for book in books]
-    made = solved(views, large, torch.float16, device=device).features
-    assert made.dtype == torch.float32
-    assert torch.isfinite(made).all()
+    solution = solved(views, large, torch.float16, device=device).features
+    assert solution.dtype == torch.float32
+    assert torch.isfinite(solution).all()
     expected = solved(views, [book.clamp(-1, 1) for book in books]).features
-    torch.testing.assert_close(made / size, expected, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(solution / size, expected, rtol=1e-5, atol=1e-6)
 
 
 @every_device
 def test_slices_of_channels_are_put_together(monkeypatch, device):
     views, books = scene(37)
-    whole = solved(views, books, device=device)
+    expected = solved(views, books, device=device)
     monkeypatch.setattr("liftcore.solve.codebook.TABLE_BYTES", 1)
-    told = []
-    cut = solved(views, books, device=device, progress=lambda *step: told.append(step))
-    assert torch.equal(cut.features, whole.features)
-    torch.testing.assert_close(cut.agreement, whole.agreement, rtol=0, atol=1e-6)
-    assert told[-1] == ("solve", 5, 5, "slices")
+    calls = []
+    cut = solved(views, books, device=device, progress=lambda *step: calls.append(step))
+    assert torch.equal(cut.features, expected.features)
+    torch.testing.assert_close(cut.agreement, expected.agreement, rtol=0, atol=1e-6)
+    assert calls[-1] == ("solve", 5, 5, "slices")
 
 
 def test_blocks_that_have_no_room_beside_others_are_solved_after_them(monkeypatch):
     """One block holds the device until another has been refused."""
     views, books = scene()
-    whole, sums = solved(views, books, device=DEVICES[1]), closed_form.bag_sums
-    held, refused = threading.Lock(), threading.Event()
+    expected, sums = solved(views, books, device=DEVICES[1]), closed_form.bag_sums
+    lock, rejected = threading.Lock(), threading.Event()
 
-    def crowded(*given):
-        if not held.acquire(blocking=False):
-            refused.set()
+    def crowded(*arguments):
+        if not lock.acquire(blocking=False):
+            rejected.set()
             raise torch.OutOfMemoryError
         try:
-            refused.wait(60)
-            return sums(*given)
+            rejected.wait(60)
+            return sums(*arguments)
         finally:
-            held.release()
+            lock.release()
 
     monkeypatch.setattr(closed_form, "bag_sums", crowded)
     monkeypatch.setattr(closed_form, "DEVICE_ROWS", SPLATS // 5)
     monkeypatch.setattr(closed_form, "LEAST_ROWS", SPLATS)  # no block may be halved
-    made = solved(views, books, device=DEVICES[1], threads=4)
-    assert refused.is_set()
-    assert torch.equal(made.features, whole.features)
+    solution = solved(views, books, device=DEVICES[1], threads=4)
+    assert rejected.is_set()
+    assert torch.equal(solution.features, expected.features)
 
 
 def test_a_device_without_room_is_given_less_at_a_time(monkeypatch):
     views, books = scene()
-    whole, sums, tried = solved(views, books, device=DEVICES[1]), closed_form.bag_sums, []
+    expected, sums, sizes = solved(views, books, device=DEVICES[1]), closed_form.bag_sums, []
 
     def crowded(index, table, starts, shares=None):
-        tried.append(starts.shape[0] - 1)
-        if tried[-1] > 256:
+        sizes.append(starts.shape[0] - 1)
+        if sizes[-1] > 256:
             raise torch.OutOfMemoryError
         return sums(index, table, starts, shares)
 
     monkeypatch.setattr(closed_form, "bag_sums", crowded)
-    made = solved(views, books, device=DEVICES[1])
-    assert tried[0] > 256 >= tried[-1]
-    assert torch.equal(made.features, whole.features)
-    torch.testing.assert_close(made.agreement, whole.agreement, rtol=0, atol=1e-6)
+    solution = solved(views, books, device=DEVICES[1])
+    assert sizes[0] > 256 >= sizes[-1]
+    assert torch.equal(solution.features, expected.features)
+    torch.testing.assert_close(solution.agreement, expected.agreement, rtol=0, atol=1e-6)
     monkeypatch.setattr(closed_form, "LEAST_ROWS", SPLATS)
     with pytest.raises(torch.OutOfMemoryError):
         solved(views, books, device=DEVICES[1])
@@ -139,16 +139,18 @@ def test_sums_of_a_million_entries_and_of_many_views_keep_their_digits(device):
     books = [torch.full((1_000_000, 1), 0.7)]
     long = [of_dense(np.full((1, 1_000_000), 0.3))]
     views = [of_dense(np.full((1, 1), 0.3))] * 2_000
-    for own, codebooks in ((long, books), (views, [torch.full((1, 1), 0.7)] * 2_000)):
-        found = solve(stacked(own, 1), codebook_of(codebooks), torch.float32, device=device)
-        assert abs(float(found.features[0, 0]) / float(torch.tensor(0.7)) - 1) < 5e-6  # one by one: the third digit
+    for views_of_case, codebooks in ((long, books), (views, [torch.full((1, 1), 0.7)] * 2_000)):
+        solution = solve(stacked(views_of_case, 1), codebook_of(codebooks), torch.float32, device=device)
+        assert (
+            abs(float(solution.features[0, 0]) / float(torch.tensor(0.7)) - 1) < 5e-6
+        )  # one by one: the third digit
 
 
 @every_device
 def test_no_view_no_region_and_codebooks_of_zeros_are_zeros(device):
-    nothing = of_dense(np.zeros((SPLATS, 2)))
-    found = solved([nothing, nothing], [torch.ones(2, 3)] * 2, torch.float16, device=device)
-    assert not found.features.any() and not found.agreement.any()
+    no_weights = of_dense(np.zeros((SPLATS, 2)))
+    solution = solved([no_weights, no_weights], [torch.ones(2, 3)] * 2, torch.float16, device=device)
+    assert not solution.features.any() and not solution.agreement.any()
     zeros = solved([random_view(0, 4, SPLATS)], [torch.zeros(4, 3)], torch.float16, device=device)
     assert not zeros.features.any() and not zeros.agreement.any()
 
@@ -156,10 +158,10 @@ def test_no_view_no_region_and_codebooks_of_zeros_are_zeros(device):
 @every_device
 def test_tiny_and_huge_weights_give_means(device):
     views, books = scene(6)
-    plain = solved(views, books, device=device)
+    expected = solved(views, books, device=device)
     for factor in (2.0**-100, 2.0**100):
         scaled = [replace(view, weight=view.weight * factor) for view in views]
-        assert torch.equal(solved(scaled, books, device=device).features, plain.features)
+        assert torch.equal(solved(scaled, books, device=device).features, expected.features)
 
 
 @given(st.integers(0, 2**31), st.sampled_from([1, 7, 50]), st.sampled_from([1e-7, 1e-5, 1.0, 6e4]))
@@ -167,8 +169,8 @@ def test_float16_codebooks_give_the_bits_of_their_float32_twins(seed, channels, 
     views = [random_view(seed + view, 5, 40) for view in range(3)]
     books = [(size * torch.rand(5, channels, generator=torch.manual_seed(seed))).half() for _ in views]
     W, before = stacked(views, 40), [book.clone() for book in books]
-    found = solve(W, codebook_of(books), torch.float32).features
-    assert torch.equal(found, solve(W, codebook_of([book.float() for book in books]), torch.float32).features)
-    mixed = [book.float() if k else book for k, book in enumerate(books)]
-    assert torch.equal(found, solve(W, codebook_of(mixed), torch.float32).features)
+    solution = solve(W, codebook_of(books), torch.float32).features
+    assert torch.equal(solution, solve(W, codebook_of([book.float() for book in books]), torch.float32).features)
+    mixed_books = [book.float() if k else book for k, book in enumerate(books)]
+    assert torch.equal(solution, solve(W, codebook_of(mixed_books), torch.float32).features)
     assert all(map(torch.equal, books, before))

@@ -29,9 +29,9 @@ def same_partition(labels: np.ndarray, group: np.ndarray) -> bool:
 
 def test_planted_clusters_are_found_whatever_the_lengths_of_the_features():
     features, group = planted(600)
-    found = cluster_splats(features, np.ones(600), SETTINGS)
-    labels = found.labels.numpy()
-    assert found.count == 4
+    clustering = cluster_splats(features, np.ones(600), SETTINGS)
+    labels = clustering.labels.numpy()
+    assert clustering.count == 4
     assert (labels == NO_CLUSTER).mean() < 0.05
     assert same_partition(labels[labels >= 0], group[labels >= 0])
 
@@ -39,9 +39,9 @@ def test_planted_clusters_are_found_whatever_the_lengths_of_the_features():
 def test_splats_outside_the_sample_join_their_cluster():
     features, group = planted(5_000)
     few = SETTINGS.model_copy(update={"aggregation_sample": 400, "aggregation_cluster_size": 250})
-    found = cluster_splats(features, np.ones(5_000), few)
-    labels = found.labels.numpy()
-    assert (found.facts["sample"], found.facts["smallest_in_sample"]) == (400, 20)
+    clustering = cluster_splats(features, np.ones(5_000), few)
+    labels = clustering.labels.numpy()
+    assert (clustering.facts["sample"], clustering.facts["smallest_in_sample"]) == (400, 20)
     assert (labels >= 0).mean() > 0.9
     assert same_partition(labels[labels >= 0], group[labels >= 0])
 
@@ -77,18 +77,18 @@ def test_the_number_of_threads_changes_no_label(channels):
     ],
 )
 def test_features_without_clusters_give_none(features):
-    found = cluster_splats(features, np.ones(len(features)), SETTINGS)
-    assert found.count == 0
-    assert bool((found.labels == NO_CLUSTER).all())
+    clustering = cluster_splats(features, np.ones(len(features)), SETTINGS)
+    assert clustering.count == 0
+    assert bool((clustering.labels == NO_CLUSTER).all())
 
 
 @pytest.mark.parametrize("scale", [1e-38, 1e30])
 def test_equal_features_in_two_groups_are_two_clusters_at_any_scale(scale):
     features = torch.cat([torch.ones(150, 1), -torch.ones(150, 1)]) * scale
-    found = cluster_splats(features, np.ones(300), SETTINGS)
-    assert found.count == 2
-    assert found.labels[:150].unique().numel() == found.labels[150:].unique().numel() == 1
-    assert found.labels[0] != found.labels[150]
+    clustering = cluster_splats(features, np.ones(300), SETTINGS)
+    assert clustering.count == 2
+    assert clustering.labels[:150].unique().numel() == clustering.labels[150:].unique().numel() == 1
+    assert clustering.labels[0] != clustering.labels[150]
 
 
 def test_splats_without_evidence_are_never_drawn_and_faint_ones_less_often():
@@ -119,9 +119,13 @@ def test_groups_that_lie_apart_are_clusters_of_their_own_unless_few() -> None:
     splats.means[:, 0] += torch.from_numpy(100.0 * place).float()
     labels = np.where(place < 2, 0, np.where(place == 2, 2, 0)).astype(np.int32)  # no splat in cluster 1
     labels[np.flatnonzero(place == 2)[:4]] = NO_CLUSTER
-    found = split_by_touch(Clustering(torch.from_numpy(labels), 3, {}), splats, 6)
-    numbers = found.labels.numpy()
-    assert found.count == 3
+    clustering = split_by_touch(Clustering(torch.from_numpy(labels), 3, {}), splats, 6)
+    numbers = clustering.labels.numpy()
+    assert clustering.count == 3
     assert (numbers[(place == 3) | (labels == NO_CLUSTER)] == NO_CLUSTER).all()
-    others = (place < 3) & (labels != NO_CLUSTER)
-    assert same_partition(numbers[others], place[others]) and set(numbers[others]) == {0, 1, 2}
+    elsewhere_mask = (place < 3) & (labels != NO_CLUSTER)
+    assert same_partition(numbers[elsewhere_mask], place[elsewhere_mask]) and set(numbers[elsewhere_mask]) == {
+        0,
+        1,
+        2,
+    }

@@ -25,44 +25,46 @@ def region_map(seed: int, levels: int, size: float = 1.0, kind: torch.dtype = to
     """Blobs, each level coarser than the one before; some lack labels. Rows of many lengths."""
     rng = np.random.default_rng(seed)
     blobs = np.repeat(np.repeat(rng.integers(0, 9, (6, 6)), 4, axis=0), 4, axis=1)
-    named = [np.where(rng.random(9) < 0.8, np.arange(9) // (level + 1), NO_LABEL) for level in range(levels)]
+    levels_labels = [np.where(rng.random(9) < 0.8, np.arange(9) // (level + 1), NO_LABEL) for level in range(levels)]
     rows = rng.normal(size=(9, 40)) * rng.uniform(0.1, 1.0, (9, 1)) * size
-    return Regions(torch.from_numpy(np.stack(named)[:, blobs].astype(np.int32)), torch.from_numpy(rows).to(kind))
+    return Regions(
+        torch.from_numpy(np.stack(levels_labels)[:, blobs].astype(np.int32)), torch.from_numpy(rows).to(kind)
+    )
 
 
-def weighed(maps: list[Regions], by_rows: bool, power: int = 1) -> tuple[RegionWeights, Codebook]:
+def stacked_weights(maps: list[Regions], by_rows: bool, power: int = 1) -> tuple[RegionWeights, Codebook]:
     """W of the maps in one camera, and what its regions stand for."""
-    read = [as_regions(own, by_rows) for own in maps]
+    pairs = [as_regions(region_map_, by_rows) for region_map_ in maps]
     weighting = Weighting(power)
-    found = [
+    parts = [
         codebook.weights_by_row(RASTER.region_weights(CAMERA, regions, CompositingParams(), weighting))
-        for regions, codebook in read
+        for regions, codebook in pairs
     ]
-    return stacked(found, RASTER.splats.count), Codebook([codebook for _, codebook in read])
+    return stacked(parts, RASTER.splats.count), Codebook([codebook for _, codebook in pairs])
 
 
 def solved(maps: list[Regions], by_rows: bool, power: int = 1, dtype=torch.float32) -> tuple[Solution, torch.Tensor]:
-    W, codebook = weighed(maps, by_rows, power)
+    W, codebook = stacked_weights(maps, by_rows, power)
     return solve(W, codebook, dtype), W.row_sums()
 
 
 @given(st.integers(0, 2**31), st.integers(2, 4), st.sampled_from([1, 2]), st.sampled_from([1e-30, 1.0, 1e14]))
 def test_tuples_give_what_rows_give_with_fewer_entries(seed, levels, power, size):
     maps = [region_map(seed + view, levels, size) for view in range(2)]
-    (rows, sums), (tuples, fewer) = (solved(maps, by_rows, power) for by_rows in (True, False))
-    np.testing.assert_allclose(fewer, sums, rtol=1e-6)
+    (rows, sums), (tuples, fewer_sums) = (solved(maps, by_rows, power) for by_rows in (True, False))
+    np.testing.assert_allclose(fewer_sums, sums, rtol=1e-6)
     np.testing.assert_allclose(tuples.features / size, rows.features / size, atol=1e-5)
     np.testing.assert_allclose(tuples.agreement, rows.agreement, atol=1e-5)
-    (by_row, _), (by_tuple, _) = weighed(maps, True), weighed(maps, False)
+    (by_row, _), (by_tuple, _) = stacked_weights(maps, True), stacked_weights(maps, False)
     assert by_tuple.region.numel() < by_row.region.numel()
     assert torch.equal(by_tuple.total_weight, by_row.total_weight)
 
 
 def test_means_of_float16_rows_are_rounded_as_the_features_are():
-    own = region_map(3, 4, kind=torch.float16)
-    rows, _ = solved([own], by_rows=True)
+    region_map_ = region_map(3, 4, kind=torch.float16)
+    rows, _ = solved([region_map_], by_rows=True)
     for dtype, error in ((torch.float32, 1e-6), (torch.float16, 2e-3)):
-        tuples, _ = solved([own], by_rows=False, dtype=dtype)
+        tuples, _ = solved([region_map_], by_rows=False, dtype=dtype)
         assert tuples.features.dtype == dtype
         np.testing.assert_allclose(tuples.features, rows.features, atol=error)
         np.testing.assert_allclose(tuples.agreement, rows.agreement, atol=error)
@@ -73,14 +75,16 @@ def test_a_map_is_left_as_it_is_where_tuples_save_nothing():
         torch.randint(0, 7, (2, 30, 30), generator=torch.manual_seed(0), dtype=torch.int32), torch.ones(7, 3)
     )
     none = Regions(torch.full((2, 4, 4), NO_LABEL, dtype=torch.int32), torch.ones(1, 3))
-    for own in (noise, none, region_map(0, 1), FeatureGrid(torch.ones(2, 2, 3))):
-        regions, codebook = as_regions(own, by_rows=False)
-        assert regions is own and codebook.tuples is None and codebook.regions == own.codebook.shape[0]
+    for region_map_ in (noise, none, region_map(0, 1), FeatureGrid(torch.ones(2, 2, 3))):
+        regions, codebook = as_regions(region_map_, by_rows=False)
+        assert (
+            regions is region_map_ and codebook.tuples is None and codebook.regions == region_map_.codebook.shape[0]
+        )
     assert as_regions(region_map(0, 3), by_rows=True)[1].tuples is None
 
 
 @pytest.mark.parametrize("levels", range(2, 20))
 def test_the_mean_of_the_largest_numbers_is_one_of_them(levels):
     largest = torch.finfo(torch.float32).max
-    same = ViewCodebook(torch.full((3, 2), largest), torch.ones(1, levels, dtype=torch.int32))
-    torch.testing.assert_close(same.means(same.rows), torch.full((1, 2), largest))
+    codebook = ViewCodebook(torch.full((3, 2), largest), torch.ones(1, levels, dtype=torch.int32))
+    torch.testing.assert_close(codebook.means(codebook.rows), torch.full((1, 2), largest))

@@ -58,10 +58,10 @@ def test_the_system_is_solved(kind):
 
 def test_every_channel_is_solved_as_if_it_were_alone():
     K, right = system("plain")
-    together = conjugate_gradients(lambda X: K @ X, right, jacobi(K), Stopping(6)).solution
+    joint = conjugate_gradients(lambda X: K @ X, right, jacobi(K), Stopping(6)).solution
     for channel in range(right.shape[1]):
-        alone = conjugate_gradients(lambda X: K @ X, right[:, [channel]], jacobi(K), Stopping(6)).solution
-        assert np.allclose(alone[:, 0], together[:, channel], rtol=1e-3, atol=1e-4)
+        single = conjugate_gradients(lambda X: K @ X, right[:, [channel]], jacobi(K), Stopping(6)).solution
+        assert np.allclose(single[:, 0], joint[:, channel], rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize("bad", [-1.0, np.nan])
@@ -75,15 +75,15 @@ def test_a_matrix_without_curvature_stops_and_says_so(bad):
 
 
 def test_inner_products_are_summed_in_float64():
-    left = np.full((100_000, 2), 1e-3, np.float32)
-    left[0] = 1e4
-    assert np.allclose(column_dots(left, np.ones_like(left)), left.astype(np.float64).sum(axis=0), rtol=1e-12)
+    values = np.full((100_000, 2), 1e-3, np.float32)
+    values[0] = 1e4
+    assert np.allclose(column_dots(values, np.ones_like(values)), values.astype(np.float64).sum(axis=0), rtol=1e-12)
 
 
-def refined(scene: SmallScene, dtype: torch.dtype = torch.float32, **chosen: float) -> Refinement:
-    knobs = LiftSettings.of(**{"cg_steps": 200, "damping": 0.1, **chosen})
+def refined(scene: SmallScene, dtype: torch.dtype = torch.float32, **overrides: float) -> Refinement:
+    knobs = LiftSettings.of(**{"cg_steps": 200, "damping": 0.1, **overrides})
     features = scene.closed_form.clone().to(dtype)
-    return refine(scene.rays(), features, scene.seen, scene.codebooks, knobs, silent)
+    return refine(scene.rays(), features, scene.has_weight, scene.codebooks, knobs, silent)
 
 
 def with_codebook(observation: ViewFeatures, codebook: torch.Tensor) -> Regions:
@@ -113,10 +113,10 @@ def test_the_operator_is_the_dense_one(seed, grids):
 @given(SEEDS, st.booleans(), st.sampled_from([0.03, 0.3, 1.0, 10.0]))
 def test_damped_steps_end_at_the_damped_normal_equations(seed, grids, damping):
     scene = SmallScene(seed, grids)
-    made = refined(scene, damping=damping)
+    refinement = refined(scene, damping=damping)
     expected = scene.damped(damping)
-    assert made.stats["result"] == "converged"
-    assert np.abs(made.features.numpy() - expected).max() < 5e-3 * max(1.0, np.abs(expected).max())
+    assert refinement.stats["result"] == "converged"
+    assert np.abs(refinement.features.numpy() - expected).max() < 5e-3 * max(1.0, np.abs(expected).max())
 
 
 @few
@@ -124,43 +124,43 @@ def test_damped_steps_end_at_the_damped_normal_equations(seed, grids, damping):
 def test_undamped_steps_reach_the_least_squares_loss(seed):
     scene = SmallScene(seed)
     least = scene.loss(np.linalg.lstsq(scene.A, scene.B, rcond=1e-12)[0])
-    made = refined(scene, damping=0.0, cg_steps=200)
+    refinement = refined(scene, damping=0.0, cg_steps=200)
     first = scene.loss(scene.closed_form)
-    assert least - 1e-6 <= scene.loss(made.features) <= least + 2e-3 * first
+    assert least - 1e-6 <= scene.loss(refinement.features) <= least + 2e-3 * first
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.3])
-def test_the_residuals_told_are_those_of_the_dense_matrix_and_fall(damping):
+def test_the_reported_residuals_are_those_of_the_dense_matrix_and_fall(damping):
     scene = SmallScene(2)
     for steps in (1, 4, 9):
-        made = refined(scene, damping=damping, cg_steps=steps)
-        told = np.array(made.stats["residuals"]) * len(scene.B)
-        assert len(told) == made.stats["steps"] + 1 <= steps + 1
-        assert told[0] == pytest.approx(scene.loss(scene.closed_form), rel=1e-4)
-        assert told[-1] == pytest.approx(scene.loss(made.features), rel=1e-3)
+        refinement = refined(scene, damping=damping, cg_steps=steps)
+        losses = np.array(refinement.stats["residuals"]) * len(scene.B)
+        assert len(losses) == refinement.stats["steps"] + 1 <= steps + 1
+        assert losses[0] == pytest.approx(scene.loss(scene.closed_form), rel=1e-4)
+        assert losses[-1] == pytest.approx(scene.loss(refinement.features), rel=1e-3)
     if damping == 0:
-        assert (np.diff(told) <= 1e-6 * told[0]).all()
-    assert "steps" in made.stats["message"]
-    assert str(damping) in made.stats["message"] or f"{damping:g}" in made.stats["message"]
+        assert (np.diff(losses) <= 1e-6 * losses[0]).all()
+    assert "steps" in refinement.stats["message"]
+    assert str(damping) in refinement.stats["message"] or f"{damping:g}" in refinement.stats["message"]
 
 
 def test_a_full_basis_gives_the_solution_of_all_channels():
     wide = SmallScene(3)
     rng = np.random.default_rng(0)
     mix = torch.tensor(rng.normal(size=(6, 40)), dtype=torch.float32)  # 40 channels of rank 6
-    mixed = [with_codebook(seen, seen.codebook @ mix) for seen in wide.observations]
-    scene = SmallScene(3, observations=mixed)
-    whole, reduced = refined(scene, damping=0.3), refined(scene, damping=0.3, cg_basis=6)
+    mixed_observations = [with_codebook(observation, observation.codebook @ mix) for observation in wide.observations]
+    scene = SmallScene(3, observations=mixed_observations)
+    full, reduced = refined(scene, damping=0.3), refined(scene, damping=0.3, cg_basis=6)
     assert reduced.stats["channels"] == 6
-    assert whole.stats["channels"] == 40
-    assert torch.allclose(whole.features, reduced.features, atol=2e-3)
+    assert full.stats["channels"] == 40
+    assert torch.allclose(full.features, reduced.features, atol=2e-3)
 
 
 def test_what_lies_outside_the_basis_is_kept():
     scene = SmallScene(4)
     axes = codebook_axes(scene.codebooks, 2)
-    made = refined(scene, damping=0.1, cg_basis=2)
-    step = made.features - scene.closed_form
+    refinement = refined(scene, damping=0.1, cg_basis=2)
+    step = refinement.features - scene.closed_form
     assert float(step.norm()) > 0.1
     assert torch.allclose(step @ axes @ axes.T, step, atol=1e-5)
 
@@ -175,48 +175,50 @@ def test_axes_hold_most_of_the_squares_and_repeat_to_the_bit():
     assert torch.allclose(axes @ axes.T, exact @ exact.T, atol=1e-3)
     threads = torch.get_num_threads()
     torch.set_num_threads(3)
-    again = codebook_axes(books, 4)
+    second_axes = codebook_axes(books, 4)
     torch.set_num_threads(threads)
-    assert torch.equal(axes, again)
+    assert torch.equal(axes, second_axes)
 
 
 def test_unseen_splats_stay_zero():
     scene = SmallScene(5)
-    hidden = np.flatnonzero(scene.seen)[0]
-    scene.seen[hidden] = False
-    scene.closed_form[~torch.from_numpy(scene.seen)] = 0
-    assert (refined(scene, damping=0.0).features[~torch.from_numpy(scene.seen)] == 0).all()
+    unseen_splat = np.flatnonzero(scene.has_weight)[0]
+    scene.has_weight[unseen_splat] = False
+    scene.closed_form[~torch.from_numpy(scene.has_weight)] = 0
+    assert (refined(scene, damping=0.0).features[~torch.from_numpy(scene.has_weight)] == 0).all()
 
 
 def test_float16_features_that_grow_too_large_become_float32():
-    large = [with_codebook(seen, seen.codebook * 6e4) for seen in SmallScene(6).observations]
+    large = [with_codebook(observation, observation.codebook * 6e4) for observation in SmallScene(6).observations]
     scene = SmallScene(6, observations=large)
-    made = refined(scene, torch.float16, damping=0.0)
-    assert torch.isfinite(made.features).all()
-    assert made.features.dtype == torch.float32
+    refinement = refined(scene, torch.float16, damping=0.0)
+    assert torch.isfinite(refinement.features).all()
+    assert refinement.features.dtype == torch.float32
 
 
 def test_all_that_was_seen_is_refined_however_faintly(tmp_path, monkeypatch):
-    paths, given = write_scene(tmp_path, 7), []
-    monkeypatch.setattr("liftcore.lifting.in_memory.refine", lambda *told: given.append(told[2]) or refine(*told))
-    made = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(preset="row-sum", cg_steps=1))
-    assert np.array_equal(given[0], made.seen.numpy())
-    assert (made.total_weight[made.seen] < 0.5).any()  # or it would say nothing of faint ones
+    paths, calls = write_scene(tmp_path, 7), []
+    monkeypatch.setattr(
+        "liftcore.lifting.in_memory.refine", lambda *arguments: calls.append(arguments[2]) or refine(*arguments)
+    )
+    result = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(preset="row-sum", cg_steps=1))
+    assert np.array_equal(calls[0], result.seen.numpy())
+    assert (result.total_weight[result.seen] < 0.5).any()  # or it would say nothing of faint ones
 
 
 def test_a_lift_takes_no_step_unless_asked(tmp_path):
     paths = write_scene(tmp_path, 8)
-    said = []
+    stages = []
 
-    def progress(stage: str, done: int, total: int, unit: str) -> None:
-        said.append((stage, done, total, unit))
+    def progress(stage: str, completed: int, total: int, unit: str) -> None:
+        stages.append((stage, completed, total, unit))
 
-    plain = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(), progress=progress)
-    assert "refinement" not in plain.metadata.diagnostics
-    assert not any(stage in ("refine", "rays") for stage, *_ in said)
+    baseline = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(), progress=progress)
+    assert "refinement" not in baseline.metadata.diagnostics
+    assert not any(stage in ("refine", "rays") for stage, *_ in stages)
     steps = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(cg_steps=3, damping=0.1), progress=progress)
-    told = steps.metadata.diagnostics["refinement"]
-    assert [word for word in said if word[0] == "refine"][-1] == ("refine", 3, 3, "steps")
-    assert told["residuals"][-1] < told["residuals"][0]
-    assert steps.metadata.diagnostics["residual"] < plain.metadata.diagnostics["residual"]
-    assert not torch.equal(steps.features, plain.features)
+    facts = steps.metadata.diagnostics["refinement"]
+    assert [word for word in stages if word[0] == "refine"][-1] == ("refine", 3, 3, "steps")
+    assert facts["residuals"][-1] < facts["residuals"][0]
+    assert steps.metadata.diagnostics["residual"] < baseline.metadata.diagnostics["residual"]
+    assert not torch.equal(steps.features, baseline.features)

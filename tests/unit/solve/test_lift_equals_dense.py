@@ -41,30 +41,30 @@ class Case:
     """A lift, and what counts as a weight in it by the words of the documentation."""
 
     settings: dict[str, Any]
-    walk: CompositingParams
+    params: CompositingParams
     weighting: Weighting
     kernel: Kernel = field(default=Kernel.GAUSSIAN_3D, kw_only=True)
 
 
-PLAIN, GAIN = CompositingParams(), CompositingParams(1.2)
+UNSCALED, GAIN = CompositingParams(), CompositingParams(1.2)
 CASES = {
-    preset: Case({"preset": preset}, walk, weighting)
-    for preset, walk, weighting in (
-        ("row-sum", PLAIN, Weighting(1)),
+    preset: Case({"preset": preset}, params, weighting)
+    for preset, params, weighting in (
+        ("row-sum", UNSCALED, Weighting(1)),
         ("tikhonov", GAIN, Weighting(2)),
-        ("argmax", PLAIN, Weighting(1, Selection.TOP_K, count=1)),
-        ("top-k", PLAIN, Weighting(1, Selection.TOP_K, count=40)),
-        ("front-mass", PLAIN, Weighting(1, Selection.FRONT_MASS, mass=0.75)),
-        ("centre", PLAIN, Weighting(1, Selection.CENTRE)),
-        ("mean", PLAIN, Weighting(0, Selection.CENTRE, floor=0.05)),
+        ("argmax", UNSCALED, Weighting(1, Selection.TOP_K, count=1)),
+        ("top-k", UNSCALED, Weighting(1, Selection.TOP_K, count=40)),
+        ("front-mass", UNSCALED, Weighting(1, Selection.FRONT_MASS, mass=0.75)),
+        ("centre", UNSCALED, Weighting(1, Selection.CENTRE)),
+        ("mean", UNSCALED, Weighting(0, Selection.CENTRE, floor=0.05)),
     )
 } | {
     "antialiased": Case({"preset": "tikhonov", "antialiased": True}, replace(GAIN, antialiased=True), Weighting(2)),
     # The gain of 1.2 acts on the logits of every kernel; the released code leaves DBS out.
     "2dgs": Case({"preset": "tikhonov"}, GAIN, Weighting(2), kernel=Kernel.GAUSSIAN_2D),
     "dbs": Case({"preset": "tikhonov"}, GAIN, Weighting(2), kernel=Kernel.BETA),
-    "every second pixel": Case({"preset": "row-sum", "stride": 2}, PLAIN, Weighting(1)),
-    "every third pixel": Case({"preset": "row-sum", "stride": 3}, PLAIN, Weighting(1)),
+    "every second pixel": Case({"preset": "row-sum", "stride": 2}, UNSCALED, Weighting(1)),
+    "every third pixel": Case({"preset": "row-sum", "stride": 3}, UNSCALED, Weighting(1)),
 }
 
 
@@ -81,22 +81,22 @@ class Dense:
 
 def dense_lift(seed: int, grids: bool, case: Case, splats: Splats, cameras: Cameras) -> Dense:
     settings = LiftSettings.of(**case.settings)
-    numerator, made = np.zeros((50, 6)), Dense(np.zeros((50, 6)), np.zeros(50), np.zeros(50), np.zeros(50, bool), 0)
+    numerator, dense = np.zeros((50, 6)), Dense(np.zeros((50, 6)), np.zeros(50), np.zeros(50), np.zeros(50, bool), 0)
     for k, camera in enumerate(cameras.values()):
-        observation, walk = observed(seed, k, grids), strided(case.walk, settings, camera, k)
-        view, walked = dense_view(splats, camera, walk), strided_rays(camera, walk)
+        observation, params = observed(seed, k, grids), strided(case.params, settings, camera, k)
+        view, is_strided = dense_view(splats, camera, params), strided_rays(camera, params)
         S, ray = reading_matrix(observation, camera.width, camera.height)
-        chosen, close = selected_weights(view.A, splats, camera, walk, case.weighting)
-        own = walked[ray]
-        weights = chosen[ray[own]]
-        numerator += weights.T @ (S[own] @ observation.codebook.double().numpy())
-        made.D += weights.sum(axis=0)
-        plain = dense_view(splats, camera, replace(walk, opacity_logit_scale=1.0))
-        made.total_weight += settings.stride**2 * plain.A[walked].sum(axis=0)
-        made.undecided |= (view.A[close | view.cut | plain.cut] > 0).any(axis=0)
-        made.rays += int(walked.sum())
-    made.X = np.divide(numerator, made.D[:, None], out=np.zeros((50, 6)), where=made.D[:, None] > 0)
-    return made
+        selected, close = selected_weights(view.A, splats, camera, params, case.weighting)
+        labels = is_strided[ray]
+        weights = selected[ray[labels]]
+        numerator += weights.T @ (S[labels] @ observation.codebook.double().numpy())
+        dense.D += weights.sum(axis=0)
+        baseline = dense_view(splats, camera, replace(params, opacity_logit_scale=1.0))
+        dense.total_weight += settings.stride**2 * baseline.A[is_strided].sum(axis=0)
+        dense.undecided |= (view.A[close | view.cut | baseline.cut] > 0).any(axis=0)
+        dense.rays += int(is_strided.sum())
+    dense.X = np.divide(numerator, dense.D[:, None], out=np.zeros((50, 6)), where=dense.D[:, None] > 0)
+    return dense
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
@@ -104,17 +104,17 @@ def dense_lift(seed: int, grids: bool, case: Case, splats: Splats, cameras: Came
 @pytest.mark.parametrize("seed", [0, 3])
 def test_a_lift_equals_the_dense_definition(tmp_path, case, grids, seed):
     splats, cameras, features = write_scene(tmp_path, seed, grids, case.kernel)
-    made = lift_files(splats, cameras, [features], LiftSettings.of(**case.settings))
-    save_lift(made, tmp_path / "lift.safetensors")
+    result = lift_files(splats, cameras, [features], LiftSettings.of(**case.settings))
+    save_lift(result, tmp_path / "lift.safetensors")
     got = load_lift(tmp_path / "lift.safetensors")
     assert read_splats(splats).kernel is case.kernel
     exact = dense_lift(seed, grids, case, read_splats(splats), read_cameras(cameras))
-    decided, seen = ~exact.undecided, exact.D > 0
-    assert np.array_equal(got.seen.numpy()[decided], seen[decided])
+    unambiguous, has_weight = ~exact.undecided, exact.D > 0
+    assert np.array_equal(got.seen.numpy()[unambiguous], has_weight[unambiguous])
     error = np.linalg.norm(got.features.double().numpy() - exact.X, axis=1)
-    assert (error <= 1e-3 * np.linalg.norm(exact.X, axis=1) + 1e-7)[decided & (exact.D > 1e-6)].all()
-    assert (decided & seen).sum() > 10
-    assert np.abs(got.total_weight.numpy() - exact.total_weight)[decided].max() < 1e-3
+    assert (error <= 1e-3 * np.linalg.norm(exact.X, axis=1) + 1e-7)[unambiguous & (exact.D > 1e-6)].all()
+    assert (unambiguous & has_weight).sum() > 10
+    assert np.abs(got.total_weight.numpy() - exact.total_weight)[unambiguous].max() < 1e-3
     assert got.metadata.diagnostics["rays"] == exact.rays
 
 
@@ -127,11 +127,11 @@ def test_agreement_is_the_norm_of_the_mean_of_unit_inputs(tmp_path, preset):
     assert float(got.agreement.max()) <= 1.0
 
 
-def same_bits(one: LiftResult, other: LiftResult) -> bool:
+def same_bits(first: LiftResult, second: LiftResult) -> bool:
     """Whether all that two lifts found is equal to the bit."""
-    names = [name for name in (*TENSORS, *CLUSTER_TENSORS) if getattr(one, name) is not None]
-    same = all(torch.equal(getattr(one, name), getattr(other, name)) for name in names)
-    return same and one.metadata.diagnostics == other.metadata.diagnostics
+    names = [name for name in (*TENSORS, *CLUSTER_TENSORS) if getattr(first, name) is not None]
+    are_equal = all(torch.equal(getattr(first, name), getattr(second, name)) for name in names)
+    return are_equal and first.metadata.diagnostics == second.metadata.diagnostics
 
 
 @pytest.mark.parametrize(
@@ -148,8 +148,8 @@ def same_bits(one: LiftResult, other: LiftResult) -> bool:
 )
 def test_the_number_of_threads_changes_no_bit_of_a_lift(tmp_path, settings):
     paths = write_scene(tmp_path, 7)
-    one, many = (lift_files(*paths[:2], paths[2:], LiftSettings.of(**settings), threads=n) for n in (1, 5))
-    assert same_bits(one, many)
+    single, threaded = (lift_files(*paths[:2], paths[2:], LiftSettings.of(**settings), threads=n) for n in (1, 5))
+    assert same_bits(single, threaded)
 
 
 def test_weights_in_files_give_the_same_lift_as_weights_in_memory(tmp_path, monkeypatch):
@@ -170,10 +170,10 @@ def test_discs_written_with_three_scales_are_discs_where_the_settings_say_so(tmp
     flat, solid = read_splats(discs), tmp_path / "three.ply"
     scales = torch.cat([flat.log_scales, torch.full((flat.count, 1), -1.0)], dim=1)  # of no account
     write_splats(solid, Splats(flat.means, flat.quats, scales, flat.opacity_logits, sh=flat.sh))
-    wanted, got = lifted((discs, cameras, features)), lifted((solid, cameras, features), kernel="2dgs")
+    expected, got = lifted((discs, cameras, features)), lifted((solid, cameras, features), kernel="2dgs")
     assert got.metadata.diagnostics["plan"]["kernel"] == "2dgs"
-    assert torch.equal(got.features, wanted.features)
-    assert not torch.equal(lifted((solid, cameras, features)).features, wanted.features)
+    assert torch.equal(got.features, expected.features)
+    assert not torch.equal(lifted((solid, cameras, features)).features, expected.features)
     save_lift(got, tmp_path / "made.safetensors")
     assert Scene(tmp_path / "made.safetensors").splats.kernel is Kernel.GAUSSIAN_2D  # in pictures too
     with pytest.raises(InvalidSplats, match="'beta' of a dbs splat"):
@@ -209,9 +209,9 @@ def test_every_nth_view_is_lifted_from_the_first_on(tmp_path):
 def per_pixel(regions: Regions) -> Regions:
     """A row a pixel: the normalised sum of its levels, as released code builds its dense maps."""
     _, rows, columns = regions.labels.shape
-    own = torch.arange(rows * columns, dtype=torch.int32).reshape(1, rows, columns)
+    labels = torch.arange(rows * columns, dtype=torch.int32).reshape(1, rows, columns)
     unlabelled = (regions.labels < 0).all(dim=0, keepdim=True)
-    return Regions(own.masked_fill(unlabelled, -1), torch.tensor(dense_sums(regions), dtype=torch.float32))
+    return Regions(labels.masked_fill(unlabelled, -1), torch.tensor(dense_sums(regions), dtype=torch.float32))
 
 
 def one_level(regions: Regions) -> Regions:
@@ -227,9 +227,9 @@ def test_levels_lift_and_certify_as_the_maps_that_they_stand_for(tmp_path, level
     assert torch.equal(got.seen, other.seen)
     assert torch.allclose(got.features, other.features, atol=1e-5)
     assert torch.allclose(got.agreement, other.agreement, atol=1e-5)
-    ours, theirs = got.metadata.diagnostics, other.metadata.diagnostics
+    actual, stand_in = got.metadata.diagnostics, other.metadata.diagnostics
     for name in ("rays", "rows", "row_sum_mean", "residual", "surrogate", "bound"):
-        assert ours[name] == pytest.approx(theirs[name], rel=1e-4), name
+        assert actual[name] == pytest.approx(stand_in[name], rel=1e-4), name
 
 
 def test_a_level_that_a_view_lacks_is_an_error_that_names_the_view(tmp_path):
@@ -247,11 +247,11 @@ def repacked(features: Path, names: dict[str, str]) -> Path:
 def test_folders_before_the_names_of_views_change_no_bit(tmp_path):
     paths = write_scene(tmp_path, 3)
     rig = repacked(paths[2], {"v0": "camA/v0", "v1": "camA/v1", "v2": "camB/v2"})
-    plain, made = lifted(paths), lifted((*paths[:2], rig))
-    assert torch.equal(plain.features, made.features)
-    assert made.metadata.views == plain.metadata.views == ("v0", "v1", "v2")
-    assert made.metadata.diagnostics["warnings"] == plain.metadata.diagnostics["warnings"]
-    save_lift(made, tmp_path / "rig.lift")
+    baseline, in_folder = lifted(paths), lifted((*paths[:2], rig))
+    assert torch.equal(baseline.features, in_folder.features)
+    assert in_folder.metadata.views == baseline.metadata.views == ("v0", "v1", "v2")
+    assert in_folder.metadata.diagnostics["warnings"] == baseline.metadata.diagnostics["warnings"]
+    save_lift(in_folder, tmp_path / "rig.lift")
     regions = observed(3, 1)
     assert isinstance(regions, Regions)
     label = int(regions.labels[0].max())  # the region is asked for by the lift's name of the view
@@ -266,7 +266,7 @@ def test_the_warning_of_skipped_views_tells_how_a_rig_is_named(tmp_path):
     for record, name in zip(records, ("camA/0", "camA/1", "camB/0"), strict=True):
         record["img_name"] = name
     cameras.write_text(json.dumps(records))
-    made = lifted((splats, cameras, repacked(features, {"v0": "0", "v1": "1"})))
-    assert (made.metadata.views, made.metadata.diagnostics["views_without_camera"]) == (("camA/1",), ["0"])
-    [warning] = [text for text in made.metadata.diagnostics["warnings"] if "skipped" in text]
+    result = lifted((splats, cameras, repacked(features, {"v0": "0", "v1": "1"})))
+    assert (result.metadata.views, result.metadata.diagnostics["views_without_camera"]) == (("camA/1",), ["0"])
+    [warning] = [text for text in result.metadata.diagnostics["warnings"] if "skipped" in text]
     assert warning.endswith("cameras are named with their folders here, such as camA/1: name views like them")

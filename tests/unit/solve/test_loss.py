@@ -20,8 +20,8 @@ def reweighted_steps(W: np.ndarray, E: np.ndarray, steps: int) -> tuple[np.ndarr
     """The factors [P, M], X [P, F] of their closed form, and delta."""
 
     def closed_form(factors: np.ndarray) -> np.ndarray:
-        own = W * factors
-        return own @ E / np.maximum(own.sum(axis=1, keepdims=True), 1e-300)
+        shares = W * factors
+        return shares @ E / np.maximum(shares.sum(axis=1, keepdims=True), 1e-300)
 
     factors, delta = np.ones_like(W), 0.0
     for step in range(steps):
@@ -43,9 +43,9 @@ def test_huber_factors_equal_their_definition_at_any_length(size, monkeypatch):
     W, E = stacked(views, 60), torch.cat(books).double().numpy()
     expected = reweighted_steps(dense(W, 60), E / size, STEPS)[0][dense(W, 60) > 0]
     assert expected.min() < 0.6 and expected.max() == 1.0
-    found = huber_factors(W, codebook_of(books), threads=1)
-    np.testing.assert_allclose(found.numpy(), expected, rtol=2e-5)
-    assert torch.equal(found, huber_factors(W, codebook_of(books), means=torch.rand(60, 3), threads=3))
+    factors = huber_factors(W, codebook_of(books), threads=1)
+    np.testing.assert_allclose(factors.numpy(), expected, rtol=2e-5)
+    assert torch.equal(factors, huber_factors(W, codebook_of(books), means=torch.rand(60, 3), threads=3))
     monkeypatch.setattr("liftcore.solve.codebook.TABLE_BYTES", 1)
     np.testing.assert_allclose(huber_factors(W, codebook_of(books)).numpy(), expected, rtol=2e-5)
 
@@ -58,13 +58,13 @@ def test_a_huber_lift_is_nearest_by_hubers_loss(tmp_path, grids):
     W = dense(lc.region_weights(splats, cameras, views, preset="row-sum"), splats.count)
     E = np.concatenate([view.codebook.double().numpy() for view in views.values()])
     X, delta = reweighted_steps(W, E, STEPS)[1:]
-    how = {"cameras": cameras, "views": views, "preset": "row-sum"}
-    lifted, squares = (lc.lift(splats, **how, dtype="float32", loss=name) for name in ("huber", "l2"))
+    options = {"cameras": cameras, "views": views, "preset": "row-sum"}
+    lifted, squares = (lc.lift(splats, **options, dtype="float32", loss=name) for name in ("huber", "l2"))
     np.testing.assert_allclose(lifted.features.numpy(), X, atol=1e-5)
     assert torch.equal(lifted.total_weight, squares.total_weight)
     for splat in np.flatnonzero(lifted.seen.numpy())[::5]:
-        own = W[splat] / W[splat].sum()
-        least = minimize(loss, squares.features[splat].double().numpy(), (own, E, delta), tol=1e-12).fun
-        before, after = (loss(made.features[splat].double().numpy(), own, E, delta) for made in (squares, lifted))
+        shares = W[splat] / W[splat].sum()
+        least = minimize(loss, squares.features[splat].double().numpy(), (shares, E, delta), tol=1e-12).fun
+        before, after = (loss(lift.features[splat].double().numpy(), shares, E, delta) for lift in (squares, lifted))
         assert least - 1e-6 <= after <= before + 1e-6
         assert after - least <= 0.05 * (before - least) + 1e-6

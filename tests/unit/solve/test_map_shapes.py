@@ -1,4 +1,4 @@
-"""Maps that do not have their images' shape are told; no lift is refused for them."""
+"""Warnings of maps that do not have their images' shape; no lift is refused for them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.benchmarks.base import cameras_of
 from tests.scenes import write_scene
 
 
-def told(tmp_path: Path, observation: ViewFeatures, size: tuple[int, int]) -> list[str]:
+def shape_warnings_of(tmp_path: Path, observation: ViewFeatures, size: tuple[int, int]) -> list[str]:
     """What is said of a view of that width and height."""
     path = tmp_path / "pack.safetensors"
     write_pack(path, {"v": observation}, {"encoder": "e"})
@@ -33,31 +33,31 @@ def grid(height: int, width: int, channels: int = 3) -> FeatureGrid:
     return FeatureGrid(torch.ones(height, width, channels))
 
 
-def test_maps_as_encoders_make_them_are_not_told(tmp_path: Path) -> None:
+def test_maps_as_encoders_make_them_give_no_warning(tmp_path: Path) -> None:
     for cells, size in (
         ((30, 40), (640, 480)), ((23, 31), (990, 742)), ((23, 30), (990, 742)), ((24, 31), (990, 742)),
         ((1, 3), (64, 48)), ((2, 2), (1280, 720)), ((371, 495), (990, 742)), ((3286, 4946), (1237, 821)),
         ((1, 1), (500, 2)),
     ):  # fmt: skip
-        assert told(tmp_path, grid(*cells), size) == [], cells
+        assert shape_warnings_of(tmp_path, grid(*cells), size) == [], cells
 
 
 CROPS = [((23, 23), (990, 742)), ((24, 24), (1280, 720)), ((16, 16), (480, 640)), ((9, 12), (500, 500))]
-OTHERS = [((40, 30), (640, 480)), ((512, 30), (640, 480)), ((6, 30), (400, 400))]
+MISMATCHED = [((40, 30), (640, 480)), ((512, 30), (640, 480)), ((6, 30), (400, 400))]
 
 
-@pytest.mark.parametrize(("cells", "size"), [*CROPS, *OTHERS])
-def test_maps_that_may_be_crops_or_have_another_shape_are_told(
+@pytest.mark.parametrize(("cells", "size"), [*CROPS, *MISMATCHED])
+def test_maps_that_may_be_crops_or_have_another_shape_give_a_warning(
     tmp_path: Path, cells: tuple[int, int], size: tuple[int, int]
 ) -> None:
-    [warning] = told(tmp_path, grid(*cells), size)
+    [warning] = shape_warnings_of(tmp_path, grid(*cells), size)
     assert f"{cells[1]}x{cells[0]} for {size[0]}x{size[1]}" in warning
     if (cells, size) in CROPS:
         assert "1 of 1 views have maps of another aspect than their images" in warning
         assert "must cover the whole image" in warning
 
 
-def test_a_crop_is_told_by_the_lift_and_by_its_plan(tmp_path: Path) -> None:
+def test_the_lift_and_its_plan_warn_of_a_crop(tmp_path: Path) -> None:
     splats, cameras, _ = write_scene(tmp_path, 3)
     pack, settings = tmp_path / "crops.safetensors", LiftSettings.of(diagnostic_rays=10)
     write_pack(pack, {"v0": grid(23, 31), "v1": grid(23, 23), "v2": grid(23, 23)}, {"encoder": "e"})
@@ -74,14 +74,14 @@ def test_a_crop_is_told_by_the_lift_and_by_its_plan(tmp_path: Path) -> None:
         ("tabletop", ("grids", "features", "features_clean", "features_hard")),
     ],
 )
-def test_real_maps_are_not_told(scene: str, packs: tuple[str, ...], shared_data: Path) -> None:
+def test_real_maps_give_no_warning(scene: str, packs: tuple[str, ...], shared_data: Path) -> None:
     cameras = read_cameras(cameras_of(shared_data / scene))
     for name in packs:
         paired = pair(read_features(shared_data / scene / f"{name}.safetensors"), cameras)[0]
         assert shape_warnings(paired, [cameras[view] for view in paired.views]) == []
 
 
-def test_channels_that_come_first_are_told_of_the_pack(tmp_path: Path) -> None:
+def test_the_pack_warns_of_channels_that_come_first(tmp_path: Path) -> None:
     path = tmp_path / "first.safetensors"
     write_pack(path, {"v": grid(512, 30, 40)}, {"encoder": "e", "normalised": "false"})
     assert any("--layout chw" in warning for warning in inspect_file(path)["warnings"])

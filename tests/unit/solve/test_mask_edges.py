@@ -24,28 +24,30 @@ def test_edges_weaken_as_often_as_views_part_them(seed: int, threads: int) -> No
     W, levels = random_scene(seed)
     graph = SplatGraph.of(random_splats(seed, SPLATS))
     _, _, groups, B = belonging(W, levels)
-    joined, parted = np.zeros((2, SPLATS, SPLATS), int)
+    joining, separating = np.zeros((2, SPLATS, SPLATS), int)
     for group in groups:
-        own = B[:, group].astype(int)
-        together, seen = own @ own.T, own.sum(axis=1)
-        joined += together
-        parted += np.outer(seen, seen) - together
+        in_group = B[:, group].astype(int)
+        same_region, observed = in_group @ in_group.T, in_group.sum(axis=1)
+        joining += same_region
+        separating += np.outer(observed, observed) - same_region
     edges, before = np.zeros((MOST_VIEWS + 1, MOST_VIEWS + 1)), dense(graph)
-    np.add.at(edges, (joined[before > 0], parted[before > 0]), 1)
+    np.add.at(edges, (joining[before > 0], separating[before > 0]), 1)
     weakened, share = weaken_edges(graph, W, levels, threads)
-    np.testing.assert_allclose(dense(weakened), before * same_object_probability(edges)[joined, parted], rtol=1e-5)
+    np.testing.assert_allclose(
+        dense(weakened), before * same_object_probability(edges)[joining, separating], rtol=1e-5
+    )
     assert 0 < share < 1
 
 
 def test_masks_that_are_often_wrong_say_less() -> None:
-    def said(split: float, merged: float) -> np.ndarray:
+    def probability(split: float, merged: float) -> np.ndarray:
         rng, edges = np.random.default_rng(0), np.zeros((MOST_VIEWS + 1, MOST_VIEWS + 1))
         for count, rate in ((95_000, split), (5_000, 1 - merged)):
-            parted = rng.binomial(5, rate, count)
-            np.add.at(edges, (5 - parted, parted), 1)
+            separating = rng.binomial(5, rate, count)
+            np.add.at(edges, (5 - separating, separating), 1)
         return same_object_probability(edges)
 
-    right, wrong = said(0.01, 0.05), said(0.2, 0.3)
+    right, wrong = probability(0.01, 0.05), probability(0.2, 0.3)
     assert right[0, 0] == wrong[0, 0] == 1
     assert right[0, 5] < 1e-3 < wrong[0, 5]
     assert right[2, 3] < 0.5 < wrong[3, 2]
@@ -54,28 +56,30 @@ def test_masks_that_are_often_wrong_say_less() -> None:
 
 SIDE = 30  # splats of a square cloth
 PLACES = np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE)), axis=-1).reshape(-1, 2)
-THINGS = {
+OBJECTS = {
     "thin": PLACES[:, 0] == 15,
     "small": (np.abs(PLACES - 15) <= 1).all(axis=1),
     "large": (np.abs(PLACES - 15) <= 7).all(axis=1),
 }
 
 
-@pytest.mark.parametrize("kind", THINGS)
+@pytest.mark.parametrize("kind", OBJECTS)
 def test_thing_of_the_colour_of_its_cloth_stays_apart_from_it(kind: str) -> None:
-    thing, rng, count, views = THINGS[kind].astype(int), np.random.default_rng(1), SIDE**2, 6
+    labels, rng, count, views = OBJECTS[kind].astype(int), np.random.default_rng(1), SIDE**2, 6
     means = torch.from_numpy(np.column_stack([PLACES, np.zeros(count)])).float()
     splats = replace(random_splats(1, count), means=means, sh=torch.zeros(count, 1, 3))
     merged = rng.permutation(views) < 2  # views whose mask of the cloth has the thing, too
-    W = stacked([of_dense(np.eye(2)[0 * thing if whole else thing]) for whole in merged], count)
+    W = stacked([of_dense(np.eye(2)[0 * labels if is_merged else labels]) for is_merged in merged], count)
     graph = SplatGraph.of(splats)
     weakened, _ = weaken_edges(graph, W, np.zeros(2 * views, np.int8))
-    truth, ones = torch.from_numpy(np.eye(2)[thing]).float(), torch.ones(count)
+    truth, ones = torch.from_numpy(np.eye(2)[labels]).float(), torch.ones(count)
     noisy = truth + 0.5 * torch.from_numpy(rng.normal(size=(count, 2))).float()
 
     def wrong(X: torch.Tensor) -> int:
-        return int((X.argmax(dim=1).numpy() != thing)[THINGS[kind]].sum())
+        return int((X.argmax(dim=1).numpy() != labels)[OBJECTS[kind]].sum())
 
-    apart, together = (smooth(noisy.clone(), one, ones, None, ones > 0, 4.0)[0] for one in (weakened, graph))
-    assert wrong(apart) == 0
-    assert wrong(together) > 0
+    separated, same_region = (
+        smooth(noisy.clone(), graph_, ones, None, ones > 0, 4.0)[0] for graph_ in (weakened, graph)
+    )
+    assert wrong(separated) == 0
+    assert wrong(same_region) > 0

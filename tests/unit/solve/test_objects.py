@@ -33,21 +33,21 @@ def mistaken_scene(seed: int, views: int = 7) -> tuple[RegionWeights, np.ndarray
 
 def defined(W: RegionWeights, levels: np.ndarray) -> np.ndarray:
     """The cluster of each region that any splat belongs to, by the module's words, line by line; -1 for none."""
-    whole, view, groups, B = belonging(W, levels)
-    R = B.T @ (np.sqrt(whole.sum(axis=1))[:, None] * B)
+    total, view, groups, B = belonging(W, levels)
+    R = B.T @ (np.sqrt(total.sum(axis=1))[:, None] * B)
     size = levels.size
     supports, observes = np.zeros((size, size)), np.zeros((size, size))
     views = W.offsets.numel() - 1
     for v in range(views):
-        sees, both = np.zeros(size, bool), np.zeros((size, size), bool)
-        for own in (group for group in groups if view[group[0]] == v):
-            held = R[:, own].sum(axis=1)
-            seen = (held > 0) & (held >= OBSERVES * np.diag(R))
-            best = own[R[:, own].argmax(axis=1)]
-            kept = seen & (R[:, own].max(axis=1) >= CONTAINS * held)
-            sees |= seen
-            both |= kept[:, None] & kept[None] & (best[:, None] == best[None])
-        supports += both
+        sees, contained = np.zeros(size, bool), np.zeros((size, size), bool)
+        for group_regions in (group for group in groups if view[group[0]] == v):
+            group_weight = R[:, group_regions].sum(axis=1)
+            observed = (group_weight > 0) & (group_weight >= OBSERVES * np.diag(R))
+            best = group_regions[R[:, group_regions].argmax(axis=1)]
+            contains = observed & (R[:, group_regions].max(axis=1) >= CONTAINS * group_weight)
+            sees |= observed
+            contained |= contains[:, None] & contains[None] & (best[:, None] == best[None])
+        supports += contained
         observes += sees[:, None] & sees[None]
     clusters = [[int(m)] for m in np.flatnonzero(B.any(axis=0))]
     while len(clusters) > 1:
@@ -60,36 +60,38 @@ def defined(W: RegionWeights, levels: np.ndarray) -> np.ndarray:
         if rates[i, j] < MERGE_RATE:
             break
         clusters[j] += clusters.pop(i)
-    found = np.full(size, -1)
-    kept = [own for own in clusters if np.unique(view[own]).size >= min(LEAST_VIEWS, views)]
-    for number, own in enumerate(kept):
-        found[own] = number
-    return found
+    objects = np.full(size, -1)
+    contains = [
+        group_regions for group_regions in clusters if np.unique(view[group_regions]).size >= min(LEAST_VIEWS, views)
+    ]
+    for number, group_regions in enumerate(contains):
+        objects[group_regions] = number
+    return objects
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_objects_are_those_of_the_definition(seed: int) -> None:
     W, levels = mistaken_scene(seed)
-    found, expected = region_objects(W, levels, np.ones(SPLATS)), defined(W, levels)
+    objects, expected = region_objects(W, levels, np.ones(SPLATS)), defined(W, levels)
     sums = np.zeros((SPLATS, expected.max() + 2))
-    for m, own in enumerate(expected):
-        sums[:, own + 1] += dense(W, SPLATS)[:, m]
-    best, whole = sums[:, 1:].argmax(axis=1), sums[:, 1:].sum(axis=1)
+    for m, group in enumerate(expected):
+        sums[:, group + 1] += dense(W, SPLATS)[:, m]
+    best, total = sums[:, 1:].argmax(axis=1), sums[:, 1:].sum(axis=1)
     assert expected.max() >= 2
-    labels = np.where((whole > 0) & (2 * sums[:, 1:].max(axis=1) >= whole), best, -1)
-    same = found.labels[:, None] == found.labels[None]
-    np.testing.assert_array_equal(same, labels[:, None] == labels[None])
-    np.testing.assert_array_equal(found.labels < 0, labels < 0)
+    labels = np.where((total > 0) & (2 * sums[:, 1:].max(axis=1) >= total), best, -1)
+    is_same = objects.labels[:, None] == objects.labels[None]
+    np.testing.assert_array_equal(is_same, labels[:, None] == labels[None])
+    np.testing.assert_array_equal(objects.labels < 0, labels < 0)
 
 
 def test_merged_and_split_masks_do_not_change_the_things() -> None:
     right = [0, 1, 2, 3]
     merged, split = [0, 0, 1, 2], [0, 1, 2, 2]
-    found = region_objects(
+    objects = region_objects(
         *of_things([right, merged, right, split, right, right]), total_weight=np.arange(SPLATS) + 1.0
     )
-    np.testing.assert_array_equal(found.labels, np.repeat([3, 2, 1, 0], SPLATS // 4))  # largest total weight first
-    assert len(found.views) == 4 and set(found.views[0][found.views[0] >= 0]) <= set(range(6))
+    np.testing.assert_array_equal(objects.labels, np.repeat([3, 2, 1, 0], SPLATS // 4))  # largest total weight first
+    assert len(objects.views) == 4 and set(objects.views[0][objects.views[0] >= 0]) <= set(range(6))
 
 
 def test_parts_are_held_together_by_masks_of_the_whole() -> None:
@@ -103,21 +105,21 @@ def test_parts_are_held_together_by_masks_of_the_whole() -> None:
 
 def test_grids_have_no_objects() -> None:
     W, levels = random_scene(0)
-    found = region_objects(W, np.full_like(levels, -1), np.ones(SPLATS))
-    assert (found.labels == -1).all() and found.views.shape[0] == 0
+    objects = region_objects(W, np.full_like(levels, -1), np.ones(SPLATS))
+    assert (objects.labels == -1).all() and objects.views.shape[0] == 0
 
 
 def test_views_beyond_the_bound_join_what_the_others_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(objects, "MOST_REGIONS", 20)
     monkeypatch.setattr(objects, "FEWEST_VIEWS", 5)
     W, levels = of_things([[0, 1, 2, 3]] * 12)
-    found = region_objects(W, levels, np.ones(SPLATS))
-    regions = found.tree.region
-    assert len(found.views) == 4 and (regions >= 0).all()
+    scene_objects = region_objects(W, levels, np.ones(SPLATS))
+    regions = scene_objects.tree.region
+    assert len(scene_objects.views) == 4 and (regions >= 0).all()
     np.testing.assert_array_equal(regions.reshape(12, 4), regions[:4][None].repeat(12, axis=0))
 
 
 def test_the_number_of_threads_changes_no_label() -> None:
     W, levels = mistaken_scene(3, views=9)
-    one, many = (region_objects(W, levels, np.ones(SPLATS), threads) for threads in (1, 5))
-    np.testing.assert_array_equal(one.labels, many.labels)
+    single, threaded = (region_objects(W, levels, np.ones(SPLATS), threads) for threads in (1, 5))
+    np.testing.assert_array_equal(single.labels, threaded.labels)

@@ -21,13 +21,15 @@ SEEDS = st.integers(0, 2**16)
 ALL_RAYS = 10_000
 
 
-def found(scene: SmallScene, features: torch.Tensor, **chosen: int) -> dict:
+def reference_facts(scene: SmallScene, features: torch.Tensor, **overrides: int) -> dict:
     samples = []
-    for number, (view, seen) in enumerate(zip(scene.views, scene.observations, strict=True)):
-        pixels = sample_pixels(view, ALL_RAYS, (0, number), scene.walk)
-        samples.append(SampledRays(scene.raster.ray_rows(view, pixels, scene.walk), read_pixels(seen, view, pixels)))
-    knobs = LiftSettings.of(**{"reference_channels": 6, **chosen})
-    return reference(scene.rays(), features, scene.seen, samples, scene.codebooks, knobs, silent)
+    for number, (view, observation) in enumerate(zip(scene.views, scene.observations, strict=True)):
+        pixels = sample_pixels(view, ALL_RAYS, (0, number), scene.params)
+        samples.append(
+            SampledRays(scene.raster.ray_rows(view, pixels, scene.params), read_pixels(observation, view, pixels))
+        )
+    knobs = LiftSettings.of(**{"reference_channels": 6, **overrides})
+    return reference(scene.rays(), features, scene.has_weight, samples, scene.codebooks, knobs, silent)
 
 
 def measures_of(A: np.ndarray, X: np.ndarray, B: np.ndarray) -> ViewMeasures:
@@ -49,9 +51,9 @@ def loss(A: np.ndarray, X: np.ndarray, B: np.ndarray) -> float:
 
 @settings(max_examples=200, deadline=None)
 @given(SEEDS, st.integers(1, 12), st.integers(1, 8), st.integers(1, 4), st.sampled_from([0.1, 1.0, 5.0]))
-def test_the_bound_holds_for_every_matrix_whose_rows_sum_to_one(seed, more, splats, channels, peak):
+def test_the_bound_holds_for_every_matrix_whose_rows_sum_to_one(seed, extra, splats, channels, peak):
     rng = np.random.default_rng(seed)
-    A = rng.dirichlet(np.full(splats, peak), splats + more) + 1e-9
+    A = rng.dirichlet(np.full(splats, peak), splats + extra) + 1e-9
     A /= A.sum(axis=1, keepdims=True)
     B = rng.normal(size=(len(A), channels))
     best = np.linalg.lstsq(A, B, rcond=None)[0]
@@ -68,23 +70,23 @@ def test_a_row_that_is_met_exactly_has_no_finite_beta_unless_its_splats_agree():
 @pytest.mark.parametrize("grids", [False, True])
 def test_the_reference_finds_the_least_squares_loss(grids):
     scene = SmallScene(3, grids)
-    told = found(scene, scene.closed_form, reference_channels=512)  # wide, so that lengths are kept well
+    facts = reference_facts(scene, scene.closed_form, reference_channels=512)  # wide, so that lengths are kept well
     least = scene.loss(np.linalg.lstsq(scene.A, scene.B, rcond=1e-12)[0])
-    assert told["residual"] * len(scene.B) == pytest.approx(scene.loss(scene.closed_form), rel=0.1)
-    assert told["optimum"] * len(scene.B) == pytest.approx(least, rel=0.1)
-    assert told["ratio"] == pytest.approx(scene.loss(scene.closed_form) / least, rel=0.03)
-    assert told["channels"] == 512
-    assert told["converged"] and "not converged" not in told["message"]
+    assert facts["residual"] * len(scene.B) == pytest.approx(scene.loss(scene.closed_form), rel=0.1)
+    assert facts["optimum"] * len(scene.B) == pytest.approx(least, rel=0.1)
+    assert facts["ratio"] == pytest.approx(scene.loss(scene.closed_form) / least, rel=0.03)
+    assert facts["channels"] == 512
+    assert facts["converged"] and "not converged" not in facts["message"]
 
 
 def test_diagnostics_show_the_reference_only_when_asked(tmp_path):
     paths = write_scene(tmp_path, 9)
-    plain = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(preset="row-sum")).metadata.diagnostics
-    assert "reference" not in plain
-    asked = LiftSettings.of(preset="row-sum", reference_channels=3)
-    told = lift_files(paths[0], paths[1], [paths[2]], asked).metadata.diagnostics["reference"]
-    assert told["ratio"] >= 1.0
-    assert told["beta"]["max"] + 1 == told["bound"]
-    assert f"{told['ratio']:.3f}" in told["message"]
-    again = lift_files(paths[0], paths[1], [paths[2]], asked).metadata.diagnostics["reference"]
-    assert told == again
+    baseline = lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(preset="row-sum")).metadata.diagnostics
+    assert "reference" not in baseline
+    settings = LiftSettings.of(preset="row-sum", reference_channels=3)
+    facts = lift_files(paths[0], paths[1], [paths[2]], settings).metadata.diagnostics["reference"]
+    assert facts["ratio"] >= 1.0
+    assert facts["beta"]["max"] + 1 == facts["bound"]
+    assert f"{facts['ratio']:.3f}" in facts["message"]
+    second = lift_files(paths[0], paths[1], [paths[2]], settings).metadata.diagnostics["reference"]
+    assert facts == second

@@ -13,12 +13,12 @@ from tests.unit.solve.sparse_views import of_dense
 
 SPLATS, VIEWS = 240, 12
 PART = np.arange(SPLATS) // 20  # twelve parts of twenty splats
-THING = PART // 3  # four things of three parts
-ROOM = np.zeros(SPLATS, int)
+OBJECT = PART // 3  # four things of three parts
+BACKGROUND = np.zeros(SPLATS, int)
 
 
 def three_levels(
-    seed: int, *, wrong: float = 0.3, rooms: bool = False, parts_in: float = 1.0
+    seed: int, *, wrong: float = 0.3, backgrounds: bool = False, parts_in: float = 1.0
 ) -> tuple[RegionWeights, np.ndarray, Codebook]:
     """Masks of parts and things, and of the whole where asked for, each with its own vector and a little noise.
 
@@ -30,31 +30,31 @@ def three_levels(
     parts, levels, books = [], [], []
     for _ in range(VIEWS):
         columns, rows = [], []
-        shown: list[np.ndarray] = [ROOM] if rooms else []
-        shown += [THING, PART] if rng.random() < parts_in else [THING]
-        for level, right in enumerate(shown):
+        masks: list[np.ndarray] = [BACKGROUND] if backgrounds else []
+        masks += [OBJECT, PART] if rng.random() < parts_in else [OBJECT]
+        for level, right in enumerate(masks):
             labels, base = right.copy(), {0: 16, 3: 12, 11: 0}[int(right.max())]
-            for one in np.unique(right):
-                if rng.random() < wrong / 2 and one:
-                    labels[labels == one] = one - 1
+            for label in np.unique(right):
+                if rng.random() < wrong / 2 and label:
+                    labels[labels == label] = label - 1
                 elif rng.random() < wrong / 2:
-                    cut = (labels == one) & (np.arange(SPLATS) > rng.choice(np.flatnonzero(right == one)))
+                    cut = (labels == label) & (np.arange(SPLATS) > rng.choice(np.flatnonzero(right == label)))
                     labels[cut] = labels.max() + 1
-            for one in range(labels.max() + 1):
-                inside = labels == one
+            for label in range(labels.max() + 1):
+                inside = labels == label
                 columns.append(inside * rng.uniform(0.5, 1.5, SPLATS))
-                meant = base + (np.bincount(right[inside]).argmax() if inside.any() else 0)
-                rows.append(vectors[meant] + 0.3 * rng.normal(size=32))
+                expected = base + (np.bincount(right[inside]).argmax() if inside.any() else 0)
+                rows.append(vectors[expected] + 0.3 * rng.normal(size=32))
                 levels.append(level)
         parts.append(of_dense(np.stack(columns, axis=1) * (rng.random(SPLATS) < 0.9)[:, None]))
         books.append(ViewCodebook(torch.tensor(np.array(rows), dtype=torch.float32)))
     return stacked(parts, SPLATS), np.array(levels, np.int8), Codebook(books)
 
 
-def members(found: RegionObjects) -> list[np.ndarray]:
+def members(objects: RegionObjects) -> list[np.ndarray]:
     """[P] bool of each node."""
-    above = found.tree.lineage().toarray().astype(bool)
-    return [np.append(above[:, node], False)[found.node] for node in range(len(above))]
+    above = objects.tree.lineage().toarray().astype(bool)
+    return [np.append(above[:, node], False)[objects.node] for node in range(len(above))]
 
 
 def mean_iou(nodes: list[np.ndarray], owners: np.ndarray) -> float:
@@ -70,10 +70,10 @@ def mean_iou(nodes: list[np.ndarray], owners: np.ndarray) -> float:
 @pytest.mark.parametrize("seed", range(4))
 def test_things_and_their_parts_are_nodes_though_a_third_of_the_masks_is_wrong(seed: int) -> None:
     W, levels, _ = three_levels(seed)
-    found = region_objects(W, levels, np.ones(SPLATS))
-    nodes, parents = members(found), found.tree.parents
-    assert found.count == 4 and (parents[:4] < 0).all()
-    assert mean_iou(nodes, THING) > 0.95
+    objects = region_objects(W, levels, np.ones(SPLATS))
+    nodes, parents = members(objects), objects.tree.parents
+    assert objects.count == 4 and (parents[:4] < 0).all()
+    assert mean_iou(nodes, OBJECT) > 0.95
     assert mean_iou(nodes, PART) > 0.85
     assert len(nodes) < 2 * 16  # of some seventy wrong masks hardly any is repeated by a quarter of the views
     for node in np.flatnonzero(parents >= 0):
@@ -82,63 +82,63 @@ def test_things_and_their_parts_are_nodes_though_a_third_of_the_masks_is_wrong(s
 
 def test_parts_that_half_of_the_views_show_are_found() -> None:
     W, levels, _ = three_levels(0, wrong=0.1, parts_in=0.5)
-    found = region_objects(W, levels, np.ones(SPLATS))
-    assert mean_iou(members(found), PART) > 0.8
+    objects = region_objects(W, levels, np.ones(SPLATS))
+    assert mean_iou(members(objects), PART) > 0.8
 
 
 def test_masks_of_a_part_and_of_what_lies_behind_it_hold_it_together() -> None:
     half = np.arange(SPLATS) < 10  # of the first part, at which three of eight views cut it
     cut, merged = np.where(half, 12, PART), np.where(PART == 0, 3, PART)  # part 3 is of another thing
     parts, levels = [], []
-    for shown in (PART, PART, cut, cut, cut, merged, merged, merged):
-        for level, labels in enumerate((THING, shown)):
+    for masks in (PART, PART, cut, cut, cut, merged, merged, merged):
+        for level, labels in enumerate((OBJECT, masks)):
             levels += [level] * len(np.unique(labels))
-        parts.append(of_dense(np.concatenate([np.equal.outer(a, np.unique(a)) for a in (THING, shown)], 1) * 1.0))
-    found = region_objects(stacked(parts, SPLATS), np.array(levels, np.int8), np.ones(SPLATS))
-    assert any(np.array_equal(node, PART == 0) for node in members(found))
+        parts.append(of_dense(np.concatenate([np.equal.outer(a, np.unique(a)) for a in (OBJECT, masks)], 1) * 1.0))
+    objects = region_objects(stacked(parts, SPLATS), np.array(levels, np.int8), np.ones(SPLATS))
+    assert any(np.array_equal(node, PART == 0) for node in members(objects))
 
 
 def test_what_holds_the_whole_scene_is_a_group_and_its_parts_are_the_objects() -> None:
-    W, levels, codebook = three_levels(1, wrong=0.0, rooms=True)
-    found = region_objects(W, levels, np.arange(SPLATS) + 1.0)
-    assert found.count == 4 and set(found.tree.parents[:4]) == {4} and found.tree.parents[4] < 0
-    np.testing.assert_array_equal(found.labels, 3 - THING)  # the largest total weight first
+    W, levels, codebook = three_levels(1, wrong=0.0, backgrounds=True)
+    objects = region_objects(W, levels, np.arange(SPLATS) + 1.0)
+    assert objects.count == 4 and set(objects.tree.parents[:4]) == {4} and objects.tree.parents[4] < 0
+    np.testing.assert_array_equal(objects.labels, 3 - OBJECT)  # the largest total weight first
     totals = np.bincount(W.region.numpy(), W.weight.numpy(), levels.size)
-    facts = object_facts(found, NodeVectors.of(codebook, totals, found))
+    facts = object_facts(objects, NodeVectors.of(codebook, totals, objects))
     assert (
         facts["largest_share"] == 1.0 and "100%" in facts["warning"] and "objects are its parts" in facts["warning"]
     )
 
 
-def test_levels_that_say_different_things_are_told_and_kept_apart() -> None:
+def test_levels_that_differ_give_a_warning_and_stay_separate() -> None:
     W, levels, codebook = three_levels(2, wrong=0.0)
     totals = np.bincount(W.region.numpy(), W.weight.numpy(), levels.size)
-    found = region_objects(W, levels, np.ones(SPLATS))
-    other = NodeVectors.of(codebook, totals, found)
+    objects = region_objects(W, levels, np.ones(SPLATS))
+    other = NodeVectors.of(codebook, totals, objects)
     assert other.level_agreement is not None and abs(other.level_agreement) < 0.5
-    assert "different things" in object_facts(found, other)["warning"]
+    assert "different vectors" in object_facts(objects, other)["warning"]
     truth = np.random.default_rng(99).normal(size=(17, 32))
     truth /= np.linalg.norm(truth, axis=1, keepdims=True)
-    for node, inside in enumerate(members(found)):
-        meant = 12 + THING[inside][0] if found.tree.parents[node] < 0 else PART[inside][0]
-        assert int((truth @ other.vectors[node]).argmax()) == meant
-    alike = [view.rows.clone() for view in codebook.views]
+    for node, inside in enumerate(members(objects)):
+        expected = 12 + OBJECT[inside][0] if objects.tree.parents[node] < 0 else PART[inside][0]
+        assert int((truth @ other.vectors[node]).argmax()) == expected
+    similar = [view.rows.clone() for view in codebook.views]
     start = 0
-    for rows in alike:  # parts that are named as their things are
+    for rows in similar:  # parts that are named as their things are
         for row in range(len(rows)):
-            node = found.tree.region[start + row]
-            thing = node if found.tree.parents[node] < 0 else found.tree.parents[node]
+            node = objects.tree.region[start + row]
+            whole_node = node if objects.tree.parents[node] < 0 else objects.tree.parents[node]
             noise = np.random.default_rng(start + row).normal(size=32)
-            rows[row] = torch.tensor(truth[int(thing)] + 0.2 * noise)
+            rows[row] = torch.tensor(truth[int(whole_node)] + 0.2 * noise)
         start += len(rows)
-    same = NodeVectors.of(Codebook([ViewCodebook(rows) for rows in alike]), totals, found)
-    assert same.level_agreement is not None and same.level_agreement > 0.9
-    assert "warning" not in object_facts(found, same)
+    vectors = NodeVectors.of(Codebook([ViewCodebook(rows) for rows in similar]), totals, objects)
+    assert vectors.level_agreement is not None and vectors.level_agreement > 0.9
+    assert "warning" not in object_facts(objects, vectors)
 
 
 def test_the_number_of_threads_changes_no_node() -> None:
     W, levels, _ = three_levels(3)
-    one, many = (region_objects(W, levels, np.ones(SPLATS), threads) for threads in (1, 5))
-    np.testing.assert_array_equal(one.node, many.node)
-    for name, part in vars(one.tree).items():
-        np.testing.assert_array_equal(getattr(many.tree, name), part)
+    single, threaded = (region_objects(W, levels, np.ones(SPLATS), threads) for threads in (1, 5))
+    np.testing.assert_array_equal(single.node, threaded.node)
+    for name, part in vars(single.tree).items():
+        np.testing.assert_array_equal(getattr(threaded.tree, name), part)

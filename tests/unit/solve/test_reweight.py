@@ -37,12 +37,12 @@ class Scene:
     def stacked(self) -> RegionWeights:
         return stacked([of_dense(view) for view in self.weights], len(self.weights[0]))
 
-    def after(self, steps: int, **how) -> list[np.ndarray]:
+    def after(self, steps: int, **options) -> list[np.ndarray]:
         """The weights of every view after so many steps, dense."""
         W = self.stacked()
-        found = scale_weights(W, reweighting_factors(W, codebook_of(self.books), steps, **how).factors)
-        whole = dense(found, len(self.weights[0])).astype(np.float32)
-        return np.split(whole, W.offsets.numpy()[1:-1], axis=1)
+        consistency = scale_weights(W, reweighting_factors(W, codebook_of(self.books), steps, **options).factors)
+        matrix = dense(consistency, len(self.weights[0])).astype(np.float32)
+        return np.split(matrix, W.offsets.numpy()[1:-1], axis=1)
 
 
 def over(values: np.ndarray, lengths: np.ndarray) -> np.ndarray:
@@ -70,15 +70,15 @@ def defined(scene: Scene, steps: int, e: list[np.ndarray] | None = None) -> list
     first, e = [view.astype(np.float64) for view in scene.weights], e or defined_directions(scene)[1]
     D, current = scene.denominators[:, None], first
     for _ in range(steps):
-        everything = sum(w @ v for w, v in zip(current, e, strict=True))
+        total = sum(w @ v for w, v in zip(current, e, strict=True))
         cosines = []
         for w, v in zip(current, e, strict=True):
-            r = over(everything - w @ v, D)
+            r = over(total - w @ v, D)
             lengths = np.linalg.norm(r, axis=1, keepdims=True)
             cosines.append(np.maximum(over(r, np.where(lengths > NO_CONSENSUS, lengths, 0.0)) @ v.T, 0.0))
-        usual = sum((w * c).sum() for w, c in zip(first, cosines, strict=True)) / (sum(w.sum() for w in first) or 1.0)
+        mean = sum((w * c).sum() for w, c in zip(first, cosines, strict=True)) / (sum(w.sum() for w in first) or 1.0)
         shares = [over(w.sum(axis=1, keepdims=True), D) for w in current]
-        new = [w * ((1 - p) * c + p * usual) for w, c, p in zip(first, cosines, shares, strict=True)]
+        new = [w * ((1 - p) * c + p * mean) for w, c, p in zip(first, cosines, shares, strict=True)]
         gain = over(D, np.sum([w.sum(axis=1, keepdims=True) for w in new], axis=0))
         current = [np.where(gain > 0, w * gain, old) for w, old in zip(new, first, strict=True)]
     return current
@@ -94,8 +94,8 @@ def scenes(draw: st.DrawFn) -> Scene:
     scene = Scene([], [])
     for _ in range(draw(st.integers(1, 5))):
         rows = draw(st.integers(1, 6))
-        kept = rng.random((count, rows)) < draw(st.sampled_from([0.0, 0.3, 0.9]))
-        scene.weights.append((rng.random((count, rows)) * kept * size).astype(np.float32))
+        mask = rng.random((count, rows)) < draw(st.sampled_from([0.0, 0.3, 0.9]))
+        scene.weights.append((rng.random((count, rows)) * mask * size).astype(np.float32))
         book = rng.normal(0.5, 1, (rows, channels)) * rng.uniform(0.1, 9, (rows, 1)) * (rng.random((rows, 1)) < 0.9)
         scene.books.append(torch.tensor(book, dtype=dtype))
     return scene
@@ -106,8 +106,8 @@ def scenes(draw: st.DrawFn) -> Scene:
 @given(scene=scenes(), steps=st.integers(0, 3))
 def test_the_steps_equal_their_definition_and_keep_every_splats_sum(scene, steps, on_card):
     got, expected, D = scene.after(steps, on_card=on_card), defined(scene, steps), scene.denominators
-    for mine, real in zip(got, expected, strict=True):
-        assert np.abs(over(mine - real, D[:, None])).max() < 2e-3
+    for actual, real in zip(got, expected, strict=True):
+        assert np.abs(over(actual - real, D[:, None])).max() < 2e-3
     sums = np.sum([view.sum(axis=1, dtype=np.float64) for view in got], axis=0)
     assert np.allclose(sums, D, rtol=1e-5)
 
@@ -117,8 +117,10 @@ def levels_apart(scene: Scene, levels: np.ndarray, steps: int) -> list[np.ndarra
     e, ends = defined_directions(scene)[1], np.cumsum([len(book) for book in scene.books])[:-1]
     parts = []
     for level in np.unique(levels):
-        own = [view * (part == level) for view, part in zip(scene.weights, np.split(levels, ends), strict=True)]
-        parts.append(defined(Scene(own, scene.books), steps, e))
+        level_weights = [
+            view * (part == level) for view, part in zip(scene.weights, np.split(levels, ends), strict=True)
+        ]
+        parts.append(defined(Scene(level_weights, scene.books), steps, e))
     return [np.sum(views, axis=0) for views in zip(*parts, strict=True)]
 
 
@@ -128,24 +130,24 @@ def test_levels_are_judged_apart(steps, on_card):
     scene = random_scene(3, count=400, channels=20)
     levels = np.random.default_rng(4).integers(-1, 3, sum(len(book) for book in scene.books)).astype(np.int8)
     got = scene.after(steps, levels=levels, on_card=on_card)
-    for mine, real in zip(got, levels_apart(scene, levels, steps), strict=True):
-        assert np.abs(over(mine - real, scene.denominators[:, None])).max() < 2e-3
+    for actual, real in zip(got, levels_apart(scene, levels, steps), strict=True):
+        assert np.abs(over(actual - real, scene.denominators[:, None])).max() < 2e-3
 
 
 def random_scene(seed: int, count: int = 9_000, views: int = 4, rows: int = 7, channels: int = 150) -> Scene:
     """More than a share and a block of splats, more than a strip of channels."""
     rng = np.random.default_rng(seed)
-    kept = [rng.random((count, rows)) * (rng.random((count, rows)) < 0.3) for _ in range(views)]
+    mask = [rng.random((count, rows)) * (rng.random((count, rows)) < 0.3) for _ in range(views)]
     books = [torch.tensor(rng.normal(0, 1, (rows, channels)), dtype=torch.float32) for _ in range(views)]
-    return Scene([view.astype(np.float32) for view in kept], books)
+    return Scene([view.astype(np.float32) for view in mask], books)
 
 
 def test_neither_threads_nor_files_nor_order_change_a_bit_and_the_first_weights_stay(monkeypatch):
     scene = random_scene(0)
     expected, means = scene.after(3, threads=1), torch.rand(9_000, 3, generator=torch.manual_seed(0))
 
-    def assert_same(**how) -> None:
-        assert all(np.array_equal(a, b) for a, b in zip(expected, scene.after(3, **how), strict=True))
+    def assert_same(**options) -> None:
+        assert all(np.array_equal(a, b) for a, b in zip(expected, scene.after(3, **options), strict=True))
 
     assert_same(threads=5)
     assert_same(threads=2, means=means)
@@ -179,20 +181,20 @@ def test_what_a_cluster_explains_is_its_mean_cosine_in_float64(monkeypatch, tabl
     scene, rng = random_scene(1, count=700, channels=40), np.random.default_rng(2)
     merged, labels = scene.books[0][:5].double().numpy(), rng.integers(-1, 5, 700)
     merged[3] = 0  # a cluster without a feature explains nothing
-    W, given = scene.stacked(), (torch.from_numpy(labels).int(), torch.from_numpy(merged).float())
+    W, clusters = scene.stacked(), (torch.from_numpy(labels).int(), torch.from_numpy(merged).float())
     directions = RegionDirections.of_weights(W, codebook_of(scene.books))
-    found = cluster_consistency(W, directions, *given, threads=1)
-    assert torch.equal(found, cluster_consistency(W, directions, *given, threads=3))
+    consistency = cluster_consistency(W, directions, *clusters, threads=1)
+    assert torch.equal(consistency, cluster_consistency(W, directions, *clusters, threads=3))
     mean, e = defined_directions(scene)
     away = np.where(
         merged.any(axis=1, keepdims=True), over(merged, np.linalg.norm(merged, axis=1)[:, None]) - mean, 0
     )
     cosines = np.concatenate(e) @ over(away, np.linalg.norm(away, axis=1, keepdims=True)).T
-    whole = np.concatenate(scene.weights, axis=1).astype(np.float64)
-    expected = over((whole @ np.maximum(cosines, 0))[np.arange(700), labels], scene.denominators)
+    matrix = np.concatenate(scene.weights, axis=1).astype(np.float64)
+    expected = over((matrix @ np.maximum(cosines, 0))[np.arange(700), labels], scene.denominators)
     expected[labels < 0] = 0
     assert expected.max() > 0.2
-    np.testing.assert_allclose(found.numpy(), expected, atol=1e-6)
+    np.testing.assert_allclose(consistency.numpy(), expected, atol=1e-6)
 
 
 @on_both
@@ -202,36 +204,36 @@ def test_steps_that_change_much_equal_their_definition_to_the_last_digits(views,
     scene.books[0][0] = 0
     scene.books[1] = scene.books[1].half()
     scene.weights[1][3] = 0
-    D, moved = scene.denominators[:, None], 0.0
-    for mine, real, first in zip(
+    D, largest_change = scene.denominators[:, None], 0.0
+    for actual, real, first in zip(
         scene.after(steps, on_card=on_card), defined(scene, steps), scene.weights, strict=True
     ):
-        np.testing.assert_allclose(over(mine, D), over(real, D), atol=1e-5)
-        moved = max(moved, np.abs(over(real - first, D)).max())
-    assert moved > 0.05
+        np.testing.assert_allclose(over(actual, D), over(real, D), atol=1e-5)
+        largest_change = max(largest_change, np.abs(over(real - first, D)).max())
+    assert largest_change > 0.05
 
 
 @on_both
 def test_slices_of_channels_are_judged_together(monkeypatch, on_card):
     scene = random_scene(3, count=500)
-    whole = scene.after(2, on_card=on_card)
+    matrix = scene.after(2, on_card=on_card)
     for module in ("codebook", "directions"):
         monkeypatch.setattr(f"liftcore.solve.{module}.TABLE_BYTES", 1)
-    for sliced, expected in zip(scene.after(2, on_card=on_card), whole, strict=True):
+    for sliced, expected in zip(scene.after(2, on_card=on_card), matrix, strict=True):
         np.testing.assert_allclose(sliced, expected, rtol=1e-4, atol=1e-5)
 
 
 @on_both
 def test_splats_of_many_views_and_of_many_regions_equal_the_definition(on_card):
     scene = random_scene(4, count=3, views=2 * LONG, rows=3)
-    seen = np.sum([view.any(axis=1) for view in scene.weights], axis=0)
-    assert (seen > LONG).all()
+    view_counts = np.sum([view.any(axis=1) for view in scene.weights], axis=0)
+    assert (view_counts > LONG).all()
     rng = np.random.default_rng(5)
     scene.weights.append(rng.random((3, 2 * LONG + 30)).astype(np.float32))
     scene.books.append(torch.tensor(rng.normal(0, 1, (2 * LONG + 30, 150)), dtype=torch.float32))
     D = scene.denominators[:, None]
-    for mine, real in zip(scene.after(1, on_card=on_card), defined(scene, 1), strict=True):
-        np.testing.assert_allclose(mine / D, real / D, atol=1e-6)
+    for actual, real in zip(scene.after(1, on_card=on_card), defined(scene, 1), strict=True):
+        np.testing.assert_allclose(actual / D, real / D, atol=1e-6)
 
 
 @on_both
@@ -246,32 +248,34 @@ def test_a_step_over_very_many_terms_keeps_its_digits(rows, channels, on_card):
     assert np.abs(got - exact).max() < 1e-6 * exact.max()
 
 
-def things(views: int = 8) -> Scene:
+def two_objects(views: int = 8) -> Scene:
     """Forty splats, half of each of two things, seen right by every view; all vectors in a narrow cone."""
     rng = np.random.default_rng(0)
-    cone, own = rng.normal(0, 1, 64), rng.normal(0, 0.3, (2, 64))
+    cone, level_weights = rng.normal(0, 1, 64), rng.normal(0, 0.3, (2, 64))
     weights = [np.kron(np.eye(2), np.ones((20, 1))) * rng.uniform(0.5, 1, (40, 1)) for _ in range(views)]
-    books = [torch.tensor(cone + own + rng.normal(0, 0.1, (2, 64)), dtype=torch.float32) for _ in range(views)]
+    books = [
+        torch.tensor(cone + level_weights + rng.normal(0, 0.1, (2, 64)), dtype=torch.float32) for _ in range(views)
+    ]
     return Scene([view.astype(np.float32) for view in weights], books)
 
 
 def shares(weights: list[np.ndarray], splat: int) -> np.ndarray:
     """Of every view in the weight of a splat."""
-    own = np.array([view[splat].sum() for view in weights])
-    return own / own.sum()
+    level_weights = np.array([view[splat].sum() for view in weights])
+    return level_weights / level_weights.sum()
 
 
 def test_one_wrong_view_loses_its_weight_to_the_others():
-    scene = things()
+    scene = two_objects()
     scene.weights[3][:5] = scene.weights[3][:5, ::-1].copy()
     before, after = shares(scene.weights, 0), shares(scene.after(1), 0)
     assert after[3] < 0.2 * before[3]
-    others = np.arange(8) != 3
-    assert np.allclose(after[others] / after[others].sum(), before[others] / before[others].sum(), atol=0.01)
+    is_other = np.arange(8) != 3
+    assert np.allclose(after[is_other] / after[is_other].sum(), before[is_other] / before[is_other].sum(), atol=0.01)
 
 
 def test_a_view_that_holds_most_of_the_weight_is_not_outvoted():
-    scene = things(views=4)
+    scene = two_objects(views=4)
     scene.weights[0][0] *= 20
     for view in scene.weights[1:]:
         view[0] = view[0, ::-1].copy()
@@ -281,26 +285,28 @@ def test_a_view_that_holds_most_of_the_weight_is_not_outvoted():
 @pytest.mark.parametrize("value", [0.0, 1.0])
 def test_nothing_changes_where_no_vector_has_a_direction(value):
     scene = random_scene(2, count=50)
-    same = Scene(scene.weights, [torch.full_like(book, value) for book in scene.books])
-    assert all(np.array_equal(a, b) for a, b in zip(same.after(2), scene.weights, strict=True))
+    constant = Scene(scene.weights, [torch.full_like(book, value) for book in scene.books])
+    assert all(np.array_equal(a, b) for a, b in zip(constant.after(2), scene.weights, strict=True))
 
 
 def test_the_default_leaves_cells_of_grids_as_a_robust_step_weighs_them(tmp_path):
     paths = write_scene(tmp_path, 9, grids=True)
     step = {"preset": "row-sum", "robust_steps": 1}
-    asked = ({"preset": "default"}, step, {**step, "reliability": True})
-    default, robust, relied = (lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(**how)) for how in asked)
+    cases = ({"preset": "default"}, step, {**step, "reliability": True})
+    default, robust, relied = (
+        lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(**options)) for options in cases
+    )
     assert torch.equal(default.features, robust.features)
     assert not torch.equal(default.features, relied.features)
 
 
 def test_a_robust_lift_keeps_what_is_seen_and_how_much(tmp_path):
     paths = write_scene(tmp_path, 9)
-    plain, robust = (
+    baseline, robust = (
         lift_files(paths[0], paths[1], [paths[2]], LiftSettings.of(robust_steps=steps, dtype="float32"))
         for steps in (0, 1)
     )
-    assert torch.equal(plain.seen, robust.seen)
-    assert torch.equal(plain.total_weight, robust.total_weight)
-    assert not torch.equal(plain.features, robust.features)
-    assert float(robust.agreement.mean()) > float(plain.agreement.mean())
+    assert torch.equal(baseline.seen, robust.seen)
+    assert torch.equal(baseline.total_weight, robust.total_weight)
+    assert not torch.equal(baseline.features, robust.features)
+    assert float(robust.agreement.mean()) > float(baseline.agreement.mean())

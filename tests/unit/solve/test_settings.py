@@ -49,20 +49,20 @@ def test_texts_may_stand_for_numbers_on_a_command_line() -> None:
     assert LiftSettings.of(stride="2", lift_gain="1.5") == LiftSettings.of_json({"stride": 2, "lift_gain": 1.5})
 
 
-@pytest.mark.parametrize("made", [LiftSettings.of_json, lambda values: LiftSettings.of(**values)])
-def test_what_is_wrong_is_told_in_our_words(made: Any) -> None:
+@pytest.mark.parametrize("read_settings", [LiftSettings.of_json, lambda values: LiftSettings.of(**values)])
+def test_errors_are_in_the_words_of_settings(read_settings: Any) -> None:
     with pytest.raises(
         InvalidSettings, match=r"^lambda: expected one of preset, speed, .*, got an unknown setting; nearest: "
     ):
-        made({"lambda": 1.2})
+        read_settings({"lambda": 1.2})
     with pytest.raises(InvalidSettings, match=r"^settings: expected other levels than composite"):
-        made({"aggregation_resolve": True, "levels": "composite"})
+        read_settings({"aggregation_resolve": True, "levels": "composite"})
     with pytest.raises(InvalidSettings, match=r"^settings: expected aggregation_clusters=hdbscan"):
-        made({"aggregation_resolve": True, "aggregation_clusters": "graph"})
+        read_settings({"aggregation_resolve": True, "aggregation_clusters": "graph"})
     with pytest.raises(InvalidSettings, match=r"^settings: expected robust_steps of 1 or more"):
-        made({"robust_steps": 0, "aggregation_guard": True})
+        read_settings({"robust_steps": 0, "aggregation_guard": True})
     with pytest.raises(InvalidSettings, match=r"^settings: expected cg_steps=0 beside loss=huber"):
-        made({"loss": "huber", "cg_steps": 1})
+        read_settings({"loss": "huber", "cg_steps": 1})
 
 
 def test_published_schema_has_every_setting_and_what_a_new_lift_may_have() -> None:
@@ -83,21 +83,21 @@ def test_regions_are_kept_from_the_papers_tau_on() -> None:
 
 @pytest.mark.parametrize("preset", list(Preset))
 def test_a_preset_only_fills_what_is_not_said(preset: Preset) -> None:
-    plain = LiftSettings.of(preset=preset)
-    said = LiftSettings.of(preset=preset, power=1, weight_floor=0.25, selection="front-mass", mass=0.5)
-    assert (said.power, said.weight_floor, said.selection, said.mass) == (1, 0.25, "front-mass", 0.5)
-    assert said.render_gain == plain.render_gain
-    assert LiftSettings.of(**plain.model_dump(mode="json")) == plain
+    preset_settings = LiftSettings.of(preset=preset)
+    explicit = LiftSettings.of(preset=preset, power=1, weight_floor=0.25, selection="front-mass", mass=0.5)
+    assert (explicit.power, explicit.weight_floor, explicit.selection, explicit.mass) == (1, 0.25, "front-mass", 0.5)
+    assert explicit.render_gain == preset_settings.render_gain
+    assert LiftSettings.of(**preset_settings.model_dump(mode="json")) == preset_settings
 
 
 @pytest.mark.parametrize("speed", Speed)
 def test_a_lift_from_before_a_setting_does_not_tell_what_the_dial_sets_today(speed: Speed) -> None:
     settings = LiftSettings.of(speed=speed)
-    made = LiftMetadata(version="1", settings=settings, views=("a",), diagnostics={}, timings={})
-    told = made.model_dump(mode="json")
-    assert LiftMetadata.model_validate(told).settings == settings
-    del told["settings"]["robust_directions"], told["settings"]["consensus"]
-    old = LiftMetadata.model_validate(told).settings
+    value = LiftMetadata(version="1", settings=settings, views=("a",), diagnostics={}, timings={})
+    document = value.model_dump(mode="json")
+    assert LiftMetadata.model_validate(document).settings == settings
+    del document["settings"]["robust_directions"], document["settings"]["consensus"]
+    old = LiftMetadata.model_validate(document).settings
     assert old == settings.model_copy(update={"robust_directions": 256, "consensus": False})
 
 
@@ -107,11 +107,11 @@ def test_keyword_arguments_of_a_lift_are_typed_as_its_settings() -> None:
     assert list(hints) == list(fields)
     assert hints.pop("device") == str | torch.device and fields.pop("device")
     for name, annotation in fields.items():
-        allowed: Any = annotation
+        expected: Any = annotation
         if isinstance(annotation, type) and issubclass(annotation, StrEnum):
-            allowed = annotation | Literal[tuple(str(one) for one in annotation)]
+            expected = annotation | Literal[tuple(str(value) for value in annotation)]
         elif annotation == LiftSettings.model_fields["levels"].annotation:
-            allowed = Literal["rows", "composite"] | int
+            expected = Literal["rows", "composite"] | int
         elif name == "smoothness":
-            allowed = float | Literal["auto"]
-        assert hints[name] == allowed, name
+            expected = float | Literal["auto"]
+        assert hints[name] == expected, name

@@ -19,14 +19,14 @@ widths = pytest.mark.parametrize("width", [1, 6, 32, 33, 70])
 def weights(seed: int) -> np.ndarray:
     """Rows of W [n, M] f32: alike, of few regions, of none, of one view, and of more than LONG regions."""
     rng = np.random.default_rng(seed)
-    shown = rng.random((23, REGIONS)) < 0.02
-    shown[4:8] = shown[4]
-    shown[11] = False
-    shown[12] &= VIEW == 2
-    shown[[0, 9, 10]] = rng.random((3, REGIONS)) < 0.8
-    found = (rng.random(shown.shape) * shown).astype(np.float32)
-    found[14, VIEW == 1] *= 100.0  # most of the splat
-    return found
+    mask = rng.random((23, REGIONS)) < 0.02
+    mask[4:8] = mask[4]
+    mask[11] = False
+    mask[12] &= VIEW == 2
+    mask[[0, 9, 10]] = rng.random((3, REGIONS)) < 0.8
+    result = (rng.random(mask.shape) * mask).astype(np.float32)
+    result[14, VIEW == 1] *= 100.0  # most of the splat
+    return result
 
 
 def sparse(dense: np.ndarray) -> list[np.ndarray]:
@@ -60,33 +60,33 @@ def test_sums_equal_float64_ones_and_those_of_each_row_alone_to_the_bit(width, s
     sums = summed(rows, dense, table, lengths)
     exact = dense * inverse_of(dense)[:, None] @ (table.numpy() * (lengths[:, None] if scaled else 1.0))
     np.testing.assert_allclose(sums, exact[rows], atol=1e-6)
-    for row, found in zip(rows, sums, strict=True):
-        assert np.array_equal(summed(np.array([row]), dense, table, lengths)[0], found)
+    for row, result in zip(rows, sums, strict=True):
+        assert np.array_equal(summed(np.array([row]), dense, table, lengths)[0], result)
 
 
-def compared(rows: np.ndarray, dense: np.ndarray, table: torch.Tensor) -> np.ndarray:
+def compare(rows: np.ndarray, dense: np.ndarray, table: torch.Tensor) -> np.ndarray:
     """Products and squares of all entries, [2, nnz]."""
     indptr, region, weight = sparse(dense)
-    W, found = [indptr, region, weight, np.zeros(0, np.float32), VIEW, LEVEL], np.zeros((2, weight.size), np.float32)
-    compare_rows(rows, W, flat_table(table), table.shape[1], found[0], found[1])
-    return found
+    W, result = [indptr, region, weight, np.zeros(0, np.float32), VIEW, LEVEL], np.zeros((2, weight.size), np.float32)
+    compare_rows(rows, W, flat_table(table), table.shape[1], result[0], result[1])
+    return result
 
 
 @widths
 def test_what_other_views_say_on_a_level_equals_float64_and_each_row_alone_to_the_bit(width):
     dense, table, rows = weights(3), table_of(width), np.random.default_rng(1).permutation(23)
-    found, e = compared(rows, dense, table), table.double().numpy()
+    result, e = compare(rows, dense, table), table.double().numpy()
     at, region = np.nonzero(dense)
-    others = np.zeros((at.size, width))
+    other_sums = np.zeros((at.size, width))
     for level in range(2):
-        own = dense * (level == LEVEL)
-        own = own * inverse_of(own)[:, None]
-        views = np.stack([np.where(view == VIEW, 0.0, own) @ e for view in range(VIEWS)])
-        others[LEVEL[region] == level] = views[VIEW[region], at][LEVEL[region] == level]
-    np.testing.assert_allclose(found[0], (others * e[region]).sum(axis=1), atol=2e-6)
-    np.testing.assert_allclose(found[1], (others**2).sum(axis=1), atol=2e-6)
-    alone = sum(compared(np.array([row]), dense, table) for row in rows)
-    assert np.array_equal(alone, found)
+        level_rows = dense * (level == LEVEL)
+        level_rows = level_rows * inverse_of(level_rows)[:, None]
+        views = np.stack([np.where(view == VIEW, 0.0, level_rows) @ e for view in range(VIEWS)])
+        other_sums[LEVEL[region] == level] = views[VIEW[region], at][LEVEL[region] == level]
+    np.testing.assert_allclose(result[0], (other_sums * e[region]).sum(axis=1), atol=2e-6)
+    np.testing.assert_allclose(result[1], (other_sums**2).sum(axis=1), atol=2e-6)
+    single_rows = sum(compare(np.array([row]), dense, table) for row in rows)
+    assert np.array_equal(single_rows, result)
 
 
 def test_a_table_is_followed_by_zeros_whoever_made_it():

@@ -30,33 +30,39 @@ class Observed:
     """The scene, what views observe of it, and words: those of steel are alike."""
 
     def __init__(self) -> None:
-        self.made: StillLife = still_life(views=10, pieces=small_things())
-        self.raster = CpuRaster(self.made.splats)
-        rows = np.random.default_rng(0).standard_normal((len(self.made.things) + 1, 64)).astype(np.float32)
+        self.still_life: StillLife = still_life(views=10, pieces=small_things())
+        self.raster = CpuRaster(self.still_life.splats)
+        rows = np.random.default_rng(0).standard_normal((len(self.still_life.things) + 1, 64)).astype(np.float32)
         rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-        vectors = rows[1:] + [[0.7 * (thing in SMALL)] for thing in self.made.things] * rows[:1]
+        vectors = rows[1:] + [[0.7 * (label in SMALL)] for label in self.still_life.things] * rows[:1]
         vectors = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
-        self.encoder = TableEncoder("words", list(self.made.things), vectors)
-        self.views = observe(self.made, self.raster, self.encoder, FEW, seed=1)
+        self.encoder = TableEncoder("words", list(self.still_life.things), vectors)
+        self.views = observe(self.still_life, self.raster, self.encoder, FEW, seed=1)
         self.truth = {
-            view: torch.from_numpy(true_labels(self.made, self.raster, view)[0]) for view in self.made.held_out
+            view: torch.from_numpy(true_labels(self.still_life, self.raster, view)[0])
+            for view in self.still_life.held_out
         }
 
     def ious(self, **settings: Any) -> dict[str, float]:
         """IoU of each thing's mask in the held-out views, asked for by its word."""
-        made = lc.lift(
-            self.made.splats, self.made.cameras, self.views, preset="default", diagnostic_rays=0, **settings
+        result = lc.lift(
+            self.still_life.splats,
+            self.still_life.cameras,
+            self.views,
+            preset="default",
+            diagnostic_rays=0,
+            **settings,
         )
-        scene = Scene(made, self.made.splats, self.made.cameras)
+        scene = Scene(result, self.still_life.splats, self.still_life.cameras)
         scene.raster = self.raster
         return {
-            thing: float(np.mean([self._iou(scene, thing, view) for view in self.truth]))
-            for thing in self.made.things
+            label: float(np.mean([self._iou(scene, label, view) for view in self.truth]))
+            for label in self.still_life.things
         }
 
-    def _iou(self, scene: Scene, thing: str, view: str) -> float:
-        mask = view_mask(scene, ask(scene, Query.of((thing,), absent="keep"), self.encoder), view).mask
-        return mask_iou(mask, self.truth[view] == self.made.things.index(thing))
+    def _iou(self, scene: Scene, label: str, view: str) -> float:
+        mask = view_mask(scene, ask(scene, Query.of((label,), absent="keep"), self.encoder), view).mask
+        return mask_iou(mask, self.truth[view] == self.still_life.things.index(label))
 
 
 @pytest.fixture(scope="module")
@@ -68,8 +74,10 @@ def scene() -> Observed:
 def test_small_things_keep_their_masks_where_the_guard_stands(scene: Observed, clusters: str) -> None:
     # In two channels steel is one cluster, of which the sword has most.
     merged = {"aggregation": True, "aggregation_clusters": clusters, "aggregation_channels": 2}
-    guarded = scene.ious(**merged)
-    assert min(guarded.values()) > 0.85
+    with_guard = scene.ious(**merged)
+    assert min(with_guard.values()) > 0.85
     if clusters == "hdbscan":
-        lost = scene.ious(**merged, aggregation_guard=False)
-        assert lost["sword"] < 0.85 and max(lost["ring"], lost["nut"]) < 0.1  # it is the guard that keeps them
+        without_guard = scene.ious(**merged, aggregation_guard=False)
+        assert (
+            without_guard["sword"] < 0.85 and max(without_guard["ring"], without_guard["nut"]) < 0.1
+        )  # it is the guard that keeps them

@@ -41,18 +41,20 @@ class Scene:
         splats = random_splats(seed, count)
         assert splats.sh is not None
         self.splats: Splats = replace(splats, sh=0.1 * splats.sh)
-        self.seen: Tensor = torch.from_numpy(rng.random(count) >= unseen)
-        self.X: Tensor = torch.from_numpy(rng.normal(size=(count, channels)).astype(np.float32)) * self.seen[:, None]
+        self.solved: Tensor = torch.from_numpy(rng.random(count) >= unseen)
+        self.X: Tensor = (
+            torch.from_numpy(rng.normal(size=(count, channels)).astype(np.float32)) * self.solved[:, None]
+        )
         self.total_weight: Tensor = torch.from_numpy(10 ** rng.uniform(-4, 3, count)).float()
         self.confidence: Tensor = torch.from_numpy(rng.random(count)).float()
 
-    def smooth(self, smoothness: float, **how: Any) -> Tensor:
-        given = SplatGraph.of(self.splats), self.total_weight, self.confidence, self.seen, smoothness
-        return smooth(self.X.clone(), *given, **how)[0]
+    def smooth(self, smoothness: float, **options: Any) -> Tensor:
+        arguments = SplatGraph.of(self.splats), self.total_weight, self.confidence, self.solved, smoothness
+        return smooth(self.X.clone(), *arguments, **options)[0]
 
     def minimum(self, smoothness: float) -> tuple[np.ndarray, np.ndarray]:
         """The features [P, F] of the splats that were seen by a dense solver, and their weights [P], both f64."""
-        weights = self.total_weight.double() * self.confidence.double().clamp_min(0.02) * self.seen
+        weights = self.total_weight.double() * self.confidence.double().clamp_min(0.02) * self.solved
         weights, affinities = weights.numpy(), dense(SplatGraph.of(self.splats))
         couplings = smoothness * affinities * np.sqrt(np.outer(weights, weights))
         K = np.diag(weights + couplings.sum(axis=1)) - couplings
@@ -68,9 +70,9 @@ class Scene:
 def test_features_are_those_of_the_least_sum(device: Device, seed: int, count: int, smoothness: float) -> None:
     scene = Scene(seed, count)
     X, weights = scene.minimum(smoothness)
-    apart = np.sqrt(weights[:, None]) * (scene.smooth(smoothness, device=device).double().numpy() - X)
-    moved = np.sqrt(weights[:, None]) * (scene.X.double().numpy() - X)
-    assert np.linalg.norm(apart) <= 1e-2 * np.linalg.norm(moved) + 1e-6 * np.sqrt(weights.sum())
+    residual = np.sqrt(weights[:, None]) * (scene.smooth(smoothness, device=device).double().numpy() - X)
+    change = np.sqrt(weights[:, None]) * (scene.X.double().numpy() - X)
+    assert np.linalg.norm(residual) <= 1e-2 * np.linalg.norm(change) + 1e-6 * np.sqrt(weights.sum())
 
 
 @pytest.mark.parametrize("channels", [31, 65, 130])
@@ -78,8 +80,8 @@ def test_features_of_more_channels_than_are_solved_at_a_time_are_those_of_the_le
     scene = Scene(5, 90, channels=channels)
     X, weights = scene.minimum(1.0)
     roots = np.sqrt(weights[:, None])
-    apart, moved = (roots * (Y.double().numpy() - X) for Y in (scene.smooth(1.0), scene.X))
-    assert (np.linalg.norm(apart, axis=0) <= 2e-2 * np.linalg.norm(moved, axis=0)).all()
+    residual, change = (roots * (Y.double().numpy() - X) for Y in (scene.smooth(1.0), scene.X))
+    assert (np.linalg.norm(residual, axis=0) <= 2e-2 * np.linalg.norm(change, axis=0)).all()
 
 
 @settings(max_examples=20, deadline=None)
@@ -88,24 +90,24 @@ def test_splats_without_evidence_take_the_mean_of_their_neighbours(seed: int, un
     scene = Scene(seed, 120, unseen=unseen)
     X, weights = scene.smooth(1.0).double().numpy(), scene.minimum(1.0)[1]
     affinities, roots = dense(SplatGraph.of(scene.splats)), np.sqrt(weights)
-    filled = weights > 0
+    has_weight = weights > 0
     while True:
         shares = affinities * roots
-        ring = ~filled & (shares.sum(axis=1) > 0)
+        ring = ~has_weight & (shares.sum(axis=1) > 0)
         if not ring.any():
             break
         means = shares[ring] @ X / shares[ring].sum(axis=1, keepdims=True)
         np.testing.assert_allclose(X[ring], means, rtol=1e-3, atol=1e-4)
-        roots, filled = ring.astype(float), filled | ring
-    assert not X[~filled].any()
+        roots, has_weight = ring.astype(float), has_weight | ring
+    assert not X[~has_weight].any()
 
 
 def test_number_of_threads_changes_no_bit() -> None:
     scene = Scene(0, 9_000, channels=40)
-    usual = scene.smooth(1.0)
-    assert not torch.equal(usual, scene.X)
-    for how in ({"threads": 1}, {"threads": 3}):
-        assert torch.equal(scene.smooth(1.0, **how), usual), how
+    expected = scene.smooth(1.0)
+    assert not torch.equal(expected, scene.X)
+    for options in ({"threads": 1}, {"threads": 3}):
+        assert torch.equal(scene.smooth(1.0, **options), expected), options
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float32])
@@ -113,8 +115,8 @@ def test_number_of_threads_changes_no_bit() -> None:
 def test_no_channel_leaves_the_range_of_the_features(dtype: torch.dtype, longest: float) -> None:
     scene = Scene(1, 300)
     X = (scene.X / scene.X.abs().max() * longest).to(dtype)
-    low, high = X[scene.seen].aminmax(dim=0)
-    smoothed, facts = smooth(X.clone(), SplatGraph.of(scene.splats), scene.total_weight, None, scene.seen, 1e6)
+    low, high = X[scene.solved].aminmax(dim=0)
+    smoothed, facts = smooth(X.clone(), SplatGraph.of(scene.splats), scene.total_weight, None, scene.solved, 1e6)
     assert smoothed.dtype == dtype
     assert ((smoothed >= low.clamp_max(0)) & (smoothed <= high.clamp_min(0))).all()
     assert ("warning" in facts) == (facts["steps"] >= STEPS)
@@ -124,9 +126,9 @@ def test_splats_that_no_neighbour_reaches_stay_as_they_are() -> None:
     scene = Scene(4, 60, unseen=0.0)
     far = scene.splats.means.clone()
     far[40:] += 1e4
-    splats, seen = replace(scene.splats, means=far), torch.arange(60) < 40
-    X = (scene.X.abs() + 1) * seen[:, None]
-    smoothed, facts = smooth(X.clone(), SplatGraph.of(splats), scene.total_weight, None, seen, 1.0)
+    splats, solved = replace(scene.splats, means=far), torch.arange(60) < 40
+    X = (scene.X.abs() + 1) * solved[:, None]
+    smoothed, facts = smooth(X.clone(), SplatGraph.of(splats), scene.total_weight, None, solved, 1.0)
     assert facts["filled"] == 0
     assert not smoothed[40:].any()
     assert (smoothed[:40] >= 1).all()
@@ -136,26 +138,26 @@ def test_features_that_are_one_stay_as_they_are() -> None:
     scene = Scene(2, 200, unseen=0.0)
     X = torch.ones(200, 3)
     smoothed, facts = smooth(
-        X.clone(), SplatGraph.of(scene.splats), scene.total_weight, scene.confidence, scene.seen, 4.0
+        X.clone(), SplatGraph.of(scene.splats), scene.total_weight, scene.confidence, scene.solved, 4.0
     )
     assert torch.equal(smoothed, X)
     assert facts["moved"] == facts["steps"] == facts["filled"] == 0
-    nothing, facts = smooth(
-        0 * X, SplatGraph.of(scene.splats), scene.total_weight, scene.confidence, ~scene.seen, 4.0
+    unchanged, facts = smooth(
+        0 * X, SplatGraph.of(scene.splats), scene.total_weight, scene.confidence, ~scene.solved, 4.0
     )
-    assert not nothing.any()
+    assert not unchanged.any()
     assert facts["moved"] is None
     assert "not at all" in smoothing_line(facts)
 
 
-MANY = 17_000  # splats: more than are told apart or solved at once
+SPLATS_OF_FIELD = 17_000  # more than are sampled or solved at once
 PLACES = np.random.default_rng(2).random((900, 2))  # of splats on a square
-THINGS = (4 * PLACES[:, 0]).astype(int)  # four stripes
-STRIPES = np.random.default_rng(4).normal(size=(4, 6))[THINGS]
+STRIPE_LABELS = (4 * PLACES[:, 0]).astype(int)  # four stripes
+STRIPES = np.random.default_rng(4).normal(size=(4, 6))[STRIPE_LABELS]
 
 
-def chosen(
-    truth: np.ndarray, noise: float, views: int = 6, places: np.ndarray = PLACES, **how: Any
+def choose(
+    truth: np.ndarray, noise: float, views: int = 6, places: np.ndarray = PLACES, **options: Any
 ) -> SmoothnessChoice:
     """The choice for splats at places, a colour a stripe, each with a noisy copy of its truth [P, F] in each view."""
     rng, count = np.random.default_rng(3), len(places)
@@ -166,34 +168,38 @@ def chosen(
     rows = truth + noise * rng.normal(size=(views, *truth.shape))
     regions = (torch.arange(views)[None] * count + torch.arange(count)[:, None]).reshape(-1).int()
     starts, total_weight = torch.arange(count + 1) * views, torch.full((count,), float(views))
-    every = torch.arange(count, dtype=torch.int32)
+    splats = torch.arange(count, dtype=torch.int32)
     offsets = torch.arange(views + 1) * count
-    W = RegionWeights(every, starts, regions, torch.ones(views * count), every, total_weight, offsets)
-    codebook = Codebook(tuple(ViewCodebook(torch.from_numpy(own).float()) for own in rows))
-    return choose_smoothness(W, codebook, graph, None, **how)
+    W = RegionWeights(splats, starts, regions, torch.ones(views * count), splats, total_weight, offsets)
+    codebook = Codebook(tuple(ViewCodebook(torch.from_numpy(book).float()) for book in rows))
+    return choose_smoothness(W, codebook, graph, None, **options)
 
 
 def test_strength_is_large_for_noise_and_small_for_what_differs_from_splat_to_splat() -> None:
-    choice = chosen(STRIPES, 2.0)
+    choice = choose(STRIPES, 2.0)
     assert choice.smoothness >= STRENGTHS[1]
     assert 0 < 1.2 * choice.information[0.0] < choice.information[choice.smoothness] < 2.1  # 2 bits name one of four
-    mixed = np.random.default_rng(6).permutation(STRIPES)  # neighbours are no more alike than others
-    for truth, noise in ((mixed, 0.3), (mixed, 1.0), (np.random.default_rng(7).normal(size=STRIPES.shape), 0.3)):
-        assert chosen(truth, noise).smoothness <= STRENGTHS[0]
+    permuted = np.random.default_rng(6).permutation(STRIPES)  # neighbours are no more alike than others
+    for truth, noise in (
+        (permuted, 0.3),
+        (permuted, 1.0),
+        (np.random.default_rng(7).normal(size=STRIPES.shape), 0.3),
+    ):
+        assert choose(truth, noise).smoothness <= STRENGTHS[0]
 
 
 def test_strength_is_the_same_for_any_number_of_threads() -> None:
-    places = np.random.default_rng(8).random((MANY, 2))
+    places = np.random.default_rng(8).random((SPLATS_OF_FIELD, 2))
     truth = np.random.default_rng(4).normal(size=(4, 3))[(4 * places[:, 0]).astype(int)]
-    one, three = (chosen(truth, 2.0, 2, places, threads=threads) for threads in (1, 3))
-    assert one == three
-    assert one.smoothness > 0
+    single, three = (choose(truth, 2.0, 2, places, threads=threads) for threads in (1, 3))
+    assert single == three
+    assert single.smoothness > 0
 
 
 @pytest.mark.parametrize("views", [1, 2])
 def test_strength_is_zero_where_halves_tell_nothing(views: int) -> None:
     noise = 0.0 if views == 2 else 1.0  # all that two views say is one vector
-    assert chosen(np.ones_like(STRIPES), noise, views) == SmoothnessChoice(0.0, {})
+    assert choose(np.ones_like(STRIPES), noise, views) == SmoothnessChoice(0.0, {})
 
 
 @pytest.fixture(scope="module")
@@ -207,19 +213,19 @@ def grids(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
 
 
 @pytest.fixture(scope="module")
-def plain(files: tuple[Path, Path, Path]) -> lc.LiftResult:
+def baseline(files: tuple[Path, Path, Path]) -> lc.LiftResult:
     return lift_files(files[0], files[1], files[2:], LiftSettings.of())
 
 
 @pytest.mark.parametrize("dtype", ["float16", "float32"])
 def test_refined_lift_is_the_lift_with_that_smoothness(grids: tuple[Path, Path, Path], dtype: str) -> None:
-    plain, smoothed = (
+    baseline, smoothed = (
         lift_files(grids[0], grids[1], grids[2:], LiftSettings.of(smoothness=strength, dtype=dtype))
         for strength in (0, 1.5)
     )
-    before = plain.features.clone()
-    refined = plain.refined(lc.read_splats(grids[0]), smoothness=1.5)
-    assert torch.equal(plain.features, before)
+    before = baseline.features.clone()
+    refined = baseline.refined(lc.read_splats(grids[0]), smoothness=1.5)
+    assert torch.equal(baseline.features, before)
     assert not torch.equal(smoothed.features, before)
     for name in ("features", "total_weight", "agreement", "confidence", "seen"):
         assert torch.equal(getattr(refined, name), getattr(smoothed, name)), name
@@ -227,7 +233,7 @@ def test_refined_lift_is_the_lift_with_that_smoothness(grids: tuple[Path, Path, 
     assert refined.diagnostics["smoothing"] | {"parted": 0} == smoothed.diagnostics["smoothing"]
     assert refined.diagnostics["smoothing"]["colours"]
     assert refined.diagnostics["residual"] is None
-    assert smoothed.diagnostics["residual"] > plain.diagnostics["residual"] * 0.5
+    assert smoothed.diagnostics["residual"] > baseline.diagnostics["residual"] * 0.5
     assert "smooth" in refined.metadata.timings
 
 
@@ -245,7 +251,7 @@ def test_lift_with_auto_is_the_lift_with_the_chosen_strength(
     auto = lifted("auto")
     facts = dict(auto.diagnostics["smoothing"])
     candidates = facts.pop("candidates")
-    assert facts["smoothness"] in [one["smoothness"] for one in candidates]
+    assert facts["smoothness"] in [single["smoothness"] for single in candidates]
     fixed = lifted(facts["smoothness"])
     assert torch.equal(auto.features, fixed.features)
     if choice is None:
@@ -260,18 +266,20 @@ def test_lift_with_auto_is_the_lift_with_the_chosen_strength(
         auto.refined(lc.read_splats(files[0]), smoothness=1)
 
 
-def test_refinement_that_cannot_be_is_refused_in_words(files: tuple[Path, Path, Path], plain: lc.LiftResult) -> None:
+def test_refinement_that_cannot_be_is_refused_in_words(
+    files: tuple[Path, Path, Path], baseline: lc.LiftResult
+) -> None:
     splats = lc.read_splats(files[0])
     with pytest.raises(lc.InvalidSettings, match="smoothness: expected a number above 0"):
-        plain.refined(splats, smoothness=0)
+        baseline.refined(splats, smoothness=0)
     with pytest.raises(lc.InvalidSettings, match="lift again with smoothness=auto"):
-        plain.refined(splats, smoothness="auto")  # pyright: ignore[reportArgumentType]
+        baseline.refined(splats, smoothness="auto")  # pyright: ignore[reportArgumentType]
     with pytest.raises(lc.InvalidSettings, match="smoothness"):
-        plain.refined(splats, smoothness=float("nan"))
+        baseline.refined(splats, smoothness=float("nan"))
     with pytest.raises(lc.InvalidSplats, match="splats"):
-        plain.refined(splats[:10], smoothness=1)
+        baseline.refined(splats[:10], smoothness=1)
     with pytest.raises(lc.InvalidLift, match="without smoothness"):
-        plain.refined(splats, smoothness=1).refined(splats, smoothness=1)
+        baseline.refined(splats, smoothness=1).refined(splats, smoothness=1)
     clustered = lift_files(files[0], files[1], files[2:], LiftSettings.of(aggregation=True))
     with pytest.raises(lc.InvalidLift, match="aggregation"):
         clustered.refined(splats, smoothness=1)
@@ -280,7 +288,7 @@ def test_refinement_that_cannot_be_is_refused_in_words(files: tuple[Path, Path, 
 
 
 def test_lift_in_blocks_refuses_smoothness_and_is_refined(
-    files: tuple[Path, Path, Path], plain: lc.LiftResult
+    files: tuple[Path, Path, Path], baseline: lc.LiftResult
 ) -> None:
     scene = lc.read_splats(files[0]), lc.read_cameras(files[1]), lc.read_features(files[2])
     strengths: list[tuple[Any, str]] = [(2, "2"), ("auto", "1")]
@@ -290,7 +298,7 @@ def test_lift_in_blocks_refuses_smoothness_and_is_refined(
             lc.lift(*scene, smoothness=strength, engine=lc.LocalEngine(1))
     in_blocks = lc.lift(*scene, engine=lc.LocalEngine(1)).refined(scene[0], smoothness=2)
     assert in_blocks.settings.smoothness == 2
-    assert torch.equal(in_blocks.features, plain.refined(scene[0], smoothness=2).features)
+    assert torch.equal(in_blocks.features, baseline.refined(scene[0], smoothness=2).features)
 
 
 @pytest.mark.parametrize("smoothness", ["0", "auto"])
@@ -304,15 +312,15 @@ def test_lift_of_few_views_tells_of_smoothness(
 
 
 def test_command_refines_a_lift_that_is_there(
-    plain: lc.LiftResult, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    baseline: lc.LiftResult, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "scene.lift.safetensors"
-    plain.save(path)
+    baseline.save(path)
     status, out, err = run(capsys, "refine", path, "--smoothness", "1")
     assert (status, err) == (0, "")
     assert "smoothness 1: features moved by" in out
     refined = lc.load_lift(tmp_path / "scene.lift.smooth.safetensors")
     assert refined.settings.smoothness == 1
-    assert torch.equal(lc.load_lift(path).features, plain.features)
+    assert torch.equal(lc.load_lift(path).features, baseline.features)
     assert run(capsys, "refine", tmp_path / "scene.lift.smooth.safetensors", "--smoothness", "1")[0] == 2
     assert run(capsys, "refine", path, "--smoothness", "1", "-o", path)[0] == 2

@@ -21,40 +21,40 @@ def views() -> list[RegionWeights]:
     return [random_view(k, 4 + k, SPLATS) for k in range(5)]
 
 
-def assert_same(one: RegionWeights, other: RegionWeights) -> None:
-    assert one.views == other.views
-    for name, own in one.tensors().items():
-        assert torch.equal(own, getattr(other, name)), name
+def assert_same(actual: RegionWeights, expected: RegionWeights) -> None:
+    assert actual.views == expected.views
+    for name, view_list in actual.tensors().items():
+        assert torch.equal(view_list, getattr(expected, name)), name
 
 
 def test_stacked_views_are_their_matrices_side_by_side():
-    own = views()
-    W = stacked(own, SPLATS)
-    assert np.array_equal(dense(W, SPLATS), np.hstack([dense(view, SPLATS) for view in own]))
+    view_list = views()
+    W = stacked(view_list, SPLATS)
+    assert np.array_equal(dense(W, SPLATS), np.hstack([dense(view, SPLATS) for view in view_list]))
     assert W.indptr.shape == (SPLATS + 1,) and W.splats.tolist() == list(range(SPLATS))
     assert W.offsets.tolist() == [0, 4, 9, 15, 22, 30]
     rows = np.split(W.region.numpy(), W.indptr.numpy()[1:-1])
     assert all((np.diff(row) > 0).all() for row in rows)
-    total_weight = np.bincount(np.concatenate([view.splats.numpy() for view in own]), minlength=SPLATS)
+    total_weight = np.bincount(np.concatenate([view.splats.numpy() for view in view_list]), minlength=SPLATS)
     assert np.array_equal(np.flatnonzero(total_weight), W.total_weight_splats.numpy())
     assert np.array_equal(total_weight[total_weight > 0], W.total_weight.numpy())
     np.testing.assert_allclose(W.row_sums().numpy(), dense(W, SPLATS).sum(axis=1), rtol=1e-12)
 
 
 def test_neither_threads_nor_files_nor_groups_of_views_change_a_bit(monkeypatch):
-    own = views()
-    whole = stacked(own, SPLATS, threads=1)
-    assert_same(whole, stacked(own, SPLATS, threads=5))
-    assert_same(whole, stacked([stacked(own[:2], SPLATS), *own[2:]], SPLATS))
-    assert_same(whole, stacked([view.in_files() for view in own], SPLATS))
+    view_list = views()
+    expected = stacked(view_list, SPLATS, threads=1)
+    assert_same(expected, stacked(view_list, SPLATS, threads=5))
+    assert_same(expected, stacked([stacked(view_list[:2], SPLATS), *view_list[2:]], SPLATS))
+    assert_same(expected, stacked([view.in_files() for view in view_list], SPLATS))
     monkeypatch.setattr(weights, "MEMORY_LIMIT", 0)
-    assert_same(whole, stacked(own, SPLATS))
+    assert_same(expected, stacked(view_list, SPLATS))
 
 
 def test_no_view_and_views_without_splats_are_rows_without_entries():
-    nothing = of_dense(np.zeros((SPLATS, 3)))
-    for own in ([], [nothing, nothing]):
-        W = stacked(own, SPLATS)
+    empty = of_dense(np.zeros((SPLATS, 3)))
+    for view_list in ([], [empty, empty]):
+        W = stacked(view_list, SPLATS)
         assert W.region.numel() == 0 and not W.row_sums().any()
         assert W.indptr.tolist() == [0] * (SPLATS + 1)
 
@@ -82,12 +82,12 @@ def test_mapped_files_are_not_kept_open(tmp_path):
 
 
 def test_more_regions_than_four_bytes_number_are_refused():
-    many = weights.replace(random_view(0, 3, 5), offsets=torch.tensor([0, 2**30]))
+    oversized = weights.replace(random_view(0, 3, 5), offsets=torch.tensor([0, 2**30]))
     with pytest.raises(Unavailable, match="regions"):
-        stacked([many] * 3, 5)
+        stacked([oversized] * 3, 5)
 
 
-def test_a_full_disk_is_told_in_words(monkeypatch):
+def test_a_full_disk_is_an_error_in_words(monkeypatch):
     monkeypatch.setattr("liftcore.runtime.memory.lack_of_disk", lambda size: "0.0 GiB of disk")
     with pytest.raises(Unavailable, match="GiB of memory for them, or of disk"):
         views()[0].in_files()
