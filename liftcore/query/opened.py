@@ -1,4 +1,4 @@
-"""A lift opened once: what questions to it share, with the splats, cameras and packs that it was made from."""
+"""An opened lift: arrays that queries share, with the splats, cameras and packs of its scene."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ if TYPE_CHECKING:  # these load torch
     from liftcore.values.lift import InputFile, Lift, LiftMetadata
     from liftcore.values.pack import Views
 
-MOST_SAMPLED = 1 << 14  # splats of which a rough mean is taken
-MOST_OF_THING = 512  # splats of a thing, likewise
+MOST_SAMPLED = 1 << 14  # splats of which a rough mean is computed
+MOST_OF_OBJECT = 512  # splats of an object, likewise
 MOST_PIXELS = 1 << 26  # of a picture: 67 million take a minute of one core and 2 GB
 
 
 @deprecated_names(**OLD_TENSORS)
 class OpenedLift:
-    """A lift, with the splats and cameras of its scene: what `liftcore.query.scene.Scene` asks.
+    """A lift with the splats and cameras of its scene: the state of `liftcore.query.scene.Scene`.
 
-    Arguments and errors are those of `Scene`. Norms, mean, axes and encoders are made once and kept.
+    Arguments and errors are those of `Scene`. Norms, mean, axes and encoders are computed once and cached.
     """
 
     features: np.ndarray
@@ -57,7 +57,7 @@ class OpenedLift:
     confidence: np.ndarray | None
     """[P] f32 in 0..1; None where the lift was not reweighted"""
     object: np.ndarray | None
-    """[P] i32, -1 = of no object; None: objects were not looked for"""
+    """[P] i32, -1 = of no object; None: the lift has no objects"""
     object_views: np.ndarray | None
     """[N, V] i32, of `Lift`"""
     node: np.ndarray | None
@@ -70,10 +70,10 @@ class OpenedLift:
     """[T] f32 in 0..1"""
     node_features: np.ndarray | None
     """[T, F] f16, unit; zero for none"""
-    _told: str
+    _metadata_json: str
     """the metadata of a lift file, as JSON"""
-    _moved: dict[str, Path | None]
-    """files that lie elsewhere now, by their roles"""
+    _new_paths: dict[str, Path | None]
+    """new paths of files that were moved, by their roles"""
 
     def __init__(
         self,
@@ -85,35 +85,35 @@ class OpenedLift:
         device: str = "cpu",
         world: WorldFrame = UNKNOWN,
     ) -> None:
-        self.device, self._said_of_world = device, world
-        self.labelled: tuple[Any, Any] | None = None  # what was last exported, and its `Labels`, for two files of it
+        self.device, self._world_override = device, world
+        self.labelled: tuple[Any, Any] | None = None  # the last exported source and its `Labels`, for the next file
         self.selections: dict[str, Selection] = {}  # by their names; `Scene.select` makes them
         self.node_boxes: dict[tuple[int, int], Box] = {}  # of listed nodes, by their ids and numbers of splats
         self.object_features: np.ndarray | None = None  # [N, F], of `liftcore.query.catalogue.object_features`
         self._encoders: dict[str | None, TextEncoder] = {}
-        places = {"splats": splats, "cameras": cameras}
-        self._moved = {role: Path(at) if isinstance(at, str | Path) else None for role, at in places.items()}
+        paths = {"splats": splats, "cameras": cameras}
+        self._new_paths = {role: Path(at) if isinstance(at, str | Path) else None for role, at in paths.items()}
         if isinstance(source, str | Path):
             self.path = Path(source)
-            arrays, self._told = read_lift(self.path)
-            moved = self._moved["splats"]
-            given: dict[str, Any] = {}
+            arrays, self._metadata_json = read_lift(self.path)
+            splats_path = self._new_paths["splats"]
+            cached: dict[str, Any] = {}
         else:
             names = ("features", "total_weight", "seen", "cluster", "cluster_features", "confidence", "embeddings")
             arrays = {name: as_numpy(getattr(source, name)) for name in (*names, *OBJECT_TENSORS, *NODE_TENSORS)}
-            self.path, moved = Path("lift"), None
-            given = {"lift": source, "metadata": self._with_places(source.metadata)}
-        self._hold(arrays)
-        if moved is not None and moved.exists():
-            self._require_rows(quick_count(moved))
-        given |= {"cameras": cameras} if cameras is not None and self._moved["cameras"] is None else {}
-        given |= {"packs": packs} if packs is not None else {}
-        self.__dict__.update(given)
+            self.path, splats_path = Path("lift"), None
+            cached = {"lift": source, "metadata": self._with_places(source.metadata)}
+        self._set_arrays(arrays)
+        if splats_path is not None and splats_path.exists():
+            self._require_rows(quick_count(splats_path))
+        cached |= {"cameras": cameras} if cameras is not None and self._new_paths["cameras"] is None else {}
+        cached |= {"packs": packs} if packs is not None else {}
+        self.__dict__.update(cached)
         if splats is not None and not isinstance(splats, str | Path):
             self.lift.require_splats(splats)
             self.__dict__["splats"] = splats.cpu()
 
-    def _hold(self, arrays: dict[str, Any]) -> None:
+    def _set_arrays(self, arrays: dict[str, Any]) -> None:
         columns = (arrays[name] for name in ("features", "total_weight", "seen"))
         self.features, self.total_weight, self._has_feature = columns
         self.cluster, self.cluster_features = arrays.get("cluster"), arrays.get("cluster_features")
@@ -131,13 +131,13 @@ class OpenedLift:
         hint: str = "give encoder=, or vectors",
         stand_in: bool = True,
     ) -> TextEncoder:
-        """The encoder of a specification, opened once and with its last texts remembered; one of yours as it is.
+        """Open the encoder of a specification once, with a cache of its last texts; return an encoder as it is.
 
-        None: the lift's own words, else that of its text space.
+        None: the lift's own words, else the encoder of its text space.
 
         Args:
-            hint: what to do where there is none. stand_in: where the weights of the space's encoder cannot be had,
-                take the table of it that ships, which knows its own words alone.
+            hint: of the error if there is none. stand_in: if the weights of the space's encoder are not available,
+                take its shipped table, which has its own words alone.
 
         Raises:
             InvalidQuery: it is something else, or the lift's text space names none.
@@ -155,46 +155,45 @@ class OpenedLift:
         key = None if encoder is None else str(encoder)
         if key not in self._encoders:
             space = self.metadata.text_space
-            opened = encoder_of_space(space, hint, stand_in=stand_in) if key is None else open_encoder(key)
-            self._encoders[key] = CachingEncoder(opened)
+            text_encoder = encoder_of_space(space, hint, stand_in=stand_in) if key is None else open_encoder(key)
+            self._encoders[key] = CachingEncoder(text_encoder)
         return self._encoders[key]
 
     @cached_property
     def metadata(self) -> LiftMetadata:
-        """How the lift was made, with its files where they are now; read when first asked for.
+        """The lift's metadata with the present paths of its files; parsed at the first access.
 
         Raises:
-            InvalidLift: the metadata are none of a lift, or the lift has not a row for each of the splats that they
-                name.
+            InvalidLift: the file has no valid lift metadata, or its rows are not those of the splats that they name.
         """
         from liftcore.values.lift_file import input_file, parse_metadata
 
-        metadata = parse_metadata(self._told, self.path)
+        metadata = parse_metadata(self._metadata_json, self.path)
         splats = Path(metadata.splats.path)
-        if metadata.splats.path and self._moved["splats"] is None and splats.exists():
+        if metadata.splats.path and self._new_paths["splats"] is None and splats.exists():
             count = quick_count(splats)
-            # Another file may lie there now, which says nothing of this lift.
+            # Another file may have this path now, whose number of rows does not matter.
             if count not in (None, len(self.features)) and input_file(splats).sha256 == metadata.splats.sha256:
                 self._require_rows(count)
         return self._with_places(metadata)
 
     def _with_places(self, metadata: LiftMetadata) -> LiftMetadata:
-        """The metadata with the files that moved where they are now."""
+        """Return the metadata with the new paths of files that were moved."""
         files = {
             name: getattr(metadata, name).model_copy(update={"path": str(place)})
-            for name, place in self._moved.items()
+            for name, place in self._new_paths.items()
             if place is not None
         }
         return metadata.model_copy(update=files) if files else metadata
 
     @cached_property
     def world(self) -> WorldFrame:
-        """Which way is up and how long a unit is, as somebody says now, else as the lift knows it; may be set."""
-        return self._said_of_world.known_or(self.metadata.world)
+        """Up axis and length unit, as passed to the scene, else as stored in the lift; may be set."""
+        return self._world_override.known_or(self.metadata.world)
 
     @cached_property
     def table(self) -> TableEncoder | None:
-        """The words that its packs brought: an encoder for these; None without any.
+        """The words of its packs, as an encoder; None without any.
 
         Raises:
             InvalidTable: its words and their vectors do not fit together.
@@ -203,7 +202,7 @@ class OpenedLift:
 
     @cached_property
     def lift(self) -> Lift:
-        """The lift as torch has it, over the same memory."""
+        """The lift with torch tensors over the same memory."""
         from liftcore.values.lift_file import open_lift
 
         return open_lift(self.path)
@@ -220,21 +219,21 @@ class OpenedLift:
 
     @cached_property
     def seen(self) -> np.ndarray:
-        """[P] bool, whether a splat has a feature."""
+        """[P] bool, True if a splat has a feature."""
         return self._has_feature & (self.norms > 0)
 
     @cached_property
     def all_seen(self) -> bool:
-        """Whether every splat has one."""
+        """True if every splat has a feature."""
         return bool(self.seen.all())
 
     @cached_property
     def weights(self) -> np.ndarray | None:
-        """How much each seen splat counts in a histogram, its total weight; None when none has total weight."""
+        """Weights in histograms of the splats with a feature, their total weights; None if all are zero."""
         return self.weights_with_feature(self.total_weight)
 
     def splat_weights(self, weight_by: str) -> np.ndarray:
-        """[P] f32, how much each splat counts: by its total weight, or by that times its confidence.
+        """Return the weight of each splat, [P] f32: its total weight, or that times its confidence.
 
         Raises:
             InvalidQuery: the lift has no confidence.
@@ -247,18 +246,18 @@ class OpenedLift:
         return self.total_weight * self.confidence
 
     def weights_with_feature(self, weights: np.ndarray) -> np.ndarray | None:
-        """Weights [P] of the seen splats; None when none is above zero, so that they count alike."""
+        """Return the weights [P] of the splats with a feature; None, which means equal ones, if all are zero."""
         weights = weights if self.all_seen else weights[self.seen]
         return weights if weights.max(initial=0.0) > 0 else None
 
     @cached_property
     def mean(self) -> np.ndarray:
-        """[F] f32, the mean of the unit features, weighted by total weight: what all the scene's features share."""
+        """[F] f32, the mean of the unit features by total weight, which all features of the scene share."""
         return mean_direction(self.features, self.norms, self.total_weight)
 
     @cached_property
     def rough_mean(self) -> np.ndarray:
-        """[F] f32, the mean of at most MOST_SAMPLED of them, evenly spaced: quicker, and near enough for words."""
+        """[F] f32, the mean of at most MOST_SAMPLED evenly spaced ones: faster, and accurate enough for words."""
         rows = slice(None, None, -(-len(self.features) // MOST_SAMPLED) or 1)
         return mean_direction(self.features[rows], self.norms[rows], self.total_weight[rows])
 
@@ -266,40 +265,40 @@ class OpenedLift:
     def object_means(self) -> np.ndarray:
         """[N, F] f32, the unit mean of the features of each object of the lift (`mean_of`)."""
         assert self.object is not None and self.object_views is not None
-        own = np.where(self.seen, self.object, -1)
-        order = np.argsort(own, kind="stable")
-        ends = np.searchsorted(own[order], np.arange(len(self.object_views) + 1))
+        objects = np.where(self.seen, self.object, -1)
+        order = np.argsort(objects, kind="stable")
+        ends = np.searchsorted(objects[order], np.arange(len(self.object_views) + 1))
         means = [self.mean_of(order[first:last]) for first, last in pairwise(ends.tolist())]
         return np.stack(means) if means else np.zeros((0, self.channels), np.float32)
 
     def node_path(self, node: int) -> tuple[int, ...]:
-        """The nodes of the tree that hold a node, the largest first, and itself."""
+        """Return the nodes of the tree that contain a node, the largest first, and the node itself."""
         assert self.node_parents is not None
-        found = [node]
-        while (above := int(self.node_parents[found[-1]])) >= 0:
-            found.append(above)
-        return tuple(reversed(found))
+        path = [node]
+        while (above := int(self.node_parents[path[-1]])) >= 0:
+            path.append(above)
+        return tuple(reversed(path))
 
     def node_kind(self, node: int) -> Literal["object", "part", "group"]:
-        """What a node of the tree is: the first are the objects."""
+        """Return the kind of a node of the tree: the first nodes are the objects."""
         objects = 0 if self.object_views is None else len(self.object_views)
         if node < objects:
             return "object"
         return "part" if min(self.node_path(node)) < objects else "group"
 
     def lack_of_objects(self) -> str:
-        """Why a lift has none, and what gives it some."""
+        """Explain why the lift has no objects, and how to get some."""
         settings = self.metadata.settings
         if settings.objects is False:
-            why = "speed=draft sets it" if settings.speed == "draft" else "they were not asked for"
-            return f"this lift looked for no objects, with objects=false ({why}): lift again with objects=auto"
+            cause = "speed=draft sets it" if settings.speed == "draft" else "they were not requested"
+            return f"this lift has no objects, as objects=false ({cause}): lift again with objects=auto"
         return (
-            "this lift holds no objects: they are found by lifts of masks, by the preset default or the setting "
+            "this lift has no objects: they are found by lifts of masks, by the preset default or the setting "
             "objects; grids have no masks"
         )
 
     def members(self, number: int) -> np.ndarray:
-        """[P] bool, the splats of an object, or of another node of the tree with its parts.
+        """Return the splats of an object, or of another node of the tree with its parts, [P] bool.
 
         Raises:
             NotFound: the lift has no such object.
@@ -316,10 +315,10 @@ class OpenedLift:
         while (above >= 0).any():
             below[:-1] |= above == number
             above = np.where(above >= 0, self.node_parents[above], -1)
-        return below[self.node]  # the last place is of no node
+        return below[self.node]  # the last entry is of splats without a node
 
     def within(self, members: np.ndarray) -> Self:
-        """The same lift as if nothing but some of its splats [P] bool were seen; the tree's nodes are its things.
+        """Return a copy of the lift in which only some splats [P] bool have features, with nodes as its objects.
 
         Means and shares of total weight are those of these splats, so that a question tells them from one another.
         """
@@ -337,8 +336,8 @@ class OpenedLift:
         return inner
 
     def mean_of(self, rows: np.ndarray) -> np.ndarray:
-        """[F] f32, the unit mean of unit features of splats [n] by total weight; of many, of evenly spaced ones."""
-        rows = rows[:: -(-len(rows) // MOST_OF_THING) or 1]
+        """Compute the unit mean [F] f32 of the unit features of splats [n] by total weight; of many, by a sample."""
+        rows = rows[:: -(-len(rows) // MOST_OF_OBJECT) or 1]
         weights = self.total_weight[rows]
         mean = mean_direction(self.features[rows], self.norms[rows], weights if weights.any() else weights + 1)
         return mean / max(float(np.linalg.norm(mean)), 1e-30)
@@ -352,7 +351,7 @@ class OpenedLift:
 
     @cached_property
     def splat_file(self) -> Path:
-        """The file of the splats that were lifted; of values in memory one that goes with the scene.
+        """The file of the splats that were lifted; of values in memory a temporary one.
 
         Raises:
             InvalidLift: it moved, is another than the one that was lifted, or has another number of splats.
@@ -364,15 +363,15 @@ class OpenedLift:
             path = Path(self._folder.name) / "splats.ply"
             write_splats(path, self.splats)
             return path
-        path = self._unchanged("splats", self.metadata.splats)
+        path = self._verified_input("splats", self.metadata.splats)
         self._require_rows(quick_count(path))
         return path
 
     def _require_rows(self, splats: int | None) -> None:
-        """Refuse a lift whose rows are not those of its splats: each answer would name others.
+        """Raise InvalidLift if the lift's rows are not those of its splats: answers would be of other splats.
 
         Args:
-            splats: how many there are; None where that is not known yet.
+            splats: their number; None if it is not known yet.
         """
         if splats not in (None, len(self.features)):
             raise InvalidLift(
@@ -395,15 +394,15 @@ class OpenedLift:
 
     @property
     def kernel(self) -> str:
-        """The kernel that was lifted with; ``auto`` where the lift does not say what that was."""
-        chosen = self.metadata.settings.kernel
+        """The kernel of the lift; ``auto`` if its diagnostics do not have it."""
+        setting = self.metadata.settings.kernel
         plan = self.metadata.diagnostics.get("plan")
-        lifted = plan.get("kernel") if chosen == "auto" and isinstance(plan, dict) else chosen
-        return str(lifted) if lifted in set(Kernel) else chosen
+        lifted = plan.get("kernel") if setting == "auto" and isinstance(plan, dict) else setting
+        return str(lifted) if lifted in set(Kernel) else setting
 
     @cached_property
     def axes(self) -> np.ndarray:
-        """[3, P], `Splats.positions` axis by axis: a box around many of them is found five times faster so."""
+        """[3, P], `Splats.positions` axis by axis: a box around many of them takes a fifth of the time."""
         if "splats" in self.__dict__:
             return np.ascontiguousarray(self.splats.positions().T)
         from liftcore.io.splats import read_places
@@ -421,30 +420,30 @@ class OpenedLift:
         """
         from liftcore.io.cameras import read_cameras
 
-        # Which of several models was meant, the lift knew: its digest tells that the same is read.
-        path = self._unchanged("cameras", self.metadata.cameras)
+        # Of several models the same is read as by the lift, which its digest verifies.
+        path = self._verified_input("cameras", self.metadata.cameras)
         return read_cameras(path, choosing=False, views=self.metadata.views)
 
     @cached_property
     def packs(self) -> Views:
-        """The feature packs that were lifted; queries by region read a row of them.
+        """The feature packs of the lift; queries by region read a row of them.
 
         Raises:
             InvalidLift: a pack moved, or is another than the one that was lifted.
         """
         from liftcore.values.pack import read_features
 
-        return read_features(*(self._unchanged("features", file) for file in self.metadata.features))
+        return read_features(*(self._verified_input("features", file) for file in self.metadata.features))
 
     def find_packs(self, paths: Sequence[Path]) -> None:
-        """Say where the feature packs lie now, when they moved since the lift; in the lift's order."""
+        """Set new paths of the feature packs, in the lift's order, if they moved since the lift."""
         files = zip(self.metadata.features, paths, strict=True)
-        moved = tuple(file.model_copy(update={"path": str(path)}) for file, path in files)
-        self.metadata = self.metadata.model_copy(update={"features": moved})
+        new_files = tuple(file.model_copy(update={"path": str(path)}) for file, path in files)
+        self.metadata = self.metadata.model_copy(update={"features": new_files})
 
     @cached_property
     def raster(self) -> Raster:
-        """A for this scene, on the device that draws."""
+        """A for this scene, on the device that renders."""
         from liftcore.raster import open_raster
         from liftcore.runtime.device import choose_device
 
@@ -452,11 +451,11 @@ class OpenedLift:
 
     @property
     def compositing(self) -> CompositingParams:
-        """How scores are rendered: with the lift's rendering scale of the opacity logits."""
+        """Parameters that scores are rendered with: the lift's rendering scale of the opacity logits."""
         return self.metadata.settings.render_params
 
     def camera(self, view: str | Camera) -> Camera:
-        """The camera of that name; a camera itself needs none of the lift's.
+        """Return the camera of a name; a camera is returned as it is.
 
         Raises:
             NotFound: no camera has this name.
@@ -465,7 +464,7 @@ class OpenedLift:
         return self.cameras[view] if isinstance(view, str) else view
 
     def image(self, view: str | Camera, draw: Callable[[Camera], Tensor]) -> Tensor:
-        """A picture [H, W, ..] of a view in its photo's pixels, from what draws one of a pinhole (`in_photo`).
+        """Render an image [H, W, ..] of a view in its photo's pixels, by a function for pinholes (`in_photo`).
 
         Args:
             view: the name of a camera of the scene, or any camera in the frame of the splats.
@@ -488,35 +487,39 @@ class OpenedLift:
                 )  # fmt: skip
         return in_photo(camera, draw)
 
-    def _unchanged(self, role: str, remembered: InputFile) -> Path:
-        """The path of an input, once its bytes are known to be those that were lifted."""
-        if not remembered.path:
-            raise InvalidLift(str(self.path), expected=f"a lift that knows its {role}", got="one of values in memory",
+    def _verified_input(self, role: str, record: InputFile) -> Path:
+        """Return the path of an input whose bytes are those that were lifted.
+
+        Raises:
+            InvalidLift: there is no such file.
+        """
+        if not record.path:
+            raise InvalidLift(str(self.path), expected=f"a lift with a path of its {role}", got="values in memory",
                               hint=f"give the {role} that were lifted, {role}=")  # fmt: skip
         from liftcore.io.transforms import FRAME_FILE
         from liftcore.values.lift_file import found_input
 
-        path, moved = Path(remembered.path), self._moved.get(role) is not None
-        if role == "splats" and moved and not remembered.sha256 and path.exists():
-            return path  # of values in memory, so nothing says more than how many they are
-        found = found_input(role, remembered, self.metadata, None if moved else self.path)
-        if found is not None:
-            return found
+        path, is_moved = Path(record.path), self._new_paths.get(role) is not None
+        if role == "splats" and is_moved and not record.sha256 and path.exists():
+            return path  # of values in memory, of which only the number is known
+        verified_path = found_input(role, record, self.metadata, None if is_moved else self.path)
+        if verified_path is not None:
+            return verified_path
         option = f"say where they are with --{role} (in Python {role}=), or " if role in ("splats", "cameras") else ""
         if not path.exists():
             raise InvalidLift(
                 str(self.path), expected=f"its {role} at {path}, or beside the lift", got="nothing there",
                 hint=f"{option}move the {role} back or beside the lift",
             )  # fmt: skip
-        beside = f" ({FRAME_FILE} beside them counts too)" if role == "cameras" else ""
+        note = f" ({FRAME_FILE} beside them counts too)" if role == "cameras" else ""
         raise InvalidLift(
             str(self.path), expected=f"the {role} that were lifted at {path}", got="a file with another SHA-256",
-            hint=f"the {role} changed since the lift{beside}: {option}restore them, or lift again",
+            hint=f"the {role} changed since the lift{note}: {option}restore them, or lift again",
         )  # fmt: skip
 
 
 def as_numpy(array: Any) -> Any:
-    """A NumPy array over the same memory where it lies on the CPU, else a copy of it; None stays None."""
+    """Return a NumPy array over the same memory if it is on the CPU, else a copy; None stays None."""
     if array is None or isinstance(array, np.ndarray):
         return array
     return array.detach().cpu().numpy() if hasattr(array, "detach") else np.asarray(array)

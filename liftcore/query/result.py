@@ -1,4 +1,4 @@
-"""The result of a lift, which answers questions, is written to a file, and is shown."""
+"""The result of a lift, which is queried, saved and shown."""
 
 from __future__ import annotations
 
@@ -31,31 +31,31 @@ if TYPE_CHECKING:
 @deprecated_names(**OLD_TENSORS)
 @dataclass(frozen=True, repr=False)
 class LiftResult(Lift):
-    """X and what supports it, one row a splat, in the splats' order."""
+    """X and its supporting values, one row a splat, in the splats' order."""
 
     @classmethod
     def of(cls, lift: Lift) -> Self:
-        """The same values, which answer questions too."""
+        """Return a result with the values of a lift, which can be queried."""
         return cls(**{field.name: getattr(lift, field.name) for field in fields(lift)})
 
     def scene(
         self, splats: Splats | None = None, cameras: Mapping[str, Camera] | None = None, *, device: str = "cpu"
     ) -> Scene:
-        """The lift opened for questions (`liftcore.Scene`): once, while splats, cameras and device are the same.
+        """Open the lift for queries (`liftcore.Scene`); cached while splats, cameras and device are the same.
 
         Args:
-            splats: that were lifted. cameras: of its views. Both may be left out where the lift was made of files
-                that are where they were. device: that draws.
+            splats: that were lifted. cameras: of its views. Both may be left out if the lift was made of files that
+                are still in place. device: that renders.
         """
         from liftcore.query.scene import Scene
 
         parts = (splats, cameras, device)
-        kept = self.__dict__.get("_scene")  # no field, so that copies with other values do not have it
-        if kept is None or any(one is not other for one, other in zip(kept[0], parts, strict=True)):
-            if isinstance(splats, str | Path):  # of a scene that may be another: values alone belong to a result
+        cached = self.__dict__.get("_scene")  # no field, so that copies with other values do not have it
+        if cached is None or any(a is not b for a, b in zip(cached[0], parts, strict=True)):
+            if isinstance(splats, str | Path):  # a result takes values alone: a file may be of another scene
                 self.require_splats(splats)
-            kept = self.__dict__["_scene"] = parts, Scene(self, splats, cameras, device=device)
-        return kept[1]
+            cached = self.__dict__["_scene"] = parts, Scene(self, splats, cameras, device=device)
+        return cached[1]
 
     def query(
         self,
@@ -67,29 +67,28 @@ class LiftResult(Lift):
         encoder: TextEncoder | str | Path | None = None,
         **fields: Any,
     ) -> VectorAnswer:
-        """Which splats answer words, or vectors of the lift's text space.
+        """Select the splats that answer words, or vectors of the lift's text space.
 
         Args:
-            positives: a text or several, or [n, F] or [F], torch or numpy: what is looked for; rows of any length
-                above zero.
-            negatives: the same, what takes away from the scores.
+            positives: the target: a text or several, or [n, F] or [F], torch or numpy, rows of any length above zero.
+            negatives: likewise; they reduce the scores.
             splats: that were lifted; with them the answer has objects with boxes.
-            references: [n, F], the vectors of 200 words or more, by which presence is known; None = those of the
-                lift's text space, where it has some.
+            references: [n, F], the vectors of 200 words or more, to estimate presence; None = those of the lift's
+                text space, if it has some.
             encoder: of texts and of reference words, or the specification of one (`liftcore.open_encoder`), which is
-                opened once. None: the lift's own words (`table`), else the encoder of its text space, or the table of
-                it that ships, where its weights cannot be had.
+                opened once. None: the lift's own words (`table`), else the encoder of its text space, or its shipped
+                table if the weights are not available.
             fields: the others of `liftcore.Query`.
 
         Raises:
-            InvalidQuery: a vector of another length, of zeros or not finite; a text that the encoder cannot read, or
-                no encoder of the lift's text space; or an unknown threshold.
+            InvalidQuery: a vector of another length, of zeros or not finite; a text that the encoder cannot encode,
+                or no encoder of the lift's text space; or an unknown threshold.
             Unavailable: the encoder's weights are not on this machine.
         """
         from liftcore.query.ask import query_vectors
 
-        more = {"references": references, "encoder": encoder, "grouped": splats is not None}
-        return query_vectors(self.scene(splats), positives, negatives, **more, **fields)
+        options = {"references": references, "encoder": encoder, "grouped": splats is not None}
+        return query_vectors(self.scene(splats), positives, negatives, **options, **fields)
 
     def segment(
         self,
@@ -99,17 +98,17 @@ class LiftResult(Lift):
         *,
         encoder: TextEncoder | str | Path | None = None,
     ) -> Segmentation:
-        """Name every splat by the word that it is most like, or by none (`liftcore.query.segment`).
+        """Label every splat with the most similar word, or none (`liftcore.query.segment`).
 
         Args:
             words: n different ones. vectors: [n, F], torch or numpy, their text vectors, of any length above zero.
-                None: the encoder makes them.
-            splats: that were lifted; may be left out where the lift was made of files that are where they were.
+                None: the encoder computes them.
+            splats: that were lifted; may be left out if the lift was made of files that are still in place.
             encoder: as in `query`.
 
         Raises:
             InvalidQuery: no words, one word twice, vectors that are no directions of the lift's space, a word that
-                the encoder cannot read, or no encoder of the space.
+                the encoder cannot encode, or no encoder of the space.
             Unavailable: the encoder's weights are not on this machine.
         """
         return self.scene(splats).segment(words, vectors, encoder=encoder)
@@ -122,17 +121,17 @@ class LiftResult(Lift):
         *,
         encoder: TextEncoder | str | Path | None = None,
     ) -> Catalogue:
-        """The objects that masks of many views agree on, found at lift time without a word; the largest first.
+        """List the objects on which masks of many views agree, found at lift time without words; the largest first.
 
         Args:
-            splats: that were lifted; may be left out where the lift was made of files that are where they were.
-            words: n, that objects are named by. vectors: [n, F], torch or numpy, their text vectors, of any length
-                above zero. None: the encoder makes them.
+            splats: that were lifted; may be left out if the lift was made of files that are still in place.
+            words: n, candidates for names. vectors: [n, F], torch or numpy, their text vectors, of any length above
+                zero. None: the encoder computes them.
             encoder: as in `query`.
 
         Raises:
-            InvalidQuery: vectors that are no directions of the lift's space, a word that the encoder cannot read, or
-                no encoder of the space.
+            InvalidQuery: vectors that are no directions of the lift's space, a word that the encoder cannot encode,
+                or no encoder of the space.
             Unavailable: the encoder's weights are not on this machine.
         """
         return self.scene(splats).catalogue(words, vectors, encoder=encoder)
@@ -145,7 +144,7 @@ class LiftResult(Lift):
         progress: Progress | bool | None = None,
         threads: int | None = None,
     ) -> LiftResult:
-        """The lift with smooth features, as the setting ``smoothness`` makes them, without lifting again.
+        """Return the lift with smooth features, as by the setting ``smoothness``, without lifting again.
 
         Args:
             splats: that were lifted, with their colours where they have any. smoothness: lambda, above zero.
@@ -165,15 +164,15 @@ class LiftResult(Lift):
     def transferred(
         self, old: Splats, new: Splats | Path | str, *, matrix: Any = None, progress: Progress | bool | None = None
     ) -> LiftResult:
-        """The lift on other splats of its scene: cropped, reordered, compressed, decimated, moved, trained anew.
+        """Transfer the lift to other splats of its scene: cropped, reordered, compressed, moved or retrained.
 
-        ``diagnostics["transfer"]`` has how many are rows of the old ones, are mixed of several, or found no partner,
-        and how the scene was moved (`liftcore.query.transfer`).
+        ``diagnostics["transfer"]`` has the numbers of rows that are old ones, mixed of several, or without a partner,
+        and the similarity of the scenes (`liftcore.query.transfer`).
 
         Args:
-            old: splats that were lifted. new: Q others, in any order, or their file, which the lift remembers.
-            matrix: [4, 4] or [3, 4], the similarity from the old frame to the new one; None: none, or one that is
-                found. progress: as `liftcore.lift` has it.
+            old: splats that were lifted. new: Q others, in any order, or their file, whose path the lift stores.
+            matrix: [4, 4] or [3, 4], the similarity from the old frame to the new one; None: none, or an estimated
+                one. progress: as `liftcore.lift` has it.
 
         Raises:
             InvalidSplats: other splats than were lifted, or no place of the new ones in the scene is clear.
@@ -191,16 +190,16 @@ class LiftResult(Lift):
         return replace(result, metadata=result.metadata.model_copy(update={"splats": input_file(Path(new))}))
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Its tensors as arrays by their names, in the order of its file; those of a file are mapped, not read."""
+        """Return its tensors as arrays by their names, in the order of its file; those of a file are mapped."""
         return {name: tensor.cpu().numpy() for name, tensor in tensors_of(self).items()}
 
     def has_cameras(self, path: Path | str) -> bool:
-        """Return whether a file or folder has the cameras of the lifted views as they were, whatever others it has.
+        """Return True if a file or folder has the cameras of the lifted views with their poses; it may have others.
 
-        Lifts from before poses were kept have none to compare: then it has not.
+        Older lifts do not store poses: then it is False.
 
         Raises:
-            InvalidCameras: it does not read.
+            InvalidCameras: the file is invalid.
         """
         return has_poses(Path(path), self.metadata)
 
@@ -208,11 +207,11 @@ class LiftResult(Lift):
         """Write a lift file (`liftcore.values.lift_file`), whole or not at all.
 
         Args:
-            path: a file; with ``.shards`` at its end, a folder of shards. Either may lie elsewhere (`io.remote`).
+            path: a file; with ``.shards`` at its end, a folder of shards. Either may be remote (`io.remote`).
             progress: as `liftcore.lift` has it; there is one step.
 
         Raises:
-            InvalidInput: it lies elsewhere and cannot be sent there.
+            InvalidInput: it is remote and the upload fails.
         """
         from liftcore.runtime.progress import one_step, shown_progress
 
@@ -222,14 +221,14 @@ class LiftResult(Lift):
     def save_scene(
         self, folder: Path, splats: Splats | None = None, cameras: Mapping[str, Camera] | None = None
     ) -> Path:
-        """Write ``lift.safetensors`` in a folder, and beside it what the lift has in memory alone; its path.
+        """Write ``lift.safetensors`` and files of inputs that are only in memory to a folder; return the lift's path.
 
         Args:
-            splats: that were lifted; None: where the lift remembers them. cameras: likewise, of its views; of files
-                that are there these count.
+            splats: that were lifted; None: the lift's file of them. cameras: likewise, of its views; an existing file
+                of the lift is preferred.
 
         Raises:
-            InvalidInput: splats or cameras that it needs are not given, or not those of the lift.
+            InvalidInput: required splats or cameras are missing, or not those of the lift.
         """
         inputs = {
             "splats": _splats_file(self, splats, folder),
@@ -247,15 +246,15 @@ class LiftResult(Lift):
         port: int = 0,
         browser: bool = True,
     ) -> None:
-        """Show it on the service's page at a port of this machine, until Ctrl-C or a notebook's interrupt.
+        """Show the lift on the service's page at a port of this machine, until Ctrl-C or a notebook's interrupt.
 
         Args:
-            splats: that were lifted. cameras: of its views. Both may be left out where the lift was made of files
-                that are where they were.
-            port: 0 picks a free one. browser: whether to open one; the address is printed.
+            splats: that were lifted. cameras: of its views. Both may be left out if the lift was made of files that
+                are still in place.
+            port: 0 takes a free one. browser: True to open one; the address is printed.
 
         Raises:
-            InvalidInput: splats or cameras that it needs are not given, or not those of the lift.
+            InvalidInput: required splats or cameras are missing, or not those of the lift.
             Unavailable: no package with the page is installed.
         """
         from liftcore.runtime.plugins import load_plugin
@@ -274,7 +273,7 @@ def load_lift(path: Path | str) -> LiftResult:
 
 def _splats_file(lift: Lift, splats: Splats | None, folder: Path) -> InputFile:
     if splats is None:
-        return _remembered("splats", lift.metadata)
+        return _recorded_input("splats", lift.metadata)
     from liftcore.io.splats import write_splats
     from liftcore.values.lift_file import input_file
 
@@ -287,19 +286,19 @@ def _cameras_file(metadata: LiftMetadata, cameras: Mapping[str, Camera] | None, 
     from liftcore.io.transforms import transforms_of
     from liftcore.values.lift_file import camera_input, found_input
 
-    there = found_input("cameras", metadata.cameras, metadata, None) if metadata.cameras.path else None
-    if cameras is None or there is not None:  # a file knows lenses and panoramas, too
-        return _remembered("cameras", metadata)
+    path = found_input("cameras", metadata.cameras, metadata, None) if metadata.cameras.path else None
+    if cameras is None or path is not None:  # a file has lenses and panoramas, too
+        return _recorded_input("cameras", metadata)
     (folder / "cameras.json").write_text(json.dumps(transforms_of(cameras)), encoding="utf-8")
     return camera_input(folder / "cameras.json")
 
 
-def _remembered(role: str, metadata: LiftMetadata) -> InputFile:
+def _recorded_input(role: str, metadata: LiftMetadata) -> InputFile:
     from liftcore.values.lift_file import found_input
 
-    remembered: InputFile = getattr(metadata, role)
-    found = found_input(role, remembered, metadata, None) if remembered.path else None
-    if found is None:
-        got = f"nothing, and they are not at {remembered.path}" if remembered.path else "nothing, of a lift in memory"
+    record: InputFile = getattr(metadata, role)
+    path = found_input(role, record, metadata, None) if record.path else None
+    if path is None:
+        got = f"nothing, and they are not at {record.path}" if record.path else "nothing, of a lift in memory"
         raise InvalidInput(role, expected=f"the {role} of the lift", got=got, hint=f"give show({role}=...)")
-    return remembered
+    return record
