@@ -34,7 +34,7 @@ def area_feature(scene: OpenedLift, area: Area) -> np.ndarray:
 
     Raises:
         NotFound: no camera has this name.
-        InvalidQuery: the area is empty, reaches out of the image, lies at the rim of a wide lens, or shows no scene;
+        InvalidQuery: the area is empty, outside the image, at the rim of a wide lens, or misses the scene;
             or a box or a stroke lacks corners.
         InvalidLift: the splats or the cameras moved or changed since the lift.
     """

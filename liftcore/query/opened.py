@@ -47,7 +47,7 @@ class OpenedLift:
     """
 
     features: np.ndarray
-    """[P, F] f16 or f32; zero rows where not seen"""
+    """[P, F] f16 or f32; zero rows without a feature"""
     total_weight: np.ndarray
     """[P] f32"""
     cluster: np.ndarray | None
@@ -320,7 +320,7 @@ class OpenedLift:
     def within(self, members: np.ndarray) -> Self:
         """Return a copy of the lift in which only some splats [P] bool have features, with nodes as its objects.
 
-        Means and shares of total weight are those of these splats, so that a question tells them from one another.
+        Means and shares of total weight are those of these splats, so that a query distinguishes among them.
         """
         inner = copy(self)
         for name in ("seen", "all_seen", "weights", "mean", "object_means", "principal"):

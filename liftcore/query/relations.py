@@ -7,7 +7,7 @@ Of objects a and b, with heights along ``up`` and the ground at right angles to 
 |---|---|
 | a is touching b | two of their splats touch (`touching`) |
 | a is inside b | its splats lie in b's box, and b lies in AROUND of the directions from its middle |
-| a is on b | b lies below COVERED of a's footprint, and a touches b or begins at most NEAR above it |
+| a is on b | b lies below COVERED_SHARE of a's footprint, and a touches b or begins at most NEAR above it |
 | b is under a | a is on it, or begins higher above it |
 | a is beside b | their heights overlap by half, and their distance on the ground is at most the smaller one's width |
 

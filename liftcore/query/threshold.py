@@ -61,7 +61,7 @@ Result = tuple[float, str, bool]  # a threshold, its explanation, and True if th
 
 
 def check_method(method: str | float) -> None:
-    """Refuse a method that `find_threshold` does not know, before any work is done.
+    """Raise InvalidQuery for a method that `find_threshold` does not have.
 
     Raises:
         InvalidQuery: an unknown method, or a number that no score can be.
@@ -134,7 +134,7 @@ def explain_no_selection(scores: np.ndarray) -> str:
         return "There are no scores: nothing can be found."
     low, high = float(scores.min()), float(scores.max())
     if high == 0 and low < 0:
-        return "No score is above zero: nothing is like what was asked for, so nothing is selected."
+        return "No score is above zero: nothing is similar to the query, so nothing is selected."
     return explain_equal_scores(low, high)
 
 
