@@ -1,4 +1,4 @@
-"""Ask a lift for words and examples: which splats answer, and where they lie."""
+"""Queries of a lift by words and examples: scores of all splats, and the selected ones."""
 
 from __future__ import annotations
 
@@ -75,22 +75,22 @@ _QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 
 @dataclass(frozen=True)
 class Question:
-    """A query whose terms were found."""
+    """A query with the directions of its terms and the words that compete with them."""
 
     query: Query
     rows: np.ndarray  # [n, F] f32, the unit direction of each term
-    plain: np.ndarray  # [n] bool, the terms that are compared by plain cosines: words
-    references: References | str  # of the words' space, or why there are none
-    asked_as: Mapping[int, Wording]  # of the texts, by their places among the terms
+    plain: np.ndarray  # [n] bool, the terms that are compared by uncentred cosines: words
+    references: References | str  # of the words' space, or the reason why there are none
+    asked_as: Mapping[int, Wording]  # of the texts, by their indices among the terms
     pack: np.ndarray | None = None  # [n, F] f32, unit, all words of a table that has too few to be references
-    candidates: tuple[Candidate, ...] = ()  # what clicks among them may mean
-    part: PartQuestion | None = None  # of a phrase that names a part of a thing
-    unknown_part: PartPhrase | None = None  # the same where no word stands for the part, so that the thing is asked
+    candidates: tuple[Candidate, ...] = ()  # nodes that clicks among the terms may mean
+    part: PartQuestion | None = None  # of a phrase that names a part of an object
+    unknown_part: PartPhrase | None = None  # a part for which there is no word, so that the object is selected
 
 
 @dataclass(frozen=True)
 class PartQuestion:
-    """A phrase that is asked as a part within a thing."""
+    """Queries for a phrase that names a part of an object."""
 
     phrase: PartPhrase
     thing: Question
@@ -100,26 +100,26 @@ class PartQuestion:
 @deprecated_names(why="reason")
 @dataclass(frozen=True)
 class VectorAnswer:
-    """How a lift answers vectors (`query_vectors`); tensors lie on the CPU, where questions are answered."""
+    """Answer of a lift to vectors (`query_vectors`); tensors are on the CPU, where queries run."""
 
     scores: Tensor
-    """[P] f32 in -1..1; -1 where not seen"""
+    """[P] f32 in -1..1; -1 for splats without a feature"""
     splats: Tensor
-    """[P] bool, what answers (`ask`)"""
+    """[P] bool, the selected splats (`ask`)"""
     threshold: float
     """on the scores"""
     explanation: str
-    """one sentence on how it was found"""
+    """one sentence on the threshold"""
     clear: bool
-    """whether some splats were found that stand apart from the others"""
+    """True if the selected splats are clearly separate from the others"""
     present: bool | None
-    """whether it is there; None: not known, or not sure"""
+    """True if the object is in the scene; None: not known, or not sure"""
     presence: float | None
     """in 0..1, present from 0.5 on"""
     reason: str
-    """one sentence on how that is known"""
+    """one sentence on the reason of `present`"""
     objects: Objects | None
-    """the things that they make up, with boxes; None where no splats were given"""
+    """the objects of the selected splats, with boxes; None without splats"""
 
     def __repr__(self) -> str:
         selection = f"{int(self.splats.sum())} of {len(self.splats)} splats at or above {self.threshold:.4g}"
@@ -127,7 +127,7 @@ class VectorAnswer:
 
 
 def ask(scene: OpenedLift, query: Query | str, encoder: TextEncoder | None = None) -> Answer:
-    """Score every splat for a query and choose those that answer it.
+    """Score every splat for a query and select those that answer it.
 
     A splat counts in the histogram by its total weight: what hardly a ray met scores by the chance of a few pixels.
     It is still selected by its score. With ``weight_by`` its confidence counts too. The threshold `auto` is held to
@@ -139,13 +139,12 @@ def ask(scene: OpenedLift, query: Query | str, encoder: TextEncoder | None = Non
     Args:
         scene: an opened lift.
         query: words and examples, or one text alone.
-        encoder: the text encoder whose space the lifted features live in; examples and words that the lift brings
-            need none.
+        encoder: the text encoder of the lifted features' space; examples and the lift's own words need none.
 
     Raises:
         InvalidQuery: a text without an encoder of the lift's space, a term that has no feature, or a lift without
-            the confidence that is asked for.
-        NotFound: an example names a view or a region that is not there.
+            the confidence that the query needs.
+        NotFound: an example names a view or a region that does not exist.
         InvalidLift: an example needs the scene's files, and they moved or changed.
     """
     query = Query.of(query) if isinstance(query, str) else query
@@ -162,21 +161,20 @@ def query_vectors(
     grouped: bool = False,
     **fields: Any,
 ) -> VectorAnswer:
-    """Ask a lift for words, or for vectors of its text space, which count as words.
+    """Query a lift by words, or by vectors of its text space, which count as words.
 
     Args:
         scene: an opened lift.
-        positives: a text or several, or [n, F] or [F], torch or numpy: what is looked for; rows of any length above
-            zero.
-        negatives: the same, what takes away from the scores (`scores.combine`).
-        references: [n, F], the vectors of 200 words or more, by which presence is known; None = those of the lift's
-            text space, where it has some (`liftcore.query.presence`).
-        encoder: of texts and of reference words, as in `Scene.ask`. grouped: whether to make objects.
+        positives: the target: a text or several, or [n, F] or [F], torch or numpy, rows of any length above zero.
+        negatives: likewise; they reduce the scores (`scores.combine`).
+        references: [n, F], the vectors of 200 words or more, to estimate presence; None = those of the lift's text
+            space, if it has some (`liftcore.query.presence`).
+        encoder: of texts and of reference words, as in `Scene.ask`. grouped: True to group the selection to objects.
         fields: of `Query`.
 
     Raises:
-        InvalidQuery: a vector of another length, of zeros or not finite; a text that the encoder cannot read, or none
-            of the lift's space; or what `Query` refuses.
+        InvalidQuery: a vector of another length, of zeros or not finite; a text that the encoder cannot encode, or no
+            encoder of the lift's space; or a field that `Query` rejects.
         Unavailable: the encoder's weights are not on this machine.
     """
     import torch
@@ -215,10 +213,10 @@ def _terms(values: Any) -> tuple[str | Vector, ...]:
 
 
 def question(scene: OpenedLift, query: Query, encoder: TextEncoder | None, names: Sequence[str] = ()) -> Question:
-    """A query with the directions of its terms; what can be wrong with a query is found here (see `ask`).
+    """Resolve the terms of a query to directions; all errors of a query are raised here (see `ask`).
 
     Args:
-        names: what errors call each of the terms; () = what they are themselves.
+        names: of the terms in errors; () = their own texts.
     """
     phrase = part_phrase(scene, query, encoder)
     if phrase is None:
@@ -237,9 +235,9 @@ def _question(
     names: Sequence[str] = (),
     phrase: PartPhrase | None = None,
 ) -> Question:
-    """The same as a whole, or of the part that a phrase names.
+    """Resolve a query as a whole, or for the part that a phrase names.
 
-    An encoder that reads any text reads the phrase, which says more of the part than its word alone.
+    An encoder of any text encodes the phrase, which is more specific than the part's word alone.
     """
     words = np.array([isinstance(term, str) for term in query.terms], np.bool_)
     asked_as = wordings(scene, query, encoder, names)
@@ -268,9 +266,9 @@ def answers(scene: OpenedLift, questions: Sequence[Question]) -> list[Answer]:
 
 
 def _part_answer(scene: OpenedLift, asked: Question) -> Answer:
-    """The part of a thing: the thing first, then the part among its splats and nodes alone.
+    """Answer a query for a part of an object: the object first, then the part among its splats and nodes alone.
 
-    What may mean something else than a part (`PartPhrase`) is asked as a whole where no such part is found.
+    A phrase that may not mean a part (`PartPhrase`) is answered as a whole if no such part is found.
     """
     assert asked.part is not None
     sure, part = asked.part.phrase.sure, asked.part.part
@@ -303,12 +301,12 @@ def _part_answer(scene: OpenedLift, asked: Question) -> Answer:
 
 
 def located(scene: OpenedLift, answer: Answer, count: int | None = None) -> Answer:
-    """An answer with its best splats, and the box around all selected ones.
+    """Add to an answer its best splats, and the box around all selected ones.
 
-    A single outlier stretches the box; ``objects`` tells outliers from things.
+    A single outlier stretches the box; boxes of ``objects`` are without outliers.
 
     Args:
-        count: of the best splats; None = as many as the query asks for. Equal scores go by their rows.
+        count: of the best splats; None = the query's. Equal scores are ordered by their rows.
 
     Raises:
         InvalidLift: the splats moved or changed since the lift.
@@ -329,10 +327,10 @@ def located(scene: OpenedLift, answer: Answer, count: int | None = None) -> Answ
 
 
 def _similarities(scene: OpenedLift, questions: Sequence[Question]) -> list[np.ndarray]:
-    """For each query [P, n] f32, how like each of its terms every splat is."""
+    """Compute for each query the cosines of every splat to each of its terms, [P, n] f32."""
     features, norms = scene.features, scene.norms
     of_words = np.concatenate([asked.rows[asked.plain] for asked in questions])
-    # Words lie in rows from here on, so that each is read in one piece.
+    # A row a word from here on, so that its scores are contiguous.
     columns = iter(np.ascontiguousarray(cosines(features, norms, of_words).T) if len(of_words) else ())
     found = []
     for asked in questions:
@@ -379,7 +377,7 @@ def _answer(scene: OpenedLift, asked: Question, similarities: np.ndarray) -> Ans
 
 
 def _without_word(phrase: PartPhrase, parts: int) -> str:
-    """Two sentences on a part that no word stands for, and how it can be asked."""
+    """Explain in two sentences that no word stands for a part, and what to do."""
     ask = "ask one of its candidates, click the part" if parts else "click the part"
     return (
         f"No word stands for {phrase.part!r}, so this is all of {phrase.object_phrase!r}. To have the part, {ask}, "
@@ -390,7 +388,7 @@ def _without_word(phrase: PartPhrase, parts: int) -> str:
 def _nearer_words(
     scene: OpenedLift, asked: Question, scores: np.ndarray, selected: np.ndarray, least: float
 ) -> tuple[str, ...]:
-    """Reference words that are the nearest of all to a share of what is selected, or of the best splats else."""
+    """Return reference words that are the nearest of all to a share of the selected splats, or else the best ones."""
     references, positives = asked.references, len(asked.query.positives)
     own = asked.rows[:positives][asked.plain[:positives]]
     if not isinstance(references, References) or not len(own):
@@ -412,7 +410,7 @@ def _nearer_words(
 
 
 def _set_answer(scene: OpenedLift, query: Query) -> Answer:
-    """Sets as they are: a score of one for their splats and zero for the others, whether seen or not."""
+    """Answer a query of sets: a score of one for their splats and zero for the others, also without a feature."""
     members = np.zeros(len(scene.features), np.bool_)
     for one in query.splat_sets:
         members |= set_members(scene, one)
@@ -428,10 +426,10 @@ def _set_answer(scene: OpenedLift, query: Query) -> Answer:
 def _selected(
     scene: OpenedLift, asked: Question, kept: np.ndarray, scores: np.ndarray, weights: np.ndarray
 ) -> tuple[Threshold, np.ndarray]:
-    """The threshold of a question and what it selects, [P] bool.
+    """Return the threshold of a query and the selected splats, [P] bool.
 
     Args:
-        kept: [n] bool, the terms that count. scores, weights: [P] f32, how much each splat counts.
+        mask: [n] bool, the terms that count. scores: [P] f32. weights: [P] f32 of the splats.
     """
     query, positives = asked.query, len(asked.query.positives)
     known = scores if scene.all_seen else scores[scene.seen]
@@ -464,7 +462,7 @@ def _selected(
     parts = part_nodes(scene, competitors[0])
     if parts:
         selected = scene.seen & np.logical_or.reduce([scene.members(node) for node in parts])
-        addition = f"levels say different things, so the parts that it names are taken: {', '.join(map(str, parts))}"
+        addition = f"levels differ in meaning, so the named parts are selected: {', '.join(map(str, parts))}"
     else:
         selected, addition = correct_by_objects(scene, selected, weights, competitors[0])
     if addition:
@@ -473,7 +471,7 @@ def _selected(
 
 
 def _rivals(asked: Question, directions: np.ndarray) -> list[CompetingWords]:
-    """The words that compete with the positives [p, F]: reference words, then the others of a pack."""
+    """Return the words that compete with the positives [p, F]: reference words, then the others of a pack."""
     if not len(directions):
         return []
     competitors = (
@@ -485,7 +483,7 @@ def _rivals(asked: Question, directions: np.ndarray) -> list[CompetingWords]:
 
 
 def _presence(scene: OpenedLift, asked: Question, similarities: np.ndarray) -> tuple[Presence, np.ndarray]:
-    """Whether any of the positives is there; and the terms that count, [n] bool: all, or without absent words."""
+    """Return the presence of the positives, and the terms that count, [n] bool: all, or without absent words."""
     kept, positives = np.ones(len(asked.rows), np.bool_), len(asked.query.positives)
     words = np.flatnonzero(asked.plain[:positives]).tolist()
     if not words:
@@ -497,7 +495,7 @@ def _presence(scene: OpenedLift, asked: Question, similarities: np.ndarray) -> t
         estimate_presence(scene, names[k], asked.rows[k], similarities[:, k], asked.references) for k in words
     ]
     presence = any_present(presences)
-    if presence.present is False and len(words) < positives:  # examples are not questioned
+    if presence.present is False and len(words) < positives:  # examples may be present
         presence = presence.model_copy(update={"present": None})
     if presence.present is not False and asked.query.absent == "drop":
         kept[[k for k, word in zip(words, presences, strict=True) if word.present is False]] = False
@@ -507,7 +505,7 @@ def _presence(scene: OpenedLift, asked: Question, similarities: np.ndarray) -> t
 def _statistics(scores: np.ndarray) -> dict[str, float]:
     if len(scores) == 0:
         return {}
-    ordered = np.sort(scores)  # in vector registers, so faster than selecting seven order statistics
+    ordered = np.sort(scores)  # vectorised, so faster than selecting seven order statistics
     quantiles = {f"q{round(100 * q):02d}": float(ordered[round(q * (len(scores) - 1))]) for q in _QUANTILES}
     mean = float(scores.mean(dtype=np.float64))
     return {"min": float(ordered[0]), "max": float(ordered[-1]), "mean": mean, **quantiles}

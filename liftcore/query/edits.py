@@ -1,4 +1,4 @@
-"""An edit of a selection, as Python and HTTP have it; loads neither numpy nor torch."""
+"""Edit, the model of a change of a selection, for Python and HTTP; imports neither numpy nor torch."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class Edit(Body):
     """One change of a selection.
 
     ``set``, ``add`` and ``remove`` take the splats of one source: a query, an area of a view, a box or bits; ``set``
-    without one selects nothing. ``grow`` adds the splats that touch a selected one, ``shrink`` takes away those that
-    touch one that is not.
+    without one selects nothing. ``grow`` adds the splats that touch a selected one, ``shrink`` removes those that
+    touch one that is not selected.
 
     Raises:
         InvalidQuery: no source or several, or an area that is neither a box nor a stroke.
@@ -67,7 +67,7 @@ class Edit(Body):
         return self
 
     def parsed_area(self) -> PixelBox | Stroke:
-        """The area; InvalidQuery where it is neither a box nor a stroke."""
+        """Parse the area; InvalidQuery if it is neither a box nor a stroke."""
         area = parse_example(str(self.area), "area")
         if not isinstance(area, PixelBox | Stroke):
             raise InvalidQuery("area", expected=AREAS, got=repr(self.area))

@@ -1,8 +1,8 @@
-"""A question to a lift and its answer, as every face has them.
+"""Models of queries of a lift and of their answers, for Python, the command line and HTTP.
 
 The fields of `Query` are the parameters and bodies of HTTP, the frames of its worker and the options of the command
-line; those of `Answer` are what HTTP answers, and ``answer`` of ``--json``. A field is declared here alone.
-Nothing here loads numpy or torch: help and the HTTP process do without.
+line; those of `Answer` are HTTP's replies, and ``answer`` of ``--json``. A field is declared here alone.
+Nothing here imports numpy or torch, which help and the HTTP process do not need.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def _several(given: Any) -> Any:
 
 
 def _examples(given: Any) -> Any:
-    """Examples as JSON has them: notations, and vectors as numbers."""
+    """Convert examples to JSON: notations, and vectors as numbers."""
     if isinstance(given, str | Example):
         return [_plain(given)]
     if hasattr(given, "ndim"):
@@ -108,16 +108,16 @@ class OwnCamera(Body):
 
     @classmethod
     def of(cls, camera: Camera, name: str = "") -> Self:
-        """A camera as JSON takes it; of a distorted photo the pinhole that stands for it."""
+        """Return the model of a camera; of a distorted photo that of the pinhole that renders it."""
         numbers = {"fx": camera.fx, "fy": camera.fy, "cx": camera.K[0, 2].item(), "cy": camera.K[1, 2].item()}
         size = {"width": camera.width, "height": camera.height}
         return cls(name=name or camera.name or "camera", viewmat=camera.viewmat.tolist(), **size, **numbers)
 
     def camera(self) -> Camera:
-        """The same as pictures are drawn by.
+        """Return the camera for rendering.
 
         Raises:
-            InvalidCameras: its numbers are none of a pinhole.
+            InvalidCameras: its numbers are no valid pinhole.
         """
         from liftcore.scene.cameras import Camera
 
@@ -127,7 +127,7 @@ class OwnCamera(Body):
 
 
 class Viewpoint(Body):
-    """Where a picture is seen from."""
+    """Viewpoint of a picture: a view or a camera."""
 
     view: ViewName | None = Field(
         default=None, description="the name of a camera, for pictures and for links to them"
@@ -137,10 +137,10 @@ class Viewpoint(Body):
     )
 
     def seen_from(self) -> str | Camera:
-        """The camera of a picture.
+        """Return the camera of a picture.
 
         Raises:
-            InvalidQuery: neither is there, or both are.
+            InvalidQuery: neither a view nor a camera, or both.
         """
         if (self.view is None) == (self.camera is None):
             got = "nothing" if self.view is None else "both"
@@ -160,7 +160,7 @@ class Picture(Viewpoint):
 
 
 class Query(Viewpoint):
-    """What is looked for, and how to find it: words and examples, for and against, make one query.
+    """Query of a lift: words and examples of the target, positive and negative, and options of the search.
 
     Texts need an encoder of the lift's text space, examples need none. The scores are defined in
     ``liftcore.query.scores.combine``.
@@ -213,7 +213,7 @@ class Query(Viewpoint):
 
     @classmethod
     def of(cls, positives: Iterable[Term] | str, negatives: Iterable[Term] | str = (), **others: Any) -> Self:
-        """A query of terms, each a text or an example; texts come before examples."""
+        """Return a query of terms, each a text or an example; texts come before examples."""
         sides = [list(_several(terms)) for terms in (positives, negatives)]
         (text, like), (against, unlike) = (
             ([term for term in side if isinstance(term, str)], [term for term in side if not isinstance(term, str)])
@@ -240,12 +240,12 @@ class Query(Viewpoint):
 
     @classmethod
     def deciding(cls) -> list[str]:
-        """The fields that decide what is found; the others say what is listed of it, and where from."""
+        """Return the fields that decide the selection; the others decide its listing and viewpoint."""
         return [name for name in cls.model_fields if name not in {*Viewpoint.model_fields, "top"}]
 
     @cached_property
     def positives(self) -> tuple[Term, ...]:
-        """Texts and examples of what to look for."""
+        """Texts and examples of the target."""
         return (*self.text, *_parsed(self.like, "like"))
 
     @cached_property
@@ -255,18 +255,18 @@ class Query(Viewpoint):
 
     @cached_property
     def splat_sets(self) -> tuple[SplatSet, ...]:
-        """The sets that are taken as they are."""
+        """The sets of splats that are selected as they are."""
         return tuple(parse_set(one, f"sets.{place}") for place, one in enumerate(self.sets))
 
     @property
     def places(self) -> list[str]:
-        """The field and the place in it of each of the terms, as errors over HTTP name them."""
+        """The field and index of each of the terms, for errors over HTTP."""
         names = ("text", "like", "negatives", "unlike")
         return [f"{name}.{place}" for name in names for place in range(len(getattr(self, name)))]
 
     @property
     def keeps_some(self) -> bool:
-        """Whether some of the objects are kept and others not, as all else than outliers is."""
+        """True if the query keeps some of the objects only, by size, scores or number."""
         return self.keep == "largest" or self.instances is not None or self.min_size > 1
 
     @property
@@ -294,7 +294,7 @@ class Box(NamedTuple):
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """In JSON an object with ``low`` and ``high``."""
+        """Return a schema that writes an object with ``low`` and ``high`` as JSON."""
         return core_schema.no_info_before_validator_function(
             lambda given: cls(*given)._asdict() if _is_pair(given) else given,
             core_schema.no_info_after_validator_function(lambda box: cls(**vars(box)), handler(Corners)),
@@ -317,7 +317,7 @@ class Value(Shown):
     model_config = ConfigDict(frozen=True, defer_build=True)
 
     def __eq__(self, other: object) -> bool:
-        """Compare what JSON has; a value a splat is not compared."""
+        """Compare the fields of JSON; per-splat arrays are not compared."""
         return isinstance(other, Value) and type(self) is type(other) and dict(self) == dict(other)
 
     def __hash__(self) -> int:
@@ -329,7 +329,7 @@ def _finite(value: float) -> float | None:
 
 
 class Threshold(Value):
-    """Which scores count as found, and why."""
+    """Threshold on the scores, and its explanation."""
 
     value: Annotated[
         float,
@@ -339,11 +339,11 @@ class Threshold(Value):
     ]
     method: str
     explanation: str = Field(description="one sentence on how it was found")
-    clear: bool = Field(default=True, exclude=True)  # whether the scores have what the method looks for
+    clear: bool = Field(default=True, exclude=True)  # True if the method has a clear result
 
 
 class Presence(Value):
-    """Whether what was asked for is there."""
+    """Presence of the target in the scene."""
 
     old_names: ClassVar[Mapping[str, str]] = {"why": "reason"}
     present: bool | None = Field(description="whether it is there; null when not known or not sure")
@@ -353,7 +353,7 @@ class Presence(Value):
 
 
 class SelectionSummary(Presence):
-    """How much was found."""
+    """Threshold, size and clarity of a selection."""
 
     threshold: Threshold
     count: int = Field(description="splats that were selected")
@@ -396,14 +396,14 @@ class WordMatch(Value):
 
 
 class SuggestedWord(Value):
-    """A word that can be asked."""
+    """A word that completes a text."""
 
     word: str
     typed: str = Field(description="what begins as the text does: the word itself, or a synonym of it")
 
 
 class SuggestedWords(Value):
-    """What a lift can be asked."""
+    """Words that complete a text, and words of the lift's objects."""
 
     old_names: ClassVar[Mapping[str, str]] = {"any_text": "open_vocabulary", "here": "scene_words"}
     open_vocabulary: bool = Field(description="true if any text can be queried, not the words of a table alone")
@@ -414,7 +414,7 @@ class SuggestedWords(Value):
 
 
 class Answer(SelectionSummary):
-    """Where in a scene is what was asked for."""
+    """Answer to a query: scores and the selected splats, with candidates and competing words."""
 
     text: list[str]
     like: list[str] = Field(description="the examples, in their notation; vectors by their length")
@@ -438,7 +438,7 @@ class Answer(SelectionSummary):
 
     @classmethod
     def of(cls, query: Query, scores: np.ndarray, seen: np.ndarray, selected: np.ndarray, **fields: Any) -> Self:
-        """An answer with what was asked and a value a splat, which JSON leaves out."""
+        """Return an answer with its query and per-splat arrays, which JSON leaves out."""
         answer = cls(
             text=query.text,
             like=[example if isinstance(example, str) else str(Vector(example)) for example in query.like],
@@ -450,17 +450,17 @@ class Answer(SelectionSummary):
 
     @property
     def query(self) -> Query:
-        """What was asked."""
+        """The query of this answer."""
         return self._query
 
     @property
     def scores(self) -> np.ndarray:
-        """[P] f32 in -1..1 (`liftcore.query.scores.combine`); the minimum where a splat was not seen."""
+        """[P] f32 in -1..1 (`liftcore.query.scores.combine`); the minimum for splats without a feature."""
         return self._arrays[0]
 
     @property
     def seen(self) -> np.ndarray:
-        """[P] bool, whether a splat has a feature."""
+        """[P] bool, True if a splat has a feature."""
         return self._arrays[1]
 
     @property
@@ -470,12 +470,12 @@ class Answer(SelectionSummary):
 
     @property
     def dropped(self) -> bool:
-        """Whether it is not there, so that nothing is selected and pictures show nothing."""
+        """True if the target is absent and the query drops absent words: nothing is selected or shown."""
         return self.present is False and self.query.absent == "drop"
 
 
 class WithUnits(Value):
-    """What tells sizes and distances: in metres where it is known how long a scene unit is."""
+    """World frame and unit of sizes and distances: metres if the length of a scene unit is known."""
 
     world: WorldFrame = Field(description="which way is up and how long a scene unit is, as far as somebody said it")
     unit: Literal["metres", "scene units"] = Field(
@@ -484,7 +484,7 @@ class WithUnits(Value):
 
 
 class SelectedObject(Value):
-    """Selected splats that hang together."""
+    """A group of touching selected splats."""
 
     splats: int = Field(description="how many")
     share: float = Field(description="of the total weight of all selected splats, or of the weights of `weight_by`")
@@ -495,7 +495,7 @@ class SelectedObject(Value):
 
 
 class Objects(WithUnits):
-    """What an answer found, thing by thing."""
+    """Objects of an answer."""
 
     old_names: ClassVar[Mapping[str, str]] = {"strays": "unassigned_splats", "found": "objects"}
     objects: tuple[SelectedObject, ...] = Field(description="those with the largest total weight first")
@@ -514,12 +514,12 @@ class Objects(WithUnits):
 
     @property
     def numbers(self) -> np.ndarray:
-        """[P] i32, the place in ``objects`` of each splat's object; -1 for none."""
+        """[P] i32, the index in ``objects`` of each splat's object; -1 for none."""
         return self._numbers
 
 
 class NamedSplats(Value):
-    """A word that is there, and how pictures show it."""
+    """A present word, with its splats and its value and colour in pictures."""
 
     word: str
     row: int = Field(description="among the words that were asked")
@@ -548,21 +548,21 @@ class LabelSummary(Value):
 
 
 class BestWord(Value):
-    """How like a word something is."""
+    """A word and its cosine to an example."""
 
     word: str
     score: float = Field(description="their cosine")
 
 
 class BestWords(Value):
-    """The words that something is most like."""
+    """The words most similar to an example."""
 
     example: str
     words: tuple[BestWord, ...] = Field(description="the nearest first")
 
 
 class SceneObject(Value):
-    """A thing that masks of many views keep together."""
+    """An object on which masks of many views agree."""
 
     id: int = Field(description="the same for the same lift; 0 has the largest total weight")
     name: str | None = Field(description="the nearest word of the vocabulary; null without one")
@@ -587,7 +587,7 @@ class ListedObjects(WithUnits):
 
 
 class SceneNode(SceneObject):
-    """An object, a part of one, or a group of objects; what is said of objects holds for it."""
+    """An object, a part of one, or a group of objects, with the fields of objects."""
 
     kind: NodeKind
     parent: int | None = Field(description="the node that it is a part of; null where it is of none")
@@ -597,7 +597,7 @@ class SceneNode(SceneObject):
 
 
 class Relation(Value):
-    """How two objects lie to each other (`liftcore.query.relations`)."""
+    """A spatial relation of two objects (`liftcore.query.relations`)."""
 
     node: int
     relation: Literal["touching", "inside", "on", "under", "beside"]
@@ -633,5 +633,5 @@ def page_fields() -> dict[str, Any]:
     return {name: fields[name] for name in Query.deciding()}
 
 
-if __name__ == "__main__":  # what `make web` builds the page with
+if __name__ == "__main__":  # `make web` builds the page with it
     print(json.dumps(page_fields(), indent=1))

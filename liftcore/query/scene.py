@@ -1,4 +1,4 @@
-"""A lift opened for questions: all that the command line and the service answer, to call."""
+"""Scene, a lift opened for queries: the library's face of all queries of the command line and the service."""
 
 from __future__ import annotations
 
@@ -43,23 +43,22 @@ Source: TypeAlias = (  # of a file
 
 @deprecated_names(look="view_mask", what="nearest_words")
 class Scene(OpenedLift):
-    """A lift opened for questions, with the splats and cameras of its scene.
+    """A lift opened for queries, with the splats and cameras of its scene.
 
-    What questions share is made once and kept: norms, mean, axes, encoders. Scores need the lift alone, and no torch.
-    Splats, cameras and packs that are not given are found where the lift remembers them, are checked against their
-    digests when first used, and are loaded once.
+    Norms, mean, axes and encoders are computed once and cached. Scores need the lift alone, and no torch. Splats,
+    cameras and packs that are not passed are read from the paths in the lift, once and at first use, and verified by
+    their digests.
 
     Args:
         source: the lift, or the path of its file, which is mapped and not read.
-        splats: that were lifted, or where they lie now, if they moved since the lift. cameras: of the scene, or where
-            they lie.
+        splats: that were lifted, or their new path if they moved since the lift. cameras: of the scene, or their path.
         packs: that were lifted.
-        device: that draws: cpu, cuda or auto. Scores are computed on the CPU.
-        world: which way is up and how long a unit is, where the lift does not know it, or wrongly.
+        device: that renders: cpu, cuda or auto. Scores are computed on the CPU.
+        world: up axis and length unit, if the lift has none, or wrong ones.
 
     Raises:
-        InvalidLift: the file is missing, is not a lift, or has other rows than the file of ``splats``, where these
-            are counted without reading them.
+        InvalidLift: the file is missing, is not a lift, or has other rows than the file of ``splats``, if these can
+            be counted without reading them.
         InvalidSplats: other splats than were lifted (`Lift.require_splats`).
     """
 
@@ -70,19 +69,19 @@ class Scene(OpenedLift):
     def ask(
         self, query: Query | str, *, encoder: TextEncoder | str | Path | None = None, places: bool | None = None
     ) -> Answer:
-        """Score every splat for a query and choose those that answer it (`liftcore.query.ask`).
+        """Score every splat for a query and select those that answer it (`liftcore.query.ask`).
 
         Args:
             query: words and examples, or one text.
             encoder: of texts, or the specification of one, which is opened once. None: the lift's own words, else
-                that of its text space, or the table of it that ships.
-            places: whether to list the best splats and the box of what is selected, which needs the splats; None:
-                where these are found.
+                that of its text space, or its shipped table.
+            places: True to list the best splats and the box of the selection, which needs the splats; None: if these
+                are available.
 
         Raises:
-            InvalidQuery: a text that the encoder cannot read or no encoder of the lift's space, a term that has no
-                feature, or a lift without the confidence that is asked for.
-            NotFound: an example names a view or a region that is not there.
+            InvalidQuery: a text that the encoder cannot encode or no encoder of the lift's space, a term that has no
+                feature, or a lift without the confidence that the query needs.
+            NotFound: an example names a view or a region that does not exist.
             InvalidLift: an example or ``places`` need the scene's files, and they moved or changed.
             Unavailable: the encoder's weights are not on this machine.
         """
@@ -99,19 +98,19 @@ class Scene(OpenedLift):
         return answer
 
     def prepare(self, query: Query, encoder: TextEncoder | None = None) -> Question:
-        """Find the directions of a query's terms, and all that can be wrong with it; arguments as in `ask`."""
+        """Resolve a query's terms to directions, and raise all of its errors; arguments as in `ask`."""
         from liftcore.query.ask import question
 
         return question(self, query, encoder, query.places)
 
     def answer(self, questions: Sequence[Question]) -> list[Answer]:
-        """Answer prepared questions in one pass over the features; each to the same bits as alone (`ask`)."""
+        """Answer prepared queries in one pass over the features; each to the same bits as alone (`ask`)."""
         from liftcore.query.ask import answers
 
         return answers(self, questions)
 
     def locate(self, answer: Answer, count: int | None = None) -> Answer:
-        """An answer with its best splats and the box of what is selected (`liftcore.query.ask.located`)."""
+        """Add to an answer its best splats and the box of its selection (`liftcore.query.ask.locate`)."""
         from liftcore.query.ask import located
 
         return located(self, answer, count)
@@ -129,7 +128,7 @@ class Scene(OpenedLift):
         Args:
             query: as in `ask`, or the answer to it. view: the name of a camera of the scene, or any camera in the
                 frame of the splats; None: the query's own.
-            find_objects: gives the answer's objects, where they may be known; None: `objects`.
+            find_objects: returns the answer's objects, such as cached ones; None: `objects`.
 
         Raises:
             InvalidQuery, NotFound, InvalidLift, Unavailable: as `ask` and `liftcore.query.render.view_mask`.
@@ -147,7 +146,7 @@ class Scene(OpenedLift):
         *,
         encoder: TextEncoder | str | Path | None = None,
     ) -> np.ndarray:
-        """[H, W] bool, the pixels of a view that are mostly of what was found; arguments as in `view_mask`."""
+        """Return the pixels of a view that mostly show the answer's objects, [H, W] bool; arguments as in `view_mask`."""
         return self.view_mask(query, view, encoder=encoder).mask
 
     def attention(
@@ -157,20 +156,19 @@ class Scene(OpenedLift):
         *,
         encoder: TextEncoder | str | Path | None = None,
     ) -> np.ndarray:
-        """[H, W] f32, the scores as a view shows them; arguments as in `view_mask`."""
+        """Render the scores of a view, [H, W] f32; arguments as in `view_mask`."""
         return self.view_mask(query, view, encoder=encoder).attention
 
     def select(self, name: str, source: Answer | Query | str | np.ndarray | int | None = None) -> Selection:
-        """A selection by its name, made where there is none: splats that `Selection.edit` corrects.
+        """Return the selection of a name, a new one if there is none; `Selection.edit` changes its splats.
 
-        It is asked for as ``Query(sets=["selection:NAME"])``, and an example of what is like it as
-        ``like="selection:NAME"``.
+        Queries take it as ``Query(sets=["selection:NAME"])``, and as an example by ``like="selection:NAME"``.
 
         Args:
-            source: what it becomes, as in `Selection.edit`; None: it stays as it is.
+            source: of its splats, as in `Selection.edit`; None: it stays as it is.
 
         Raises:
-            InvalidQuery: a name that questions cannot take; or as `Selection.edit`, like NotFound and InvalidLift.
+            InvalidQuery: a name that queries cannot take; or as `Selection.edit`, like NotFound and InvalidLift.
         """
         from liftcore.query.selections import Selection
         from liftcore.query.terms import parse_set
@@ -178,13 +176,13 @@ class Scene(OpenedLift):
         parse_set(f"selection:{name}", "name")
         found = self.selections.get(name) or Selection(self, name)
         if source is not None:
-            found.edit("set", source)  # what cannot be selected leaves no selection
+            found.edit("set", source)  # an invalid source leaves no selection
         self.selections[name] = found
         return found
 
     @deprecated_keywords(what="channel")
     def render(self, view: str | Camera, channel: str = "rgb") -> np.ndarray:
-        """A view: [H, W, 3] u8 sRGB of ``rgb``, ``pca``, ``cluster`` or ``confidence``; [H, W] f32 of ``depth``.
+        """Render a view: ``rgb``, ``pca``, ``cluster`` or ``confidence``, [H, W, 3] u8 sRGB; ``depth``, [H, W] f32.
 
         Depths are expected ones, in scene units, 0 where no splat is.
 
@@ -196,7 +194,7 @@ class Scene(OpenedLift):
         return expected_depth(self, view)[0] if channel == "depth" else render(self, view, channel)
 
     def objects(self, query: Query | str | Answer, *, encoder: TextEncoder | str | Path | None = None) -> Objects:
-        """The things that a question finds: splats that touch, each with its box (`liftcore.query.objects`)."""
+        """Group the splats of an answer to objects of touching splats with boxes (`liftcore.query.objects`)."""
         from liftcore.query.objects import objects
 
         return objects(self, self._answer(query, encoder))
@@ -204,11 +202,11 @@ class Scene(OpenedLift):
     def catalogue(
         self, words: Sequence[str] = (), vectors: Any = None, *, encoder: TextEncoder | str | Path | None = None
     ) -> Catalogue:
-        """The things that masks of many views agree on, found when it was lifted; words name them.
+        """List the objects on which masks of many views agree, found at lift time; words name them.
 
         Args:
             words: n. vectors: [n, F], torch or numpy, their text vectors, of any length above zero. None: the encoder
-                makes them.
+                computes them.
         """
         from liftcore.query.catalogue import catalogue
 
@@ -225,13 +223,13 @@ class Scene(OpenedLift):
         relations: bool = False,
         up: tuple[float, float, float] | Literal["cameras"] | None = None,
     ) -> SceneTree:
-        """The objects of `catalogue` with their parts and groups of them: a node's parts are nodes, too.
+        """List the objects of `catalogue` with their parts and groups of them: a node's parts are nodes, too.
 
         Args:
             words, vectors, encoder: as in `catalogue`.
-            relations: whether to say how the objects lie to each other (`liftcore.query.relations`).
-            up: in place of what ``world`` knows: the direction against gravity in the frame of the splats, or
-                ``cameras``, where photos were taken upright. Where it is not known, no object is on another.
+            relations: True to add spatial relations of the objects (`liftcore.query.relations`).
+            up: in place of the axis of ``world``: the direction against gravity in the frame of the splats, or
+                ``cameras`` if photos were taken upright. Without an up axis no object is on another.
         """
         from liftcore.query.catalogue import tree
 
@@ -247,7 +245,7 @@ class Scene(OpenedLift):
         encoder: TextEncoder | str | Path | None = None,
         progress: Progress | bool | None = False,
     ) -> Segmentation:
-        """Name every splat by the word that it is most like, or by none (`liftcore.query.segment`).
+        """Label every splat with the most similar word, or none (`liftcore.query.segment`).
 
         Args:
             words: n different ones; None: all words of the encoder, which is a table. vectors: as in `catalogue`.
@@ -272,7 +270,7 @@ class Scene(OpenedLift):
         top: int = 5,
         encoder: TextEncoder | str | Path | None = None,
     ) -> tuple[BestWord, ...]:
-        """The words that an example is most like, the nearest first.
+        """Return the words most similar to an example, the nearest first.
 
         Args:
             example: or its notation, as in `Query.like`, or a vector [F].
@@ -290,7 +288,7 @@ class Scene(OpenedLift):
         return best_words(self, example, words, reader.encode(words), top)
 
     def words(self, encoder: TextEncoder | str | Path | None = None) -> list[str]:
-        """All words of an encoder that is a table, each once; another one is an InvalidQuery."""
+        """Return all words of an encoder that is a table, each once; another encoder is an InvalidQuery."""
         from liftcore.query.segment import words_of
 
         return words_of(self.encoder(encoder))
@@ -298,7 +296,7 @@ class Scene(OpenedLift):
     def askable(
         self, text: str = "", count: int = 8, *, encoder: TextEncoder | str | Path | None = None
     ) -> SuggestedWords:
-        """What can be asked: at most so many words that a text which is being typed may become, and what is here.
+        """Suggest at most ``count`` words that complete a text, and words of the lift's objects.
 
         Raises:
             InvalidQuery: the lift's text space names no encoder.
@@ -309,13 +307,13 @@ class Scene(OpenedLift):
         return askable_words(self, self.encoder(encoder), text, count)
 
     def regions(self, view: str, x: int, y: int) -> tuple[CoveringRegion, ...]:
-        """The regions of the lift's feature packs that cover a pixel of a view's photo, the smallest first."""
+        """Return the regions of the lift's feature packs that cover a pixel of a view's photo, the smallest first."""
         from liftcore.query.regions import regions_at
 
         return regions_at(self, view, x, y)
 
     def region_mask(self, view: str, level: int, region: int) -> np.ndarray:
-        """[H, W] bool, the pixels of a view's photo that a region of its feature pack covers.
+        """Return the pixels of a view's photo that a region of its feature pack covers, [H, W] bool.
 
         Raises:
             NotFound: there is no such view, level or region.
@@ -330,21 +328,21 @@ class Scene(OpenedLift):
         """[P, 3] u8 sRGB, of splats by ``pca``, ``cluster``, ``total_weight``, ``agreement`` or ``confidence``.
 
         Raises:
-            InvalidQuery: the lift has no such thing.
+            InvalidQuery: the lift has no such layer.
         """
         from liftcore.query.export import layer_colours
 
         return layer_colours(self, what)
 
     def labels(self, source: Answer | Mapping[str, Answer] | Segmentation | Catalogue | SceneTree) -> Labels:
-        """Numbers a splat and what they mean, as files of labels have them (`liftcore.query.labels.labels`)."""
+        """Return class and instance labels of all splats, as written to files (`liftcore.query.labels.labels`)."""
         from liftcore.query.labels import labels
 
         return labels(self, source)
 
     @staticmethod
     def warm_up(kernel: Kernel | None = None) -> None:
-        """Load the compiled code of questions, or compile it; with a kernel that of pictures of such splats."""
+        """Load or compile the code of queries; with a kernel that of rendering such splats."""
         from liftcore.query.scores import warm_up
 
         if kernel is None:
@@ -354,7 +352,7 @@ class Scene(OpenedLift):
         return warm_up_kernel(kernel)
 
     def export(self, path: Path | str, source: Source = None, what: str = "", **how: Any) -> None:
-        """Write a file, whole or not at all; arguments and errors as in `blocks_of`, which takes its suffix."""
+        """Write a file, whole or not at all; arguments and errors as in `blocks_of`, with the suffix of the path."""
         from liftcore.io.files import whole_file
 
         how = {"suffix": Path(path).suffix.lower(), **how}
@@ -376,21 +374,21 @@ class Scene(OpenedLift):
         """Make a file, in blocks.
 
         Args:
-            source: a question or its answer, answers by names, a segmentation, a catalogue or a tree, the id of an
+            source: a query or its answer, answers by names, a segmentation, a catalogue or a tree, the id of an
                 object or another node, or an array; None: the scene.
             what: of an answer object, coloured, scores, selection, mask, attention or overlay; of a segmentation
                 coloured, labels, picture or splat_labels; of a catalogue csv; of all these and of a tree labelled
-                (splats with labels), prims (of USD, a prim an object), names (what these mean), lines (an object a
-                line, JSON), masks (COCO's JSON, in the views) or bundle (all of it in a ZIP); of the scene what
-                `render` draws, or splats; of an array npy, or mask of booleans [H, W]. Empty: the first of these; of
+                (splats with labels), prims (of USD, a prim an object), names (of the labels), lines (an object a
+                line, JSON), masks (COCO's JSON, in the views) or bundle (all of it in a ZIP); of the scene a channel
+                of `render`, or splats; of an array npy, or mask of booleans [H, W]. Empty: the first of these; of
                 a segmentation or a catalogue as a .glb, .spz or .usdz labelled (a catalogue as a .ply, too), .json
                 masks, .jsonl lines; as a .zip the bundle.
             view: of pictures, as in `view_mask`. suffix: of its name, where there are several formats.
-            seen: the answer as the view shows it, where that is known. photo: of the view, for an overlay.
+            seen: the answer's mask in the view, if it is cached. photo: of the view, for an overlay.
 
         Raises:
-            InvalidQuery: there is no such file of it, or nothing was found that it could hold.
-            NotFound, InvalidLift, Unavailable: as the question, or as pictures.
+            InvalidQuery: there is no such file of the source, or the file would be empty.
+            NotFound, InvalidLift, Unavailable: as the query, or as `render`.
         """
         import numpy as np
 

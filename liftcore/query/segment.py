@@ -53,16 +53,16 @@ SHOWN = 20  # words of a drawn legend
 @deprecated_names(found="named_words")
 @dataclass(frozen=True)
 class Segmentation:
-    """What every splat is, of some words."""
+    """Word of every splat, of some words."""
 
     words: tuple[str, ...]
-    """as asked"""
+    """as passed"""
     labels: np.ndarray
-    """[P] i32, rows of words; -1 where none of them is"""
+    """[P] i32, rows of words; -1 for none"""
     score: np.ndarray
-    """[P] f32, the cosine to its word; 0 where it has none"""
+    """[P] f32, the cosine of a splat to its word; 0 without a word"""
     margin: np.ndarray
-    """[P] f32, the cosine to its word less that to the nearest other; 0 where it has none"""
+    """[P] f32, the cosine of a splat to its word minus that to the nearest other; 0 without a word"""
     named_words: tuple[NamedSplats, ...]
     """the words that are there, those with the largest total weight first"""
 
@@ -86,7 +86,7 @@ class Segmentation:
 
     @property
     def summary(self) -> LabelSummary:
-        """What is there, and what has no name."""
+        """Present words, and the number of splats without a word."""
         none = int((self.labels < 0).sum())
         return LabelSummary(
             word_count=len(self.words), splats=len(self.labels), none=none, named_words=self.named_words
@@ -94,15 +94,15 @@ class Segmentation:
 
 
 def _palette(words: int) -> np.ndarray:
-    """[words + 1, 3] u8 sRGB, grey first."""
+    """Return a colour a word after grey, [words + 1, 3] u8 sRGB."""
     return np.roll(cluster_colours(words), 1, axis=0)
 
 
 def words_of(encoder: TextEncoder) -> list[str]:
-    """All words of a table, each once.
+    """Return all words of a table, each once.
 
     Raises:
-        InvalidQuery: the encoder is no table, and reads any text.
+        InvalidQuery: the encoder is no table, and encodes any text.
     """
     told: Sequence[str] = getattr(encoder, "words", ())
     words = list(dict.fromkeys(told))
@@ -120,13 +120,13 @@ def segment(
     progress: Progress = silent,
     references: References | str | None = None,
 ) -> Segmentation:
-    """Name every splat by the word that it is most like, or by none.
+    """Label every splat with the most similar word, or none.
 
     Args:
         scene: an opened lift.
         words: n different ones. vectors: [n, F], torch or numpy, their text vectors, of any length above zero.
-        progress: told about a stage "words".
-        references: of the words' encoder (`liftcore.query.presence.references_of`); None = the words themselves where
+        progress: called with the stage "words".
+        references: of the words' encoder (`liftcore.query.presence.references_of`); None = the words themselves if
             they are many, else those of the lift's text space.
 
     Raises:
@@ -146,8 +146,8 @@ def segment(
     thresholds, answered = np.empty(len(words)), np.empty(len(words))
     nearest = _Nearest(len(weights))
     for row, scores in _scores(scene, rows, range(len(words))):
-        found = find_threshold(scores[scene.seen], "auto", scene.weights)
-        thresholds[row] = found.value if found.clear else np.inf
+        threshold = find_threshold(scores[scene.seen], "auto", scene.weights)
+        thresholds[row] = threshold.value if threshold.clear else np.inf
         answered[row] = weights[scores >= thresholds[row]].sum()
         nearest.take(row, scores)
         progress("words", row + 1, len(words), "words")
@@ -202,7 +202,7 @@ def segment(
 
 
 def _parts(scene: OpenedLift, unit: np.ndarray, references: References | str | None) -> np.ndarray:
-    """[n, N] bool: the nodes of parts that each of some words [n, F] f32 names."""
+    """Return the nodes of parts that each of some words [n, F] f32 names, [n, N] bool."""
     found = np.zeros((len(unit), 0 if scene.node_parents is None else len(scene.node_parents)), np.bool_)
     if isinstance(references, References) and levels_disagree(scene):
         for row, nodes in enumerate(parts_of_words(scene, references, unit)):
@@ -211,7 +211,7 @@ def _parts(scene: OpenedLift, unit: np.ndarray, references: References | str | N
 
 
 def _by_nodes(scene: OpenedLift, labels: np.ndarray, weights: np.ndarray, parts: np.ndarray) -> np.ndarray:
-    """[P] i32: labels after what nodes say: of parts that a word names, and of splats without a word.
+    """Correct labels by the lift's nodes: parts that a word names, and splats without a word; [P] i32.
 
     Args:
         labels: [P] i32, NO_WORD for none. weights: [P] f64. parts: [n, N] bool, the nodes that words name.
@@ -234,7 +234,7 @@ def _by_nodes(scene: OpenedLift, labels: np.ndarray, weights: np.ndarray, parts:
 
 
 class _Nearest:
-    """The nearest word of every splat so far, and how near it and the next one are."""
+    """The nearest word of every splat so far, its cosine, and that of the second nearest."""
 
     def __init__(self, count: int) -> None:
         self.row = np.zeros(count, np.int32)
@@ -242,14 +242,14 @@ class _Nearest:
         self.second = np.full(count, -np.inf, np.float32)
 
     def take(self, row: int, scores: np.ndarray) -> None:
-        nearer = scores > self.score  # of equal ones the first stays
+        nearer = scores > self.score  # the first of equal ones stays
         self.second = np.where(nearer, self.score, np.maximum(self.second, scores))
         self.score = np.where(nearer, scores, self.score)
         self.row[nearer] = row
 
 
 def _scores(scene: OpenedLift, vectors: np.ndarray, rows: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-    """Each of the rows with the cosines [P] f32 of its vector; some rows in one pass over the features."""
+    """Yield each row with the cosines [P] f32 of its vector; AT_ONCE rows in one pass over the features."""
     for first in range(0, len(rows), AT_ONCE):
         some = rows[first : first + AT_ONCE]
         yield from zip(some, np.ascontiguousarray(cosines(scene.features, scene.norms, vectors[some]).T), strict=True)
@@ -258,7 +258,7 @@ def _scores(scene: OpenedLift, vectors: np.ndarray, rows: Sequence[int]) -> Iter
 def best_words(
     scene: OpenedLift, example: Example, words: Sequence[str], vectors: Any, count: int = 5
 ) -> tuple[BestWord, ...]:
-    """The words that an example is most like, the nearest first.
+    """Return the words most similar to an example, the nearest first.
 
     Args:
         scene: an opened lift. example: as in a query. words: n. vectors: [n, F], their text vectors.
@@ -274,11 +274,11 @@ def best_words(
 
 
 def named_ply(scene: OpenedLift, segmentation: Segmentation) -> Iterable[bytes]:
-    """All splats in the colours of their words, grey where they have none, as a file in blocks.
+    """Write all splats in the colours of their words, grey without one, as a file in blocks.
 
     Raises:
         InvalidLift: the splats moved or changed since the lift.
-        InvalidSplats: their file holds no colours; told when the first block is asked for.
+        InvalidSplats: their file holds no colours; raised with the first block.
     """
     from liftcore.io.splats import recoloured
 
@@ -286,7 +286,7 @@ def named_ply(scene: OpenedLift, segmentation: Segmentation) -> Iterable[bytes]:
 
 
 def word_map(scene: OpenedLift, segmentation: Segmentation, view: str | Camera) -> np.ndarray:
-    """[H, W] i32, the value of the word (`Segmentation.values`) that has the most weight on each ray.
+    """Render the value of the word (`Segmentation.values`) with the most weight on each ray, [H, W] i32.
 
     Raises:
         NotFound, InvalidQuery, InvalidLift: as `liftcore.query.render.view_mask`.
@@ -295,7 +295,7 @@ def word_map(scene: OpenedLift, segmentation: Segmentation, view: str | Camera) 
 
 
 def value_map(scene: OpenedLift, values: np.ndarray, view: str | Camera) -> np.ndarray:
-    """[H, W] i32, which of the splats' values [P] i32 has the most weight on each ray; 0 where hardly a splat is.
+    """Render the splats' value [P] i32 with the most weight on each ray, [H, W] i32; 0 where it misses the scene.
 
     Raises:
         NotFound, InvalidQuery, InvalidLift: as `liftcore.query.render.view_mask`.
@@ -309,15 +309,15 @@ def value_map(scene: OpenedLift, values: np.ndarray, view: str | Camera) -> np.n
 
 
 def map_png(values: np.ndarray, segmentation: Segmentation) -> bytes:
-    """Values [H, W] as a picture with a palette, 0 black; its text ``legend`` is JSON from values to words.
+    """Write values [H, W] as a PNG with a palette, 0 black; its text ``legend`` is JSON from values to words.
 
-    More than 255 words make a grey picture of 16 bits.
+    Above 255 words it is a grey image of 16 bits.
     """
     return palette_png(values, [named.word for named in segmentation.named_words], segmentation.colours)
 
 
 def palette_png(values: np.ndarray, names: Sequence[str], colours: np.ndarray) -> bytes:
-    """The same of values [H, W] with their names, from 1, and colours [n + 1, 3] u8, from 0."""
+    """Write values [H, W] as `map_png` does, with names of values from 1 and colours [n + 1, 3] u8 from 0."""
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
@@ -335,7 +335,7 @@ def palette_png(values: np.ndarray, names: Sequence[str], colours: np.ndarray) -
 
 
 def picture_png(image: np.ndarray, values: np.ndarray, segmentation: Segmentation) -> bytes:
-    """A view [H, W, 3] u8 tinted with the colours of its words, and a drawn legend beside it, as a PNG."""
+    """Tint a view [H, W, 3] u8 with the colours of its words, and draw a legend next to it, as a PNG."""
     from PIL import Image, ImageDraw, ImageFont
 
     colours = segmentation.colours

@@ -32,22 +32,22 @@ def fine_maps(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return path
 
 
-def certified(scene: Path, pack: Path, own: dict[str, Any]) -> dict[str, Any]:
+def certified(scene: Path, pack: Path, options: dict[str, Any]) -> dict[str, Any]:
     """The diagnostics of a lift."""
-    settings = LiftSettings.of(**{"preset": "row-sum"} | own, diagnostic_rays=100, device="cpu")
+    settings = LiftSettings.of(**{"preset": "row-sum"} | options, diagnostic_rays=100, device="cpu")
     return lift_files(scene / "point_cloud.ply", scene / "cameras.json", [pack], settings).metadata.diagnostics
 
 
-def told(scene: Path, pack: Path, own: dict[str, Any]) -> tuple[float, float]:
+def planned_and_measured(scene: Path, pack: Path, options: dict[str, Any]) -> tuple[float, float]:
     """Bytes of W that the plan expects, and those of the entries that the lift made."""
-    diagnostics = certified(scene, pack, own)
+    diagnostics = certified(scene, pack, options)
     plan = diagnostics["plan"]
     return plan["memory"]["weights"], ENTRY_BYTES * diagnostics["weights_entries"]
 
 
 # The most that a plan may be above what is found: the more levels a view has, the fewer of its regions a splat meets.
 @pytest.mark.parametrize(
-    ("name", "own", "most"),
+    ("name", "options", "limit"),
     [
         ("features", {"view_stride": 6}, 9),
         ("features", {"view_stride": 6, "levels": 0}, 7),
@@ -56,35 +56,35 @@ def told(scene: Path, pack: Path, own: dict[str, Any]) -> tuple[float, float]:
         ("grids", {"view_stride": 6, "stride": 3}, 5),
     ],
 )
-def test_plan_has_room_for_the_region_weights_there_will_be(shared_data, name, own, most):
+def test_plan_has_room_for_the_region_weights_there_will_be(shared_data, name, options, limit):
     """An upper bound: a splat meets a region or four cells in each tile and level that it touches."""
     scene = shared_data / "tabletop"
-    planned, found = told(scene, scene / f"{name}.safetensors", own)
-    assert found < planned < most * found
+    planned, measured = planned_and_measured(scene, scene / f"{name}.safetensors", options)
+    assert measured < planned < limit * measured
 
 
-@pytest.mark.parametrize(("reading", "most"), [("bilinear", 1.4), ("nearest", 2.5)])
-def test_fine_maps_are_planned_with_their_many_weights(shared_data, fine_maps, reading, most):
-    planned, found = told(shared_data / "tabletop", fine_maps, {"grid_reading": reading})
-    assert found < planned < most * found
+@pytest.mark.parametrize(("reading", "limit"), [("bilinear", 1.4), ("nearest", 2.5)])
+def test_fine_maps_are_planned_with_their_many_weights(shared_data, fine_maps, reading, limit):
+    planned, measured = planned_and_measured(shared_data / "tabletop", fine_maps, {"grid_reading": reading})
+    assert measured < planned < limit * measured
 
 
 def test_plan_has_room_for_what_reweighting_holds(shared_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    held, made = [], (reweight.zeros, in_memory.mask_consensus)
+    arrays, originals = [], (reweight.zeros, in_memory.mask_consensus)
 
-    def array(*arguments: Any, **own: Any) -> torch.Tensor:
-        held.append(made[0](*arguments, **own))
-        return held[-1]
+    def array(*arguments: Any, **options: Any) -> torch.Tensor:
+        arrays.append(originals[0](*arguments, **options))
+        return arrays[-1]
 
-    def consensus(*arguments: Any, **own: Any) -> Any:
+    def consensus(*arguments: Any, **options: Any) -> Any:
         tracemalloc.start()
-        found = made[1](*arguments, **own)
-        held.append(torch.empty(tracemalloc.get_traced_memory()[1], dtype=torch.uint8))
+        result = originals[1](*arguments, **options)
+        arrays.append(torch.empty(tracemalloc.get_traced_memory()[1], dtype=torch.uint8))
         tracemalloc.stop()
-        return found
+        return result
 
     monkeypatch.setattr(reweight, "zeros", array)
     monkeypatch.setattr(in_memory, "mask_consensus", consensus)
-    scene, own = shared_data / "tabletop", {"view_stride": 6, "preset": "default"}
-    planned = certified(scene, scene / "features_hard.safetensors", own)["plan"]["memory"]["reweighting"]
-    assert sum(part.nbytes for part in held) < planned
+    scene, options = shared_data / "tabletop", {"view_stride": 6, "preset": "default"}
+    planned = certified(scene, scene / "features_hard.safetensors", options)["plan"]["memory"]["reweighting"]
+    assert sum(part.nbytes for part in arrays) < planned

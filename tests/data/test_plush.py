@@ -70,9 +70,9 @@ def test_check_tells_broken_inputs_alone(plush, cameras, raster, tmp_path: Path,
         grids = {name: grid.transpose(2, 0, 1).copy().reshape(grid.shape) for name, grid in load_file(pack).items()}
         pack = tmp_path / "grids.safetensors"
         save_file(grids, pack)
-    found = check_scene(raster.splats, cameras, find_images([plush / "images"]), read_features(pack))
+    check = check_scene(raster.splats, cameras, find_images([plush / "images"]), read_features(pack))
     expected = {None: [], "cameras": ["photos"], "features": ["features"]}[broken]
-    assert [told.partition(":")[0] for told in found.wrong] == expected
+    assert [sentence.partition(":")[0] for sentence in check.wrong] == expected
 
 
 def test_rays_are_as_full_as_the_training_measured(plush, cameras, raster):
@@ -90,7 +90,7 @@ def test_lifted_cnn_features_render_like_those_of_unseen_photos(plush, cameras, 
     settings = LiftSettings.of(preset="row-sum", diagnostic_rays=0, view_stride=12, stride=3)
     paths = [plush / name for name in ("point_cloud.ply", "cameras.json", "grids.safetensors")]
     features = lift_files(paths[0], paths[1], paths[2:], settings).features
-    held_out, found = read_features(plush / "grids_test.safetensors"), []
+    held_out, means = read_features(plush / "grids_test.safetensors"), []
     for name in HELD_OUT:
         observed = held_out[name]
         assert isinstance(observed, FeatureGrid)
@@ -98,8 +98,8 @@ def test_lifted_cnn_features_render_like_those_of_unseen_photos(plush, cameras, 
         image = raster.render(quarter(cameras[name]), features[:, ::CHANNELS].float(), settings.render_params)
         cosines = [cosine_with(image, cells) for cells in (grid, grid.flip(1), grid.flip(0))]
         assert cosines[0] > max(cosines[1:]) + 0.2
-        found.append(cosines[0])
-    assert np.mean(found) > 0.77  # .795
+        means.append(cosines[0])
+    assert np.mean(means) > 0.77  # .795
 
 
 def quarter(camera: Camera) -> Camera:

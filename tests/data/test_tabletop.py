@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 ROUNDING = 0.0005 + 1e-9  # of three printed digits
 SHORT = ("features_hard", "grids")  # python -m tests.benchmarks.tabletop measures all
 BARS = [case for case in CASES if case.pack in SHORT and case.accuracy is not None and case.power == 1]
-NOTHING = 0.001
-THINGS, CLOTH, CURTAIN = range(12), 12, 13
+TOLERANCE = 0.001
+OBJECTS, CLOTH, CURTAIN = range(12), 12, 13
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def encoder(folder: Path) -> TableEncoder:
 
 
 @pytest.fixture(scope="module")
-def usual(truth: Truth, folder: Path) -> lc.LiftResult:
+def default_lift(truth: Truth, folder: Path) -> lc.LiftResult:
     """The lift of masks that are mostly right, by default; every fourth view."""
     return truth.lift(read_pack(folder, "features", every=4))
 
@@ -85,66 +85,68 @@ def test_a_row_sum_lift_reaches_the_baseline(
 
 
 def test_hard_masks_gain_and_confidence_tells_right_from_wrong(truth: Truth, hard: lc.LiftResult) -> None:
-    found = truth.judge(hard)
-    assert found.accuracy > 0.893  # .818 with row-sum, .862 with a robust step
-    assert found.miou > 0.894  # .834 and .878
+    figures = truth.judge(hard)
+    assert figures.accuracy > 0.893  # .818 with row-sum, .862 with a robust step
+    assert figures.miou > 0.894  # .834 and .878
     assert hard.confidence is not None
     assert ranked(truth, hard, hard.confidence) > 0.8
     assert ranked(truth, hard, hard.agreement) < 0.5  # which is not what it is for
 
 
 def test_masks_that_are_mostly_right_lose_nothing_by_the_default(
-    truth: Truth, folder: Path, usual: lc.LiftResult
+    truth: Truth, folder: Path, default_lift: lc.LiftResult
 ) -> None:
-    plain = truth.judge(truth.lift(read_pack(folder, "features", every=4), preset="row-sum"))
-    found = truth.judge(usual)
-    assert found.accuracy >= plain.accuracy - NOTHING
-    assert found.miou >= plain.miou - NOTHING
-    assert usual.confidence is not None
-    assert ranked(truth, usual, usual.confidence) > 0.8
+    row_sum = truth.judge(truth.lift(read_pack(folder, "features", every=4), preset="row-sum"))
+    figures = truth.judge(default_lift)
+    assert figures.accuracy >= row_sum.accuracy - TOLERANCE
+    assert figures.miou >= row_sum.miou - TOLERANCE
+    assert default_lift.confidence is not None
+    assert ranked(truth, default_lift, default_lift.confidence) > 0.8
 
 
 def test_the_objects_of_hard_masks_are_the_things_of_the_scene(
     truth: Truth, lift_of: Callable[[Case], lc.LiftResult], encoder: TableEncoder
 ) -> None:
     scene = truth.opened(lift_of(BARS[0]))
-    answers = {thing: ask(scene, truth.words[thing], encoder) for thing in THINGS}
-    found = measure_lift(scene, answers, truth.objects.numpy())
-    assert found["one"] == found["things"] == 12
-    assert found["box"] > 0.93 and found["worst"] > 0.85  # .059 around all selected splats
-    assert found["middle"] < 0.01
-    assert found["apart"] == found["pairs"] == 66
+    answers = {number: ask(scene, truth.words[number], encoder) for number in OBJECTS}
+    measures = measure_lift(scene, answers, truth.objects.numpy())
+    assert measures["one"] == measures["things"] == 12
+    assert measures["box"] > 0.93 and measures["worst"] > 0.85  # .059 around all selected splats
+    assert measures["middle"] < 0.01
+    assert measures["apart"] == measures["pairs"] == 66
 
 
-def test_fourteen_words_are_found_among_many(truth: Truth, usual: lc.LiftResult, encoder: TableEncoder) -> None:
-    scene, real = truth.opened(usual), truth.objects.numpy()
+def test_fourteen_words_are_found_among_many(
+    truth: Truth, default_lift: lc.LiftResult, encoder: TableEncoder
+) -> None:
+    scene, real = truth.opened(default_lift), truth.objects.numpy()
     words = list(truth.words)
-    others = [word for word in encoder.words if word not in words]
-    absent = np.random.default_rng(0).choice(others, 100, replace=False).tolist()
-    found = segment(scene, words + absent, encoder.encode(words + absent))
-    assert {named.word for named in found.found} == set(words)
-    counted = scene.seen & (scene.total_weight > 0.5)
-    assert (found.labels == real)[counted].mean() > 0.9
-    alone = segment(scene, words[:7], encoder.encode(words[:7])).labels
-    assert (alone[counted & (real >= 7)] < 0).mean() > 0.5
+    other_words = [word for word in encoder.words if word not in words]
+    absent = np.random.default_rng(0).choice(other_words, 100, replace=False).tolist()
+    segmentation = segment(scene, words + absent, encoder.encode(words + absent))
+    assert {label.word for label in segmentation.found} == set(words)
+    mask = scene.seen & (scene.total_weight > 0.5)
+    assert (segmentation.labels == real)[mask].mean() > 0.9
+    seven = segment(scene, words[:7], encoder.encode(words[:7])).labels
+    assert (seven[mask & (real >= 7)] < 0).mean() > 0.5
 
 
-def test_a_thing_stays_found_when_something_else_is_not_wanted(truth: Truth, usual: lc.LiftResult) -> None:
-    scene, real = truth.opened(usual), truth.objects.numpy()
-    best = [int(np.argmax(np.where(real == thing, scene.total_weight, -1.0))) for thing in range(CURTAIN + 1)]
+def test_a_thing_stays_found_when_something_else_is_not_wanted(truth: Truth, default_lift: lc.LiftResult) -> None:
+    scene, real = truth.opened(default_lift), truth.objects.numpy()
+    best = [int(np.argmax(np.where(real == number, scene.total_weight, -1.0))) for number in range(CURTAIN + 1)]
 
-    def iou(thing: int, *unlike: int) -> float:
+    def iou(number: int, *unlike: int) -> float:
         """Of the splats found with those of the thing, asked by the splat of each class that was seen best."""
-        like, *against = (SplatTerm(best[other]) for other in (thing, *unlike))
-        found, wanted = ask(scene, Query.of((like,), tuple(against))).selected, (real == thing) & scene.seen
-        return float((found & wanted).sum() / (found | wanted).sum())
+        like, *against = (SplatTerm(best[other]) for other in (number, *unlike))
+        selected, expected = ask(scene, Query.of((like,), tuple(against))).selected, (real == number) & scene.seen
+        return float((selected & expected).sum() / (selected | expected).sum())
 
-    plain = np.array([iou(thing) for thing in THINGS])
-    assert plain.mean() > 0.9
+    ious = np.array([iou(number) for number in OBJECTS])
+    assert ious.mean() > 0.9
     cases: list[Any] = [(CLOTH,), (CURTAIN,), (CLOTH, CURTAIN), None]  # None: the next thing
     for unlike in cases:
-        against = np.array([iou(thing, *(unlike or ((thing + 1) % len(THINGS),))) for thing in THINGS])
-        assert (against > plain - 0.01).all(), unlike
+        against = np.array([iou(number, *(unlike or ((number + 1) % len(OBJECTS),))) for number in OBJECTS])
+        assert (against > ious - 0.01).all(), unlike
 
 
 def test_things_are_found_in_the_words_of_their_masks(
@@ -156,16 +158,16 @@ def test_things_are_found_in_the_words_of_their_masks(
         regions = packs[view]
         assert isinstance(regions, lc.Regions)
         nearest = np.append((regions.codebook.float().numpy() @ vectors.T).argmax(axis=1), -1)
-        things = nearest[regions.labels[0].numpy()]
-        for thing in set(np.unique(things).tolist()) & {*THINGS}:
-            (tmp_path / truth.words[thing]).mkdir(exist_ok=True)
-            Image.fromarray(things == thing).save(tmp_path / truth.words[thing] / f"{view}.png")
-    found = prompt_views(tmp_path)
-    write_pack(tmp_path / "pack", found.views, {}, table=found.table)
+        labels = nearest[regions.labels[0].numpy()]
+        for number in set(np.unique(labels).tolist()) & {*OBJECTS}:
+            (tmp_path / truth.words[number]).mkdir(exist_ok=True)
+            Image.fromarray(labels == number).save(tmp_path / truth.words[number] / f"{view}.png")
+    views = prompt_views(tmp_path)
+    write_pack(tmp_path / "pack", views.views, {}, table=views.table)
     scene = truth.opened(truth.lift(read_features(tmp_path / "pack"), preset="row-sum"))
-    for thing in THINGS:
-        answer, ious = ask(scene, truth.words[thing]), []
+    for number in OBJECTS:
+        answer, ious = ask(scene, truth.words[number]), []
         for view, mask in truth.held_out.items():
-            shown, right = view_mask(scene, answer, view).mask, (mask == thing).numpy()
-            ious.append((shown & right).sum() / (shown | right).sum() if right.any() else 1.0)
-        assert np.mean(ious) >= 0.95, (truth.words[thing], ious)
+            visible, right = view_mask(scene, answer, view).mask, (mask == number).numpy()
+            ious.append((visible & right).sum() / (visible | right).sum() if right.any() else 1.0)
+        assert np.mean(ious) >= 0.95, (truth.words[number], ious)

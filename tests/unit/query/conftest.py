@@ -20,8 +20,8 @@ def lift_tiny() -> Callable[..., Path]:
         tiny = make_scene()
         for name, content in (("s.ply", splats or tiny.splats), ("c.json", tiny.cameras), ("f.st", tiny.features)):
             (folder / name).write_bytes(content)
-        made = lift_files(folder / "s.ply", folder / "c.json", [folder / "f.st"], LiftSettings.of(preset=preset))
-        save_lift(made, folder / "scene.lift")
+        lift = lift_files(folder / "s.ply", folder / "c.json", [folder / "f.st"], LiftSettings.of(preset=preset))
+        save_lift(lift, folder / "scene.lift")
         return folder / "scene.lift"
 
     return lift_in

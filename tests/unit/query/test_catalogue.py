@@ -26,17 +26,17 @@ EYE = np.eye(3, CHANNELS, dtype=np.float32)
 
 
 def test_each_object_has_its_place_its_views_and_the_nearest_word(scene: Scene) -> None:
-    found = catalogue(scene, WORDS, 3.0 * EYE)
-    assert [one.id for one in found.objects] == [0, 1, 2] and found.features.shape == (3, CHANNELS)
-    assert sorted(one.share for one in found.objects)[::-1] == [one.share for one in found.objects]
-    for one in found.objects:
-        cluster = round(one.centre[0] / 1.2) + 1
-        assert (one.name, one.splats) == (WORDS[cluster], SPLATS_A_CLUSTER)
-        assert set(one.views) == set(VIEWS) and one.score == pytest.approx(1, abs=0.1)
+    listing = catalogue(scene, WORDS, 3.0 * EYE)
+    assert [obj.id for obj in listing.objects] == [0, 1, 2] and listing.features.shape == (3, CHANNELS)
+    assert sorted(obj.share for obj in listing.objects)[::-1] == [obj.share for obj in listing.objects]
+    for obj in listing.objects:
+        cluster = round(obj.centre[0] / 1.2) + 1
+        assert (obj.name, obj.splats) == (WORDS[cluster], SPLATS_A_CLUSTER)
+        assert set(obj.views) == set(VIEWS) and obj.score == pytest.approx(1, abs=0.1)
         means = scene.splats.means.numpy()[SPLATS_A_CLUSTER * cluster : SPLATS_A_CLUSTER * (cluster + 1)]
-        np.testing.assert_allclose(one.box, [means.min(axis=0), means.max(axis=0)], atol=1e-6)
-    lines = list(csv.DictReader(io.StringIO(table_csv(found).decode())))
-    assert [line["name"] for line in lines] == [one.name for one in found.objects]
+        np.testing.assert_allclose(obj.box, [means.min(axis=0), means.max(axis=0)], atol=1e-6)
+    lines = list(csv.DictReader(io.StringIO(table_csv(listing).decode())))
+    assert [line["name"] for line in lines] == [obj.name for obj in listing.objects]
     assert [int(line["splats"]) for line in lines] == [SPLATS_A_CLUSTER] * 3
 
 
@@ -54,8 +54,8 @@ def test_a_draft_says_that_it_looked_for_no_objects_and_what_finds_them(scene: S
     bare = {field: None for field in vars(LiftResult.of(scene.lift)) if field.startswith(("object", "node"))}
     save_lift(replace(scene.lift, metadata=metadata, **bare), tmp_path / "draft.lift")
     draft = Scene(tmp_path / "draft.lift")
-    for told in (draft.catalogue().explanation, draft.tree().explanation):
-        assert "speed=draft" in told and "objects=auto" in told
+    for explanation in (draft.catalogue().explanation, draft.tree().explanation):
+        assert "speed=draft" in explanation and "objects=auto" in explanation
     with pytest.raises(NotFound, match="objects=auto"):
         draft.export(tmp_path / "object.ply", source=0)
 
@@ -75,22 +75,22 @@ def with_parts(scene: Scene) -> LiftResult:
 
 def test_parts_have_paths_places_and_names_of_what_their_own_masks_say(scene: Scene, tmp_path: Path) -> None:
     with_parts(scene).save(tmp_path / "parts.lift")
-    opened = Scene(tmp_path / "parts.lift", scene.splats, scene.cameras)
-    found, objects = opened.tree(WORDS, EYE), opened.catalogue(WORDS, EYE).objects
-    assert [(one.id, one.kind, one.parent) for one in found.nodes[:3]] == [(n, "object", None) for n in range(3)]
-    for one, thing in zip(found.nodes, objects, strict=False):
-        assert {name: getattr(one, name) for name in vars(thing)} == vars(thing)
-    assert [(one.kind, one.path, one.name) for one in found.nodes[3:]] == [
+    saved = Scene(tmp_path / "parts.lift", scene.splats, scene.cameras)
+    tree, objects = saved.tree(WORDS, EYE), saved.catalogue(WORDS, EYE).objects
+    assert [(node.id, node.kind, node.parent) for node in tree.nodes[:3]] == [(n, "object", None) for n in range(3)]
+    for node, obj in zip(tree.nodes, objects, strict=False):
+        assert {name: getattr(node, name) for name in vars(obj)} == vars(obj)
+    assert [(node.kind, node.path, node.name) for node in tree.nodes[3:]] == [
         ("part", (0, 3), WORDS[1]), ("part", (0, 4), WORDS[2])
     ]  # fmt: skip
-    assert found.nodes[0].parts == (3, 4) and found.nodes[0].splats == sum(one.splats for one in found.nodes[3:])
-    for one in found.nodes:
-        inside = opened.members(one.id)
-        assert inside.sum() == one.splats and set(np.flatnonzero(inside)) <= set(
-            np.flatnonzero(opened.members(one.path[0]))
+    assert tree.nodes[0].parts == (3, 4) and tree.nodes[0].splats == sum(node.splats for node in tree.nodes[3:])
+    for node in tree.nodes:
+        inside = saved.members(node.id)
+        assert inside.sum() == node.splats and set(np.flatnonzero(inside)) <= set(
+            np.flatnonzero(saved.members(node.path[0]))
         )
     with pytest.raises(NotFound, match="from 0 to 4"):
-        opened.members(5)
+        saved.members(5)
 
 
 def test_the_command_lists_the_tree_and_writes_its_nodes_by_their_paths(
@@ -99,19 +99,19 @@ def test_the_command_lists_the_tree_and_writes_its_nodes_by_their_paths(
     with_parts(scene).save(tmp_path / "parts.lift.safetensors")
     command = ["objects", str(tmp_path / "parts.lift.safetensors"), "--tree", "--into", str(tmp_path / "things")]
     assert main([*command, "--up", "0", "-1", "0"]) == 0
-    told = capsys.readouterr().out
-    assert "3 objects with 2 parts\n" in told and "3, part: " in told
+    stdout = capsys.readouterr().out
+    assert "3 objects with 2 parts\n" in stdout and "3, part: " in stdout
     names = ["object-0", "object-0-3", "object-0-4", "object-1", "object-2"]
     assert sorted(path.stem for path in (tmp_path / "things").iterdir()) == names
     assert main([*command, "--relations", "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)["answer"]
-    assert {one["relation"] for one in answer["relations"]} <= {"touching", "inside"}
+    assert {relation["relation"] for relation in answer["relations"]} <= {"touching", "inside"}
     assert answer["world"] == {"up": None, "metres_per_unit": None} and answer["unit"] == "scene units"
-    sizes = [one["size"] for one in answer["nodes"]]
+    sizes = [relation["size"] for relation in answer["nodes"]]
     assert main([*command, "--distance", "0", "0", "0", "0", "0", "2", "1", "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)["answer"]
     assert answer["unit"] == "metres" and answer["world"]["metres_per_unit"] == 0.5
-    assert [[2 * side for side in one["size"]] for one in answer["nodes"]] == sizes
+    assert [[2 * side for side in relation["size"]] for relation in answer["nodes"]] == sizes
     assert main([*command[:3], "--up", "0", "0", "0"]) == 2 and "--up: expected" in capsys.readouterr().err
     assert main([*command, "--features"]) != 0
 
@@ -152,23 +152,28 @@ def test_the_command_lists_names_and_writes_them(
 ) -> None:
     (tmp_path / "words.safetensors").write_bytes(text_table())
     files = ["--csv", str(tmp_path / "things.csv"), "--splats", str(tmp_path / "things")]
-    named = ["--vocabulary", str(tmp_path / "words.safetensors"), "--features", "--json"]
-    assert main(["objects", str(tiny_lift), *named, *files]) == 0
-    printed = capsys.readouterr()
-    assert "--splats FOLDER is now --into FOLDER" in printed.err
-    told = json.loads(printed.out)
-    assert {one["name"] for one in told["objects"]} == set(WORDS) and len(told["objects"][0]["feature"]) == CHANNELS
-    assert told["answer"]["count"] == 3 and told["answer"]["objects"][2]["feature"] == told["objects"][2]["feature"]
+    options = ["--vocabulary", str(tmp_path / "words.safetensors"), "--features", "--json"]
+    assert main(["objects", str(tiny_lift), *options, *files]) == 0
+    streams = capsys.readouterr()
+    assert "--splats FOLDER is now --into FOLDER" in streams.err
+    document = json.loads(streams.out)
+    assert {obj["name"] for obj in document["objects"]} == set(WORDS) and len(
+        document["objects"][0]["feature"]
+    ) == CHANNELS
+    assert (
+        document["answer"]["count"] == 3
+        and document["answer"]["objects"][2]["feature"] == document["objects"][2]["feature"]
+    )
     assert (tmp_path / "things.csv").read_text().count("\n") == 4
     assert sorted(path.name for path in (tmp_path / "things").iterdir()) == [f"object-{k}.ply" for k in range(3)]
     (splats,) = tiny_lift.parent.glob("*.ply")
-    again = ["--splats", str(splats), "--into", str(tmp_path / "again")]
-    assert main(["objects", str(tiny_lift), *again]) == 0 and "--into FOLDER" not in capsys.readouterr().err
+    more_options = ["--splats", str(splats), "--into", str(tmp_path / "again")]
+    assert main(["objects", str(tiny_lift), *more_options]) == 0 and "--into FOLDER" not in capsys.readouterr().err
     assert len(list((tmp_path / "again").iterdir())) == 3
     assert main(["objects", str(tiny_lift)]) == 0 and "3 objects" in capsys.readouterr().out
     assert main(["objects", str(tiny_lift), "--json"]) == 0
-    plain = json.loads(capsys.readouterr().out)
-    assert [one.keys() for one in plain["objects"]] == [one.keys() - {"feature"} for one in told["objects"]]
+    unnamed = json.loads(capsys.readouterr().out)
+    assert [obj.keys() for obj in unnamed["objects"]] == [obj.keys() - {"feature"} for obj in document["objects"]]
 
 
 def test_a_folder_of_before_is_not_blamed_for_another_argument(
@@ -179,8 +184,8 @@ def test_a_folder_of_before_is_not_blamed_for_another_argument(
     folder.mkdir()
     shutil.copy(splats, folder / "object-0.ply")
     assert main(["objects", str(tiny_lift), "--splats", str(folder), "--up", "0", "0", "0"]) == 2
-    told = capsys.readouterr().err
-    assert "--up: expected" in told and "expected splats" not in told
+    stderr = capsys.readouterr().err
+    assert "--up: expected" in stderr and "expected splats" not in stderr
     assert main(["objects", str(tiny_lift), "--splats", str(folder)]) == 0
     assert len(list(folder.iterdir())) == 3
 
@@ -191,7 +196,7 @@ def test_a_folder_that_is_splats_gets_no_objects(tiny_lift: Path, tmp_path: Path
         folder.mkdir()
         (folder / name).write_text(json.dumps({part: {} for part in ("means", "scales", "quats")}))
         assert main(["objects", str(tiny_lift), "--splats", str(folder)]) == 2
-        assert [one.name for one in folder.iterdir()] == [name]
+        assert [path.name for path in folder.iterdir()] == [name]
 
 
 def test_objects_without_splats_are_left_out(scene: Scene, tmp_path: Path) -> None:
@@ -204,6 +209,6 @@ def test_objects_without_splats_are_left_out(scene: Scene, tmp_path: Path) -> No
     }  # fmt: skip
     save_lift(replace(lift, object_views=lift.object_views[[0, 1, 2, 0]], **tree), tmp_path / "l.safetensors")
     other = Scene(tmp_path / "l.safetensors")
-    assert [one.id for one in other.catalogue().objects] == [0, 1, 2] and len(other.catalogue().features) == 3
-    assert [(one.id, one.parts) for one in other.tree(relations=True).nodes] == [(0, ()), (1, ()), (2, ())]
+    assert [obj.id for obj in other.catalogue().objects] == [0, 1, 2] and len(other.catalogue().features) == 3
+    assert [(obj.id, obj.parts) for obj in other.tree(relations=True).nodes] == [(0, ()), (1, ()), (2, ())]
     assert len(other.labels(other.catalogue()).document["instances"]) == 3

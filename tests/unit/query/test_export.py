@@ -23,9 +23,9 @@ from tests.api.tiny_scene import SPLATS_A_CLUSTER, ply, splat_rows
 @pytest.fixture
 def scene(lift_tiny: Callable[..., Path], tmp_path: Path) -> Scene:
     """The tiny scene lifted, and one splat more that no camera sees."""
-    hidden = splat_rows()[:1].copy()
-    hidden[0, 2] = 40.0
-    return Scene(lift_tiny(tmp_path, splats=ply(np.concatenate([splat_rows(), hidden]))))
+    behind = splat_rows()[:1].copy()
+    behind[0, 2] = 40.0
+    return Scene(lift_tiny(tmp_path, splats=ply(np.concatenate([splat_rows(), behind]))))
 
 
 def of_lamp(scene: Scene, threshold: float = 0.5) -> Answer:
@@ -39,11 +39,11 @@ def test_the_object_is_what_was_selected_and_can_be_lifted_again(scene: Scene, t
     assert SPLATS_A_CLUSTER * 0.8 <= len(rows) <= SPLATS_A_CLUSTER * 1.2
     assert (tmp_path / "lamp.ply").read_bytes() == ply(rows)
     files = tmp_path / "lamp.ply", tmp_path / "c.json", [tmp_path / "f.st"]
-    again = lift_files(*files, LiftSettings.of(preset="row-sum"))
-    assert again.features.shape[0] == len(rows)
-    everything = of_lamp(scene, -1.0)
-    assert np.array_equal(everything.selected, everything.seen)
-    assert b"".join(object_splats(scene, everything)) == ply(splat_rows())
+    second_lift = lift_files(*files, LiftSettings.of(preset="row-sum"))
+    assert second_lift.features.shape[0] == len(rows)
+    all_splats = of_lamp(scene, -1.0)
+    assert np.array_equal(all_splats.selected, all_splats.seen)
+    assert b"".join(object_splats(scene, all_splats)) == ply(splat_rows())
 
 
 @pytest.mark.parametrize("suffix", [".splat", ".spz"])
@@ -51,13 +51,13 @@ def test_the_object_as_an_editors_file_has_the_same_rows(suffix: str, scene: Sce
     answer = of_lamp(scene)
     for name in ("lamp.ply", f"lamp{suffix}"):
         (tmp_path / name).write_bytes(b"".join(object_splats(scene, answer, Path(name).suffix)))
-    plain, made = read_splats(tmp_path / "lamp.ply"), read_splats(tmp_path / f"lamp{suffix}")
-    assert made.count == plain.count > 10
-    np.testing.assert_allclose(made.means, plain.means, atol=1e-6)
-    np.testing.assert_allclose(made.log_scales, plain.log_scales, atol=0.04)
-    np.testing.assert_allclose(made.opacity_logits.sigmoid(), plain.opacity_logits.sigmoid(), atol=0.003)
-    assert made.sh is not None and plain.sh is not None
-    np.testing.assert_allclose(made.sh, plain.sh, atol=0.02)
+    expected, exported = read_splats(tmp_path / "lamp.ply"), read_splats(tmp_path / f"lamp{suffix}")
+    assert exported.count == expected.count > 10
+    np.testing.assert_allclose(exported.means, expected.means, atol=1e-6)
+    np.testing.assert_allclose(exported.log_scales, expected.log_scales, atol=0.04)
+    np.testing.assert_allclose(exported.opacity_logits.sigmoid(), expected.opacity_logits.sigmoid(), atol=0.003)
+    assert exported.sh is not None and expected.sh is not None
+    np.testing.assert_allclose(exported.sh, expected.sh, atol=0.02)
 
 
 def test_scores_have_the_colours_of_the_map_and_what_was_not_seen_is_grey(scene: Scene, tmp_path: Path) -> None:
@@ -70,8 +70,8 @@ def test_scores_have_the_colours_of_the_map_and_what_was_not_seen_is_grey(scene:
     assert tuple(colours[-1]) == NOT_SEEN_COLOUR
     best, worst = int(answer.scores[:-1].argmax()), int(answer.scores[:-1].argmin())
     assert np.array_equal(colours[best], colour_map()[-1]) and np.array_equal(colours[worst], colour_map()[0])
-    known = {tuple(colour) for colour in colour_map().tolist()}
-    assert {tuple(colour) for colour in colours[:-1].tolist()} <= known
+    map_colours = {tuple(colour) for colour in colour_map().tolist()}
+    assert {tuple(colour) for colour in colours[:-1].tolist()} <= map_colours
 
 
 def test_exports_load_no_splats_and_know_when_their_file_changed(scene: Scene, tmp_path: Path) -> None:

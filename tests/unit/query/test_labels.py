@@ -1,4 +1,4 @@
-"""What every splat is, in files: the same labels from words, an answer and the objects of a lift."""
+"""Labels of all splats in files: the same from words, an answer and the objects of a lift."""
 
 from __future__ import annotations
 
@@ -32,39 +32,39 @@ def test_every_source_gives_instances_that_lie_in_their_boxes(scene: Scene) -> N
     answer = scene.ask(Query.of((Region("left", 0, 2),), threshold=0.5))
     sources = scene.segment(WORDS, EYE), answer, scene.catalogue(WORDS, EYE), scene.catalogue()
     for source, classes, instances in zip(sources, (3, 1, 3, 0), (3, 1, 3, 3), strict=True):
-        found = scene.labels(source)
-        assert [len(found.document[kind]) for kind in ("classes", "instances")] == [classes, instances]
-        for one in found.document["instances"]:
-            inside = found.columns["instance_id"] == one["instance_id"]
-            assert inside.sum() == one["splats"] and one["provenance"].endswith(f"{len(VIEWS)} views")
+        labels = scene.labels(source)
+        assert [len(labels.document[kind]) for kind in ("classes", "instances")] == [classes, instances]
+        for instance in labels.document["instances"]:
+            inside = labels.columns["instance_id"] == instance["instance_id"]
+            assert inside.sum() == instance["splats"] and instance["provenance"].endswith(f"{len(VIEWS)} views")
             if classes:
-                assert set(found.columns["class_id"][inside]) == {one["class_id"]}
+                assert set(labels.columns["class_id"][inside]) == {instance["class_id"]}
             places = scene.splats.positions()[inside]
-            low, high = one["box"]["low"], one["box"]["high"]
+            low, high = instance["box"]["low"], instance["box"]["high"]
             assert (places >= np.array(low) - 1e-6).all() and (places <= np.array(high) + 1e-6).all()
     with pytest.raises(InvalidQuery, match="an answer with selected splats"):
         scene.labels(scene.ask(Query.of((Vector((1.0,) * CHANNELS),), threshold=1.0)))
 
 
 def test_masks_in_views_are_those_of_the_instances(scene: Scene, tmp_path: Path) -> None:
-    found = scene.segment(WORDS, EYE)
-    scene.export(tmp_path / "m.json", found)
+    segmentation = scene.segment(WORDS, EYE)
+    scene.export(tmp_path / "m.json", segmentation)
     document = json.loads((tmp_path / "m.json").read_text(encoding="utf-8"))
-    assert [one["file_name"] for one in document["images"]] == list(scene.metadata.views)
-    names = {one["id"]: one["name"] for one in document["categories"]}
+    assert [entry["file_name"] for entry in document["images"]] == list(scene.metadata.views)
+    names = {entry["id"]: entry["name"] for entry in document["categories"]}
     assert sorted(names.values()) == sorted(WORDS)
-    view = next(one for one in document["images"] if one["file_name"] == "middle")
-    own = [one for one in document["annotations"] if one["image_id"] == view["id"]]
-    assert len(own) == 3
-    for one in own:
-        assert sum(one["segmentation"]["counts"]) == view["width"] * view["height"]
-        assert sum(one["segmentation"]["counts"][1::2]) == one["area"] > 0
-        centre = one["bbox"][0] + one["bbox"][2] / 2
-        assert WORDS.index(names[one["category_id"]]) == int(3 * centre / view["width"])
+    view = next(entry for entry in document["images"] if entry["file_name"] == "middle")
+    annotations = [entry for entry in document["annotations"] if entry["image_id"] == view["id"]]
+    assert len(annotations) == 3
+    for entry in annotations:
+        assert sum(entry["segmentation"]["counts"]) == view["width"] * view["height"]
+        assert sum(entry["segmentation"]["counts"][1::2]) == entry["area"] > 0
+        centre = entry["bbox"][0] + entry["bbox"][2] / 2
+        assert WORDS.index(names[entry["category_id"]]) == int(3 * centre / view["width"])
 
 
 @pytest.fixture
-def parted(scene: Scene, tmp_path: Path) -> Scene:
+def tree_scene(scene: Scene, tmp_path: Path) -> Scene:
     """The scene with its first object in two parts, nodes 3 and 4."""
     with_parts(scene).save(tmp_path / "parts.lift.safetensors")
     return Scene(tmp_path / "parts.lift.safetensors", scene.splats, scene.cameras)
@@ -72,52 +72,56 @@ def parted(scene: Scene, tmp_path: Path) -> Scene:
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".spz", pytest.param(".usdc", marks=needs_usd)])
 def test_files_of_a_tree_come_back_with_paths_and_the_smallest_nodes(
-    parted: Scene, tmp_path: Path, suffix: str, capsys: pytest.CaptureFixture[str]
+    tree_scene: Scene, tmp_path: Path, suffix: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "words.safetensors").write_bytes(text_table())
-    named = ["--table", str(tmp_path / "words.safetensors")]
-    assert main(["export", str(parted.path), "-o", str(tmp_path / f"x{suffix}"), *named, "--json"]) == 0
+    options = ["--table", str(tmp_path / "words.safetensors")]
+    assert main(["export", str(tree_scene.path), "-o", str(tmp_path / f"x{suffix}"), *options, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["nodes"] == 5
-    found = read_labels(tmp_path / f"x{suffix}")
-    assert parted.node is not None and parted.object is not None
-    np.testing.assert_array_equal(found.columns["node_id"], parted.node + 1)
-    np.testing.assert_array_equal(found.columns["instance_id"], parted.object + 1)
-    nodes = {one["node_id"]: one for one in found.document["nodes"]}
-    tree = parted.tree(WORDS, EYE).nodes
-    assert set(nodes) == {one.id + 1 for one in tree}
-    for one in tree:
-        told = nodes[one.id + 1]
-        assert (told["kind"], told["name"], told["splats"]) == (one.kind, one.name, one.splats)
-        assert list(told["path"]) == [node + 1 for node in one.path] and told["depth"] == len(one.path) - 1
-        assert list(told["parts"]) == [node + 1 for node in one.parts]
-        assert told["parent"] == (0 if one.parent is None else one.parent + 1)
-    for one in found.document["instances"]:
-        assert list(one["path"]) == [one["instance_id"]]
+    labels = read_labels(tmp_path / f"x{suffix}")
+    assert tree_scene.node is not None and tree_scene.object is not None
+    np.testing.assert_array_equal(labels.columns["node_id"], tree_scene.node + 1)
+    np.testing.assert_array_equal(labels.columns["instance_id"], tree_scene.object + 1)
+    nodes = {tree_node["node_id"]: tree_node for tree_node in labels.document["nodes"]}
+    tree = tree_scene.tree(WORDS, EYE).nodes
+    assert set(nodes) == {tree_node.id + 1 for tree_node in tree}
+    for tree_node in tree:
+        entry = nodes[tree_node.id + 1]
+        assert (entry["kind"], entry["name"], entry["splats"]) == (tree_node.kind, tree_node.name, tree_node.splats)
+        assert (
+            list(entry["path"]) == [node + 1 for node in tree_node.path] and entry["depth"] == len(tree_node.path) - 1
+        )
+        assert list(entry["parts"]) == [node + 1 for node in tree_node.parts]
+        assert entry["parent"] == (0 if tree_node.parent is None else tree_node.parent + 1)
+    for tree_node in labels.document["instances"]:
+        assert list(tree_node["path"]) == [tree_node["instance_id"]]
 
 
-def test_lines_and_masks_of_a_tree_have_its_parts(parted: Scene, tmp_path: Path) -> None:
-    tree = parted.tree()
-    parted.export(tmp_path / "o.jsonl", tree)
+def test_lines_and_masks_of_a_tree_have_its_parts(tree_scene: Scene, tmp_path: Path) -> None:
+    tree = tree_scene.tree()
+    tree_scene.export(tmp_path / "o.jsonl", tree)
     lines = [json.loads(line) for line in (tmp_path / "o.jsonl").read_text(encoding="utf-8").splitlines()]
-    assert [one["path"] for one in lines] == [[1], [2], [3], [1, 4], [1, 5]]
-    written = document_lines(Labels({}, {"instances": [{"name": "a\u2028b\x85\u2029"}]}))
-    (line,) = written.decode().splitlines()
+    assert [record["path"] for record in lines] == [[1], [2], [3], [1, 4], [1, 5]]
+    text = document_lines(Labels({}, {"instances": [{"name": "a\u2028b\x85\u2029"}]}))
+    (line,) = text.decode().splitlines()
     assert json.loads(line)["name"] == "a\u2028b\x85\u2029"
-    parted.export(tmp_path / "m.json", tree)
+    tree_scene.export(tmp_path / "m.json", tree)
     document = json.loads((tmp_path / "m.json").read_text(encoding="utf-8"))
     assert document["categories"] == [{"id": 0, "name": "object"}]
-    views = {one["image_id"] for one in document["annotations"]}
-    assert len(views) == len(parted.metadata.views)
+    views = {record["image_id"] for record in document["annotations"]}
+    assert len(views) == len(tree_scene.metadata.views)
     for view in views:
-        areas = {tuple(one["path"]): one["area"] for one in document["annotations"] if one["image_id"] == view}
+        areas = {
+            tuple(record["path"]): record["area"] for record in document["annotations"] if record["image_id"] == view
+        }
         assert set(areas) == {(1,), (2,), (3,), (1, 4), (1, 5)}
         assert areas[1, 4] + areas[1, 5] == pytest.approx(areas[1,], abs=0.1 * areas[1,])
 
 
-def test_rows_of_labels_keep_the_nodes_that_hold_theirs(parted: Scene) -> None:
-    found = parted.labels(parted.tree())
-    some = found.subset(found.columns["node_id"] == 4)
-    assert [one["node_id"] for one in some.document["nodes"]] == [1, 4]
+def test_rows_of_labels_keep_the_nodes_that_hold_theirs(tree_scene: Scene) -> None:
+    labels = tree_scene.labels(tree_scene.tree())
+    subset = labels.subset(labels.columns["node_id"] == 4)
+    assert [node["node_id"] for node in subset.document["nodes"]] == [1, 4]
 
 
 def test_run_lengths_are_columns_and_begin_with_zeros() -> None:
@@ -129,8 +133,8 @@ def test_run_lengths_are_columns_and_begin_with_zeros() -> None:
 def test_objects_are_lines_of_json(scene: Scene, tmp_path: Path) -> None:
     scene.export(tmp_path / "o.jsonl", scene.catalogue(WORDS, EYE))
     lines = [json.loads(line) for line in (tmp_path / "o.jsonl").read_text(encoding="utf-8").splitlines()]
-    assert sorted(one["name"] for one in lines) == sorted(WORDS)
-    assert all({"box", "oriented_box", "score", "views", "frame"} <= one.keys() for one in lines)
+    assert sorted(record["name"] for record in lines) == sorted(WORDS)
+    assert all({"box", "oriented_box", "score", "views", "frame"} <= record.keys() for record in lines)
 
 
 def test_the_command_writes_what_the_suffix_says(
@@ -144,11 +148,11 @@ def test_the_command_writes_what_the_suffix_says(
         return tmp_path / name
 
     labelled = read_labels(export("scene.glb", *words))
-    assert sorted(one["name"] for one in labelled.document["classes"]) == sorted(WORDS)
+    assert sorted(entry["name"] for entry in labelled.document["classes"]) == sorted(WORDS)
     for value in range(3):
         assert len(set(labelled.columns["class_id"][value == CLUSTER])) == 1
     ply = read_labels(export("scene.ply", *words))
-    for one, other in zip(ply.document["instances"], labelled.document["instances"], strict=True):
+    for entry, other in zip(ply.document["instances"], labelled.document["instances"], strict=True):
         exact = (
             "instance_id",
             "class_id",
@@ -160,14 +164,16 @@ def test_the_command_writes_what_the_suffix_says(
             "question",
             "provenance",
         )
-        assert [one[key] for key in exact] == [other[key] for key in exact]
-        assert one["score"] == pytest.approx(other["score"], abs=1e-6)
+        assert [entry[key] for key in exact] == [other[key] for key in exact]
+        assert entry["score"] == pytest.approx(other["score"], abs=1e-6)
     assert all(np.array_equal(ply.columns[name], values) for name, values in labelled.columns.items())
     assert read_splats(export("object.glb", "--object", "1")).count == SPLATS_A_CLUSTER
     assert read_splats(export("scene.spz")).count == 3 * SPLATS_A_CLUSTER
     assert len(export("objects.jsonl").read_text().splitlines()) == 3
-    found = read_labels(export("lamp.glb", "--text", "lamp", "--only", *words[1:]))
-    assert {one["name"] for one in found.document["instances"]} == {"lamp"} and (found.columns["class_id"] == 1).all()
+    labels = read_labels(export("lamp.glb", "--text", "lamp", "--only", *words[1:]))
+    assert {entry["name"] for entry in labels.document["instances"]} == {"lamp"} and (
+        labels.columns["class_id"] == 1
+    ).all()
     capsys.readouterr()
     export("object.ply", "--object", "1", "--json")
     assert json.loads(capsys.readouterr().out)["splats"] == SPLATS_A_CLUSTER  # that are in the file
@@ -185,7 +191,7 @@ def test_answers_that_were_added_are_labelled_too(scene: Scene) -> None:
     answers = {
         name: scene.ask(Query.of((Region("left", 0, row),), threshold=0.5)) for row, name in ((1, "a"), (2, "b"))
     }
-    some = dict(list(answers.items())[:1])
-    assert [one["name"] for one in scene.labels(some).document["classes"]] == ["a"]
-    some["b"] = answers["b"]
-    assert [one["name"] for one in scene.labels(some).document["classes"]] == ["a", "b"]
+    subset = dict(list(answers.items())[:1])
+    assert [entry["name"] for entry in scene.labels(subset).document["classes"]] == ["a"]
+    subset["b"] = answers["b"]
+    assert [entry["name"] for entry in scene.labels(subset).document["classes"]] == ["a", "b"]

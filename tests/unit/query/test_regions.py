@@ -1,4 +1,4 @@
-"""Which regions cover a pixel, and the pixels that a region covers."""
+"""Regions that cover a pixel, and the pixels that a region covers."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ def levels(scene: Scene) -> Scene:
 
 
 def test_regions_of_a_pixel_come_with_the_smallest_first(levels: Scene) -> None:
-    found = regions_at(levels, "left", 11, 6)
-    assert [one.example for one in found] == ["region:left:2:2", "region:left:0:0"]
-    assert [one.share for one in found] == [4 / (WIDTH * HEIGHT), 0.5]
+    regions = regions_at(levels, "left", 11, 6)
+    assert [region.example for region in regions] == ["region:left:2:2", "region:left:0:0"]
+    assert [region.share for region in regions] == [4 / (WIDTH * HEIGHT), 0.5]
     assert regions_at(levels, "left", WIDTH - 1, 0) == ()
     mask = region_mask(levels, Region("left", 2, 2))
     assert mask.shape == (HEIGHT, WIDTH) and np.argwhere(mask).tolist() == [[6, 10], [6, 11], [7, 10], [7, 11]]
     for y, x in np.ndindex(mask.shape):  # each says what the other does
-        assert mask[y, x] == ("region:left:2:2" in [one.example for one in regions_at(levels, "left", x, y)])
+        assert mask[y, x] == ("region:left:2:2" in [region.example for region in regions_at(levels, "left", x, y)])
 
 
 @pytest.mark.parametrize(
-    ("view", "x", "error", "said"),
+    ("view", "x", "error", "message"),
     [
         ("left", WIDTH, InvalidQuery, f"x in 0..{WIDTH - 1}"),
         ("middle", 0, InvalidQuery, "a view with regions"),
@@ -44,6 +44,8 @@ def test_regions_of_a_pixel_come_with_the_smallest_first(levels: Scene) -> None:
         ("nowhere", 0, NotFound, "a view of the lift's feature packs"),
     ],
 )
-def test_where_no_regions_are_is_told(levels: Scene, view: str, x: int, error: type[Exception], said: str) -> None:
-    with pytest.raises(error, match=said):
+def test_a_pixel_without_regions_is_an_error(
+    levels: Scene, view: str, x: int, error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
         regions_at(levels, view, x, 0)

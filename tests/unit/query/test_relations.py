@@ -1,4 +1,4 @@
-"""How things lie to each other, on a table of boxes of splats that are known by construction."""
+"""Spatial relations of objects, on a table of boxes of splats whose relations follow from their construction."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def shell(low: tuple[float, ...], high: tuple[float, ...], *, lid: bool = True) 
     return points[faces.any(axis=1)]
 
 
-THINGS = {
+POINTS = {
     "table": shell((0, 0, 0), (6, 4, 0.2)),
     "bowl": shell((1, 1, 0.3), (2.5, 2.5, 1.2), lid=False),
     "apple": shell((1.5, 1.5, 0.45), (2.0, 2.0, 0.95)),
@@ -35,11 +35,13 @@ THINGS = {
     "lamp": shell((1, 1, 3), (4, 3, 3.5)),
     "tree": shell((30, 30, 0), (31, 31, 5)),
 }
-ROWS = np.split(np.arange(sum(map(len, THINGS.values()))), np.cumsum([len(one) for one in THINGS.values()])[:-1])
+ROWS = np.split(
+    np.arange(sum(map(len, POINTS.values()))), np.cumsum([len(points) for points in POINTS.values()])[:-1]
+)
 
 
-def scene(turn: np.ndarray, things: Iterable[np.ndarray] = tuple(THINGS.values())) -> Splats:
-    means = np.concatenate(list(things)) @ turn.T
+def scene(turn: np.ndarray, clouds: Iterable[np.ndarray] = tuple(POINTS.values())) -> Splats:
+    means = np.concatenate(list(clouds)) @ turn.T
     count = len(means)
     return Splats(
         means=torch.tensor(means).float(),
@@ -50,30 +52,30 @@ def scene(turn: np.ndarray, things: Iterable[np.ndarray] = tuple(THINGS.values()
     )
 
 
-def found(turn: np.ndarray, up: tuple[float, float, float] | None) -> set[tuple[str, str, str]]:
-    splats, names = scene(turn), list(THINGS)
-    told = relations(splats, ROWS, np.ones(splats.count), WorldFrame(up=up))
-    return {(names[one.node], one.relation, names[one.other]) for one in told}
+def relations_of(turn: np.ndarray, up: tuple[float, float, float] | None) -> set[tuple[str, str, str]]:
+    splats, names = scene(turn), list(POINTS)
+    pairs = relations(splats, ROWS, np.ones(splats.count), WorldFrame(up=up))
+    return {(names[pair.node], pair.relation, names[pair.other]) for pair in pairs}
 
 
-LEFT = np.array([[0, 0, -1.0], [0, 1, 0], [1, 0, 0]])  # the table's up is the frame's -x
+ROTATION = np.array([[0, 0, -1.0], [0, 1, 0], [1, 0, 0]])  # the table's up is the frame's -x
 
 
-@pytest.mark.parametrize(("turn", "up"), [(np.eye(3), (0, 0, 2.0)), (LEFT, (-3.0, 0, 0))])
+@pytest.mark.parametrize(("turn", "up"), [(np.eye(3), (0, 0, 2.0)), (ROTATION, (-3.0, 0, 0))])
 def test_things_lie_as_they_were_put(turn: np.ndarray, up: tuple[float, float, float]) -> None:
-    told = found(turn, up)
+    triples = relations_of(turn, up)
     assert {
         ("bowl", "on", "table"), ("book", "on", "table"), ("table", "under", "bowl"), ("apple", "inside", "bowl"),
         ("table", "under", "lamp"), ("book", "under", "lamp"), ("bowl", "beside", "book"),
-    } <= told  # fmt: skip
-    assert not any("tree" in one for one in told) and ("lamp", "on", "table") not in told
-    assert ("apple", "beside", "bowl") not in told and ("table", "on", "bowl") not in told
+    } <= triples  # fmt: skip
+    assert not any("tree" in triple for triple in triples) and ("lamp", "on", "table") not in triples
+    assert ("apple", "beside", "bowl") not in triples and ("table", "on", "bowl") not in triples
 
 
 def test_without_up_nothing_is_on_another() -> None:
-    told = found(np.eye(3), None)
-    assert {relation for _, relation, _ in told} == {"touching", "inside"}
-    assert ("table", "touching", "bowl") in told and ("table", "touching", "lamp") not in told
+    triples = relations_of(np.eye(3), None)
+    assert {relation for _, relation, _ in triples} == {"touching", "inside"}
+    assert ("table", "touching", "bowl") in triples and ("table", "touching", "lamp") not in triples
 
 
 def circling(turn: np.ndarray, *, roll: float = 0.0, over: float = np.pi) -> list[Camera]:
@@ -84,8 +86,8 @@ def circling(turn: np.ndarray, *, roll: float = 0.0, over: float = np.pi) -> lis
         right = np.cross(forward, (0, 0, 1))
         right /= np.linalg.norm(right)
         down = np.cross(forward, right)
-        lean = roll * angle
-        sides = np.cos(lean) * right + np.sin(lean) * down, np.cos(lean) * down - np.sin(lean) * right
+        tilt = roll * angle
+        sides = np.cos(tilt) * right + np.sin(tilt) * down, np.cos(tilt) * down - np.sin(tilt) * right
         viewmat = np.eye(4)
         viewmat[:3, :3] = np.stack([*sides, forward]) @ turn.T
         cameras.append(Camera.pinhole("", 64, 48, 50.0, 50.0, 32.0, 24.0, viewmat))
@@ -100,13 +102,13 @@ def test_what_stands_before_a_slanting_wall_is_not_inside_of_it() -> None:
     hut = shell((-4, -4, 0), (4, 4, 5)) @ diagonal.T
     for around, expected in ((wall, False), (hut, True)):
         splats, rows = scene(np.eye(3), (around, cup)), [np.arange(len(around)), len(around) + np.arange(len(cup))]
-        told = relations(splats, rows, np.ones(splats.count), WorldFrame())
-        assert any(one.relation == "inside" for one in told) == expected
+        pairs = relations(splats, rows, np.ones(splats.count), WorldFrame())
+        assert any(pair.relation == "inside" for pair in pairs) == expected
 
 
 @pytest.mark.parametrize("over", [2 * np.pi, np.pi / 2, 0.6])
 def test_up_is_that_of_cameras_that_look_down(over: float) -> None:
-    for turn in (np.eye(3), LEFT):
+    for turn in (np.eye(3), ROTATION):
         assert np.array(upright(circling(turn, over=over))) @ turn[:, 2] > np.cos(np.deg2rad(5))
 
 
@@ -117,11 +119,11 @@ def test_cameras_that_are_rolled_have_no_up() -> None:
 
 def test_an_up_without_a_direction_is_refused() -> None:
     with pytest.raises(InvalidInput, match="up: expected"):
-        found(np.eye(3), (0.0, 0.0, 0.0))
+        relations_of(np.eye(3), (0.0, 0.0, 0.0))
 
 
 def test_gaps_are_in_metres_where_a_unit_is_known() -> None:
     splats, rows = scene(np.eye(3)), np.ones(sum(map(len, ROWS)))
     up = (0.0, 0.0, 1.0)
-    plain, metres = (relations(splats, ROWS, rows, WorldFrame(up=up, metres_per_unit=m)) for m in (None, 0.5))
-    assert [one.gap for one in metres] == [one.gap / 2 for one in plain] and any(one.gap for one in plain)
+    in_units, metres = (relations(splats, ROWS, rows, WorldFrame(up=up, metres_per_unit=m)) for m in (None, 0.5))
+    assert [pair.gap for pair in metres] == [pair.gap / 2 for pair in in_units] and any(pair.gap for pair in in_units)

@@ -25,9 +25,9 @@ def test_cosine_equals_its_definition(count: int, channels: int, dtype: torch.dt
     text = torch.randn(channels, generator=generator)
     wide = features.double()
     expected = (wide @ text.double()) / (wide.norm(dim=1) * text.double().norm()).clamp_min(1e-300)
-    found = torch.from_numpy(cosines(features.numpy(), norms_of(features.numpy()), text[None].numpy())[:, 0])
+    actual = torch.from_numpy(cosines(features.numpy(), norms_of(features.numpy()), text[None].numpy())[:, 0])
     torch.testing.assert_close(
-        found.double()[wide.norm(dim=1) > 0], expected[wide.norm(dim=1) > 0], atol=1e-5, rtol=0
+        actual.double()[wide.norm(dim=1) > 0], expected[wide.norm(dim=1) > 0], atol=1e-5, rtol=0
     )
 
 
@@ -35,10 +35,10 @@ def test_texts_in_one_pass_equal_one_by_one_and_no_feature_scores_the_minimum() 
     features = torch.randn(3000, 96).half().numpy()
     features[7] = 0
     norms, texts = norms_of(features), torch.randn(4, 96).numpy()
-    together = cosines(features, norms, texts)
+    batched = cosines(features, norms, texts)
     for column, text in enumerate(texts):
-        assert np.array_equal(together[:, column], cosines(features, norms, text[None])[:, 0])
-    assert together[7].tolist() == [-1.0] * 4
+        assert np.array_equal(batched[:, column], cosines(features, norms, text[None])[:, 0])
+    assert batched[7].tolist() == [-1.0] * 4
     for wrong in (torch.zeros(96), torch.full((96,), torch.nan), torch.ones(95)):
         with pytest.raises(InvalidQuery):
             cosines(features, norms, wrong[None].numpy())
@@ -74,11 +74,11 @@ def test_cosines_about_the_mean_equal_their_definition(seed: int, cone: float, d
     unit = torch.nn.functional.normalize(features.double(), dim=1)
     shares = weights.double() * torch.from_numpy(norms > 0)
     mean = (unit * shares[:, None]).sum(dim=0) / shares.sum()
-    found = mean_direction(rows, norms, weights.numpy())
-    np.testing.assert_allclose(found, mean.numpy(), atol=1e-5)
+    actual = mean_direction(rows, norms, weights.numpy())
+    np.testing.assert_allclose(actual, mean.numpy(), atol=1e-5)
     examples = unit[:3].float()
     expected = torch.nn.functional.cosine_similarity((unit - mean)[:, None], (unit[:3] - mean)[None], dim=2)
-    about = cosines_about(rows, norms, found, examples.numpy())
+    about = cosines_about(rows, norms, actual, examples.numpy())
     np.testing.assert_allclose(about[norms > 0], expected.numpy()[norms > 0], atol=3e-3)
 
 

@@ -168,17 +168,17 @@ def test_labels_go_out_as_columns_and_a_document(tiny_lift: Path, tmp_path: Path
     assert json.loads(capsys.readouterr().out)["files"] == {"labelled": str(out), "names": f"{out}.json"}
     document = json.loads((tmp_path / "labels.ply.json").read_text(encoding="utf-8"))
     assert (document["frame"], document["splats"]) == ("file", 60)
-    names = {one["class_id"]: one["name"] for one in document["classes"]}
+    names = {entry["class_id"]: entry["name"] for entry in document["classes"]}
     assert set(names.values()) == {"apple", "book", "lamp"}
     rows = PlyData.read(out)["vertex"]
     source = PlyData.read(tiny_lift.with_name("s.ply"))["vertex"]
     assert all(np.array_equal(rows[column.name], source[column.name]) for column in source.properties)
     assert [names[value] for value in rows["class_id"][::20]] == ["apple", "book", "lamp"]
     assert rows["score"].min() > 0.5 and rows["class_id"].dtype == np.int32
-    for one in document["instances"]:
-        inside = rows["instance_id"] == one["instance_id"]
-        assert set(rows["class_id"][inside]) == {one["class_id"]} and inside.sum() == one["splats"]
-        box, axes = one["oriented_box"], np.array(one["oriented_box"]["axes"])
+    for entry in document["instances"]:
+        inside = rows["instance_id"] == entry["instance_id"]
+        assert set(rows["class_id"][inside]) == {entry["class_id"]} and inside.sum() == entry["splats"]
+        box, axes = entry["oriented_box"], np.array(entry["oriented_box"]["axes"])
         places = np.stack([rows[axis][inside] for axis in "xyz"], axis=1) - box["centre"]
         assert (np.abs(places @ axes.T) <= np.array(box["half_sizes"]) + 1e-5).all()
         assert np.linalg.det(axes) == pytest.approx(1)

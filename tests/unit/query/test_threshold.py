@@ -27,9 +27,9 @@ def hills(*parts: tuple[float, float, int], seed: int = 0) -> torch.Tensor:
 @pytest.mark.parametrize("method", SEARCHED)
 def test_two_hills_are_parted_between_them_in_any_order_of_the_scores(method: str) -> None:
     scores = hills((0.2, 0.01, 9000), (0.3, 0.01, 3000))
-    found = find_threshold(scores, method)
-    assert 0.22 < found.value < 0.285
-    assert find_threshold(scores.flip(0), method) == found
+    threshold = find_threshold(scores, method)
+    assert 0.22 < threshold.value < 0.285
+    assert find_threshold(scores.flip(0), method) == threshold
 
 
 @pytest.mark.parametrize(
@@ -46,17 +46,17 @@ def test_two_hills_are_parted_between_them_in_any_order_of_the_scores(method: st
 def test_auto_finds_the_thing_that_stands_apart(
     parts: list[tuple[float, float, int]], low: float, high: float
 ) -> None:
-    strays = torch.linspace(0.66, 0.93, 6) if high > 0.9 else torch.empty(0)  # which leave a wide gap empty
-    assert low < find_threshold(torch.cat([hills(*parts), strays]), "auto").value < high
+    outliers = torch.linspace(0.66, 0.93, 6) if high > 0.9 else torch.empty(0)  # which leave a wide gap empty
+    assert low < find_threshold(torch.cat([hills(*parts), outliers]), "auto").value < high
 
 
 def test_paper_takes_the_valley_next_to_the_largest_peak_and_auto_the_topmost() -> None:
     scores = hills((0.15, 0.008, 50_000), (0.2, 0.008, 20_000), (0.3, 0.005, 3000))
-    found = find_threshold(scores, "paper")
-    assert 0.16 < found.value < 0.19
+    threshold = find_threshold(scores, "paper")
+    assert 0.16 < threshold.value < 0.19
     assert re.match(
         r"The histogram's largest peak lies at 0\.1[45]\d* and the next valley above it at 0\.1[678]",
-        found.explanation,
+        threshold.explanation,
     )
     assert 0.22 < find_threshold(scores, "auto").value < 0.29
 
@@ -67,7 +67,7 @@ def test_a_few_stray_scores_are_no_object() -> None:
         assert 0.22 < find_threshold(scores, method).value < 0.29
 
 
-def test_auto_looks_no_lower_than_it_is_told_to() -> None:
+def test_auto_takes_no_score_below_least() -> None:
     scores = hills((-0.3, 0.05, 50_000), (0.3, 0.05, 20_000), (0.7, 0.05, 5000))
     anywhere, above = find_threshold(scores), find_threshold(scores, least=0.4)
     assert anywhere.value < 0.15 and anywhere.explanation.startswith("The share")
@@ -79,8 +79,8 @@ def test_auto_looks_no_lower_than_it_is_told_to() -> None:
 
 def test_the_valley_lies_below_the_first_hill_from_above() -> None:
     scores = hills((0.2, 0.01, 50_000), (0.3, 0.01, 3000), (0.4, 0.01, 2000), (0.6, 0.01, 1000))
-    found = find_threshold(scores, "valley")
-    assert 0.45 < found.value < 0.55 and "first hill" in found.explanation
+    threshold = find_threshold(scores, "valley")
+    assert 0.45 < threshold.value < 0.55 and "first hill" in threshold.explanation
 
 
 def test_auto_says_when_nothing_stands_apart() -> None:
@@ -89,8 +89,8 @@ def test_auto_says_when_nothing_stands_apart() -> None:
 
 
 def test_a_given_threshold_is_kept_where_a_score_can_be_it() -> None:
-    found = find_threshold(torch.rand(10), 0.3)
-    assert (found.value, found.method) == (0.3, "fixed")
+    threshold = find_threshold(torch.rand(10), 0.3)
+    assert (threshold.value, threshold.method) == (0.3, "fixed")
     for number in (1.001, math.nan):
         with pytest.raises(InvalidQuery, match="threshold: expected a number from -1 to 1"):
             find_threshold(torch.rand(10), number)
@@ -102,15 +102,15 @@ def test_a_given_threshold_is_kept_where_a_score_can_be_it() -> None:
 
 def test_the_stable_stretch_lies_between_the_hills() -> None:
     scores = hills((0.2, 0.02, 9000), (0.5, 0.02, 3000))
-    found = find_threshold(scores, "stability")
-    assert 0.27 < found.value < 0.43 and "stable from" in found.explanation
+    threshold = find_threshold(scores, "stability")
+    assert 0.27 < threshold.value < 0.43 and "stable from" in threshold.explanation
 
 
 @pytest.mark.parametrize("method", SEARCHED)
 def test_scores_that_are_equal_or_none_say_so(method: str) -> None:
     for count in (1, 1000):
-        found = find_threshold(torch.full((count,), 0.25), method)
-        assert found.value == 0.25 and "no valley" in found.explanation
+        threshold = find_threshold(torch.full((count,), 0.25), method)
+        assert threshold.value == 0.25 and "no valley" in threshold.explanation
     assert find_threshold(torch.empty(0), method).value == math.inf
 
 
@@ -118,28 +118,28 @@ def test_scores_that_are_equal_or_none_say_so(method: str) -> None:
 def test_one_hill_falls_back_to_otsu_and_says_so(method: str) -> None:
     rising = torch.linspace(0, 1, 10_000)  # is nowhere stable, and its square root's histogram only rises
     rising = rising if method == "stability" else rising**0.5
-    found = find_threshold(rising, method)
-    assert found.value == find_threshold(rising, "otsu").value and "stands in" in found.explanation
+    threshold = find_threshold(rising, method)
+    assert threshold.value == find_threshold(rising, "otsu").value and "stands in" in threshold.explanation
 
 
 def test_weights_count_like_repeated_scores() -> None:
     scores = hills((0.2, 0.01, 2000), (0.3, 0.01, 500))
     weights = torch.where(scores > 0.25, 3.0, 1.0)
-    repeated = torch.cat([scores, scores[scores > 0.25], scores[scores > 0.25]])
+    copies = torch.cat([scores, scores[scores > 0.25], scores[scores > 0.25]])
     for method in SEARCHED:
         weighted = find_threshold(scores, method, weights).value
-        assert weighted == pytest.approx(find_threshold(repeated, method).value, abs=2e-3)
+        assert weighted == pytest.approx(find_threshold(copies, method).value, abs=2e-3)
 
 
 @pytest.mark.parametrize("method", SEARCHED)
-def test_the_share_above_is_told_as_one_of_the_evidence_or_of_the_pixels(method: str) -> None:
+def test_explanation_has_the_share_above_the_threshold(method: str) -> None:
     scores = hills((0.2, 0.01, 9000), (0.3, 0.01, 1000))
     weights = torch.where(scores > 0.25, 1.0, 9.0)  # a tenth of the scores is an eighty-second of the weight
-    assert f"; 10.0% of the pixels at or above {find_threshold(scores, method).value:.4g}." in told(scores, method)
-    assert "; 1.2% of the total weight at or above 0.2" in told(scores, method, weights)
+    assert f"; 10.0% of the pixels at or above {find_threshold(scores, method).value:.4g}." in explain(scores, method)
+    assert "; 1.2% of the total weight at or above 0.2" in explain(scores, method, weights)
 
 
-def told(scores: torch.Tensor, method: str, weights: torch.Tensor | None = None) -> str:
+def explain(scores: torch.Tensor, method: str, weights: torch.Tensor | None = None) -> str:
     return find_threshold(scores, method, weights).explanation
 
 
@@ -149,9 +149,9 @@ SCORES = hnp.arrays(np.float32, st.integers(1, 300), elements=st.floats(-1, 1, w
 @given(scores=SCORES, method=st.sampled_from(SEARCHED))
 @settings(max_examples=200, deadline=None)
 def test_any_scores_have_a_threshold_between_their_least_and_greatest(scores: np.ndarray, method: str) -> None:
-    found = find_threshold(torch.from_numpy(scores), method)
-    assert scores.min() <= found.value <= scores.max()
-    assert found.explanation.endswith(".")
+    threshold = find_threshold(torch.from_numpy(scores), method)
+    assert scores.min() <= threshold.value <= scores.max()
+    assert threshold.explanation.endswith(".")
 
 
 @given(scores=SCORES, method=st.sampled_from(SEARCHED), power=st.integers(-3, 6))
@@ -171,7 +171,7 @@ def test_thresholds_scale_with_any_scores(scores: np.ndarray, method: str, power
 @settings(max_examples=60, deadline=None)
 def test_thresholds_move_with_the_scores(seed: int, method: str, scale: float, shift: float) -> None:
     scores = hills((0.2, 0.02, 3000), (0.35, 0.02, 900), (0.6, 0.03, 400), seed=seed)
-    plain = find_threshold(scores, method).value
-    moved = find_threshold(scores * scale + shift, method).value
+    base = find_threshold(scores, method).value
+    scaled = find_threshold(scores * scale + shift, method).value
     spread = float(scores.max() - scores.min())
-    assert (moved - shift) / scale == pytest.approx(plain, abs=0.02 * spread)
+    assert (scaled - shift) / scale == pytest.approx(base, abs=0.02 * spread)

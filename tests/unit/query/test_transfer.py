@@ -39,40 +39,46 @@ def lifted(scene: Scene) -> tuple[LiftResult, Splats]:
 def test_rows_that_are_kept_come_back_as_they_were(lifted: tuple[LiftResult, Splats]) -> None:
     result, splats = lifted
     order = np.random.default_rng(1).permutation(splats.count)[:45]
-    found = result.transferred(splats, splats[order])
+    moved_lift = result.transferred(splats, splats[order])
     for name in ("features", "total_weight", "agreement", "seen"):
-        assert torch.equal(getattr(found, name), getattr(result, name)[order]), name
+        assert torch.equal(getattr(moved_lift, name), getattr(result, name)[order]), name
     expected = result[order]
-    assert expected.object is not None and found.object is not None and torch.equal(found.object, expected.object)
-    facts = found.diagnostics["transfer"]
+    assert (
+        expected.object is not None
+        and moved_lift.object is not None
+        and torch.equal(moved_lift.object, expected.object)
+    )
+    facts = moved_lift.diagnostics["transfer"]
     assert (facts["rows"], facts["mixed"], facts["without_partner"], facts["moved"]) == (45, 0, 0, None)
-    found.require_splats(splats[order])
+    moved_lift.require_splats(splats[order])
 
 
 def test_exact_copies_share_what_the_lift_says_of_them(lifted: tuple[LiftResult, Splats]) -> None:
-    whole, splats = lifted
+    lift, splats = lifted
     twice = np.r_[np.arange(splats.count), [3, 3]]  # three splats where one was
-    result, copied = whole[twice], splats[twice]
+    result, copied = lift[twice], splats[twice]
     rows = [3, splats.count, splats.count + 1]
     features = result.features.clone()
     features[rows[1]] = -features[3]  # which views saw otherwise
     result = replace(result, features=features)
     for order in (np.arange(len(twice)), np.arange(len(twice))[::-1].copy()):
-        found = result.transferred(copied, copied[order])
+        moved_lift = result.transferred(copied, copied[order])
         mean = features[rows].float().mean(dim=0)
         for place in np.flatnonzero(np.isin(order, rows)):
-            torch.testing.assert_close(found.features[place].float(), mean, atol=1e-3, rtol=0)
-        others = np.flatnonzero(~np.isin(order, rows))
-        assert torch.equal(found.features[others], features[order][others])
-        assert float(found.total_weight.sum()) == pytest.approx(float(result.total_weight.sum()), rel=1e-5)
-        assert found.diagnostics["transfer"]["rows"] == len(twice)
+            torch.testing.assert_close(moved_lift.features[place].float(), mean, atol=1e-3, rtol=0)
+        rest = np.flatnonzero(~np.isin(order, rows))
+        assert torch.equal(moved_lift.features[rest], features[order][rest])
+        assert float(moved_lift.total_weight.sum()) == pytest.approx(float(result.total_weight.sum()), rel=1e-5)
+        assert moved_lift.diagnostics["transfer"]["rows"] == len(twice)
 
 
 def test_quantised_rows_are_still_rows(lifted: tuple[LiftResult, Splats], tmp_path: Path) -> None:
     result, splats = lifted
     write_splats(tmp_path / "s.spz", splats)
-    found = result.transferred(splats, tmp_path / "s.spz")
-    assert torch.equal(found.features, result.features) and found.metadata.splats.path == str(tmp_path / "s.spz")
+    moved_lift = result.transferred(splats, tmp_path / "s.spz")
+    assert torch.equal(moved_lift.features, result.features) and moved_lift.metadata.splats.path == str(
+        tmp_path / "s.spz"
+    )
 
 
 def test_splats_between_others_mix_what_these_have(lifted: tuple[LiftResult, Splats]) -> None:
@@ -84,39 +90,45 @@ def test_splats_between_others_mix_what_these_have(lifted: tuple[LiftResult, Spl
         splats.opacity_logits[1:],
     )
     inside = CLUSTER[:-1] == CLUSTER[1:]
-    found = result.transferred(splats, middles[inside])
-    old, new = result.features.float().numpy(), found.features.float().numpy()
-    centres = np.stack([old[one == CLUSTER].mean(axis=0) for one in range(3)])
+    moved_lift = result.transferred(splats, middles[inside])
+    old, new = result.features.float().numpy(), moved_lift.features.float().numpy()
+    centres = np.stack([old[cluster == CLUSTER].mean(axis=0) for cluster in range(3)])
     assert (np.argmax(new @ centres.T, axis=1) == CLUSTER[:-1][inside]).all()
-    assert found.diagnostics["transfer"]["mixed"] > 0 and found.object is not None and result.object is not None
-    assert (found.object.numpy() == result.object.numpy()[:-1][inside]).all()
+    assert (
+        moved_lift.diagnostics["transfer"]["mixed"] > 0
+        and moved_lift.object is not None
+        and result.object is not None
+    )
+    assert (moved_lift.object.numpy() == result.object.numpy()[:-1][inside]).all()
 
 
 def test_splats_of_elsewhere_find_no_partner_and_have_no_feature(lifted: tuple[LiftResult, Splats]) -> None:
     result, splats = lifted
-    more = splats.means.clone()
-    more[:7] += 50
-    other = Splats(more, splats.quats, splats.log_scales, splats.opacity_logits, sh=splats.sh)
-    found = result.transferred(splats, other)
-    assert found.diagnostics["transfer"]["without_partner"] == 7
+    means = splats.means.clone()
+    means[:7] += 50
+    other = Splats(means, splats.quats, splats.log_scales, splats.opacity_logits, sh=splats.sh)
+    moved_lift = result.transferred(splats, other)
+    assert moved_lift.diagnostics["transfer"]["without_partner"] == 7
     assert (
-        not found.seen[:7].any()
-        and not found.features[:7].any()
-        and (found.object is None or (found.object[:7] == -1).all())
+        not moved_lift.seen[:7].any()
+        and not moved_lift.features[:7].any()
+        and (moved_lift.object is None or (moved_lift.object[:7] == -1).all())
     )
 
 
-@pytest.mark.parametrize("given", [True, False])
-def test_a_moved_scene_is_found_or_told(given: bool, lifted: tuple[LiftResult, Splats]) -> None:
+@pytest.mark.parametrize("with_matrix", [True, False])
+def test_a_moved_scene_is_found_or_given(with_matrix: bool, lifted: tuple[LiftResult, Splats]) -> None:
     result, splats = lifted
     order = np.random.default_rng(2).permutation(splats.count)
-    moved = splats[order].transformed(**MOVE)
+    transformed = splats[order].transformed(**MOVE)
     matrix = np.eye(4)
-    found = find_similarity(splats, moved)
-    matrix[:3, :3], matrix[:3, 3] = found.scale * found.rotation, found.translation
-    assert found.scale == pytest.approx(2.5, rel=1e-4)
-    np.testing.assert_allclose(found.points(splats.positions()[order].astype(float)), moved.positions(), atol=1e-3)
-    other = result.transferred(splats, moved, matrix=matrix if given else None)
+    move = find_similarity(splats, transformed)
+    matrix[:3, :3], matrix[:3, 3] = move.scale * move.rotation, move.translation
+    assert move.scale == pytest.approx(2.5, rel=1e-4)
+    np.testing.assert_allclose(
+        move.points(splats.positions()[order].astype(float)), transformed.positions(), atol=1e-3
+    )
+    other = result.transferred(splats, transformed, matrix=matrix if with_matrix else None)
     assert torch.equal(other.features, result.features[order]) and not other.metadata.cameras.path
 
 
@@ -125,9 +137,9 @@ def test_a_scene_that_stays_with_new_splats_added_is_not_moved(lifted: tuple[Lif
     places = splats.means.clone()
     places[::4] += 20  # a quarter of the copy is of elsewhere
     copy = Splats(places, splats.quats, splats.log_scales, splats.opacity_logits, sh=splats.sh)
-    found = result.transferred(splats, copy)
-    assert found.diagnostics["transfer"]["moved"] is None
-    assert torch.equal(found.features[1::4], result.features[1::4])
+    moved_lift = result.transferred(splats, copy)
+    assert moved_lift.diagnostics["transfer"]["moved"] is None
+    assert torch.equal(moved_lift.features[1::4], result.features[1::4])
 
 
 def test_a_file_whose_frame_is_undeclared_is_found_half_a_turn_away(
@@ -135,9 +147,9 @@ def test_a_file_whose_frame_is_undeclared_is_found_half_a_turn_away(
 ) -> None:
     result, splats = lifted
     write_splats(tmp_path / "undeclared.spz", splats.transformed(rotation=(0.0, 1.0, 0.0, 0.0)))
-    found = result.transferred(splats, tmp_path / "undeclared.spz")
-    assert torch.equal(found.features, result.features)
-    rotation = np.array(found.diagnostics["transfer"]["moved"]["rotation"])
+    moved_lift = result.transferred(splats, tmp_path / "undeclared.spz")
+    assert torch.equal(moved_lift.features, result.features)
+    rotation = np.array(moved_lift.diagnostics["transfer"]["moved"]["rotation"])
     np.testing.assert_allclose(rotation, np.diag([1.0, -1.0, -1.0]), atol=1e-3)
 
 
@@ -180,8 +192,11 @@ def test_the_command_writes_a_lift_that_is_asked_like_the_first(
 def test_splats_at_one_place_that_look_alike_take_from_one_another(lifted: tuple[LiftResult, Splats]) -> None:
     result, splats = lifted
     rows = np.zeros(60, np.int64)  # all as the first
-    alike = splats[rows]
-    found = result[rows].transferred(alike, alike[:40])
-    assert torch.equal(found.features, result.features[rows[:40]]) and found.diagnostics["transfer"]["rows"] == 40
+    copies = splats[rows]
+    moved_lift = result[rows].transferred(copies, copies[:40])
+    assert (
+        torch.equal(moved_lift.features, result.features[rows[:40]])
+        and moved_lift.diagnostics["transfer"]["rows"] == 40
+    )
     with pytest.raises(InvalidSplats, match="agree on one"):
-        find_similarity(alike, alike.transformed(**MOVE))
+        find_similarity(copies, copies.transformed(**MOVE))
