@@ -358,7 +358,7 @@ class Answers:
         selection = _selected(scene, EDITED, request["before"]).edit(edit, answer)
         count, box = int(selection.splats.sum()), selection.box
         corners = None if box is None else {"low": box.low, "high": box.high}
-        return Frame({"edit": edit.described(), "count": count, "box": corners}, zlib.compress(selection.bits))
+        return Frame({"edit": edit.to_json(), "count": count, "box": corners}, zlib.compress(selection.bits))
 
     def _export(self, request: dict[str, Any]) -> Frame:
         """Write a ZIP of answers, of words or of objects, as the draft."""

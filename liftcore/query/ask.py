@@ -65,36 +65,36 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-MOST_RIVALS = 3  # words that are named as nearer than what was asked
-MOST_OF_IT = 0.5  # the same where an answer is clear
-LEAST_RIVAL = 0.1  # of what is looked at, by total weight, to which such a word is the nearest
-WHOLE = 0.9  # of a thing's splats, from which what is found of it is no part
+MOST_RIVALS = 3  # competing words in an answer
+LEAST_RIVAL = 0.1  # least share of the selected total weight to which such a word is the nearest
+LEAST_RIVAL_OF_CLEAR = 0.5  # the same for a clear answer
+WHOLE_SHARE = 0.9  # of an object's splats, from which a selection is no part of it
 _OF_ANSWER = ("rivals", "candidates", "threshold", "clear", "statistics", "present", "presence", "reason")
 _QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 
 
 @dataclass(frozen=True)
-class Question:
+class ResolvedQuery:
     """A query with the directions of its terms and the words that compete with them."""
 
     query: Query
     rows: np.ndarray  # [n, F] f32, the unit direction of each term
-    plain: np.ndarray  # [n] bool, the terms that are compared by uncentred cosines: words
+    by_cosine: np.ndarray  # [n] bool, the terms that are compared by uncentred cosines: words
     references: References | str  # of the words' space, or the reason why there are none
     asked_as: Mapping[int, Wording]  # of the texts, by their indices among the terms
     pack: np.ndarray | None = None  # [n, F] f32, unit, all words of a table that has too few to be references
     candidates: tuple[Candidate, ...] = ()  # nodes that clicks among the terms may mean
-    part: PartQuestion | None = None  # of a phrase that names a part of an object
+    part: PartQuery | None = None  # of a phrase that names a part of an object
     unknown_part: PartPhrase | None = None  # a part for which there is no word, so that the object is selected
 
 
 @dataclass(frozen=True)
-class PartQuestion:
+class PartQuery:
     """Queries for a phrase that names a part of an object."""
 
     phrase: PartPhrase
-    thing: Question
-    part: Question
+    whole_query: ResolvedQuery
+    part: ResolvedQuery
 
 
 @deprecated_names(why="reason")
@@ -129,12 +129,12 @@ class VectorAnswer:
 def ask(scene: OpenedLift, query: Query | str, encoder: TextEncoder | None = None) -> Answer:
     """Score every splat for a query and select those that answer it.
 
-    A splat counts in the histogram by its total weight: what hardly a ray met scores by the chance of a few pixels.
-    It is still selected by its score. With ``weight_by`` its confidence counts too. The threshold `auto` is held to
-    other words, and things of the region graph may be taken whole (`liftcore.query.selection`); any other selects by
-    the score alone. Scores that are all equal or zero select nothing. A word for what is not there
-    (`liftcore.query.presence`) is left out of the scores, and where no other positive is left nothing is selected,
-    unless the query keeps what is absent. Negatives and examples are not questioned.
+    A splat counts in the histogram by its total weight, as splats hit by few rays have noisy scores. It is still
+    selected by its score. With ``weight_by`` its confidence counts, too. The threshold `auto` is compared with other
+    words, and objects of the region graph may be selected as a whole (`liftcore.query.selection`). Any other
+    threshold selects by the score alone. Scores that are all equal or zero select nothing. Absent words
+    (`liftcore.query.presence`) are left out of the scores, and without another positive nothing is selected, unless
+    the query keeps absent words. The presence of negatives and examples is not estimated.
 
     Args:
         scene: an opened lift.
@@ -148,7 +148,7 @@ def ask(scene: OpenedLift, query: Query | str, encoder: TextEncoder | None = Non
         InvalidLift: an example needs the scene's files, and they moved or changed.
     """
     query = Query.of(query) if isinstance(query, str) else query
-    return answers(scene, [question(scene, query, encoder)])[0]
+    return answers(scene, [resolve_query(scene, query, encoder)])[0]
 
 
 def query_vectors(
@@ -184,17 +184,19 @@ def query_vectors(
     asked_as = wordings(scene, query, reader)
     rows = directions(scene, query, reader, asked_as=asked_as)
     if references is not None:
-        others = References.of(references, scene.channels)
+        reference_words = References.of(references, scene.channels)
     elif reader is not None:
-        others = references_of(reader, scene.metadata.text_space)
+        reference_words = references_of(reader, scene.metadata.text_space)
     else:
-        others = references_of_space(rows, scene.metadata.text_space)
+        reference_words = references_of_space(rows, scene.metadata.text_space)
     pack = None if reader is None else pack_of(reader)
-    answer = answers(scene, [Question(query, rows, np.ones(len(rows), np.bool_), others, asked_as, pack)])[0]
+    answer = answers(
+        scene, [ResolvedQuery(query, rows, np.ones(len(rows), np.bool_), reference_words, asked_as, pack)]
+    )[0]
     scores, selected = map(torch.from_numpy, (answer.scores, answer.selected))
-    found = objects(scene, answer) if grouped else None
-    cut, known = answer.threshold, (answer.present, answer.presence, answer.reason)
-    return VectorAnswer(scores, selected, cut.value, cut.explanation, answer.clear, *known, found)
+    groups = objects(scene, answer) if grouped else None
+    cut, presence_fields = answer.threshold, (answer.present, answer.presence, answer.reason)
+    return VectorAnswer(scores, selected, cut.value, cut.explanation, answer.clear, *presence_fields, groups)
 
 
 def _terms(values: Any) -> tuple[str | Vector, ...]:
@@ -207,12 +209,14 @@ def _terms(values: Any) -> tuple[str | Vector, ...]:
             raise TypeError
         rows = np.asarray(as_numpy(values), np.float64)
     except (TypeError, ValueError):
-        what = type(values).__name__
-        raise InvalidQuery("query", expected="a text, a list of texts, or vectors [n, F]", got=what) from None
+        type_name = type(values).__name__
+        raise InvalidQuery("query", expected="a text, a list of texts, or vectors [n, F]", got=type_name) from None
     return tuple(Vector(tuple(row.tolist())) for row in np.atleast_2d(rows)) if rows.size else ()
 
 
-def question(scene: OpenedLift, query: Query, encoder: TextEncoder | None, names: Sequence[str] = ()) -> Question:
+def resolve_query(
+    scene: OpenedLift, query: Query, encoder: TextEncoder | None, names: Sequence[str] = ()
+) -> ResolvedQuery:
     """Resolve the terms of a query to directions; all errors of a query are raised here (see `ask`).
 
     Args:
@@ -220,21 +224,21 @@ def question(scene: OpenedLift, query: Query, encoder: TextEncoder | None, names
     """
     phrase = part_phrase(scene, query, encoder)
     if phrase is None:
-        return replace(_question(scene, query, encoder, names), unknown_part=unknown_part(scene, query, encoder))
-    thing = _question(
+        return replace(_resolve(scene, query, encoder, names), unknown_part=unknown_part(scene, query, encoder))
+    object_query = _resolve(
         scene, Query(text=[phrase.object_phrase], weight_by=query.weight_by, absent=query.absent), encoder
     )
-    asked = _question(scene, query, encoder, names) if not phrase.sure else replace(thing, query=query)
-    return replace(asked, part=PartQuestion(phrase, thing, _question(scene, query, encoder, names, phrase)))
+    request = _resolve(scene, query, encoder, names) if not phrase.sure else replace(object_query, query=query)
+    return replace(request, part=PartQuery(phrase, object_query, _resolve(scene, query, encoder, names, phrase)))
 
 
-def _question(
+def _resolve(
     scene: OpenedLift,
     query: Query,
     encoder: TextEncoder | None,
     names: Sequence[str] = (),
     phrase: PartPhrase | None = None,
-) -> Question:
+) -> ResolvedQuery:
     """Resolve a query as a whole, or for the part that a phrase names.
 
     An encoder of any text encodes the phrase, which is more specific than the part's word alone.
@@ -249,58 +253,56 @@ def _question(
     scene.splat_weights(query.weight_by)
     encoder = encoder or scene.table
     if encoder is None or not words[: len(query.positives)].any():
-        return Question(query, rows, words, "", asked_as, candidates=candidates(scene, query))
-    return Question(query, rows, words, references_of(encoder, scene.metadata.text_space), asked_as, pack_of(encoder))
+        return ResolvedQuery(query, rows, words, "", asked_as, candidates=candidates(scene, query))
+    return ResolvedQuery(
+        query, rows, words, references_of(encoder, scene.metadata.text_space), asked_as, pack_of(encoder)
+    )
 
 
 @one_thread()
-def answers(scene: OpenedLift, questions: Sequence[Question]) -> list[Answer]:
+def answers(scene: OpenedLift, requests: Sequence[ResolvedQuery]) -> list[Answer]:
     """Answer several queries in one pass over the features; each to the same bits as alone."""
-    if any(asked.part for asked in questions):
-        return [_part_answer(scene, asked) if asked.part else answers(scene, [asked])[0] for asked in questions]
-    similarities = _similarities(scene, questions)
-    if len(questions) == 1:
-        return [_answer(scene, questions[0], similarities[0])]
+    if any(request.part for request in requests):
+        return [
+            _part_answer(scene, request) if request.part else answers(scene, [request])[0] for request in requests
+        ]
+    similarities = _similarities(scene, requests)
+    if len(requests) == 1:
+        return [_answer(scene, requests[0], similarities[0])]
     with ThreadPoolExecutor(cores()) as pool:
-        return list(pool.map(lambda asked, similar: _answer(scene, asked, similar), questions, similarities))
+        return list(pool.map(lambda request, similar: _answer(scene, request, similar), requests, similarities))
 
 
-def _part_answer(scene: OpenedLift, asked: Question) -> Answer:
+def _part_answer(scene: OpenedLift, request: ResolvedQuery) -> Answer:
     """Answer a query for a part of an object: the object first, then the part among its splats and nodes alone.
 
     A phrase that may not mean a part (`PartPhrase`) is answered as a whole if no such part is found.
     """
-    assert asked.part is not None
-    sure, part = asked.part.phrase.sure, asked.part.part
-    (thing,) = answers(scene, [asked.part.thing])
-    if thing.count:
-        inside = add_objects(scene, thing.selected)
-        (found,) = answers(scene.within(inside), [part])
-        nothing = "" if found.count or found.present is False else " Nothing stands out there."
-        told = f"{asked.part.phrase.object_phrase!r} has {thing.count:,} splats. Within it: {found.reason}{nothing}"
-        if found.count >= WHOLE * inside.sum() and asked.query.absent == "drop":
-            told = (
-                f"{asked.part.phrase.object_phrase!r} is there, but {part.query.text[0]!r} tells no part of it from "
-                "the rest."
-            )
-            fields = {name: getattr(found, name) for name in _OF_ANSWER} | {"clear": False, "present": False}
-            found = Answer.of(found.query, found.scores, found.seen, np.zeros_like(inside), **fields)
+    assert request.part is not None
+    phrase, part = request.part.phrase.object_phrase, request.part.part
+    (object_answer,) = answers(scene, [request.part.whole_query])
+    if object_answer.count:
+        inside = add_objects(scene, object_answer.selected)
+        (answer,) = answers(scene.within(inside), [part])
+        note = "" if answer.count or answer.present is False else " Nothing stands out there."
+        reason = f"{phrase!r} has {object_answer.count:,} splats. Within it: {answer.reason}{note}"
+        if answer.count >= WHOLE_SHARE * inside.sum() and request.query.absent == "drop":
+            reason = f"{phrase!r} is there, but {part.query.text[0]!r} tells no part of it from the rest."
+            fields = {name: getattr(answer, name) for name in _OF_ANSWER} | {"clear": False, "present": False}
+            answer = Answer.of(answer.query, answer.scores, answer.seen, np.zeros_like(inside), **fields)
     else:
-        found, nothing = (
-            thing,
-            "it" if thing.present is False else f"{asked.part.phrase.object_phrase!r} is not found, and",
-        )
-        told = f"{thing.reason} So {nothing} has no parts."
-    if not found.count and not sure:
-        return answers(scene, [replace(asked, part=None)])[0]
-    fields = {name: getattr(found, name) for name in _OF_ANSWER} | {"reason": told}
-    if thing.present is False:
-        fields |= {"present": False, "presence": thing.presence}
+        answer, note = object_answer, "it" if object_answer.present is False else f"{phrase!r} is not found, and"
+        reason = f"{object_answer.reason} So {note} has no parts."
+    if not answer.count and not request.part.phrase.sure:
+        return answers(scene, [replace(request, part=None)])[0]
+    fields = {name: getattr(answer, name) for name in _OF_ANSWER} | {"reason": reason}
+    if object_answer.present is False:
+        fields |= {"present": False, "presence": object_answer.presence}
     wording = tuple(WordMatch(**word._asdict()) for word in part.asked_as.values() if word.match)
-    return Answer.of(asked.query, found.scores, found.seen, found.selected, **fields, wording=wording)
+    return Answer.of(request.query, answer.scores, answer.seen, answer.selected, **fields, wording=wording)
 
 
-def located(scene: OpenedLift, answer: Answer, count: int | None = None) -> Answer:
+def locate(scene: OpenedLift, answer: Answer, count: int | None = None) -> Answer:
     """Add to an answer its best splats, and the box around all selected ones.
 
     A single outlier stretches the box; boxes of ``objects`` are without outliers.
@@ -312,66 +314,70 @@ def located(scene: OpenedLift, answer: Answer, count: int | None = None) -> Answ
         InvalidLift: the splats moved or changed since the lift.
     """
     places, count = scene.axes, answer.query.top if count is None else count
-    seen = np.flatnonzero(answer.seen)
-    scores = answer.scores[seen]
+    rows = np.flatnonzero(answer.seen)
+    scores = answer.scores[rows]
     if 0 < count < len(scores):
         last = np.partition(scores, len(scores) - count)[len(scores) - count]
-        seen = np.concatenate([seen[scores > last], seen[scores == last]])[:count]
-    best = seen[np.argsort(-answer.scores[seen], kind="stable")][:count]
+        rows = np.concatenate([rows[scores > last], rows[scores == last]])[:count]
+    best = rows[np.argsort(-answer.scores[rows], kind="stable")][:count]
     top = tuple(
         TopSplat(splat=int(row), score=float(answer.scores[row]), position=_point(places[:, row])) for row in best
     )
-    chosen = [axis[np.flatnonzero(answer.selected)] for axis in places] if answer.count else []
-    ends = [np.array([end(axis) for axis in chosen]) for end in (np.min, np.max)] if chosen else []
+    selected_axes = [axis[np.flatnonzero(answer.selected)] for axis in places] if answer.count else []
+    ends = [np.array([end(axis) for axis in selected_axes]) for end in (np.min, np.max)] if selected_axes else []
     return answer.model_copy(update={"top": top, "box": Box(*map(_point, ends)) if ends else None})
 
 
-def _similarities(scene: OpenedLift, questions: Sequence[Question]) -> list[np.ndarray]:
+def _similarities(scene: OpenedLift, requests: Sequence[ResolvedQuery]) -> list[np.ndarray]:
     """Compute for each query the cosines of every splat to each of its terms, [P, n] f32."""
     features, norms = scene.features, scene.norms
-    of_words = np.concatenate([asked.rows[asked.plain] for asked in questions])
+    of_words = np.concatenate([request.rows[request.by_cosine] for request in requests])
     # A row a word from here on, so that its scores are contiguous.
     columns = iter(np.ascontiguousarray(cosines(features, norms, of_words).T) if len(of_words) else ())
-    found = []
-    for asked in questions:
-        similar = np.empty((len(asked.rows), len(features)), np.float32)
-        if not asked.plain.all():
-            similar[~asked.plain] = cosines_about(features, norms, scene.mean, asked.rows[~asked.plain]).T
-        for row in np.flatnonzero(asked.plain):
+    output = []
+    for request in requests:
+        similar = np.empty((len(request.rows), len(features)), np.float32)
+        if not request.by_cosine.all():
+            similar[~request.by_cosine] = cosines_about(
+                features, norms, scene.mean, request.rows[~request.by_cosine]
+            ).T
+        for row in np.flatnonzero(request.by_cosine):
             similar[row] = next(columns)
-        found.append(similar.T)
-    return found
+        output.append(similar.T)
+    return output
 
 
-def _answer(scene: OpenedLift, asked: Question, similarities: np.ndarray) -> Answer:
-    query, seen = asked.query, scene.seen
+def _answer(scene: OpenedLift, request: ResolvedQuery, similarities: np.ndarray) -> Answer:
+    query, has_feature = request.query, scene.seen
     if query.sets:
         return _set_answer(scene, query)
-    presence, kept = _presence(scene, asked, similarities)
-    scores = combine(similarities if kept.all() else similarities[:, kept], int(kept[: len(query.positives)].sum()))
+    presence, mask = _presence(scene, request, similarities)
+    scores = combine(similarities if mask.all() else similarities[:, mask], int(mask[: len(query.positives)].sum()))
     if not scene.all_seen:
-        scores = np.where(seen, scores, np.float32(LOWEST_COSINE))
-    known = scores if scene.all_seen else scores[seen]
+        scores = np.where(has_feature, scores, np.float32(LOWEST_COSINE))
+    valid_scores = scores if scene.all_seen else scores[has_feature]
     if presence.present is False and query.absent == "drop":
         method = query.threshold if isinstance(query.threshold, str) else "fixed"
-        found = Threshold(value=math.inf, method=method, explanation=presence.reason, clear=False)
-        selected = np.zeros_like(seen)
+        threshold = Threshold(value=math.inf, method=method, explanation=presence.reason, clear=False)
+        selected = np.zeros_like(has_feature)
     else:
-        found, selected = _selected(scene, asked, kept, scores, scene.splat_weights(query.weight_by))
-    clear = found.clear and presence.present is not False and bool(selected.any())
-    least = MOST_OF_IT if clear and presence.present is not None else LEAST_RIVAL
-    competitors = _nearer_words(scene, asked, scores, selected, least)
-    meant = asked.candidates
-    if asked.unknown_part is not None and selected.any():
-        meant = parts_of(scene, objects_within(scene, selected))
-        thing = presence.reason.replace(
-            repr(query.text[0]), repr(asked.unknown_part.object_phrase)
+        threshold, selected = _select(scene, request, mask, scores, scene.splat_weights(query.weight_by))
+    clear = threshold.clear and presence.present is not False and bool(selected.any())
+    least = LEAST_RIVAL_OF_CLEAR if clear and presence.present is not None else LEAST_RIVAL
+    competitors = _nearer_words(scene, request, scores, selected, least)
+    nodes = request.candidates
+    if request.unknown_part is not None and selected.any():
+        nodes = parts_of(scene, objects_within(scene, selected))
+        sentence = presence.reason.replace(
+            repr(query.text[0]), repr(request.unknown_part.object_phrase)
         )  # what is there is the thing
-        presence = presence.model_copy(update={"reason": f"{thing} {_without_word(asked.unknown_part, len(meant))}"})
-    wording = tuple(WordMatch(**word._asdict()) for word in asked.asked_as.values() if word.match)
+        presence = presence.model_copy(
+            update={"reason": f"{sentence} {_without_word(request.unknown_part, len(nodes))}"}
+        )
+    wording = tuple(WordMatch(**word._asdict()) for word in request.asked_as.values() if word.match)
     return Answer.of(
-        query, scores, seen, selected, wording=wording, rivals=competitors,
-        candidates=meant, threshold=found, clear=clear, statistics=finite(_statistics(known)),
+        query, scores, has_feature, selected, wording=wording, rivals=competitors,
+        candidates=nodes, threshold=threshold, clear=clear, statistics=finite(_statistics(valid_scores)),
         **dict(presence),
     )  # fmt: skip
 
@@ -386,24 +392,24 @@ def _without_word(phrase: PartPhrase, parts: int) -> str:
 
 
 def _nearer_words(
-    scene: OpenedLift, asked: Question, scores: np.ndarray, selected: np.ndarray, least: float
+    scene: OpenedLift, request: ResolvedQuery, scores: np.ndarray, selected: np.ndarray, least: float
 ) -> tuple[str, ...]:
     """Return reference words that are the nearest of all to a share of the selected splats, or else the best ones."""
-    references, positives = asked.references, len(asked.query.positives)
-    own = asked.rows[:positives][asked.plain[:positives]]
-    if not isinstance(references, References) or not len(own):
+    references, positives = request.references, len(request.query.positives)
+    own_rows = request.rows[:positives][request.by_cosine[:positives]]
+    if not isinstance(references, References) or not len(own_rows):
         return ()
     rows, weights = best_splats(scene, np.where(selected, scores, np.float32(-1.0)) if selected.any() else scores)
     if not len(rows):
         return ()
     names = {
-        normalize_text(base_of(word.word)) for word in asked.asked_as.values()
+        normalize_text(base_of(word.word)) for word in request.asked_as.values()
     }  # "fish" and "fish (food)" are one
-    same = (references.vectors @ own.T >= SAME_WORD).any(axis=1)
-    same |= np.array([word in names for word in references.plain_words])
-    near, others = products(scene.features[rows], scene.norms[rows], own, references.vectors)
-    others[:, same] = -1.0
-    nearest = np.where(others.max(axis=1) > near.max(axis=1), others.argmax(axis=1), -1)
+    is_own = (references.vectors @ own_rows.T >= SAME_WORD).any(axis=1)
+    is_own |= np.array([word in names for word in references.plain_words])
+    own_cosines, reference_cosines = products(scene.features[rows], scene.norms[rows], own_rows, references.vectors)
+    reference_cosines[:, is_own] = -1.0
+    nearest = np.where(reference_cosines.max(axis=1) > own_cosines.max(axis=1), reference_cosines.argmax(axis=1), -1)
     shares = np.bincount(nearest[nearest >= 0], weights[nearest >= 0], len(references.words)) / weights.sum()
     order = np.argsort(-shares, kind="stable")[:MOST_RIVALS]
     return tuple(references.words[row].replace("_", " ") for row in order.tolist() if shares[row] >= least)
@@ -412,51 +418,51 @@ def _nearer_words(
 def _set_answer(scene: OpenedLift, query: Query) -> Answer:
     """Answer a query of sets: a score of one for their splats and zero for the others, also without a feature."""
     members = np.zeros(len(scene.features), np.bool_)
-    for one in query.splat_sets:
-        members |= set_members(scene, one)
-    named, count, scores = ", ".join(query.sets), int(members.sum()), members.astype(np.float32)
-    found = Threshold(value=0.5, method="set", explanation=f"the splats of {named}, as they are", clear=count > 0)
-    here = Presence(present=count > 0, presence=float(count > 0), reason=f"{named} has {count} splats.")
+    for splat_set in query.splat_sets:
+        members |= set_members(scene, splat_set)
+    label, count, scores = ", ".join(query.sets), int(members.sum()), members.astype(np.float32)
+    threshold = Threshold(value=0.5, method="set", explanation=f"the splats of {label}, as they are", clear=count > 0)
+    presence = Presence(present=count > 0, presence=float(count > 0), reason=f"{label} has {count} splats.")
     return Answer.of(
         query, scores, np.ones_like(members), members,
-        threshold=found, clear=count > 0, statistics=finite(_statistics(scores)), **dict(here),
+        threshold=threshold, clear=count > 0, statistics=finite(_statistics(scores)), **dict(presence),
     )  # fmt: skip
 
 
-def _selected(
-    scene: OpenedLift, asked: Question, kept: np.ndarray, scores: np.ndarray, weights: np.ndarray
+def _select(
+    scene: OpenedLift, request: ResolvedQuery, mask: np.ndarray, scores: np.ndarray, weights: np.ndarray
 ) -> tuple[Threshold, np.ndarray]:
     """Return the threshold of a query and the selected splats, [P] bool.
 
     Args:
         mask: [n] bool, the terms that count. scores: [P] f32. weights: [P] f32 of the splats.
     """
-    query, positives = asked.query, len(asked.query.positives)
-    known = scores if scene.all_seen else scores[scene.seen]
-    nothing = explain_no_selection(known)
-    if nothing:
+    query, positives = request.query, len(request.query.positives)
+    valid_scores = scores if scene.all_seen else scores[scene.seen]
+    lack = explain_no_selection(valid_scores)
+    if lack:
         method = query.threshold if isinstance(query.threshold, str) else "fixed"
-        found = Threshold(value=math.inf, method=method, explanation=nothing, clear=False)
-        return found, np.zeros_like(scene.seen)
-    in_words = (asked.plain & kept)[:positives]
+        threshold = Threshold(value=math.inf, method=method, explanation=lack, clear=False)
+        return threshold, np.zeros_like(scene.seen)
+    in_words = (request.by_cosine & mask)[:positives]
     least = -math.inf if in_words.any() else LEAST_LIKENESS
-    counted = "total weight" if query.weight_by == "evidence" else "total weight times confidence"
-    alone = scene.weights if query.weight_by == "evidence" else scene.weights_with_feature(weights)
-    found = find_threshold(known, query.threshold, alone, least, counted)
-    selected = scene.seen & (scores >= np.float32(found.value))
-    competitors = _rivals(asked, asked.rows[:positives][in_words])
-    if query.threshold != "auto" or not competitors or in_words.sum() < kept[:positives].sum():
-        return found, selected
-    standing = compare_ranks(scene, scores, weights, found.value, competitors[0])
-    if standing.lowest > found.value:
-        again = find_threshold(known, "auto", alone, standing.lowest, counted)
-        value = max(again.value, standing.lowest)
-        explanation = f"Below {standing.lowest:.4g} other words are nearer. {again.explanation}"
-        found = again.model_copy(
-            update={"value": value, "explanation": explanation, "clear": again.clear and again.value == value}
+    weight_name = "total weight" if query.weight_by == "evidence" else "total weight times confidence"
+    feature_weights = scene.weights if query.weight_by == "evidence" else scene.weights_with_feature(weights)
+    threshold = find_threshold(valid_scores, query.threshold, feature_weights, least, weight_name)
+    selected = scene.seen & (scores >= np.float32(threshold.value))
+    competitors = _competing_words(request, request.rows[:positives][in_words])
+    if query.threshold != "auto" or not competitors or in_words.sum() < mask[:positives].sum():
+        return threshold, selected
+    comparison = compare_ranks(scene, scores, weights, threshold.value, competitors[0])
+    if comparison.lowest > threshold.value:
+        retry = find_threshold(valid_scores, "auto", feature_weights, comparison.lowest, weight_name)
+        value = max(retry.value, comparison.lowest)
+        explanation = f"Below {comparison.lowest:.4g} other words are nearer. {retry.explanation}"
+        threshold = retry.model_copy(
+            update={"value": value, "explanation": explanation, "clear": retry.clear and retry.value == value}
         )
         selected = scene.seen & (scores >= np.float32(value))
-    found = found.model_copy(update={"clear": found.clear and standing.first >= LEAST_FIRST})
+    threshold = threshold.model_copy(update={"clear": threshold.clear and comparison.first >= LEAST_FIRST})
     if competitors[-1].nearer_limit == 0:
         selected = nearest_to_query(scene, selected, competitors[-1])
     parts = part_nodes(scene, competitors[0])
@@ -466,40 +472,42 @@ def _selected(
     else:
         selected, addition = correct_by_objects(scene, selected, weights, competitors[0])
     if addition:
-        found = found.model_copy(update={"explanation": f"{found.explanation.removesuffix('.')}; {addition}."})
-    return found, selected
+        threshold = threshold.model_copy(
+            update={"explanation": f"{threshold.explanation.removesuffix('.')}; {addition}."}
+        )
+    return threshold, selected
 
 
-def _rivals(asked: Question, directions: np.ndarray) -> list[CompetingWords]:
+def _competing_words(request: ResolvedQuery, directions: np.ndarray) -> list[CompetingWords]:
     """Return the words that compete with the positives [p, F]: reference words, then the others of a pack."""
     if not len(directions):
         return []
     competitors = (
-        [CompetingWords.among(asked.references, directions)] if isinstance(asked.references, References) else []
+        [CompetingWords.among(request.references, directions)] if isinstance(request.references, References) else []
     )
-    if asked.pack is not None:
-        competitors.append(CompetingWords.of_pack(asked.pack, directions))
-    return [some for some in competitors if len(some.vectors)]
+    if request.pack is not None:
+        competitors.append(CompetingWords.of_pack(request.pack, directions))
+    return [words for words in competitors if len(words.vectors)]
 
 
-def _presence(scene: OpenedLift, asked: Question, similarities: np.ndarray) -> tuple[Presence, np.ndarray]:
+def _presence(scene: OpenedLift, request: ResolvedQuery, similarities: np.ndarray) -> tuple[Presence, np.ndarray]:
     """Return the presence of the positives, and the terms that count, [n] bool: all, or without absent words."""
-    kept, positives = np.ones(len(asked.rows), np.bool_), len(asked.query.positives)
-    words = np.flatnonzero(asked.plain[:positives]).tolist()
+    mask, positives = np.ones(len(request.rows), np.bool_), len(request.query.positives)
+    words = np.flatnonzero(request.by_cosine[:positives]).tolist()
     if not words:
-        return NOT_IN_WORDS, kept
-    if isinstance(asked.references, str):
-        return Presence(present=None, presence=None, reason=asked.references), kept
-    names = [repr(term) if isinstance(term, str) else str(term) for term in asked.query.positives]
+        return NOT_IN_WORDS, mask
+    if isinstance(request.references, str):
+        return Presence(present=None, presence=None, reason=request.references), mask
+    names = [repr(term) if isinstance(term, str) else str(term) for term in request.query.positives]
     presences = [
-        estimate_presence(scene, names[k], asked.rows[k], similarities[:, k], asked.references) for k in words
+        estimate_presence(scene, names[k], request.rows[k], similarities[:, k], request.references) for k in words
     ]
     presence = any_present(presences)
     if presence.present is False and len(words) < positives:  # examples may be present
         presence = presence.model_copy(update={"present": None})
-    if presence.present is not False and asked.query.absent == "drop":
-        kept[[k for k, word in zip(words, presences, strict=True) if word.present is False]] = False
-    return presence, kept
+    if presence.present is not False and request.query.absent == "drop":
+        mask[[k for k, word in zip(words, presences, strict=True) if word.present is False]] = False
+    return presence, mask
 
 
 def _statistics(scores: np.ndarray) -> dict[str, float]:

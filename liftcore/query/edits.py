@@ -57,9 +57,9 @@ class Edit(Body):
     @model_validator(mode="after")
     def _one_source(self) -> Self:
         sources = [name for name in SOURCES if getattr(self, name) is not None]
-        most, least = (0, 0) if self.operation in ("grow", "shrink") else (1, int(self.operation != "set"))
-        if not least <= len(sources) <= most:
-            expected = "no source" if not most else f"one of {', '.join(SOURCES)}"
+        maximum, minimum = (0, 0) if self.operation in ("grow", "shrink") else (1, int(self.operation != "set"))
+        if not minimum <= len(sources) <= maximum:
+            expected = "no source" if not maximum else f"one of {', '.join(SOURCES)}"
             got = " and ".join(sources) or "none"
             raise InvalidQuery("operation", expected=f"{expected} with {self.operation}", got=got)
         if self.area is not None:
@@ -73,7 +73,7 @@ class Edit(Body):
             raise InvalidQuery("area", expected=AREAS, got=repr(self.area))
         return area
 
-    def described(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return the edit as a history has it, JSON: all but the bits, and of a vector its length."""
         document = self.model_dump(mode="json", exclude_defaults=True, exclude={"bits", "camera"})
         query = document.get("query", {})

@@ -42,27 +42,27 @@ VIEW_CHARACTERS = 500  # of a view's name
 Point = tuple[float, float, float]  # x y z, world frame, scene units
 
 
-def _several(given: Any) -> Any:
-    return [given] if isinstance(given, str) else given
+def _several(value: Any) -> Any:
+    return [value] if isinstance(value, str) else value
 
 
-def _examples(given: Any) -> Any:
+def _examples(value: Any) -> Any:
     """Convert examples to JSON: notations, and vectors as numbers."""
-    if isinstance(given, str | Example):
-        return [_plain(given)]
-    if hasattr(given, "ndim"):
-        given = given.tolist() if given.ndim == 2 else [given.tolist()]
-    return list(map(_plain, given)) if isinstance(given, list | tuple) else given
+    if isinstance(value, str | Example):
+        return [_json_of(value)]
+    if hasattr(value, "ndim"):
+        value = value.tolist() if value.ndim == 2 else [value.tolist()]
+    return list(map(_json_of, value)) if isinstance(value, list | tuple) else value
 
 
-def _plain(example: Any) -> Any:
+def _json_of(example: Any) -> Any:
     if isinstance(example, Vector):
         return example.values
     return str(example) if isinstance(example, Example) else example
 
 
-def as_own_camera(given: Any) -> Any:
-    return OwnCamera.of(given) if hasattr(given, "K") else given
+def as_own_camera(value: Any) -> Any:
+    return OwnCamera.of(value) if hasattr(value, "K") else value
 
 
 MOST_CHARACTERS = 4096  # of an example: a stroke of some hundred corners
@@ -212,14 +212,14 @@ class Query(Viewpoint):
     )
 
     @classmethod
-    def of(cls, positives: Iterable[Term] | str, negatives: Iterable[Term] | str = (), **others: Any) -> Self:
+    def of(cls, positives: Iterable[Term] | str, negatives: Iterable[Term] | str = (), **options: Any) -> Self:
         """Return a query of terms, each a text or an example; texts come before examples."""
         sides = [list(_several(terms)) for terms in (positives, negatives)]
         (text, like), (against, unlike) = (
             ([term for term in side if isinstance(term, str)], [term for term in side if not isinstance(term, str)])
             for side in sides
         )
-        return cls(text=text, like=like, negatives=against, unlike=unlike, **others)
+        return cls(text=text, like=like, negatives=against, unlike=unlike, **options)
 
     @model_validator(mode="after")
     def _asks(self) -> Self:
@@ -246,17 +246,17 @@ class Query(Viewpoint):
     @cached_property
     def positives(self) -> tuple[Term, ...]:
         """Texts and examples of the target."""
-        return (*self.text, *_parsed(self.like, "like"))
+        return (*self.text, *_parse_examples(self.like, "like"))
 
     @cached_property
     def terms(self) -> tuple[Term, ...]:
         """Positives, then negatives."""
-        return (*self.positives, *self.negatives, *_parsed(self.unlike, "unlike"))
+        return (*self.positives, *self.negatives, *_parse_examples(self.unlike, "unlike"))
 
     @cached_property
     def splat_sets(self) -> tuple[SplatSet, ...]:
         """The sets of splats that are selected as they are."""
-        return tuple(parse_set(one, f"sets.{place}") for place, one in enumerate(self.sets))
+        return tuple(parse_set(notation, f"sets.{place}") for place, notation in enumerate(self.sets))
 
     @property
     def places(self) -> list[str]:
@@ -275,10 +275,10 @@ class Query(Viewpoint):
         return [*self.text, *self.negatives]
 
 
-def _parsed(examples: list[Any], field: str) -> list[Example]:
+def _parse_examples(examples: list[Any], field: str) -> list[Example]:
     return [
-        parse_example(one, f"{field}.{place}") if isinstance(one, str) else Vector(tuple(one))
-        for place, one in enumerate(examples)
+        parse_example(example, f"{field}.{place}") if isinstance(example, str) else Vector(tuple(example))
+        for place, example in enumerate(examples)
     ]
 
 
@@ -296,7 +296,7 @@ class Box(NamedTuple):
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         """Return a schema that writes an object with ``low`` and ``high`` as JSON."""
         return core_schema.no_info_before_validator_function(
-            lambda given: cls(*given)._asdict() if _is_pair(given) else given,
+            lambda value: cls(*value)._asdict() if _is_pair(value) else value,
             core_schema.no_info_after_validator_function(lambda box: cls(**vars(box)), handler(Corners)),
             serialization=core_schema.plain_serializer_function_ser_schema(
                 lambda box: Corners(low=box.low, high=box.high), return_schema=handler(Corners)
@@ -579,7 +579,7 @@ class SceneObject(Value):
 
 
 class ListedObjects(WithUnits):
-    """The things in a scene, or some of them, those with the largest total weight first."""
+    """The objects of a scene, or some of them, those with the largest total weight first."""
 
     explanation: str = Field(description="why there are so many; or why there are none")
     count: int = Field(description="of all pages")

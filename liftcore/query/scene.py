@@ -17,7 +17,7 @@ if TYPE_CHECKING:  # these load torch
     from PIL.Image import Image
 
     from liftcore.io.labels import Labels
-    from liftcore.query.ask import Question
+    from liftcore.query.ask import ResolvedQuery
     from liftcore.query.catalogue import Catalogue
     from liftcore.query.question import (
         Answer,
@@ -51,7 +51,7 @@ class Scene(OpenedLift):
 
     Args:
         source: the lift, or the path of its file, which is mapped and not read.
-        splats: that were lifted, or their new path if they moved since the lift. cameras: of the scene, or their path.
+        splats: that were lifted, or their new path if they moved. cameras: of the scene, or their path.
         packs: that were lifted.
         device: that renders: cpu, cuda or auto. Scores are computed on the CPU.
         world: up axis and length unit, if the lift has none, or wrong ones.
@@ -85,25 +85,25 @@ class Scene(OpenedLift):
             InvalidLift: an example or ``places`` need the scene's files, and they moved or changed.
             Unavailable: the encoder's weights are not on this machine.
         """
-        from liftcore.query.ask import ask, located
+        from liftcore.query.ask import ask, locate
         from liftcore.query.question import Query
 
         query = Query.of(query) if isinstance(query, str) else query
-        needed = bool(query.texts) or encoder is not None
-        answer = ask(self, query, self.encoder(encoder) if needed else None)
+        needs_encoder = bool(query.texts) or encoder is not None
+        answer = ask(self, query, self.encoder(encoder) if needs_encoder else None)
         if places is False:
             return answer
         with nullcontext() if places else suppress(InvalidLift):
-            return located(self, answer)
+            return locate(self, answer)
         return answer
 
-    def prepare(self, query: Query, encoder: TextEncoder | None = None) -> Question:
+    def prepare(self, query: Query, encoder: TextEncoder | None = None) -> ResolvedQuery:
         """Resolve a query's terms to directions, and raise all of its errors; arguments as in `ask`."""
-        from liftcore.query.ask import question
+        from liftcore.query.ask import resolve_query
 
-        return question(self, query, encoder, query.places)
+        return resolve_query(self, query, encoder, query.places)
 
-    def answer(self, questions: Sequence[Question]) -> list[Answer]:
+    def answer(self, questions: Sequence[ResolvedQuery]) -> list[Answer]:
         """Answer prepared queries in one pass over the features; each to the same bits as alone (`ask`)."""
         from liftcore.query.ask import answers
 
@@ -111,9 +111,9 @@ class Scene(OpenedLift):
 
     def locate(self, answer: Answer, count: int | None = None) -> Answer:
         """Add to an answer its best splats and the box of its selection (`liftcore.query.ask.locate`)."""
-        from liftcore.query.ask import located
+        from liftcore.query.ask import locate
 
-        return located(self, answer, count)
+        return locate(self, answer, count)
 
     def view_mask(
         self,
@@ -146,7 +146,7 @@ class Scene(OpenedLift):
         *,
         encoder: TextEncoder | str | Path | None = None,
     ) -> np.ndarray:
-        """Return the pixels of a view that mostly show the answer's objects, [H, W] bool; arguments as in `view_mask`."""
+        """Return the pixels of a view with the answer's objects, [H, W] bool; arguments as in `view_mask`."""
         return self.view_mask(query, view, encoder=encoder).mask
 
     def attention(
@@ -174,11 +174,11 @@ class Scene(OpenedLift):
         from liftcore.query.terms import parse_set
 
         parse_set(f"selection:{name}", "name")
-        found = self.selections.get(name) or Selection(self, name)
+        selection = self.selections.get(name) or Selection(self, name)
         if source is not None:
-            found.edit("set", source)  # an invalid source leaves no selection
-        self.selections[name] = found
-        return found
+            selection.edit("set", source)  # an invalid source leaves no selection
+        self.selections[name] = selection
+        return selection
 
     @deprecated_keywords(what="channel")
     def render(self, view: str | Camera, channel: str = "rgb") -> np.ndarray:
@@ -351,12 +351,12 @@ class Scene(OpenedLift):
 
         return warm_up_kernel(kernel)
 
-    def export(self, path: Path | str, source: Source = None, what: str = "", **how: Any) -> None:
+    def export(self, path: Path | str, source: Source = None, what: str = "", **options: Any) -> None:
         """Write a file, whole or not at all; arguments and errors as in `blocks_of`, with the suffix of the path."""
         from liftcore.io.files import whole_file
 
-        how = {"suffix": Path(path).suffix.lower(), **how}
-        content = self.blocks_of(source, what, **how)
+        options = {"suffix": Path(path).suffix.lower(), **options}
+        content = self.blocks_of(source, what, **options)
         with whole_file(Path(path)) as handle:
             handle.writelines(content)
 

@@ -1,14 +1,13 @@
-"""Many words at once: to every splat the word that it is most like, or none; and the best words for an example.
+"""Segmentation by many words: the most similar word of every splat, or none; and the best words for an example.
 
-A word alone is asked as a query is: its automatic threshold says which splats answer it. A splat is named by the
-nearest of the words that it answers, and by none where it answers none. Asked for what is not there, a threshold
-finds what is most like it; beside other words such a word wins hardly a splat that it answers, as these are more like
-their own. So a word is there if it is the nearest of all words for at least a quarter of its answer, by total weight,
-and if reference words do not say that it is not (`liftcore.query.presence`; the words themselves, where they are
-many). Words that are not there name nothing.
+Each word has an automatic threshold, as a query has. A splat gets the nearest of the words whose threshold it
+reaches, or none. The threshold of an absent word selects the splats most similar to it, but most of these are nearer
+to their own words. So a word is present if it is the nearest of all words for at least a quarter of its selection,
+by total weight, and if reference words do not show that it is absent (`liftcore.query.presence`; many words are their
+own references). Absent words get no splats.
 
-The lift's tree has its say: a word that names parts, where levels say different things, names their nodes
-(`liftcore.query.selection.parts_of_words`); and what has no word in a node gets the one that names most of the node.
+The lift's tree corrects this: a word that names parts, where levels differ in meaning, gets their nodes
+(`liftcore.query.selection.parts_of_words`); and splats of a node without a word get the word of most of the node.
 """
 
 from __future__ import annotations
@@ -44,10 +43,10 @@ if TYPE_CHECKING:
     from liftcore.text import TextEncoder
 
 NO_WORD = -1
-LEAST_OWN = 0.25  # of a word's answer, by total weight, that no other word is nearer to
+LEAST_OWN = 0.25  # of a word's selection, by total weight, to which no other word is nearer
 MOST_WORDS = 4_096
-AT_ONCE = 16  # words whose cosines are held at a time: [P, AT_ONCE] f32
-SHOWN = 20  # words of a drawn legend
+AT_ONCE = 16  # words whose cosines are in memory at once: [P, AT_ONCE] f32
+LEGEND_WORDS = 20  # words of a drawn legend
 
 
 @deprecated_names(found="named_words")
@@ -64,19 +63,19 @@ class Segmentation:
     margin: np.ndarray
     """[P] f32, the cosine of a splat to its word minus that to the nearest other; 0 without a word"""
     named_words: tuple[NamedSplats, ...]
-    """the words that are there, those with the largest total weight first"""
+    """the present words, those with the largest total weight first"""
 
     def __repr__(self) -> str:
-        found = ", ".join(f"{one.word!r}: {one.splats}" for one in self.named_words)
+        text = ", ".join(f"{label.word!r}: {label.splats}" for label in self.named_words)
         return one_line(
-            self, f"{len(self.labels)} splats", f"{len(self.named_words)} of {len(self.words)} words: {found}"
+            self, f"{len(self.labels)} splats", f"{len(self.named_words)} of {len(self.words)} words: {text}"
         )
 
     @property
     def values(self) -> np.ndarray:
         """[P] i32, the place of each splat's word in ``named_words``, from 1; 0 for none."""
         places = np.zeros(len(self.words) + 1, np.int32)  # the last is of -1
-        places[[named.row for named in self.named_words]] = np.arange(1, len(self.named_words) + 1)
+        places[[label.row for label in self.named_words]] = np.arange(1, len(self.named_words) + 1)
         return places[self.labels]
 
     @property
@@ -104,8 +103,8 @@ def words_of(encoder: TextEncoder) -> list[str]:
     Raises:
         InvalidQuery: the encoder is no table, and encodes any text.
     """
-    told: Sequence[str] = getattr(encoder, "words", ())
-    words = list(dict.fromkeys(told))
+    table_words: Sequence[str] = getattr(encoder, "words", ())
+    words = list(dict.fromkeys(table_words))
     if not words:
         expected, hint = f"words beside the encoder {encoder.name}", "say what may be there"
         raise InvalidQuery("words", expected=expected, got="none", hint=hint)
@@ -143,21 +142,21 @@ def segment(
         raise InvalidQuery("words", expected="every word once", got=f"{twice!r} twice")
     weights = np.where(scene.seen, scene.total_weight, 0.0).astype(np.float64)
     weights = weights if weights.any() else scene.seen.astype(np.float64)
-    thresholds, answered = np.empty(len(words)), np.empty(len(words))
+    thresholds, answer_weights = np.empty(len(words)), np.empty(len(words))
     nearest = _Nearest(len(weights))
     for row, scores in _scores(scene, rows, range(len(words))):
         threshold = find_threshold(scores[scene.seen], "auto", scene.weights)
         thresholds[row] = threshold.value if threshold.clear else np.inf
-        answered[row] = weights[scores >= thresholds[row]].sum()
+        answer_weights[row] = weights[scores >= thresholds[row]].sum()
         nearest.take(row, scores)
         progress("words", row + 1, len(words), "words")
-    own = nearest.score >= thresholds[nearest.row]
-    shares = np.bincount(nearest.row[own], weights[own], len(words)) / np.maximum(answered, 1e-30)
-    named = _Nearest(len(weights))
+    is_answer = nearest.score >= thresholds[nearest.row]
+    shares = np.bincount(nearest.row[is_answer], weights[is_answer], len(words)) / np.maximum(answer_weights, 1e-30)
+    winners = _Nearest(len(weights))
     unit = rows / np.linalg.norm(rows, axis=1, keepdims=True)
     if references is None:
-        many = len(words) >= LEAST_WORDS
-        references = References(words, unit) if many else references_of_space(unit, scene.metadata.text_space)
+        suffices = len(words) >= LEAST_WORDS
+        references = References(words, unit) if suffices else references_of_space(unit, scene.metadata.text_space)
     parts = _parts(scene, unit, references)
     for row, scores in _scores(scene, rows, np.flatnonzero((shares >= LEAST_OWN) | parts.any(axis=1)).tolist()):
         if (
@@ -167,47 +166,47 @@ def segment(
             parts[row] = False
             continue
         if shares[row] >= LEAST_OWN and not parts[row].any():
-            named.take(row, np.where(scene.seen & (scores >= thresholds[row]), scores, -np.inf))
-    labels = np.where(named.score > -np.inf, named.row, NO_WORD).astype(np.int32)
+            winners.take(row, np.where(scene.seen & (scores >= thresholds[row]), scores, -np.inf))
+    labels = np.where(winners.score > -np.inf, winners.row, NO_WORD).astype(np.int32)
     labels = _by_nodes(scene, labels, weights, parts)
     score = np.zeros(len(labels), np.float32)
     for row, scores in _scores(scene, rows, np.unique(labels[labels != NO_WORD]).tolist()):
         score[labels == row] = scores[labels == row]
     other = np.where(labels == nearest.row, nearest.second, nearest.score)
-    apart = (labels != NO_WORD) & (other > -np.inf)
-    margin = np.subtract(score, other, out=np.zeros_like(score), where=apart)
+    has_margin = (labels != NO_WORD) & (other > -np.inf)
+    margin = np.subtract(score, other, out=np.zeros_like(score), where=has_margin)
     groups = [
-        (float(weights[mine].sum() / weights.sum()), row, mine)
+        (float(weights[members].sum() / weights.sum()), row, members)
         for row in np.unique(labels[labels != NO_WORD]).tolist()
-        if weights[mine := np.flatnonzero(labels == row)].any()
+        if weights[members := np.flatnonzero(labels == row)].any()
     ]
     groups.sort(key=lambda group: -group[0])
     palette = _palette(len(groups)).tolist()
-    found = tuple(
+    summaries = tuple(
         NamedSplats(
             word=words[row],
             row=row,
             value=value,
             colour=palette[value],
-            splats=len(mine),
+            splats=len(members),
             share=share,
-            score=float(np.average(score[mine], weights=weights[mine])),
-            margin=float(np.average(margin[mine], weights=weights[mine])),
+            score=float(np.average(score[members], weights=weights[members])),
+            margin=float(np.average(margin[members], weights=weights[members])),
             threshold=float(thresholds[row]),
-            box=trimmed_box(scene.splats.positions(mine), weights[mine]),
+            box=trimmed_box(scene.splats.positions(members), weights[members]),
         )
-        for value, (share, row, mine) in enumerate(groups, 1)
+        for value, (share, row, members) in enumerate(groups, 1)
     )
-    return Segmentation(words, labels, score, margin, found)
+    return Segmentation(words, labels, score, margin, summaries)
 
 
 def _parts(scene: OpenedLift, unit: np.ndarray, references: References | str | None) -> np.ndarray:
     """Return the nodes of parts that each of some words [n, F] f32 names, [n, N] bool."""
-    found = np.zeros((len(unit), 0 if scene.node_parents is None else len(scene.node_parents)), np.bool_)
+    mask = np.zeros((len(unit), 0 if scene.node_parents is None else len(scene.node_parents)), np.bool_)
     if isinstance(references, References) and levels_disagree(scene):
         for row, nodes in enumerate(parts_of_words(scene, references, unit)):
-            found[row, nodes] = True
-    return found
+            mask[row, nodes] = True
+    return mask
 
 
 def _by_nodes(scene: OpenedLift, labels: np.ndarray, weights: np.ndarray, parts: np.ndarray) -> np.ndarray:
@@ -218,19 +217,19 @@ def _by_nodes(scene: OpenedLift, labels: np.ndarray, weights: np.ndarray, parts:
     """
     if scene.node is None or scene.node_parents is None:
         return labels
-    changed = labels.copy()
-    for node in sorted(np.flatnonzero(parts.any(axis=0)).tolist(), key=lambda one: len(scene.node_path(one))):
-        changed[scene.seen & scene.members(node)] = int(parts[:, node].argmax())
-    own, words = np.where(scene.seen, scene.node, -1), len(parts)
-    within = own >= 0
-    shape = len(scene.node_parents), words + 1
-    places = own[within].astype(np.int64) * shape[1] + np.where(changed < 0, words, changed)[within]
+    output = labels.copy()
+    for node in sorted(np.flatnonzero(parts.any(axis=0)).tolist(), key=lambda n: len(scene.node_path(n))):
+        output[scene.seen & scene.members(node)] = int(parts[:, node].argmax())
+    nodes, word_count = np.where(scene.seen, scene.node, -1), len(parts)
+    within = nodes >= 0
+    shape = len(scene.node_parents), word_count + 1
+    places = nodes[within].astype(np.int64) * shape[1] + np.where(output < 0, word_count, output)[within]
     table = np.bincount(places, weights[within], shape[0] * shape[1]).reshape(shape)
-    word = table[:, :words].argmax(axis=1)
-    most = 2 * table[np.arange(len(table)), word] >= np.maximum(table.sum(axis=1), 1e-30)
-    empty = within & (changed == NO_WORD) & most[own]
-    changed[empty] = word[own[empty]]
-    return changed
+    word = table[:, :word_count].argmax(axis=1)
+    is_majority = 2 * table[np.arange(len(table)), word] >= np.maximum(table.sum(axis=1), 1e-30)
+    empty = within & (output == NO_WORD) & is_majority[nodes]
+    output[empty] = word[nodes[empty]]
+    return output
 
 
 class _Nearest:
@@ -251,8 +250,10 @@ class _Nearest:
 def _scores(scene: OpenedLift, vectors: np.ndarray, rows: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
     """Yield each row with the cosines [P] f32 of its vector; AT_ONCE rows in one pass over the features."""
     for first in range(0, len(rows), AT_ONCE):
-        some = rows[first : first + AT_ONCE]
-        yield from zip(some, np.ascontiguousarray(cosines(scene.features, scene.norms, vectors[some]).T), strict=True)
+        block = rows[first : first + AT_ONCE]
+        yield from zip(
+            block, np.ascontiguousarray(cosines(scene.features, scene.norms, vectors[block]).T), strict=True
+        )
 
 
 def best_words(
@@ -303,9 +304,9 @@ def value_map(scene: OpenedLift, values: np.ndarray, view: str | Camera) -> np.n
     import torch
 
     labels, params = torch.from_numpy(values), scene.compositing
-    found = scene.image(view, lambda camera: scene.raster.strongest_labels(camera, labels, params)).numpy()
+    strongest = scene.image(view, lambda camera: scene.raster.strongest_labels(camera, labels, params)).numpy()
     sums = scene.image(view, lambda camera: scene.raster.row_sums(camera, params)).numpy()
-    return np.where(sums >= MINIMUM_ROW_SUM, np.maximum(found, 0), 0)
+    return np.where(sums >= MINIMUM_ROW_SUM, np.maximum(strongest, 0), 0)
 
 
 def map_png(values: np.ndarray, segmentation: Segmentation) -> bytes:
@@ -313,7 +314,7 @@ def map_png(values: np.ndarray, segmentation: Segmentation) -> bytes:
 
     Above 255 words it is a grey image of 16 bits.
     """
-    return palette_png(values, [named.word for named in segmentation.named_words], segmentation.colours)
+    return palette_png(values, [label.word for label in segmentation.named_words], segmentation.colours)
 
 
 def palette_png(values: np.ndarray, names: Sequence[str], colours: np.ndarray) -> bytes:
@@ -341,18 +342,20 @@ def picture_png(image: np.ndarray, values: np.ndarray, segmentation: Segmentatio
     colours = segmentation.colours
     tinted = np.where(values[..., None] > 0, (0.4 * image + 0.6 * colours[values]).astype(np.uint8), image // 2)
     pixels = np.bincount(values.ravel(), minlength=len(colours))
-    shown = [place for place in np.argsort(-pixels, kind="stable").tolist() if place and pixels[place]][:SHOWN]
+    visible = [place for place in np.argsort(-pixels, kind="stable").tolist() if place and pixels[place]][
+        :LEGEND_WORDS
+    ]
     size = max(12, image.shape[0] // 30)
     font = ImageFont.load_default(size)
-    words = [segmentation.named_words[place - 1].word for place in shown] or ["no word is here"]
+    words = [segmentation.named_words[place - 1].word for place in visible] or ["no word is here"]
     width = int(max(font.getlength(word) for word in words)) + 3 * size
     canvas = Image.new("RGB", (image.shape[1] + width, max(image.shape[0], (2 * len(words) + 1) * size)), "white")
     canvas.paste(Image.fromarray(tinted), (0, 0))
     draw = ImageDraw.Draw(canvas)
     for line, word in enumerate(words):
         x, y = image.shape[1] + size // 2, size // 2 + line * 2 * size
-        if shown:
-            draw.rectangle((x, y, x + size, y + size), fill=tuple(colours[shown[line]].tolist()))
+        if visible:
+            draw.rectangle((x, y, x + size, y + size), fill=tuple(colours[visible[line]].tolist()))
         draw.text((x + 1.5 * size, y), word, fill="black", font=font)
     content = io.BytesIO()
     canvas.save(content, format="PNG")

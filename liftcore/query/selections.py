@@ -105,7 +105,7 @@ class Selection:
         if edit.query is not None and answer is None:
             answer = self._scene.ask(edit.query, places=False)
         splats = apply_edit(self._scene, self.splats, edit, answer)
-        self._steps = [*self._steps[: self._place + 1], Step.of(edit.described(), splats)][-MOST_HISTORY - 1 :]
+        self._steps = [*self._steps[: self._place + 1], Step.of(edit.to_json(), splats)][-MOST_HISTORY - 1 :]
         self._place = len(self._steps) - 1
         return self
 

@@ -21,7 +21,7 @@ from liftcore.errors import InvalidLift, InvalidQuery, NotFound, SplatliftError
 from liftcore.io.splats import some_rows
 from liftcore.query import ask as ask_module
 from liftcore.query import segment as segment_module
-from liftcore.query.ask import answers, ask, located, question
+from liftcore.query.ask import answers, ask, locate, resolve_query
 from liftcore.query.directions import directions, read_vector
 from liftcore.query.question import Query
 from liftcore.query.result import LiftResult, load_lift
@@ -71,13 +71,13 @@ def test_splats_that_mean_the_text_are_selected_the_best_with_places_and_a_box(e
     assert np.flatnonzero(answer.selected).tolist() == list(range(0, COUNT - 1, 3))
     assert answer.count == len(range(0, COUNT - 1, 3))
     assert answer.statistics["min"] <= answer.statistics["q50"] <= answer.statistics["max"]
-    found, means = located(exact, answer, 4), exact.splats.means.numpy()
+    found, means = locate(exact, answer, 4), exact.splats.means.numpy()
     assert [best.splat for best in found.top] == [0, 3, 6, 9]  # of equal scores the first in the file
     assert found.top[0].position == pytest.approx(means[0].tolist())
     selected = means[answer.selected]
     assert found.box == tuple(tuple(end.tolist()) for end in (selected.min(axis=0), selected.max(axis=0)))
-    assert len(located(exact, answer, 1000).top) == COUNT - 1  # none that was not seen
-    assert located(exact, ask(exact, Query.of(("x",), ("y",), threshold=1.0), Axes()), 1).box is None
+    assert len(locate(exact, answer, 1000).top) == COUNT - 1  # none that was not seen
+    assert locate(exact, ask(exact, Query.of(("x",), ("y",), threshold=1.0), Axes()), 1).box is None
 
 
 def test_negatives_take_away_and_unseen_splats_are_never_selected(exact: Scene) -> None:
@@ -118,7 +118,7 @@ def test_questions_together_have_the_bits_of_each_alone(scene: Scene) -> None:
         Query.of((SplatTerm(1),)),
         Query.of(("z", "x")),
     ]
-    asked = [question(scene, query, Axes()) for query in queries]
+    asked = [resolve_query(scene, query, Axes()) for query in queries]
     for together, one in zip(answers(scene, asked), asked, strict=True):
         (alone,) = answers(scene, [one])
         assert np.array_equal(together.scores, alone.scores) and together.threshold == alone.threshold
@@ -153,7 +153,7 @@ def test_what_cannot_be_asked_is_refused(scene: Scene) -> None:
         (lambda: ask(of_space(""), "x"), r"text space: not named\), got no encoder"),
         (lambda: ask(of_space("axes"), "x"), r"text space: axes\), got no encoder"),
         (
-            lambda: question(scene, Query.of(("x",), weight_by="confidence"), Axes()),
+            lambda: resolve_query(scene, Query.of(("x",), weight_by="confidence"), Axes()),
             "a lift with confidence.*preset default",
         ),
         (lambda: Query.of(("x",), weight_by="light"), "weight_by: expected one of evidence, confidence"),
@@ -196,11 +196,11 @@ def test_scene_made_of_values_needs_no_files(scene: Scene) -> None:
 
 def test_words_of_a_table_are_asked_without_torch(tiny_lift: Path) -> None:
     code = (
-        "import sys; from pathlib import Path; from liftcore.query.ask import ask, located; "
+        "import sys; from pathlib import Path; from liftcore.query.ask import ask, locate; "
         "from liftcore.query.scene import Scene; from liftcore.query.question import Query; "
         "import liftcore.text.table; "
         "scene = Scene(Path(sys.argv[1])); answer = ask(scene, Query(like=['splat:0'])); "
-        "assert located(scene, answer, 3).top and 'torch' not in sys.modules"
+        "assert locate(scene, answer, 3).top and 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code, str(tiny_lift)], check=True)
 
@@ -340,7 +340,7 @@ def test_term_without_a_feature_says_why_under_its_name(
     if example != "apple":
         query = Query.of((SplatTerm(0),), (example,))
         with pytest.raises(error, match=r"unlike\.0"):
-            question(scene, query, None, query.places)
+            resolve_query(scene, query, None, query.places)
 
 
 @given(view=NAMES, x=st.integers(0, 9999), y=st.integers(0, 9999))

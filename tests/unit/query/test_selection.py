@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from liftcore.query.ask import answers, ask, question
+from liftcore.query.ask import answers, ask, resolve_query
 from liftcore.query.presence import References
 from liftcore.query.question import Query
 from liftcore.query.scene import Scene
@@ -77,7 +77,7 @@ def test_competition_keeps_what_the_histogram_finds_well(thin: Scene, table: Tab
 
 
 def test_selection_has_the_same_bits_together_and_alone(thin: Scene, table: TableEncoder) -> None:
-    asked = [question(thin, Query.of((word,), absent="keep"), table) for word in ("cat", "cow", "sofa")]
+    asked = [resolve_query(thin, Query.of((word,), absent="keep"), table) for word in ("cat", "cow", "sofa")]
     for together, one in zip(answers(thin, asked), asked, strict=True):
         (alone,) = answers(thin, [one])
         assert np.array_equal(together.selected, alone.selected) and together.threshold == alone.threshold
@@ -195,13 +195,13 @@ def test_phrase_finds_the_part_within_the_thing_alone(phrase: str, handles: Scen
     (wording,) = answer.wording
     assert (wording.text, wording.word, wording.match) == (phrase, "handle of the mug", "part")
     assert answer.present is not False and "Within it" in answer.reason and answer.query.text == [phrase]
-    together = answers(handles, [question(handles, Query.of(some), table) for some in ("cat", phrase)])
+    together = answers(handles, [resolve_query(handles, Query.of(some), table) for some in ("cat", phrase)])
     assert (together[1].scores == answer.scores).all() and (together[1].selected == answer.selected).all()
 
 
 def test_part_is_asked_by_its_own_word(handles: Scene, table: TableEncoder) -> None:
     words = TableEncoder("words", ["tea mug", "mug handle", "handle"], table.encode(["mug", "cat", "handle"]))
-    phrase = question(handles, Query.of("tea mug handle"), words).part
+    phrase = resolve_query(handles, Query.of("tea mug handle"), words).part
     assert phrase is not None and np.array_equal(phrase.part.rows, words.encode(["handle"]))
 
 
@@ -244,7 +244,7 @@ def test_word_of_a_part_takes_its_node_where_levels_disagree(
     told = lifted(scene, rows, metadata=scene.lift.metadata.model_copy(update=facts), **fields)
     found = ask(told, Query.of(("handle",), absent="keep"), table)
     assert (np.flatnonzero(found.selected).tolist() == list(range(60))) == by_node
-    assert ("parts that it names" in found.threshold.explanation) == by_node
+    assert ("the named parts are selected" in found.threshold.explanation) == by_node
     assert np.flatnonzero(ask(told, "mug", table).selected)[[0, -1]].tolist() == [0, 299]
     references = References(tuple(table.words), table.embeddings)
     every = parts_of_words(told, references, table.embeddings)

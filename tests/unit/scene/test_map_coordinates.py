@@ -24,7 +24,7 @@ from liftcore.lifting.engines.lift import steps_in_blocks
 from liftcore.lifting.files import lift_files
 from liftcore.lifting.inputs import LiftInputs
 from liftcore.lifting.planning.views import visibility
-from liftcore.query.ask import ask, located
+from liftcore.query.ask import ask, locate
 from liftcore.query.catalogue import catalogue, table_csv
 from liftcore.query.labels import labels
 from liftcore.query.objects import objects
@@ -299,7 +299,7 @@ def asked_of(splats: Splats, cameras: Cameras, views: dict[str, Any]) -> dict[st
     scene = Scene(lift, splats, cameras)
     vectors = np.eye(6, dtype=np.float32)[:2]
     answer = ask(scene, Query.of((Vector(tuple(vectors[0].tolist())),), threshold=0.2, absent="keep"))
-    best, parts = located(scene, answer, 5), objects(scene, answer)
+    best, parts = locate(scene, answer, 5), objects(scene, answer)
     words = segment(scene, ["one", "two"], vectors)
     told = labels(scene, words).document
     whole = replace(lift, object=torch.arange(len(lift.features)).int() % 2, object_views=torch.zeros(2, 5).int())
