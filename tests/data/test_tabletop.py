@@ -124,7 +124,7 @@ def test_fourteen_words_are_found_among_many(
     other_words = [word for word in encoder.words if word not in words]
     absent = np.random.default_rng(0).choice(other_words, 100, replace=False).tolist()
     segmentation = segment(scene, words + absent, encoder.encode(words + absent))
-    assert {label.word for label in segmentation.found} == set(words)
+    assert {label.word for label in segmentation.named_words} == set(words)
     mask = scene.seen & (scene.total_weight > 0.5)
     assert (segmentation.labels == real)[mask].mean() > 0.9
     seven = segment(scene, words[:7], encoder.encode(words[:7])).labels
