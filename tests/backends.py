@@ -48,8 +48,8 @@ class Backend:
 
         def run(check: Callable[..., None]) -> None:
             slow = [HealthCheck.too_slow, HealthCheck.data_too_large]
-            chosen = settings(max_examples=self.examples, deadline=None, suppress_health_check=slow)
-            chosen(given(*strategies)(check))()
+            configure = settings(max_examples=self.examples, deadline=None, suppress_health_check=slow)
+            configure(given(*strategies)(check))()
 
         return run
 

@@ -77,23 +77,23 @@ def lift_and_ask(lc: Any, folder: Path) -> None:
 
 def check_replacing(lc: Any, folder: Path) -> None:
     """See that a lift is replaced while it is open, or that words say why not."""
-    opened = lc.load_lift(folder / "lift.safetensors")
+    stored = lc.load_lift(folder / "lift.safetensors")
     try:
-        opened.save(folder / "lift.safetensors")
+        stored.save(folder / "lift.safetensors")
     except lc.Unavailable as error:
         assert sys.platform == "win32" and "open" in str(error), error
-    assert lc.load_lift(folder / "lift.safetensors").features.equal(opened.features)
+    assert lc.load_lift(folder / "lift.safetensors").features.equal(stored.features)
 
 
 def lift_in_blocks(lc: Any, folder: Path) -> None:
     """Lift views of an iterator by pieces in files, and in shards."""
     splats, cameras = lc.read_splats(folder / "splats.ply"), lc.read_cameras(folder / "cameras.json")
     features = lc.read_features(folder / "features.safetensors")
-    alone = lc.lift(splats, cameras, features)
+    expected = lc.lift(splats, cameras, features)
     pieces = lc.lift(splats, cameras, iter(features.items()), engine=lc.LocalEngine())
-    assert pieces.features.equal(alone.features)
+    assert pieces.features.equal(expected.features)
     pieces.save(folder / "lift.shards")
-    assert lc.load_lift(folder / "lift.shards").features.equal(alone.features)
+    assert lc.load_lift(folder / "lift.shards").features.equal(expected.features)
 
 
 def hold_in_files() -> None:
@@ -127,8 +127,8 @@ def check_hints(lc: Any, folder: Path) -> None:
         try:
             call()
         except lc.Unavailable as error:
-            elsewhere = extra == "service" and sys.platform != "linux"
-            assert ("Linux" if elsewhere else f"splatlift[{extra}]") in str(error), error
+            is_foreign = extra == "service" and sys.platform != "linux"
+            assert ("Linux" if is_foreign else f"splatlift[{extra}]") in str(error), error
         else:
             raise AssertionError(f"{package} is missing, and nobody says so")
 

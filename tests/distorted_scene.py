@@ -56,9 +56,9 @@ def wall() -> Splats:
 
 def photo_of(view: str, lens: str, clear: float = 0.0) -> np.ndarray:
     """[H, W] i64, the quarter that each pixel of a photo shows; -1 beyond the wall, and nearer to a border."""
-    taken = Lens(WIDTH, HEIGHT, FX, FY, CX, CY, LENSES[lens][1])
+    photo_lens = Lens(WIDTH, HEIGHT, FX, FY, CX, CY, LENSES[lens][1])
     v, u = np.meshgrid(np.arange(HEIGHT) + 0.5, np.arange(WIDTH) + 0.5, indexing="ij")
-    x, y = taken.on_plane(u, v)
+    x, y = photo_lens.on_plane(u, v)
     x, y = AWAY * x + VIEWS[view], AWAY * y
     inside = (np.abs(x) < 2.9) & (np.abs(y) < 2.9)
     return np.where(inside & is_clear(x, y, clear), quarter(x, y), -1)

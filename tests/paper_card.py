@@ -41,13 +41,13 @@ class OnCard(Tensor):
         tensors = _tensors((args, kwargs))
         if _mixes(name, args, tensors):
             raise RuntimeError(f"Expected all tensors to be on the same device: {name}")
-        asked = [leaf for leaf in tree_leaves((args, kwargs)) if _is_place(leaf)]
-        ours = name == "copy_" and not isinstance(tensors[0], OnCard)
-        leaves = ours or name == "cpu" or (asked and torch.device(asked[0]).type == "cpu")
+        places = [leaf for leaf in tree_leaves((args, kwargs)) if _is_place(leaf)]
+        is_copy = name == "copy_" and not isinstance(tensors[0], OnCard)
+        leaves = is_copy or name == "cpu" or (places and torch.device(places[0]).type == "cpu")
         args, kwargs = tree_map(_behind, (args, kwargs))
         with torch._C.DisableTorchFunctionSubclass():
-            made = func(*args, **kwargs)
-        return made if leaves else tree_map(_on_card, made)
+            output = func(*args, **kwargs)
+        return output if leaves else tree_map(_on_card, output)
 
 
 def lay(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -98,9 +98,12 @@ def _mixes(name: str, args: Any, tensors: list[Tensor]) -> bool:
     if name == "__setitem__" and not indices:
         return False  # a slice is copied
     # The processor's numbers, and its indices of a card's tensor, are brought there.
-    brought = [own for own in tensors if not isinstance(own, OnCard) and not own.dim()]
-    brought += indices if isinstance(first, OnCard) else []
-    return len({isinstance(own, OnCard) for own in tensors if all(own is not other for other in brought)}) > 1
+    host_scalars = [tensor for tensor in tensors if not isinstance(tensor, OnCard) and not tensor.dim()]
+    host_scalars += indices if isinstance(first, OnCard) else []
+    return (
+        len({isinstance(tensor, OnCard) for tensor in tensors if all(tensor is not other for other in host_scalars)})
+        > 1
+    )
 
 
 def _tensors(values: Any) -> list[Tensor]:

@@ -8,13 +8,13 @@ import numpy as np
 
 
 def sam_records(masks: np.ndarray, *, as_string: bool = False) -> list[dict[str, Any]]:
-    """What segment-anything returns for masks [K, H, W]: as uncompressed_rle, or as coco_rle."""
-    found = []
+    """Return segment-anything output of masks [K, H, W]: as uncompressed_rle, or as coco_rle."""
+    records = []
     for mask in masks:
         lengths = lengths_of(mask)
         counts = compressed(lengths) if as_string else lengths
-        found.append({"segmentation": {"size": [*mask.shape], "counts": counts}, "area": int(mask.sum())})
-    return found
+        records.append({"segmentation": {"size": [*mask.shape], "counts": counts}, "area": int(mask.sum())})
+    return records
 
 
 def lengths_of(mask: np.ndarray) -> list[int]:

@@ -80,12 +80,12 @@ def observed(seed: int, view: int, grids: bool = False) -> ViewFeatures:
 
 @st.composite
 def scenes(
-    draw: st.DrawFn, kernel: Kernel = Kernel.GAUSSIAN_3D, most: int = 60, largest: tuple[int, int] = (50, 40)
+    draw: st.DrawFn, kernel: Kernel = Kernel.GAUSSIAN_3D, max_splats: int = 60, largest: tuple[int, int] = (50, 40)
 ) -> tuple[Splats, Camera, ViewFeatures]:
     """A scene of at most so many splats, a view of at most that width and height, and what the view observes."""
     seed = draw(st.integers(0, 2**20))
     spread = draw(st.sampled_from([0.2, 1.0, 3.0]))
-    splats = random_splats(seed, draw(st.integers(1, most)), spread, kernel)
+    splats = random_splats(seed, draw(st.integers(1, max_splats)), spread, kernel)
     camera = random_camera(seed, width=draw(st.integers(1, largest[0])), height=draw(st.integers(1, largest[1])))
     size = (draw(st.integers(1, 45)), draw(st.integers(1, 55)))
     if draw(st.booleans()):

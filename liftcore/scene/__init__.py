@@ -1,1 +1,1 @@
-"""What A is made from: splats and cameras, and the readers of their file formats."""
+"""Inputs of the weight matrix A: splats and cameras, and their geometry."""

@@ -31,10 +31,10 @@ def blended(state, shape, fade):
     store_lanes(state, WEIGHTS, blend_lanes(state, 0, shape, fade))
 
 
-def active(floor: float = ALPHA_FLOOR, cap: float = CAP, light: float = 1.0) -> np.ndarray:
+def active(floor: float = ALPHA_FLOOR, cap: float = CAP, transmittance: float = 1.0) -> np.ndarray:
     """A tile's state with so much transmittance on the first segment."""
     state = new_state(floor, cap, STOP)
-    state[TRANSMITTANCE : TRANSMITTANCE + LANES] = light
+    state[TRANSMITTANCE : TRANSMITTANCE + LANES] = transmittance
     return state
 
 
@@ -50,14 +50,14 @@ BROKEN = [("start", -math.inf), *product(("start", "base", "fade"), (math.inf, m
 
 @pytest.mark.parametrize(("part", "broken"), BROKEN)
 def test_what_is_no_number_has_no_weight_and_takes_no_light(part, broken):
-    given = {"start": 0.0, "base": 0.0, "fade": 1.0, part: broken}
+    values = {"start": 0.0, "base": 0.0, "fade": 1.0, part: broken}
     for shape in (
-        GaussianSegment(F(given["start"]), F(0.1), F(given["base"])),
-        BetaSegment(F(given["start"]), F(0), F(0.1), F(0), F(given["base"]), F(3.0)),
+        GaussianSegment(F(values["start"]), F(0.1), F(values["base"])),
+        BetaSegment(F(values["start"]), F(0), F(0.1), F(0), F(values["base"]), F(3.0)),
     ):
         for floor in (ALPHA_FLOOR, 0.0):
-            state = active(floor, light=0.5)
-            blended(state, shape, F(given["fade"]))
+            state = active(floor, transmittance=0.5)
+            blended(state, shape, F(values["fade"]))
             assert np.array_equal(state[WEIGHTS : WEIGHTS + LANES], np.zeros(LANES))
             assert np.array_equal(state[TRANSMITTANCE : TRANSMITTANCE + LANES], np.full(LANES, 0.5))
 

@@ -51,12 +51,12 @@ plausible = st.lists(st.sampled_from(LINES), max_size=40).map(
 damaged = st.tuples(plausible.map(str.encode), st.binary(max_size=80)).map(b"".join)
 
 
-def read_or_refused(read: Callable[[Path], Any], path: Path, error: type[InvalidInput]) -> Any:
-    """What the file is read as; None where it is refused, in one line."""
+def read_or_refused(reader: Callable[[Path], Any], path: Path, error: type[InvalidInput]) -> Any:
+    """Read a file; return None if it is refused, in one line."""
     try:
-        return read(path)
-    except error as told:
-        assert "\n" not in str(told)
+        return reader(path)
+    except error as refusal:
+        assert "\n" not in str(refusal)
         return None
 
 
@@ -66,8 +66,8 @@ def test_any_bytes_are_splats_or_an_error_of_ours(content: bytes) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "fuzz.ply"
         path.write_bytes(content)
-        found = read_or_refused(read_splats, path, InvalidSplats)
-        assert found is None or found.count > 0
+        splats = read_or_refused(read_splats, path, InvalidSplats)
+        assert splats is None or splats.count > 0
 
 
 @given(st.floats(), st.floats(), st.integers(0, 15))
@@ -79,12 +79,12 @@ def test_any_number_in_a_pose_is_a_camera_or_an_error_of_ours(focal, value, plac
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "transforms.json"
         path.write_text(json.dumps({"fl_x": focal, "w": 64, "h": 48, "frames": [frame]}))
-        found = read_or_refused(read_cameras, path, InvalidCameras)
-        assert found is None or np.isfinite(found["a"].centre).all()
+        cameras = read_or_refused(read_cameras, path, InvalidCameras)
+        assert cameras is None or np.isfinite(cameras["a"].centre).all()
 
 
 def as_bytes(write: Callable[[Path], object]) -> bytes:
-    """What is written into a file."""
+    """Bytes that are written into a file."""
     with tempfile.TemporaryDirectory() as folder:
         write(Path(folder) / "a.npy")
         return (Path(folder) / "a.npy").read_bytes()
@@ -129,13 +129,16 @@ EDITS = st.lists(st.tuples(st.integers(0, 400), st.integers(0, 255)), max_size=6
 @given(st.sampled_from(FILES), EDITS, st.integers(0, 2_000), st.one_of(st.none(), st.binary(max_size=60)))
 @settings(max_examples=1_000, deadline=None)
 def test_any_damage_to_a_file_is_read_or_an_error_of_ours(file, changes, keep, noise) -> None:
-    name, content, others, read = file
-    changed = bytearray(content)
+    name, content, siblings, reader = file
+    damaged = bytearray(content)
     for place, value in changes:
-        changed[place % len(changed)] = value
+        damaged[place % len(damaged)] = value
     with tempfile.TemporaryDirectory() as folder:
-        for other, own in {**others, name: bytes(changed[:keep]) if noise is None else content[:8] + noise}.items():
-            (Path(folder) / other).write_bytes(own)
-        error = InvalidCameras if read in (read_cameras, whole_model) else InvalidFeatures
-        found = read_or_refused(read, Path(folder) / name, error)
-        assert found is None or len(found) > 0
+        for other, data in {
+            **siblings,
+            name: bytes(damaged[:keep]) if noise is None else content[:8] + noise,
+        }.items():
+            (Path(folder) / other).write_bytes(data)
+        error = InvalidCameras if reader in (read_cameras, whole_model) else InvalidFeatures
+        output = read_or_refused(reader, Path(folder) / name, error)
+        assert output is None or len(output) > 0

@@ -73,12 +73,12 @@ def drawn(
     """A scene of the kernel, a view, what it observes, and a walk, over some of its pixels if asked."""
     kernel, antialiased = FOOTPRINTS[footprint]
     splats, camera, observation = data.draw(scenes(kernel, backend.splats, backend.size))
-    walk = replace(data.draw(st.sampled_from(WALKS)), antialiased=antialiased)
+    params = replace(data.draw(st.sampled_from(WALKS)), antialiased=antialiased)
     if strided:
         stride = data.draw(st.integers(1, 5))
         left, top = (data.draw(st.integers(0, min(stride, side) - 1)) for side in (camera.width, camera.height))
-        walk = replace(walk, stride=stride, offset=(left, top))
-    return splats, camera, observation, walk
+        params = replace(params, stride=stride, offset=(left, top))
+    return splats, camera, observation, params
 
 
 def seeded(footprint: str, seed: int, count: int) -> tuple[Splats, CompositingParams]:
@@ -92,8 +92,8 @@ def seeded(footprint: str, seed: int, count: int) -> tuple[Splats, CompositingPa
 def test_renders_equal_the_oracle(footprint, backend):
     @backend.holds(st.data())
     def check(data) -> None:
-        splats, camera, _, walk = drawn(data, footprint, backend)
-        check_render(backend.open(splats), splats, camera, walk)
+        splats, camera, _, params = drawn(data, footprint, backend)
+        check_render(backend.open(splats), splats, camera, params)
 
 
 @every_footprint
@@ -101,8 +101,8 @@ def test_renders_equal_the_oracle(footprint, backend):
 def test_splats_that_a_ray_meets_have_a_footprint(footprint, backend):
     @backend.holds(st.data())
     def check(data) -> None:
-        splats, camera, _, walk = drawn(data, footprint, backend)
-        check_footprints(backend.open(splats), splats, camera, walk)
+        splats, camera, _, params = drawn(data, footprint, backend)
+        check_footprints(backend.open(splats), splats, camera, params)
 
 
 @every_backend
@@ -122,8 +122,8 @@ def test_footprint_of_a_ball_is_as_large_as_the_pixels_that_it_holds(backend):
 def test_region_weights_and_evidence_equal_the_oracle(footprint, backend):
     @backend.holds(st.data(), st.sampled_from(POWERS))
     def check(data, weighting) -> None:
-        splats, camera, observation, walk = drawn(data, footprint, backend, strided=True)
-        check_region_weights(backend.open(splats), splats, camera, observation, walk, weighting)
+        splats, camera, observation, params = drawn(data, footprint, backend, strided=True)
+        check_region_weights(backend.open(splats), splats, camera, observation, params, weighting)
 
 
 @every_footprint
@@ -131,8 +131,8 @@ def test_region_weights_and_evidence_equal_the_oracle(footprint, backend):
 def test_weights_that_count_equal_the_oracle_ray_by_ray(footprint, backend):
     @backend.holds(st.data(), st.sampled_from(SELECTIONS))
     def check(data, weighting) -> None:
-        splats, camera, _, walk = drawn(data, footprint, backend, strided=True)
-        check_selected_weights(backend.open(splats), splats, camera, walk, weighting)
+        splats, camera, _, params = drawn(data, footprint, backend, strided=True)
+        check_selected_weights(backend.open(splats), splats, camera, params, weighting)
 
 
 @every_backend
@@ -201,9 +201,9 @@ def test_flips_at_the_cut_offs_are_rare_and_unbiased(footprint, backend):
     rays = flips = 0
     drift = 0.0
     for seed in range(backend.seeds):
-        (splats, walk), camera = seeded(footprint, seed, 80), random_camera(seed, 64, 48)
-        expected = dense_view(splats, camera, walk).A.sum(axis=1)
-        error = backend.open(splats).render(camera, torch.ones(splats.count, 1), walk).numpy().ravel() - expected
+        (splats, params), camera = seeded(footprint, seed, 80), random_camera(seed, 64, 48)
+        expected = dense_view(splats, camera, params).A.sum(axis=1)
+        error = backend.open(splats).render(camera, torch.ones(splats.count, 1), params).numpy().ravel() - expected
         rays += error.size
         flips += int((np.abs(error) > INSIDE).sum())
         drift += float(error.sum())
@@ -216,24 +216,24 @@ def test_flips_at_the_cut_offs_are_rare_and_unbiased(footprint, backend):
 def test_ray_rows_are_rows_of_a(footprint, backend):
     @backend.holds(st.data())
     def check(data) -> None:
-        splats, camera, _, walk = drawn(data, footprint, backend)
-        check_ray_rows(backend.open(splats), splats, camera, walk, backend.rays)
+        splats, camera, _, params = drawn(data, footprint, backend)
+        check_ray_rows(backend.open(splats), splats, camera, params, backend.rays)
 
 
 @every_backend
 def test_adjoints_equal_the_oracle(backend):
-    @backend.holds(scenes(most=backend.splats, largest=backend.size), st.sampled_from(WALKS), CHANNELS)
-    def check(scene, walk, channels) -> None:
+    @backend.holds(scenes(max_splats=backend.splats, largest=backend.size), st.sampled_from(WALKS), CHANNELS)
+    def check(scene, params, channels) -> None:
         splats, camera, _ = scene
-        check_adjoint(backend.open(splats), splats, camera, walk, channels)
+        check_adjoint(backend.open(splats), splats, camera, params, channels)
 
 
 @every_backend
 def test_a_render_and_its_adjoint_agree_on_every_inner_product(backend):
-    @backend.holds(scenes(most=backend.splats, largest=backend.size), st.sampled_from(WALKS))
-    def check(scene, walk) -> None:
+    @backend.holds(scenes(max_splats=backend.splats, largest=backend.size), st.sampled_from(WALKS))
+    def check(scene, params) -> None:
         splats, camera, _ = scene
-        check_inner_product(backend.open(splats), splats, camera, walk)
+        check_inner_product(backend.open(splats), splats, camera, params)
 
 
 @every_backend
@@ -253,9 +253,9 @@ def test_rays_end_at_the_same_splat_in_every_product(cap, stop):
         log_scales=torch.full((6, 3), 2.0),
     )
     camera = random_camera(0, 5, 5).replace(cx=2.5, cy=2.5, fx=5.0, fy=5.0, viewmat=np.eye(4))
-    raster, walk = CpuRaster(splats), CompositingParams(alpha_cap=cap, transmittance_stop=stop)
-    image = raster.render(camera, torch.ones(6, 1), walk)[..., 0]
-    rows = raster.ray_rows(camera, pixels_of(camera), walk)
+    raster, params = CpuRaster(splats), CompositingParams(alpha_cap=cap, transmittance_stop=stop)
+    image = raster.render(camera, torch.ones(6, 1), params)[..., 0]
+    rows = raster.ray_rows(camera, pixels_of(camera), params)
     sums = [float(part.sum()) for part in rows.weights.split(rows.indptr.diff().tolist())]
     assert image.ravel().tolist() == pytest.approx(sums, rel=1e-6, abs=1e-7)
 
@@ -263,17 +263,17 @@ def test_rays_end_at_the_same_splat_in_every_product(cap, stop):
 @every_footprint
 @every_backend
 def test_views_walked_in_a_row_are_those_walked_alone_to_the_bit(footprint, backend):
-    splats, walk = seeded(footprint, 7, 12)
-    check_iterated_views(backend.open(splats), backend.open(splats), walk)
+    splats, params = seeded(footprint, 7, 12)
+    check_iterated_views(backend.open(splats), backend.open(splats), params)
 
 
 @every_footprint
 def test_the_number_of_threads_changes_no_bit(footprint):
-    (splats, walk), camera = seeded(footprint, 7, 3_000), random_camera(7, 200, 150)
-    gain, strided = replace(walk, opacity_logit_scale=1.2), replace(walk, stride=3, offset=(1, 2))
+    (splats, params), camera = seeded(footprint, 7, 3_000), random_camera(7, 200, 150)
+    gain, strided = replace(params, opacity_logit_scale=1.2), replace(params, stride=3, offset=(1, 2))
     one, many = CpuRaster(splats, threads=1), CpuRaster(splats, threads=5)
     for own, weighting in (
-        (walk, Weighting()),
+        (params, Weighting()),
         (gain, Weighting(2)),
         (gain, Weighting(2, Selection.TOP_K, count=3)),
         (strided, Weighting(1, Selection.FRONT_MASS, mass=0.75)),
@@ -283,7 +283,7 @@ def test_the_number_of_threads_changes_no_bit(footprint):
             first, second = (raster.region_weights(camera, observation, own, weighting) for raster in (one, many))
             assert same_bits(first, second)
     image, labels = random_image(camera, 5), torch.arange(3_000, dtype=torch.int32) % 60 - 1
-    for own in (walk, gain):
+    for own in (params, gain):
         for product in (
             lambda raster, own=own: raster.row_sums(camera, own),
             lambda raster, own=own: raster.adjoint(camera, image, own),
@@ -295,11 +295,11 @@ def test_the_number_of_threads_changes_no_bit(footprint):
 
 def test_images_and_traced_rays_are_whole_whatever_the_stride():
     splats, camera = random_splats(5, 300), random_camera(5, 61, 47)
-    raster, walk = CpuRaster(splats), CompositingParams(stride=4, offset=(3, 1))
-    assert torch.equal(raster.row_sums(camera, walk), raster.row_sums(camera, CompositingParams()))
+    raster, params = CpuRaster(splats), CompositingParams(stride=4, offset=(3, 1))
+    assert torch.equal(raster.row_sums(camera, params), raster.row_sums(camera, CompositingParams()))
     pixels = torch.tensor([[3, 1], [7, 5], [59, 45]], dtype=torch.int32)
     for asked in (pixels, torch.cat([pixels, torch.tensor([[0, 0]], dtype=torch.int32)])):
-        got, full = (raster.ray_rows(camera, asked, own) for own in (walk, CompositingParams()))
+        got, full = (raster.ray_rows(camera, asked, own) for own in (params, CompositingParams()))
         assert torch.equal(got.splats, full.splats)
         assert torch.allclose(got.weights, full.weights, atol=1e-6)
 
@@ -308,8 +308,8 @@ def test_the_oracle_is_a_backend_that_gives_the_same_products():
     splats, camera = random_splats(1, 30), random_camera(1)
     assert not dense_view(splats, camera, GAIN).cut.any()
     fast, plain = CpuRaster(splats), ReferenceRaster(splats)
-    observation, walk = random_regions(1), replace(GAIN, stride=2, offset=(1, 0))
-    ours, theirs = (raster.region_weights(camera, observation, walk, Weighting(2)) for raster in (fast, plain))
+    observation, params = random_regions(1), replace(GAIN, stride=2, offset=(1, 0))
+    ours, theirs = (raster.region_weights(camera, observation, params, Weighting(2)) for raster in (fast, plain))
     assert np.abs(dense(ours, 30, 5) - dense(theirs, 30, 5)).max() < INSIDE
     assert torch.equal(ours.total_weight_splats, theirs.total_weight_splats)
     assert torch.allclose(ours.total_weight, theirs.total_weight, atol=INSIDE)
@@ -334,23 +334,23 @@ def test_the_oracle_is_a_backend_that_gives_the_same_products():
     ],
     ids=str,
 )
-def test_knobs_out_of_range_are_refused_by_name(backend, name, weighting, walk):
+def test_knobs_out_of_range_are_refused_by_name(backend, name, weighting, params):
     with pytest.raises(InvalidInput, match=f"^{name}: "):
         backend.open(random_splats(0)).region_weights(
-            random_camera(0), random_grid(0), CompositingParams(**walk), weighting
+            random_camera(0), random_grid(0), CompositingParams(**params), weighting
         )
 
 
 @every_backend
 def test_values_of_another_shape_and_walks_without_meaning_are_refused(backend):
     splats, camera = random_splats(0, 4, kernel=Kernel.GAUSSIAN_2D), random_camera(0)
-    raster, walk = backend.open(splats), CompositingParams()
+    raster, params = backend.open(splats), CompositingParams()
     with pytest.raises(InvalidInput, match="values"):
-        raster.render(camera, torch.zeros(3, 1), walk)
+        raster.render(camera, torch.zeros(3, 1), params)
     with pytest.raises(InvalidInput, match="values"):
-        raster.adjoint(camera, torch.zeros(3, 4, 1), walk)
+        raster.adjoint(camera, torch.zeros(3, 4, 1), params)
     with pytest.raises(InvalidInput, match="labels"):
-        raster.strongest_labels(camera, torch.zeros(3, dtype=torch.int32), walk)
+        raster.strongest_labels(camera, torch.zeros(3, dtype=torch.int32), params)
     for made in (raster, ReferenceRaster(splats)):
         with pytest.raises(InvalidSettings, match="3D Gaussians"):
             made.row_sums(camera, CompositingParams(antialiased=True))
