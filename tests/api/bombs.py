@@ -45,7 +45,7 @@ def cameras() -> dict[str, bytes]:
 
 def camera_documents() -> dict[str, bytes]:
     """Those in JSON."""
-    document, plain = cameras_document(), cameras_json()
+    document, frames = cameras_document(), cameras_json()
     first = document["frames"][0]
     return {
         "deep array": b"[" * 100_000,
@@ -53,13 +53,13 @@ def camera_documents() -> dict[str, bytes]:
         "deep array that ends": b"[" * 50_000 + b"]" * 50_000,
         "NaN": json.dumps(document | {"fl_x": float("nan")}).encode(),
         "Infinity": json.dumps(document | {"fl_x": float("inf")}).encode(),
-        "number beyond every float": plain.replace(b"30.0", b"1e999"),
-        "integer of 4,000 digits": plain.replace(b"30.0", b"9" * 4000),
-        "integer of 5,000 digits": plain.replace(b"30.0", b"9" * 5000),
+        "number beyond every float": frames.replace(b"30.0", b"1e999"),
+        "integer of 4,000 digits": frames.replace(b"30.0", b"9" * 4000),
+        "integer of 5,000 digits": frames.replace(b"30.0", b"9" * 5000),
         "an image of 10^18 pixels": json.dumps(document | {"w": 10**18}).encode(),
         "negative size": json.dumps(document | {"w": -5}).encode(),
-        "half a surrogate pair in a name": plain.replace(b"images/left", b"images/\\ud800left"),
-        "zero byte in a name": plain.replace(b"images/left", b"images/\\u0000left"),
+        "half a surrogate pair in a name": frames.replace(b"images/left", b"images/\\ud800left"),
+        "zero byte in a name": frames.replace(b"images/left", b"images/\\u0000left"),
         "half a surrogate pair as a key": b'{"\\ud800": 1, "frames": []}',
         "not UTF-8": b'{"a": "\xff\xfe"}',
         "10,000 names in emoji": json.dumps(
@@ -130,11 +130,18 @@ def masks() -> dict[str, bytes]:
 def table() -> dict[str, bytes]:
     """Bombs for the reader of text tables, likewise."""
     row = {"embeddings": tensor([1, 1], 0, 4)}
-    both = {"embeddings": tensor([1, 1], 0, 4), "v/mask": tensor([1, 1], 4, 8), "__metadata__": {"words": '["a"]'}}
-    worded = {name: {**row, "__metadata__": {"words": words}} for name, words in WORDS.items()}
+    two_tensors = {
+        "embeddings": tensor([1, 1], 0, 4),
+        "v/mask": tensor([1, 1], 4, 8),
+        "__metadata__": {"words": '["a"]'},
+    }
+    headers_with_words = {name: {**row, "__metadata__": {"words": words}} for name, words in WORDS.items()}
     return (
         features()
-        | {name: safetensors(json.dumps(header).encode()) + struct.pack("<f", 1) for name, header in worded.items()}
+        | {
+            name: safetensors(json.dumps(header).encode()) + struct.pack("<f", 1)
+            for name, header in headers_with_words.items()
+        }
         | {
             "no words": pack(row, 4),
             "zeros": pack({**row, "__metadata__": {"words": '["apple"]'}}, 4),
@@ -142,7 +149,7 @@ def table() -> dict[str, bytes]:
                 json.dumps(row | {"__metadata__": {"words": json.dumps(["x" * 10**6])}}).encode()
             )
             + struct.pack("<f", 1),
-            "masks too": safetensors(json.dumps(both).encode()) + struct.pack("<ff", 1, 1),
+            "masks too": safetensors(json.dumps(two_tensors).encode()) + struct.pack("<ff", 1, 1),
             "a long word without a direction": pack({**row, "__metadata__": {"words": json.dumps(["x" * 10**6])}}, 4),
             "100,000 sides": pack(
                 {"embeddings": tensor([1] * 100_000, 0, 4), "__metadata__": {"words": '["apple"]'}}, 4

@@ -22,7 +22,7 @@ from service.store.assets import CheckedUpload
 from service.store.owners import SERVICE
 from service.store.store import Store
 
-from .following import ended
+from .following import wait_for_end
 from .tiny_scene import CHANNELS, TinyScene, make_scene, text_table
 
 LIFT_REQUEST = "the-request-of-the-lift"
@@ -32,7 +32,7 @@ ADDRESS = "http://127.0.0.1"
 @contextmanager
 def serving(data: Path, table: Path, **settings: Any) -> Iterator[TestClient]:
     """The application over a data directory, with the text table of the tiny scene."""
-    chosen = ServiceSettings.model_validate(
+    server_settings = ServiceSettings.model_validate(
         {
             "data": data,
             "encoder": f"table:{table}",
@@ -40,9 +40,9 @@ def serving(data: Path, table: Path, **settings: Any) -> Iterator[TestClient]:
             **settings,
         }
     )
-    store = Store.open(chosen.data, floor_bytes=chosen.disk_floor_bytes)
+    store = Store.open(server_settings.data, floor_bytes=server_settings.disk_floor_bytes)
     try:
-        with TestClient(assemble(chosen, store), ADDRESS, raise_server_exceptions=False) as client:
+        with TestClient(assemble(server_settings, store), ADDRESS, raise_server_exceptions=False) as client:
             yield client
     finally:
         store.close()
@@ -66,14 +66,14 @@ def put(client: TestClient, kind: AssetKind, content: bytes) -> str:
         draft.write_bytes(content)
         copy = folder / "copy"
         copy.write_bytes(content)
-        said = tasks.check(kind, str(copy))
+        report = tasks.check(kind, str(copy))
         digest = hashlib.sha256(content).hexdigest()
-        upload = CheckedUpload(draft, kind, digest, said["suffix"], said["counts"], said["warnings"])
+        upload = CheckedUpload(draft, kind, digest, report["suffix"], report["counts"], report["warnings"])
         return store.assets.add(SERVICE, upload)[0].id
 
 
 @dataclass(frozen=True)
-class Uploaded:
+class SceneAssets:
     """The ids of the tiny scene's assets."""
 
     splats: str
@@ -122,7 +122,7 @@ def client(data: Path, table: Path) -> Iterator[TestClient]:
 
 
 @pytest.fixture(scope="session")
-def uploaded(client: TestClient, scene: TinyScene) -> Uploaded:
+def scene_assets(client: TestClient, scene: TinyScene) -> SceneAssets:
     replies = [
         client.put("/assets/splats", content=scene.splats),
         client.put("/assets/cameras", content=scene.cameras),
@@ -130,15 +130,15 @@ def uploaded(client: TestClient, scene: TinyScene) -> Uploaded:
     ]
     for reply in replies:
         assert reply.status_code == 201, reply.text
-    return Uploaded(*(reply.json()["id"] for reply in replies))
+    return SceneAssets(*(reply.json()["id"] for reply in replies))
 
 
 @pytest.fixture(scope="session")
-def lift(client: TestClient, uploaded: Uploaded) -> dict[str, Any]:
+def lift(client: TestClient, scene_assets: SceneAssets) -> dict[str, Any]:
     """The lift of the tiny scene, as GET /lifts/{id} tells it."""
-    reply = client.post("/lift", json=uploaded.order(preset="row-sum"), headers={"X-Request-ID": LIFT_REQUEST})
+    reply = client.post("/lift", json=scene_assets.order(preset="row-sum"), headers={"X-Request-ID": LIFT_REQUEST})
     assert reply.status_code == 202, reply.text
-    job = ended(client, reply.headers["location"])
+    job = wait_for_end(client, reply.headers["location"])
     assert job["state"] == "succeeded", job
     return client.get(job["links"]["lift"]).json()
 
@@ -146,6 +146,6 @@ def lift(client: TestClient, uploaded: Uploaded) -> dict[str, Any]:
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[Store]:
     """An empty store that no application holds."""
-    opened = Store.open(tmp_path / "data")
-    yield opened
-    opened.close()
+    new_store = Store.open(tmp_path / "data")
+    yield new_store
+    new_store.close()

@@ -56,24 +56,24 @@ PATIENCE_SECONDS = 300.0  # for what takes some seconds; the machine may be busy
 
 
 @contextmanager
-def served(data: Path, *, keys: bool, **settings: Any) -> Iterator[tuple[str, str | None]]:
+def serve(data: Path, *, keys: bool, **settings: Any) -> Iterator[tuple[str, str | None]]:
     """A server in a thread over a data directory: its address, and a key that may do everything."""
-    chosen = ServiceSettings.model_validate({"data": data, **settings})
-    store = Store.open(chosen.data)
+    server_settings = ServiceSettings.model_validate({"data": data, **settings})
+    store = Store.open(server_settings.data)
     secret = store.keys.create("contract", frozenset({Scope.ADMIN}), Quota())[1] if keys else None
-    runner = Supervisor(store, job_limits(chosen), command=stand_in("answer"))
-    app = create_app(chosen, store, runner, QueryClient(query_limits(chosen)))
-    nowhere = {"sha256": "0" * 64}
-    metadata = {"splats": nowhere, "cameras": nowhere, "features": [], "settings": {}, "views": ["v"]}
+    runner = Supervisor(store, job_limits(server_settings), command=stand_in("answer"))
+    app = create_app(server_settings, store, runner, QueryClient(query_limits(server_settings)))
+    empty_asset = {"sha256": "0" * 64}
+    metadata = {"splats": empty_asset, "cameras": empty_asset, "features": [], "settings": {}, "views": ["v"]}
     lift = {"metadata": metadata, "count": 1}
     report = Report(".bin", {"names": ["v"], "channels": 1, "classes": 1, "words": ["apple"], **lift}, [])
     planned = SandboxResult({"event": "valid", "plan": {"summary": [], "warnings": []}}, 0, "")
     with (
-        mock.patch("service.uploads.check", lambda *given: report),
-        mock.patch("service.routes.jobs.run_sandboxed", lambda *given: planned),
+        mock.patch("service.uploads.check", lambda *arguments: report),
+        mock.patch("service.routes.jobs.run_sandboxed", lambda *arguments: planned),
     ):
         try:
-            with listening(app, chosen) as server:
+            with listening(app, server_settings) as server:
                 address = "http://{}:{}".format(*address_of(server))
                 _warm_up(address, secret)
                 yield address, secret
@@ -123,10 +123,10 @@ def conformance(
         Path(folder, "schemathesis.toml").write_text(REFUSALS)
         Path(folder, "hooks.py").write_text(HOOKS)
         hooked = os.environ | {"SCHEMATHESIS_HOOKS": "hooks", "PYTHONPATH": folder}
-        found = subprocess.run(
+        process = subprocess.run(
             command, cwd=folder, env=hooked, capture_output=True, text=True, timeout=seconds, check=False
         )
-    return "" if found.returncode == 0 else f"{found.stdout}\n{found.stderr}"
+    return "" if process.returncode == 0 else f"{process.stdout}\n{process.stderr}"
 
 
 def main() -> int:
@@ -141,14 +141,14 @@ def main() -> int:
     for keys in options.keys:
         with (
             tempfile.TemporaryDirectory() as folder,
-            served(Path(folder) / "data", keys=keys == "with") as (address, secret),
+            serve(Path(folder) / "data", keys=keys == "with") as (address, secret),
         ):
-            begun = time.monotonic()
+            start = time.monotonic()
             failures = conformance(
                 address, secret, examples=options.examples, phases=options.phases, seconds=options.seconds
             )
         wrong = wrong or bool(failures)
-        head = f"--- {keys} keys, {time.monotonic() - begun:.0f} s ---"
+        head = f"--- {keys} keys, {time.monotonic() - start:.0f} s ---"
         print(head, failures or "everything conforms", sep="\n", flush=True)
     return int(wrong)
 

@@ -16,12 +16,12 @@ class Client(Protocol):
         ...
 
 
-def ended(client: Client, job: str) -> dict[str, Any]:
+def wait_for_end(client: Client, job: str) -> dict[str, Any]:
     """Poll a job until it has ended; the job."""
     deadline = time.monotonic() + PATIENCE_SECONDS
     while time.monotonic() < deadline:
-        found = client.get(job).json()
-        if found["state"] in ("succeeded", "failed", "canceled"):
-            return found
+        record = client.get(job).json()
+        if record["state"] in ("succeeded", "failed", "canceled"):
+            return record
         time.sleep(0.1)
     raise AssertionError(f"{job} did not end within {PATIENCE_SECONDS:g} s")

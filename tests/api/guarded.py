@@ -43,7 +43,7 @@ class NoJobs(NoQueries):
 
 
 @dataclass(frozen=True)
-class Guarded:
+class KeyedServer:
     """The application, its store, the secrets by name, and what Alice has."""
 
     client: TestClient
@@ -51,14 +51,14 @@ class Guarded:
     secrets: Mapping[str, str]
     ids: Mapping[str, str]  # of keys, by name
     order: JobOrder
-    done: str  # a job with a lift
-    compared: str  # one with a trade-off
+    lift_job: str  # a job with a lift
+    tradeoff_job: str  # one with a trade-off
     queued: str
 
-    def ask(self, name: str | None, method: str, path: str, **how: Any) -> Any:
+    def ask(self, name: str | None, method: str, path: str, **options: Any) -> Any:
         """A request with somebody's key, or without one."""
-        headers = how.pop("headers", {}) | ({} if name is None else bearer(self.secrets[name]))
-        return self.client.request(method, path, headers=headers, **how)
+        headers = options.pop("headers", {}) | ({} if name is None else bearer(self.secrets[name]))
+        return self.client.request(method, path, headers=headers, **options)
 
     def body(self) -> dict[str, Any]:
         """Alice's order, as POST /lift takes it."""
@@ -73,23 +73,25 @@ def bearer(secret: str) -> dict[str, str]:
 
 
 @contextmanager
-def guarded(data: Path, views: Sequence[str] = ("v",), **settings: Any) -> Iterator[Guarded]:
+def keyed_server(data: Path, views: Sequence[str] = ("v",), **settings: Any) -> Iterator[KeyedServer]:
     """Serve it; her lift is of these views."""
     store = Store.open(data)
-    chosen = ServiceSettings.model_validate({"data": data, "disk_floor_bytes": 0, **settings})
-    app = create_app(chosen, store, cast("Supervisor", NoJobs()), cast("QueryClient", NoQueries()))
-    made = {name: make_key(store, scopes) for name, scopes in SCOPES.items()}
-    ids, secrets = ({name: pair[place] for name, pair in made.items()} for place in (0, 1))
+    server_settings = ServiceSettings.model_validate({"data": data, "disk_floor_bytes": 0, **settings})
+    app = create_app(server_settings, store, cast("Supervisor", NoJobs()), cast("QueryClient", NoQueries()))
+    keys = {name: make_key(store, scopes) for name, scopes in SCOPES.items()}
+    ids, secrets = ({name: pair[place] for name, pair in keys.items()} for place in (0, 1))
     alice = Owner(ids["alice"], sees_all=False)
-    wanted = order(store, alice)
-    done = store.jobs.submit(alice, wanted)[0]
+    lift_order = order(store, alice)
+    lift_job = store.jobs.submit(alice, lift_order)[0]
     finish(store, b"a lift", views)
-    compared = store.jobs.submit(alice, replace(wanted, kind=JobKind.TRADEOFF, parameters={"budget_s": 60}))[0]
+    tradeoff_job = store.jobs.submit(alice, replace(lift_order, kind=JobKind.TRADEOFF, parameters={"budget_s": 60}))[
+        0
+    ]
     finish_tradeoff(store, b"a chart")
-    queued = store.jobs.submit(alice, wanted)[0]
+    queued = store.jobs.submit(alice, lift_order)[0]
     try:
         with TestClient(app, ADDRESS, raise_server_exceptions=False) as client:
-            yield Guarded(client, store, secrets, ids, wanted, done, compared, queued)
+            yield KeyedServer(client, store, secrets, ids, lift_order, lift_job, tradeoff_job, queued)
     finally:
         store.close()
 
@@ -104,32 +106,32 @@ def finish(store: Store, content: bytes, views: Sequence[str] = ("v",)) -> None:
     """Claim the oldest job in line and end it with a lift."""
     diagnostics = {"warnings": ["x"], "views_without_splats": list(views)}
     metadata = {**METADATA, "diagnostics": diagnostics, "views": list(views)}
-    claimed = store.jobs.claim()
-    assert claimed is not None
+    attempt = store.jobs.claim()
+    assert attempt is not None
     with store.files.draft(".safetensors") as draft:
         draft.write_bytes(content)
-        assert store.lifts.finish(claimed.id, claimed.attempt, FinishedLift(draft, "0" * 64, 1, 1, metadata))
+        assert store.lifts.finish(attempt.id, attempt.attempt, FinishedLift(draft, "0" * 64, 1, 1, metadata))
 
 
 def finish_tradeoff(store: Store, chart: bytes) -> None:
     """Claim the oldest job in line and end it with a trade-off."""
-    claimed = store.jobs.claim()
-    assert claimed is not None
-    found = {"runs": [], "skipped": [], "choice": {}, "views": {}, "budget_s": 60, "seconds": 1}
-    assert store.tradeoffs.finish(claimed.id, claimed.attempt, FinishedTradeoff(found, "a table", chart))
+    attempt = store.jobs.claim()
+    assert attempt is not None
+    results = {"runs": [], "skipped": [], "choice": {}, "views": {}, "budget_s": 60, "seconds": 1}
+    assert store.tradeoffs.finish(attempt.id, attempt.attempt, FinishedTradeoff(results, "a table", chart))
 
 
 def every_route(app: FastAPI) -> list[tuple[str, str]]:
     """Method and path of all that the application answers, documented or not."""
-    found: list[tuple[str, str]] = []
+    results: list[tuple[str, str]] = []
     routes = list(app.routes)
     while routes:
         route = routes.pop(0)
         if isinstance(route, Route):
-            found += [(method, route.path) for method in sorted(route.methods or ()) if method != "HEAD"]
+            results += [(method, route.path) for method in sorted(route.methods or ()) if method != "HEAD"]
         else:
             routes += vars(route)["original_router"].routes  # of a router that was included
-    return found
+    return results
 
 
 def address(path: str, job: str, asset: str) -> str:

@@ -41,8 +41,8 @@ from .tiny_scene import (
 
 def files_below(data: Path) -> set[str]:
     """Every file but the database's own and the number beside it, which is written as the server starts."""
-    found = (path for path in data.rglob("*") if path.is_file())
-    return {str(path) for path in found if not path.name.startswith(("service.sqlite", "generation", ".generation"))}
+    files = (path for path in data.rglob("*") if path.is_file())
+    return {str(path) for path in files if not path.name.startswith(("service.sqlite", "generation", ".generation"))}
 
 
 def with_label_out_of_the_codebook() -> bytes:
@@ -85,15 +85,15 @@ def test_malformed_upload_is_refused_and_gone(
 
 
 def test_names_of_cameras_are_as_long_as_a_query_may_say(tmp_path: Path) -> None:
-    for image, said in (("a" * 500, None), ("a" * 501, "501: 'aaa"), ("", "an empty one")):
+    for image, message in (("a" * 500, None), ("a" * 501, "501: 'aaa"), ("", "an empty one")):
         path = tmp_path / "draft.cameras"
         path.write_bytes(camera_of(image))
-        told = tasks.check(AssetKind.CAMERAS, str(path))
-        assert told["event"] == ("valid" if said is None else "invalid")
-        if said is not None:
-            fault = told["fault"]
+        report = tasks.check(AssetKind.CAMERAS, str(path))
+        assert report["event"] == ("valid" if message is None else "invalid")
+        if message is not None:
+            fault = report["fault"]
             assert (fault["argument"], fault["expected"]) == ("view name", "1 to 500 characters")
-            assert fault["got"].startswith(said) and len(fault["got"]) < 60
+            assert fault["got"].startswith(message) and len(fault["got"]) < 60
 
 
 def test_upload_beyond_the_limit_is_413(client: TestClient, data: Path) -> None:
@@ -157,12 +157,12 @@ for kind, corpus in CORPUS.items():
 def test_every_bomb_is_refused_in_one_line_within_time_and_memory(tmp_path: Path) -> None:
     command = [sys.executable, "-c", ALL_IN_ONE_PROCESS, str(tmp_path), str(MEMORY_BYTES)]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path)}
-    done = subprocess.run(command, capture_output=True, check=True, timeout=SECONDS, env=environment, cwd=ROOT)
-    found = [json.loads(line) for line in done.stdout.splitlines()]
-    assert {kind for kind, _, _ in found} == set(AssetKind)
-    for kind, name, said in found:
-        assert said["event"] == "invalid", (kind, name)
-        problem = problem_of(error_of(said["fault"]))
+    process = subprocess.run(command, capture_output=True, check=True, timeout=SECONDS, env=environment, cwd=ROOT)
+    reports = [json.loads(line) for line in process.stdout.splitlines()]
+    assert {kind for kind, _, _ in reports} == set(AssetKind)
+    for kind, name, message in reports:
+        assert message["event"] == "invalid", (kind, name)
+        problem = problem_of(error_of(message["fault"]))
         assert (problem.status, problem.type) == (422, f"/problems/invalid-{kind}"), name
         assert problem.expected and problem.got and "memory" not in problem.expected, name
         assert len(problem.detail) < 1_000 and "\n" not in problem.detail, name
@@ -215,15 +215,15 @@ def test_real_file_with_changed_bytes_is_taken_or_refused_and_never_crashes(
     packed = content[:2] == b"\x1f\x8b" and early  # else what is changed is the stream, which hardly ever ends well
     content = gzip.decompress(content) if packed else content
     reach = min(len(content), 700) if early else len(content)  # headers lie at the beginning
-    for where, gone, come in changes:
-        place = int(where * reach)
-        content = content[:place] + come + content[place + gone :]
+    for offset, old, new in changes:
+        place = int(offset * reach)
+        content = content[:place] + new + content[place + old :]
     content = content[: round(end * len(content))] if end < 1 else content
     path = tmp_path / f"draft.{kind}"
     path.write_bytes(gzip.compress(content) if packed else content)
-    said = tasks.check(kind, str(path))
-    if said["event"] == "valid":
-        json.dumps(said, allow_nan=False, ensure_ascii=False).encode()
+    report = tasks.check(kind, str(path))
+    if report["event"] == "valid":
+        json.dumps(report, allow_nan=False, ensure_ascii=False).encode()
     else:
-        problem = problem_of(error_of(said["fault"]))
+        problem = problem_of(error_of(report["fault"]))
         assert problem.status == 422 and problem.expected and problem.got

@@ -16,7 +16,7 @@ from fastapi.testclient import TestClient
 
 from liftcore.values.settings import LiftSettings
 
-from .contract import conformance, served
+from .contract import conformance, serve
 
 
 @pytest.fixture
@@ -39,10 +39,10 @@ def references(document: Any) -> Iterator[str]:
 def test_document_refers_to_what_is_in_it(client: TestClient) -> None:
     document = client.get("/openapi.json").json()
     for reference in set(references(document)):
-        found = document
+        node = document
         for part in reference.removeprefix("#/").split("/"):
-            assert part in found, reference
-            found = found[part]
+            assert part in node, reference
+            node = node[part]
 
 
 def test_document_has_every_setting_of_a_lift_with_its_meaning(client: TestClient) -> None:
@@ -64,5 +64,5 @@ def test_operations_have_names_of_functions_and_a_sentence(client: TestClient) -
 
 
 def test_answers_are_as_the_document_says_and_what_is_deleted_is_gone(copied: Path, table: Path) -> None:
-    with served(copied, keys=True, encoder=f"table:{table}") as (address, secret):
+    with serve(copied, keys=True, encoder=f"table:{table}") as (address, secret):
         assert not conformance(address, secret, examples=1, phases=("fuzzing", "stateful"))

@@ -21,9 +21,9 @@ from service.store.jobs import JobOrder
 from service.store.owners import SERVICE
 from tests.crash.conftest import until
 
-from .conftest import Uploaded, parts_of
-from .test_problems import NO_ASSET, NOBODY, assert_problem
-from .test_slow_clients import answer, client_of, served
+from .conftest import SceneAssets, parts_of
+from .test_problems import NO_ASSET, UNKNOWN_ID, assert_problem
+from .test_slow_clients import answer, client_of, serve
 
 METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS", "TRACE", "BREW")
 ODD_PARTS = ("%00", "%FF%FE", "%ED%A0%80", "..%2F..%2Fetc%2Fpasswd", "a" * 6000, "%0d%0aX:y", "-1")
@@ -48,21 +48,21 @@ ODD_MEDIA = ("multipart/form-data; boundary=x", "nonsense", "application/json; c
 def routes(client: TestClient) -> dict[str, set[str]]:
     """What the application takes: path template -> methods."""
     assert isinstance(client.app, FastAPI)
-    found: dict[str, set[str]] = {}
+    methods_by_path: dict[str, set[str]] = {}
     for context in iter_route_contexts(client.app.routes):
         if context.path is not None:
-            found.setdefault(context.path, set()).update(context.methods or ())
-    assert {"/", "/metrics", "/lift", "/openapi.json", "/assets/{asset}"} <= found.keys()
-    return {path: taken | {"HEAD"} if "GET" in taken else taken for path, taken in found.items()}
+            methods_by_path.setdefault(context.path, set()).update(context.methods or ())
+    assert {"/", "/metrics", "/lift", "/openapi.json", "/assets/{asset}"} <= methods_by_path.keys()
+    return {path: methods | {"HEAD"} if "GET" in methods else methods for path, methods in methods_by_path.items()}
 
 
 def address(path: str, part: str | None = None) -> str:
     """A path of a template: of nothing that exists, or with an odd part."""
-    named = path.replace("{asset}", part or NO_ASSET)
-    return re.sub(r"\{\w+\}", part or NOBODY, named)
+    address_text = path.replace("{asset}", part or NO_ASSET)
+    return re.sub(r"\{\w+\}", part or UNKNOWN_ID, address_text)
 
 
-def refused(reply: Any, method: str) -> str:
+def assert_refused(reply: Any, method: str) -> str:
     """The type of a problem; answers to HEAD have no body to tell it."""
     if method != "HEAD":
         return assert_problem(reply)["type"]
@@ -71,12 +71,12 @@ def refused(reply: Any, method: str) -> str:
 
 
 def test_every_route_answers_405_to_what_it_does_not_take(client: TestClient, routes: dict[str, set[str]]) -> None:
-    for path, taken in routes.items():
-        for method in set(METHODS) - taken:
+    for path, methods in routes.items():
+        for method in set(METHODS) - methods:
             reply = client.request(method, address(path))
             assert reply.status_code == 405, (method, path)
-            assert set(reply.headers["allow"].split(", ")) == taken
-            assert refused(reply, method) in ("/problems/method-not-allowed", "(no body)")
+            assert set(reply.headers["allow"].split(", ")) == methods
+            assert assert_refused(reply, method) in ("/problems/method-not-allowed", "(no body)")
             if method != "HEAD":
                 assert reply.json()["expected"] == f"one of {reply.headers['allow']}"
                 assert reply.json()["detail"].endswith(f"expected one of {reply.headers['allow']}, got {method}")
@@ -89,60 +89,60 @@ def test_unknown_paths_are_404_for_every_method(client: TestClient, path: str) -
     for method in METHODS:
         reply = client.request(method, f"http://127.0.0.1{path}")
         assert reply.status_code == 404, (method, reply.status_code, reply.headers)
-        assert refused(reply, method) in ("/problems/no-such-route", "(no body)")
+        assert assert_refused(reply, method) in ("/problems/no-such-route", "(no body)")
         assert len(reply.content) < 1000
 
 
-def odd_requests(client: TestClient, path: str, taken: set[str]) -> Iterator[tuple[str, str, dict[str, Any]]]:
+def odd_requests(client: TestClient, path: str, methods: set[str]) -> Iterator[tuple[str, str, dict[str, Any]]]:
     """Method, address and more of what no route of this path expects."""
-    for method, part in itertools.product(taken, ODD_PARTS if "{" in path else ()):
+    for method, part in itertools.product(methods, ODD_PARTS if "{" in path else ()):
         yield method, address(path, part), {}
     operations = client.get("/openapi.json").json()["paths"].get(path, {}).values()
-    told = [parameter for operation in operations for parameter in operation.get("parameters", ())]
-    names = {parameter["name"] for parameter in told if parameter["in"] == "query"}
-    for method, name, value in itertools.product(taken, names, ODD_VALUES):
-        needed = "".join(f"&{other}=left" for other in names & {"text", "view"} - {name})
-        yield method, f"{address(path)}?{name}={value}{needed}", {}
+    problem = [parameter for operation in operations for parameter in operation.get("parameters", ())]
+    names = {parameter["name"] for parameter in problem if parameter["in"] == "query"}
+    for method, name, value in itertools.product(methods, names, ODD_VALUES):
+        required = "".join(f"&{other}=left" for other in names & {"text", "view"} - {name})
+        yield method, f"{address(path)}?{name}={value}{required}", {}
     for odd in ODD_HEADERS:  # one method is enough, as what reads headers knows none
-        yield min(taken), address(path), {"headers": {name.encode(): value for name, value in odd.items()}}
+        yield min(methods), address(path), {"headers": {name.encode(): value for name, value in odd.items()}}
     bodies = itertools.chain(
         itertools.product(ODD_BODIES, ["application/json"]), itertools.product(ODD_BODIES[:4], ODD_MEDIA)
     )
-    for body, media in bodies if "POST" in taken else ():
+    for body, media in bodies if "POST" in methods else ():
         yield "POST", address(path), {"content": body, "headers": {"Content-Type": media}}
 
 
 def test_odd_requests_are_refused_as_problems_or_taken(
     client: TestClient, routes: dict[str, set[str]], lift: Any
 ) -> None:
-    for path, taken in routes.items():
-        for method, asked, more in odd_requests(client, path, taken - {"HEAD"}):
-            reply = client.request(method, asked, **more)
-            assert reply.status_code < 500, (method, asked, more, reply.text)
+    for path, methods in routes.items():
+        for method, route, options in odd_requests(client, path, methods - {"HEAD"}):
+            reply = client.request(method, route, **options)
+            assert reply.status_code < 500, (method, route, options, reply.text)
             if reply.status_code >= 400:
                 assert_problem(reply)
-            elif "content" in more:  # many words at once need to be told nothing
+            elif "content" in options:  # many words at once need to be told nothing
                 by_default = path.startswith(("/query/segment", "/query/export"))
-                assert more["content"].endswith(b"{}") and by_default, (path, more)
+                assert options["content"].endswith(b"{}") and by_default, (path, options)
 
 
 def test_body_that_is_no_object_is_named_so(client: TestClient, lift: dict[str, Any]) -> None:
     selection = client.post(f"/lifts/{lift['id']}/selections", json={"name": "mine"}).json()["links"]["self"]
     for path, operations in client.get("/openapi.json").json()["paths"].items():
-        asked = re.sub(r"/lifts/{lift}/selections/{selection}", selection, path).replace("{lift}", lift["id"])
+        route = re.sub(r"/lifts/{lift}/selections/{selection}", selection, path).replace("{lift}", lift["id"])
         for method, operation in operations.items():
             if "application/json" in operation.get("requestBody", {}).get("content", {}):
                 for body in (b"3", b"[]", b'"text"', b"null"):
                     media = {"Content-Type": "application/json"}
-                    reply = client.request(method, address(asked), content=body, headers=media)
+                    reply = client.request(method, address(route), content=body, headers=media)
                     problem = assert_problem(reply)
                     assert (problem["status"], problem["argument"]) == (422, "body"), (method, path, body, problem)
     assert client.delete(selection).status_code == 204
 
 
 def test_long_bodies_are_413_where_bodies_are_read(client: TestClient, routes: dict[str, set[str]]) -> None:
-    for path, taken in routes.items():
-        if "POST" in taken and "{" not in path and path != "/assets":  # which takes a file
+    for path, methods in routes.items():
+        if "POST" in methods and "{" not in path and path != "/assets":  # which takes a file
             reply = client.post(path, content=b" " * 2_000_000, headers={"Content-Type": "application/json"})
             assert assert_problem(reply)["status"] == 413, path
 
@@ -150,8 +150,8 @@ def test_long_bodies_are_413_where_bodies_are_read(client: TestClient, routes: d
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, int]]:
     """A server behind a socket."""
-    with served(tmp_path_factory.mktemp("live") / "data") as found:
-        yield found
+    with serve(tmp_path_factory.mktemp("live") / "data") as host_and_port:
+        yield host_and_port
 
 
 HOST = b"Host: 127.0.0.1\r\n"
@@ -200,44 +200,45 @@ def test_what_is_no_http_is_400_and_the_connection_is_closed(live: tuple[str, in
 
 @pytest.mark.parametrize("name", ODD_HTTP)
 def test_odd_requests_are_problems_too(live: tuple[str, int], name: str) -> None:
-    sent, status = ODD_HTTP[name]
+    request_bytes, status = ODD_HTTP[name]
     with client_of(live) as connection:
         with contextlib.suppress(ConnectionError):  # the server may have heard enough before all was sent
-            connection.sendall(sent)
+            connection.sendall(request_bytes)
         head, body = (part.decode() for part in answer(connection))
     assert head.startswith(f"HTTP/1.1 {status} "), head
     assert "content-type: application/problem+json" in head.lower()
-    told = json.loads(body)
-    assert told["status"] == status and told["title"] and told["detail"]
-    assert told["type"].startswith("/problems/")
-    assert f"x-request-id: {told['request_id']}" in head.lower()
+    problem = json.loads(body)
+    assert problem["status"] == status and problem["title"] and problem["detail"]
+    assert problem["type"].startswith("/problems/")
+    assert f"x-request-id: {problem['request_id']}" in head.lower()
 
 
 # HEAD is answered wherever GET is, with the head of that answer and nothing after it
 
 
-def test_head_is_the_head_of_get(client: TestClient, lift: dict[str, Any], uploaded: Uploaded) -> None:
-    own, asked = f"/lifts/{lift['id']}", f"text=apple&lift={lift['id']}"
-    content = f"/assets/{uploaded.splats}/content"
-    found = [
+def test_head_is_the_head_of_get(client: TestClient, lift: dict[str, Any], scene_assets: SceneAssets) -> None:
+    lift_path, route = f"/lifts/{lift['id']}", f"text=apple&lift={lift['id']}"
+    content = f"/assets/{scene_assets.splats}/content"
+    paths = [
         "/healthz", "/readyz", "/version", "/metrics", "/", "/openapi.json", "/docs", "/assets", content,
-        f"/assets/{uploaded.splats}", "/jobs", f"/jobs/{lift['id']}", f"/jobs/{lift['id']}/events", "/lifts", own,
-        f"{own}/features", f"/query?{asked}", f"/query/objects?{asked}", f"/query/scores?{asked}",
-        f"/query/mask?{asked}&view=left", f"{own}/objects/0/splats", f"/render?lift={lift['id']}&view=left",
+        f"/assets/{scene_assets.splats}", "/jobs", f"/jobs/{lift['id']}", f"/jobs/{lift['id']}/events", "/lifts",
+        lift_path,
+        f"{lift_path}/features", f"/query?{route}", f"/query/objects?{route}", f"/query/scores?{route}",
+        f"/query/mask?{route}&view=left", f"{lift_path}/objects/0/splats", f"/render?lift={lift['id']}&view=left",
     ]  # fmt: skip
-    for path in (*found, f"/lifts/{NOBODY}", "/query?text=", "/nowhere"):
-        whole, head = client.get(path), client.head(path)
-        assert (head.status_code, head.content) == (whole.status_code, b""), path
-        assert (head.status_code == 200) is (path in found), path
-        names = (set(whole.headers) | set(head.headers)) - {"x-request-id"}
+    for path in (*paths, f"/lifts/{UNKNOWN_ID}", "/query?text=", "/nowhere"):
+        full, head = client.get(path), client.head(path)
+        assert (head.status_code, head.content) == (full.status_code, b""), path
+        assert (head.status_code == 200) is (path in paths), path
+        names = (set(full.headers) | set(head.headers)) - {"x-request-id"}
         if path == "/metrics" or head.status_code >= 400:  # counts come to have more digits, and ids are other ones
             names -= {"content-length"}
-        assert all(head.headers.get(name) == whole.headers.get(name) for name in names), path
-    whole = client.head(content, headers={"Range": "bytes=0-3"})  # ranges are for GET alone
-    assert (whole.status_code, int(whole.headers["content-length"])) == (200, len(client.get(content).content))
-    assert client.head(content, headers={"If-None-Match": whole.headers["etag"]}).status_code == 304
-    refused = client.head("/lift")
-    assert (refused.status_code, refused.headers["allow"]) == (405, "POST")
+        assert all(head.headers.get(name) == full.headers.get(name) for name in names), path
+    full = client.head(content, headers={"Range": "bytes=0-3"})  # ranges are for GET alone
+    assert (full.status_code, int(full.headers["content-length"])) == (200, len(client.get(content).content))
+    assert client.head(content, headers={"If-None-Match": full.headers["etag"]}).status_code == 304
+    head_of_lift = client.head("/lift")
+    assert (head_of_lift.status_code, head_of_lift.headers["allow"]) == (405, "POST")
 
 
 def test_connection_goes_on_after_a_head(live: tuple[str, int]) -> None:
@@ -245,13 +246,15 @@ def test_connection_goes_on_after_a_head(live: tuple[str, int]) -> None:
         with client_of(live) as connection:
             line = f"{path} HTTP/1.1\r\nHost: localhost\r\n"
             connection.sendall(f"HEAD {line}\r\nHEAD {line}Connection: close\r\n\r\n".encode())
-            told = b"\r\n\r\n".join(answer(connection))
-        assert told.count(b"HTTP/1.1 ") == told.count(b"\r\n\r\n") == 2 and told.endswith(b"\r\n\r\n")
+            problem = b"\r\n\r\n".join(answer(connection))
+        assert problem.count(b"HTTP/1.1 ") == problem.count(b"\r\n\r\n") == 2 and problem.endswith(b"\r\n\r\n")
 
 
-def test_head_of_events_ends_at_once_and_leaves_no_stream(client: TestClient, uploaded: Uploaded) -> None:
+def test_head_of_events_ends_at_once_and_leaves_no_stream(client: TestClient, scene_assets: SceneAssets) -> None:
     parts = parts_of(client)
-    order = JobOrder(splats=uploaded.splats, cameras=uploaded.cameras, features=(uploaded.features,), settings={})
+    order = JobOrder(
+        splats=scene_assets.splats, cameras=scene_assets.cameras, features=(scene_assets.features,), settings={}
+    )
     job, _ = parts.store.jobs.submit(SERVICE, order, max_queued=10)  # nobody is woken for it, so it stays in line
     try:
         for _ in range(3):

@@ -48,10 +48,10 @@ def values_of(name: str) -> st.SearchStrategy[Any]:
 @st.composite
 def questions(draw: st.DrawFn) -> dict[str, Any]:
     """The fields of a question, of which some are left out."""
-    chosen = draw(st.sets(st.sampled_from(lc.Query.deciding()), max_size=4)) | {
+    field_names = draw(st.sets(st.sampled_from(lc.Query.deciding()), max_size=4)) | {
         draw(st.sampled_from(("text", "like")))
     }
-    return {name: draw(values_of(name)) for name in sorted(chosen)} | {"top": draw(st.integers(1, 9))}
+    return {name: draw(values_of(name)) for name in sorted(field_names)} | {"top": draw(st.integers(1, 9))}
 
 
 class Faces:
@@ -68,52 +68,56 @@ class Faces:
         self.scene = lc.Scene(self.path, self.splats, self.cameras)
         self.scene.find_packs([self.pack])
 
-    def python(self, asked: dict[str, Any]) -> dict[str, Any] | None:
+    def python(self, fields: dict[str, Any]) -> dict[str, Any] | None:
         """The answer with its objects; None where the question is refused."""
         try:
-            answer = self.scene.ask(lc.Query(**asked), encoder=f"table:{self.table}", places=True)
-            found = self.scene.objects(answer)
+            answer = self.scene.ask(lc.Query(**fields), encoder=f"table:{self.table}", places=True)
+            objects = self.scene.objects(answer)
         except lc.SplatliftError:
             return None
-        return answer.model_dump(mode="json") | found.model_dump(mode="json")
+        return answer.model_dump(mode="json") | objects.model_dump(mode="json")
 
-    def http(self, method: str, asked: dict[str, Any]) -> dict[str, Any] | None:
+    def http(self, method: str, query_fields: dict[str, Any]) -> dict[str, Any] | None:
         """The same of GET or POST."""
-        told: dict[str, Any] = {}
+        answers: dict[str, Any] = {}
         for path in ("/query", "/query/objects"):
-            fields = asked if path == "/query" or method == "POST" else {**asked, "top": None}
-            given = {name: value for name, value in fields.items() if value is not None} | {"lift": self.lift}
-            reply = self.client.get(path, params=given) if method == "GET" else self.client.post(path, json=given)
+            fields = query_fields if path == "/query" or method == "POST" else {**query_fields, "top": None}
+            parameters = {name: value for name, value in fields.items() if value is not None} | {"lift": self.lift}
+            reply = (
+                self.client.get(path, params=parameters)
+                if method == "GET"
+                else self.client.post(path, json=parameters)
+            )
             assert reply.status_code in (200, 404, 422), reply.text
             if reply.status_code != 200:
                 return None
-            told |= reply.json()
+            answers |= reply.json()
         fields = (*lc.Answer.model_fields, *lc.Answer.model_computed_fields)
         fields += (*lc.Objects.model_fields, *lc.Objects.model_computed_fields)
-        return {name: told[name] for name in fields}
+        return {name: answers[name] for name in fields}
 
-    def command(self, asked: dict[str, Any]) -> dict[str, Any] | None:
+    def command(self, fields: dict[str, Any]) -> dict[str, Any] | None:
         """The same of the command line; it takes feature packs where the lift remembers them."""
         words = [*self.places, "--objects"]
-        words += [text for text in asked.get("text", ()) if text]
-        for name, value in asked.items():
+        words += [text for text in fields.get("text", ()) if text]
+        for name, value in fields.items():
             flag = FLAGS.get(name, f"--{name.replace('_', '-')}")
-            words += [part for one in (value if isinstance(value, list) else [value]) for part in (flag, one)]
+            words += [part for item in (value if isinstance(value, list) else [value]) for part in (flag, item)]
             words = words[: -2 * len(value)] if name == "text" and value else words
-        return self.printed("query", *words).get("answer")
+        return self.run_command("query", *words).get("answer")
 
     @property
     def places(self) -> list[Path | str]:
         """The lift and its files, as commands take them."""
         return [self.path, "--splats", self.splats, "--cameras", self.cameras]
 
-    def printed(self, command: str, *words: object) -> dict[str, Any]:
+    def run_command(self, command: str, *words: object) -> dict[str, Any]:
         """What a command prints; nothing where it refuses."""
-        printed = io.StringIO()
-        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(io.StringIO()):
+        output = io.StringIO()
+        with contextlib.redirect_stdout(output), contextlib.redirect_stderr(io.StringIO()):
             status = cli.main([command, *map(str, words), "--table", str(self.table), "--json"])
         assert status in (0, cli.BAD_INPUT)
-        return json.loads(printed.getvalue()) if status == 0 else {}
+        return json.loads(output.getvalue()) if status == 0 else {}
 
 
 @pytest.fixture(scope="module")
@@ -122,41 +126,41 @@ def faces(client: TestClient, lift: dict[str, Any], table: Path) -> Faces:
 
 
 def test_words_and_things_have_the_same_answers(faces: Faces, table: Path, tmp_path: Path) -> None:
-    beside = tmp_path / "scene.lift"  # the command for objects looks for the splats there
-    shutil.copy(faces.path, beside)
-    shutil.copy(faces.splats, tmp_path / lc.load_lift(beside).metadata.splats.path)
+    lift_copy = tmp_path / "scene.lift"  # the command for objects looks for the splats there
+    shutil.copy(faces.path, lift_copy)
+    shutil.copy(faces.splats, tmp_path / lc.load_lift(lift_copy).metadata.splats.path)
     encoder = faces.scene.encoder(f"table:{table}")
     expected = {
         "segment": faces.scene.segment(encoder=encoder).summary,
         "what": models.BestWords(example="splat:0", words=faces.scene.nearest_words("splat:0", encoder=encoder)),
         "objects": faces.scene.catalogue(faces.scene.words(encoder), encoder=encoder).summary(features=True),
     }
-    served = faces.client.put("/assets/table", content=table.read_bytes()).json()["id"]
-    asked = {"lift": faces.lift, "table": served}
-    told = {
-        "segment": faces.client.post("/query/segment", json=asked).json(),
-        "what": faces.client.post("/query/what", json=asked | {"example": "splat:0"}).json(),
+    table_id = faces.client.put("/assets/table", content=table.read_bytes()).json()["id"]
+    fields = {"lift": faces.lift, "table": table_id}
+    answers = {
+        "segment": faces.client.post("/query/segment", json=fields).json(),
+        "what": faces.client.post("/query/what", json=fields | {"example": "splat:0"}).json(),
         "objects": faces.client.get(
-            f"/lifts/{faces.lift}/objects", params={"table": served, "features": True}
+            f"/lifts/{faces.lift}/objects", params={"table": table_id, "features": True}
         ).json(),
     }
-    for one in told["objects"]["objects"]:
-        del one["hidden"]  # which the service alone knows
-    printed = {
-        "segment": faces.printed("segment", *faces.places)["answer"],
-        "what": faces.printed("segment", *faces.places, "--example", "splat:0")["examples"][0],
-        "objects": faces.printed("objects", beside, "--features")["answer"],
+    for item in answers["objects"]["objects"]:
+        del item["hidden"]  # which the service alone knows
+    output = {
+        "segment": faces.run_command("segment", *faces.places)["answer"],
+        "what": faces.run_command("segment", *faces.places, "--example", "splat:0")["examples"][0],
+        "objects": faces.run_command("objects", lift_copy, "--features")["answer"],
     }
     for name, answer in expected.items():
         document = answer.model_dump(mode="json")
-        assert {field: told[name][field] for field in document} == document == printed[name]
+        assert {field: answers[name][field] for field in document} == document == output[name]
 
 
 @settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(asked=questions())
-def test_every_face_gives_the_same_answer(faces: Faces, asked: dict[str, Any]) -> None:
-    expected = faces.python(asked)
-    assert faces.http("GET", asked) == expected
-    assert faces.http("POST", asked) == expected
-    if not any(example.startswith("region:") for name in ("like", "unlike") for example in asked.get(name, ())):
-        assert faces.command(asked) == expected
+def test_every_face_gives_the_same_answer(faces: Faces, fields: dict[str, Any]) -> None:
+    expected = faces.python(fields)
+    assert faces.http("GET", fields) == expected
+    assert faces.http("POST", fields) == expected
+    if not any(example.startswith("region:") for name in ("like", "unlike") for example in fields.get(name, ())):
+        assert faces.command(fields) == expected

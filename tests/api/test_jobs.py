@@ -41,8 +41,8 @@ from service.tasks import plan_document
 from tests.crash.conftest import asset_of, order, until
 from tests.crash.server import standing_in
 
-from .conftest import LIFT_REQUEST, Uploaded, parts_of, put
-from .following import ended
+from .conftest import LIFT_REQUEST, SceneAssets, parts_of, put
+from .following import wait_for_end
 from .guarded import finish
 from .test_problems import assert_problem
 from .tiny_scene import CHANNELS, SPLATS_A_CLUSTER, VIEWS, TinyScene, cameras_document
@@ -58,28 +58,28 @@ def quick(store: Store) -> Quick:
 
 def events(text: str) -> list[tuple[int, str, dict[str, Any]]]:
     """The events of a stream: id, name, data."""
-    found = []
+    records = []
     for block in text.strip().split("\n\n"):
         fields = dict(line.split(": ", 1) for line in block.split("\n") if not line.startswith(":"))
         if fields:
-            found.append((int(fields["id"]), fields["event"], json.loads(fields["data"])))
-    return found
+            records.append((int(fields["id"]), fields["event"], json.loads(fields["data"])))
+    return records
 
 
 def test_same_key_is_the_same_job_or_refused_with_another_order(quick: Quick) -> None:
     with quick("answer") as (client, body):
         first = client.post("/lift", json=body, headers={"Idempotency-Key": "one"})
-        again = client.post("/lift", json=body, headers={"Idempotency-Key": "one"})
-        assert (first.status_code, again.status_code) == (202, 200)
-        assert first.json()["id"] == again.json()["id"] and first.headers["location"] == again.headers["location"]
-        ended(client, first.headers["location"])
+        second = client.post("/lift", json=body, headers={"Idempotency-Key": "one"})
+        assert (first.status_code, second.status_code) == (202, 200)
+        assert first.json()["id"] == second.json()["id"] and first.headers["location"] == second.headers["location"]
+        wait_for_end(client, first.headers["location"])
         late = client.post("/lift", json=body, headers={"Idempotency-Key": "one"})
         assert late.status_code == 200 and late.json()["state"] == "succeeded"
         assert len(client.get("/jobs").json()["jobs"]) == 1
         other = client.post("/lift", json=body, headers={"Idempotency-Key": "two"})
         assert other.status_code == 202 and other.json()["id"] != first.json()["id"]
-        changed = body | {"settings": {"preset": "row-sum"}}
-        reply = client.post("/lift", json=changed, headers={"Idempotency-Key": "one"})
+        other_body = body | {"settings": {"preset": "row-sum"}}
+        reply = client.post("/lift", json=other_body, headers={"Idempotency-Key": "one"})
         assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/key-reused", 422)
         for key in ("", "x" * 256):
             reply = client.post("/lift", json=body, headers={"Idempotency-Key": key})
@@ -89,13 +89,13 @@ def test_same_key_is_the_same_job_or_refused_with_another_order(quick: Quick) ->
 def test_lifts_are_ordered_by_json_and_times_are_in_seconds_and_iso(quick: Quick) -> None:
     with quick("answer") as (client, body):
         first = client.post("/lift", json=body, headers={"Idempotency-Key": "one"})
-        again = client.post("/lifts", json=body, headers={"Idempotency-Key": "one"})
+        second = client.post("/lifts", json=body, headers={"Idempotency-Key": "one"})
         other = client.post("/lifts", content=json.dumps(body), headers={"Content-Type": "Application/json"})
-        assert [reply.status_code for reply in (first, again, other)] == [202, 200, 202]
-        assert first.json()["id"] == again.json()["id"] != other.json()["id"]
+        assert [reply.status_code for reply in (first, second, other)] == [202, 200, 202]
+        assert first.json()["id"] == second.json()["id"] != other.json()["id"]
         assert other.headers["location"] == f"/jobs/{other.json()['id']}"
         assert client.post("/lifts?sha256=" + "0" * 64, json=body).status_code == 422  # of files
-        job = ended(client, other.headers["location"])
+        job = wait_for_end(client, other.headers["location"])
         for name in ("created", "started", "ended"):
             assert datetime.fromisoformat(job[f"{name}_at"]).timestamp() == pytest.approx(job[name], abs=1e-5)
         queued = client.post("/lift", json=body).json()
@@ -120,20 +120,20 @@ def test_canceled_job_keeps_its_plan(quick: Quick) -> None:
     with quick("hang") as (client, body):
         running = client.post("/lift", json=body).headers["location"]
         until(lambda: client.get(running).json()["plan"])
-        found = client.get(running).json()
-        assert found["state"] == "running" and found["plan"]["summary"] == ["a long time"]
+        record = client.get(running).json()
+        assert record["state"] == "running" and record["plan"]["summary"] == ["a long time"]
         waiting = client.post("/lift", json=body).headers["location"]
         assert client.get(waiting).json()["links"]["cancel"] == f"{waiting}/cancel"
         reply = client.post(f"{waiting}/cancel")
         assert (reply.status_code, reply.json()["state"]) == (200, "canceled")
         reply = client.post(f"{running}/cancel")
         assert (reply.status_code, reply.json()["state"]) == (202, "canceling")
-        assert ended(client, running)["state"] == "canceled"
+        assert wait_for_end(client, running)["state"] == "canceled"
         for job in (running, waiting):
             reply = client.post(f"{job}/cancel")
             assert (reply.status_code, reply.json()["state"]) == (200, "canceled")
-        told = [data for _, name, data in events(client.get(f"{running}/events").text) if name == "plan"]
-        assert told == [found["plan"]] == [client.get(running).json()["plan"]]
+        problem_fields = [data for _, name, data in events(client.get(f"{running}/events").text) if name == "plan"]
+        assert problem_fields == [record["plan"]] == [client.get(running).json()["plan"]]
 
 
 def test_ended_job_cannot_be_canceled_and_only_an_ended_one_can_be_deleted(quick: Quick, store: Store) -> None:
@@ -141,7 +141,7 @@ def test_ended_job_cannot_be_canceled_and_only_an_ended_one_can_be_deleted(quick
         job = client.post("/lift", json=body).headers["location"]
         reply = client.delete(job)
         assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/conflict", 409)
-        assert ended(client, job)["state"] == "succeeded"
+        assert wait_for_end(client, job)["state"] == "succeeded"
         assert assert_problem(client.post(f"{job}/cancel"))["status"] == 409
         reply = client.delete(job)  # a retried DELETE must not cost a lift that nobody gave up
         assert reply.status_code == 409 and "with_lift" in reply.json()["hint"]
@@ -165,8 +165,10 @@ def test_events_tell_the_whole_story_and_go_on_after_the_last_one_seen(quick: Qu
         numbers = [number for number, _, _ in story]
         assert numbers == sorted(set(numbers))
         third = {"Last-Event-ID": str(numbers[2])}
-        kept = [event for event in events(client.get(f"{job}/events", headers=third).text) if event[1] != "progress"]
-        assert kept == [event for event in story[3:] if event[1] != "progress"]
+        recent = [
+            event for event in events(client.get(f"{job}/events", headers=third).text) if event[1] != "progress"
+        ]
+        assert recent == [event for event in story[3:] if event[1] != "progress"]
         assert client.get(f"{job}/events", headers={"Last-Event-ID": str(numbers[-1])}).status_code == 204
         for nonsense in ("x", "-1", "9" * 30):
             reply = client.get(f"{job}/events", headers={"Last-Event-ID": nonsense})
@@ -196,19 +198,19 @@ def test_no_work_is_taken_below_the_disk_floor_and_the_service_lives(
             assert (assert_problem(reply)["type"], reply.status_code) == ("/problems/no-space", 507)
         assert client.get("/jobs").json()["jobs"] == [] and len(client.get("/assets").json()["assets"]) == 3
         monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=1000))
-        assert ended(client, client.post("/lift", json=body).headers["location"])["state"] == "succeeded"
+        assert wait_for_end(client, client.post("/lift", json=body).headers["location"])["state"] == "succeeded"
 
 
-def test_job_and_lift_keep_what_the_plan_warned_of(client: TestClient, uploaded: Uploaded) -> None:
+def test_job_and_lift_keep_what_the_plan_warned_of(client: TestClient, scene_assets: SceneAssets) -> None:
     away = cameras_document()
     for frame in away["frames"]:  # they look the other way
         frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([-1.0, 1, -1, 1])).tolist()
     cameras = put(client, AssetKind.CAMERAS, json.dumps(away).encode())
-    order = replace(uploaded, cameras=cameras).order(preset="row-sum")
-    job = ended(client, client.post("/lift", json=order).headers["location"])
+    order = replace(scene_assets, cameras=cameras).order(preset="row-sum")
+    job = wait_for_end(client, client.post("/lift", json=order).headers["location"])
     assert job["state"] == "succeeded", job
-    told = [line for line in job["plan"]["warnings"] if "no camera can see" in line]
-    assert told and set(told) <= set(client.get(job["links"]["lift"]).json()["diagnostics"]["warnings"])
+    data = [line for line in job["plan"]["warnings"] if "no camera can see" in line]
+    assert data and set(data) <= set(client.get(job["links"]["lift"]).json()["diagnostics"]["warnings"])
     assert client.delete(f"{job['links']['self']}?with_lift=true").status_code == 204
 
 
@@ -246,8 +248,8 @@ def test_lists_begin_with_the_newest(store: Store) -> None:
             connection.execute("UPDATE jobs SET created = ? WHERE id = ?", (created, job))
             connection.execute("UPDATE lifts SET created = ? WHERE id = ?", (created, job))
             connection.execute("UPDATE asset_owners SET created = ? WHERE asset = ?", (created, asset))
-    for listed, ids in ((store.jobs, jobs), (store.lifts, jobs), (store.assets, assets)):
-        assert [one.id for one in listed.all(SERVICE)] == [ids[2], ids[0], ids[1]]
+    for table, ids in ((store.jobs, jobs), (store.lifts, jobs), (store.assets, assets)):
+        assert [record.id for record in table.all(SERVICE)] == [ids[2], ids[0], ids[1]]
 
 
 def test_job_keeps_its_states_the_last_of_its_log_and_its_latest_progress(store: Store) -> None:
@@ -271,41 +273,41 @@ def test_what_a_stage_will_still_take_follows_from_its_own_pace(monkeypatch: pyt
     monkeypatch.setattr(pace, "time", SimpleNamespace(monotonic=lambda: now))
     stages = pace.StagePace()
 
-    def left(stage: str, done: int) -> float | None:
-        return stages.progress({"stage": stage, "done": done, "total": 10, "unit": "views"})["eta_s"]
+    def seconds_left(stage: str, completed: int) -> float | None:
+        return stages.progress({"stage": stage, "done": completed, "total": 10, "unit": "views"})["eta_s"]
 
-    assert left("walk", 4) is None  # what an earlier attempt has done says nothing of the pace
+    assert seconds_left("walk", 4) is None  # what an earlier attempt has done says nothing of the pace
     now += 10
-    assert left("walk", 4) is None
-    assert left("walk", 6) == 20
-    assert left("solve", 0) is None
+    assert seconds_left("walk", 4) is None
+    assert seconds_left("walk", 6) == 20
+    assert seconds_left("solve", 0) is None
     now += 3
-    assert left("solve", 3) == 7
-    assert left("solve", 10) == 0
+    assert seconds_left("solve", 3) == 7
+    assert seconds_left("solve", 10) == 0
 
 
 COUNT = 3 * SPLATS_A_CLUSTER
 
 
-def test_assets_say_what_is_in_them_and_their_names_alone(client: TestClient, uploaded: Uploaded) -> None:
-    listed = {asset["id"]: asset["counts"] for asset in client.get("/assets").json()["assets"]}
+def test_assets_say_what_is_in_them_and_their_names_alone(client: TestClient, scene_assets: SceneAssets) -> None:
+    table = {asset["id"]: asset["counts"] for asset in client.get("/assets").json()["assets"]}
     splats, cameras, features = (
         client.get(f"/assets/{asset}").json()["counts"]
-        for asset in (uploaded.splats, uploaded.cameras, uploaded.features)
+        for asset in (scene_assets.splats, scene_assets.cameras, scene_assets.features)
     )
     assert (splats["splats"], splats["kernel"]) == (COUNT, "3dgs")
     assert (cameras["views"], features["channels"], features["text_space"]) == (len(VIEWS), CHANNELS, "tiny")
-    for asset, counts in ((uploaded.cameras, cameras), (uploaded.features, features)):
-        assert "middle" in counts.pop("names") and listed[asset] == counts  # lists leave out the names
+    for asset, counts in ((scene_assets.cameras, cameras), (scene_assets.features, features)):
+        assert "middle" in counts.pop("names") and table[asset] == counts  # lists leave out the names
 
 
-def test_lift_tells_how_far_to_trust_it(client: TestClient, lift: dict[str, Any], uploaded: Uploaded) -> None:
+def test_lift_tells_how_far_to_trust_it(client: TestClient, lift: dict[str, Any], scene_assets: SceneAssets) -> None:
     assert (lift["count"], lift["channels"], lift["text_space"]) == (COUNT, CHANNELS, "tiny")
     assert sorted(lift["views"]) == sorted(VIEWS) and lift["diagnostics"] and lift["timings"]
     assert lift["certificate"] == lift["diagnostics"]  # by its old name, until version 1 ends
     assert lift["settings"]["certificate_rays"] == lift["settings"]["diagnostic_rays"]
     assert (lift["splats"], lift["cameras"], lift["features"]) == (
-        uploaded.splats, uploaded.cameras, [uploaded.features]
+        scene_assets.splats, scene_assets.cameras, [scene_assets.features]
     )  # fmt: skip
     now = client.get(f"/lifts/{lift['id']}").json()
     assert now in client.get("/lifts").json()["lifts"]
@@ -315,16 +317,16 @@ def test_lift_tells_how_far_to_trust_it(client: TestClient, lift: dict[str, Any]
 def test_lift_and_its_files_are_found_where_they_were_downloaded(
     client: TestClient, data: Path, lift: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = client.get(lift["links"]["features"])
-    assert len(whole.content) == lift["bytes"] and whole.headers["etag"] == f'"{lift["sha256"]}"'
+    full = client.get(lift["links"]["features"])
+    assert len(full.content) == lift["bytes"] and full.headers["etag"] == f'"{lift["sha256"]}"'
     files = [f"/assets/{asset}/content" for asset in (lift["splats"], lift["cameras"], *lift["features"])]
-    for reply in (whole, *map(client.get, files)):
+    for reply in (full, *map(client.get, files)):
         name = reply.headers["content-disposition"].partition('filename="')[2].rstrip('"')
         (tmp_path / name).write_bytes(reply.content)
-    [made] = tmp_path.glob("lift-*.safetensors")
-    assert str(data).encode() not in made.read_bytes()  # paths of the server are nobody's business
+    [file] = tmp_path.glob("lift-*.safetensors")
+    assert str(data).encode() not in file.read_bytes()  # paths of the server are nobody's business
     monkeypatch.chdir(tmp_path)
-    scene = Scene(made)
+    scene = Scene(file)
     assert scene.splats.count == COUNT and {camera.name for camera in scene.cameras.values()} == set(VIEWS)
     assert set(scene.packs.views) == set(VIEWS)
 
@@ -339,11 +341,11 @@ def test_downloaded_lift_has_the_world_that_it_was_given_later(
         after = client.get(path)
         tag, content = after.headers["etag"], after.content
         (tmp_path / "lift.safetensors").write_bytes(content)
-        opened, bare = load_lift(tmp_path / "lift.safetensors"), tmp_path / "before.safetensors"
+        lift_with_world, bare = load_lift(tmp_path / "lift.safetensors"), tmp_path / "before.safetensors"
         bare.write_bytes(before.content)
-        assert opened.metadata.world == WorldFrame(up=(0, -1, 0), metres_per_unit=0.5)
-        assert opened.metadata == load_lift(bare).with_world(opened.metadata.world).metadata
-        assert torch.equal(opened.features, load_lift(bare).features)
+        assert lift_with_world.metadata.world == WorldFrame(up=(0, -1, 0), metres_per_unit=0.5)
+        assert lift_with_world.metadata == load_lift(bare).with_world(lift_with_world.metadata.world).metadata
+        assert torch.equal(lift_with_world.features, load_lift(bare).features)
         assert int(after.headers["content-length"]) == len(content) and tag != before.headers["etag"]
         assert client.get(path, headers={"If-None-Match": tag}).status_code == 304
         header = 8 + int.from_bytes(content[:8], "little")
@@ -363,21 +365,21 @@ def test_downloaded_lift_has_the_world_that_it_was_given_later(
 
 
 def test_card_that_is_missing_refuses_the_order_in_the_words_of_a_lift(
-    client: TestClient, uploaded: Uploaded
+    client: TestClient, scene_assets: SceneAssets
 ) -> None:
     jobs = len(client.get("/jobs").json()["jobs"])
-    unknown = assert_problem(client.post("/lift", json=uploaded.order(device="gpu")))
+    unknown = assert_problem(client.post("/lift", json=scene_assets.order(device="gpu")))
     assert unknown["type"] == "/problems/invalid-settings"
     try:
         choose_device("cuda")
     except Unavailable as lack:
         for _ in range(2):
-            problem = assert_problem(client.post("/lift", json=uploaded.order(device="cuda")))
+            problem = assert_problem(client.post("/lift", json=scene_assets.order(device="cuda")))
             assert (problem["status"], problem["type"]) == (422, "/problems/unavailable")
-            told = [problem[name] for name in ("argument", "expected", "got", "hint")]
-            assert told == [lack.argument, lack.expected, lack.got, lack.hint]
+            data = [problem[name] for name in ("argument", "expected", "got", "hint")]
+            assert data == [lack.argument, lack.expected, lack.got, lack.hint]
     else:
-        assert client.post("/lift/plan", json=uploaded.order(device="cuda")).status_code == 200
+        assert client.post("/lift/plan", json=scene_assets.order(device="cuda")).status_code == 200
     assert len(client.get("/jobs").json()["jobs"]) == jobs
 
 

@@ -45,13 +45,13 @@ from tests.crash.conftest import order, until
 from tests.crash.server import NoQueries
 from tests.crash.service_process import ServiceProcess, processes_of, template_of
 
-from .conftest import Uploaded, app_of, parts_of, put
-from .guarded import address, every_route, guarded
+from .conftest import SceneAssets, app_of, parts_of, put
+from .guarded import address, every_route, keyed_server
 from .test_problems import assert_problem
 from .tiny_scene import TinyScene, cameras_document
 
 Start = Callable[..., Any]
-MADE = re.compile(r"[0-9a-f]{32}")
+REQUEST_ID = re.compile(r"[0-9a-f]{32}")
 
 
 def fails(client: TestClient, check: str) -> None:
@@ -80,15 +80,15 @@ def samples(client: TestClient) -> dict[tuple[str, tuple[tuple[str, str], ...]],
     }
 
 
-def counted(found: dict[Any, float], name: str, **labels: str) -> float:
-    return found.get((name, tuple(sorted(labels.items()))), 0.0)
+def metric_value(value: dict[Any, float], name: str, **labels: str) -> float:
+    return value.get((name, tuple(sorted(labels.items()))), 0.0)
 
 
 def test_readyz_names_what_fails_until_it_works_again(start: Start, tmp_path: Path, monkeypatch: Any) -> None:
     with start() as client:
         until(lambda: client.get("/readyz").status_code == 200)
-        found = client.get("/readyz").json()
-        assert found == {"status": "ready", "checks": ["database", "disk", "supervisor", "queries", "uploads"]}
+        value = client.get("/readyz").json()
+        assert value == {"status": "ready", "checks": ["database", "disk", "supervisor", "queries", "uploads"]}
         with monkeypatch.context() as full:
             full.setattr(DataDirectory, "free_bytes", lambda files: 0)
             fails(client, "disk")
@@ -110,7 +110,7 @@ def test_readyz_names_what_fails_until_it_works_again(start: Start, tmp_path: Pa
             process.send_signal(ends)
             fails(client, "queries")
             until(lambda: client.get("/readyz").status_code == 200)
-            assert counted(samples(client), "splatlift_query_worker_restarts_total") == restarts
+            assert metric_value(samples(client), "splatlift_query_worker_restarts_total") == restarts
             os.kill(template_of(os.getpid()), ends)
             fails(client, "uploads")
             until(lambda: client.get("/readyz").status_code == 200)
@@ -120,11 +120,11 @@ def test_readyz_names_what_fails_until_it_works_again(start: Start, tmp_path: Pa
 
 
 def test_operations_and_errors_answer_while_every_thread_of_the_pool_is_busy(start: Start) -> None:
-    release, held, answered = threading.Event(), threading.Event(), []
+    release, threads_held, all_answered = threading.Event(), threading.Event(), []
 
     def slow() -> None:
-        held.set()
-        answered.append(not release.wait(60))
+        threads_held.set()
+        all_answered.append(not release.wait(60))
 
     def broken() -> None:
         raise RuntimeError("the secret")
@@ -136,45 +136,50 @@ def test_operations_and_errors_answer_while_every_thread_of_the_pool_is_busy(sta
         client.portal.call(lambda: setattr(anyio.to_thread.current_default_thread_limiter(), "total_tokens", 1))
         thread = threading.Thread(target=client.get, args=("/slow",))
         thread.start()
-        assert held.wait(60)
+        assert threads_held.wait(60)
         try:
             for path, status in (("/healthz", 200), ("/readyz", 200), ("/version", 200), ("/metrics", 200)):
                 assert client.get(path).status_code == status
             assert client.get("/nowhere").status_code == 404
             assert client.patch("/query").status_code == 405
-            assert thread.is_alive() and not answered
+            assert thread.is_alive() and not all_answered
         finally:
             release.set()
             thread.join()
-        assert answered == [False]
-        found = client.get("/version").json()
-        assert (found["version"], found["commit"]) == (version("splatlift"), "abc1234")
-        assert found["python"] == ".".join(map(str, sys.version_info[:3]))
-        assert found["packages"]["torch"] == version("torch")
+        assert all_answered == [False]
+        value = client.get("/version").json()
+        assert (value["version"], value["commit"]) == (version("splatlift"), "abc1234")
+        assert value["python"] == ".".join(map(str, sys.version_info[:3]))
+        assert value["packages"]["torch"] == version("torch")
         assert any(dict(labels).get("commit") == "abc1234" for name, labels in samples(client) if "build" in name)
         for path, status in (("/nowhere", 404), ("/jobs/x", 404), ("/lifts?x", 422), ("/broken", 500)):
             problem = assert_problem(client.get(path, headers={"X-Request-ID": "mine"}))
             assert (problem["status"], problem["request_id"]) == (status, "mine")
 
 
-def test_metrics_count_requests_by_route_template_and_labels_stay_few(client: TestClient, uploaded: Uploaded) -> None:
+def test_metrics_count_requests_by_route_template_and_labels_stay_few(
+    client: TestClient, scene_assets: SceneAssets
+) -> None:
     name, labels = "splatlift_http_requests_total", {"route": "/assets/{asset}", "status": "200"}
     for path in ("/x", "/jobs/x"):
         client.get(path)
     client.request("BREW", "/x")
     before = samples(client)
-    for asset in (uploaded.splats, uploaded.cameras):
+    for asset in (scene_assets.splats, scene_assets.cameras):
         client.get(f"/assets/{asset}")
         client.head(f"/assets/{asset}")
-    found = samples(client)
+    value = samples(client)
     for method in ("GET", "HEAD"):
-        assert counted(found, name, method=method, **labels) == counted(before, name, method=method, **labels) + 2
-    assert counted(found, "splatlift_http_request_seconds_count", method="GET", route="/assets/{asset}") >= 2
+        assert (
+            metric_value(value, name, method=method, **labels)
+            == metric_value(before, name, method=method, **labels) + 2
+        )
+    assert metric_value(value, "splatlift_http_request_seconds_count", method="GET", route="/assets/{asset}") >= 2
     for number in range(20):
         client.get(f"/nowhere/{number}?{number}", headers={"X-Request-ID": f"id{number}"})
         client.get(f"/jobs/{number}")
         client.request(f"BREW{number}", f"/y{number}")
-    assert samples(client).keys() == found.keys()
+    assert samples(client).keys() == value.keys()
     # Each application counts for itself.
     assert not [family.name for family in REGISTRY.collect() if family.name.startswith("splatlift")]
 
@@ -185,50 +190,50 @@ def test_metrics_tell_of_uploads_jobs_queries_and_the_disk(client: TestClient, s
     assert client.put("/assets/cameras", content=body).status_code == 200  # it is there already, and still was sent
     assert client.get("/query", params={"text": "apple", "lift": lift["id"]}).status_code == 200
     assert client.get("/query", params={"text": "zeppelin", "lift": lift["id"]}).status_code == 422
-    found = samples(client)
+    value = samples(client)
 
-    def grown(name: str, **labels: str) -> float:
-        return counted(found, name, **labels) - counted(before, name, **labels)
+    def growth(name: str, **labels: str) -> float:
+        return metric_value(value, name, **labels) - metric_value(before, name, **labels)
 
     uploads = {"method": "PUT", "route": "/assets/{asset}"}
-    assert grown("splatlift_http_request_body_bytes_total", **uploads) == len(body)
+    assert growth("splatlift_http_request_body_bytes_total", **uploads) == len(body)
     for outcome in ("answered", "invalid-query"):
-        assert grown("splatlift_query_seconds_count", operation="query", outcome=outcome) == 1
+        assert growth("splatlift_query_seconds_count", operation="query", outcome=outcome) == 1
     succeeded = len([job for job in client.get("/jobs").json()["jobs"] if job["state"] == "succeeded"])
-    assert counted(found, "splatlift_jobs", state="succeeded") == succeeded > 0
-    assert counted(found, "splatlift_attempt_seconds_count", outcome="succeeded") >= succeeded
-    assert counted(found, "splatlift_disk_free_bytes") > 0
-    assert counted(found, "splatlift_query_worker_up") == 1
+    assert metric_value(value, "splatlift_jobs", state="succeeded") == succeeded > 0
+    assert metric_value(value, "splatlift_attempt_seconds_count", outcome="succeeded") >= succeeded
+    assert metric_value(value, "splatlift_disk_free_bytes") > 0
+    assert metric_value(value, "splatlift_query_worker_up") == 1
 
 
 def test_sane_request_id_is_kept_and_any_other_replaced(client: TestClient) -> None:
     for sane in ("a", "7f3c-22.ab_~", "Root=1-67891233-abcdef012345678912345678", "x" * 128):
         assert client.get("/healthz", headers={"X-Request-ID": sane}).headers.get_list("x-request-id") == [sane]
     odd = ["", " ", "a b", 'a"b', "x" * 129, "a\tb", "<script>", "{}", "\u00e4"]
-    for headers in [[(b"X-Request-ID", one.encode())] for one in odd] + [[(b"X-Request-ID", b"a")] * 2]:
-        (found,) = client.get("/healthz", headers=headers).headers.get_list("x-request-id")
-        assert MADE.fullmatch(found), headers
+    for headers in [[(b"X-Request-ID", request_id.encode())] for request_id in odd] + [[(b"X-Request-ID", b"a")] * 2]:
+        (value,) = client.get("/healthz", headers=headers).headers.get_list("x-request-id")
+        assert REQUEST_ID.fullmatch(value), headers
 
 
 def record(message: str, **fields: Any) -> logging.LogRecord:
-    found = logging.makeLogRecord({"name": "place", "levelname": "INFO", "msg": message, "created": 0.25})
-    found.fields = fields
-    return found
+    value = logging.makeLogRecord({"name": "place", "levelname": "INFO", "msg": message, "created": 0.25})
+    value.fields = fields
+    return value
 
 
 def test_json_log_is_one_object_a_line_whatever_is_logged() -> None:
     try:
         raise ValueError("two\nlines with Bearer abc.def and \ud800")
     except ValueError:
-        found = record("a\nb \x1b[31m\u2028", path="/\x00", odd=Path("p"))
-        found.exc_info = sys.exc_info()
+        value = record("a\nb \x1b[31m\u2028", path="/\x00", odd=Path("p"))
+        value.exc_info = sys.exc_info()
     with working_for("r"):
-        line = JsonLines().format(found)
+        line = JsonLines().format(value)
     assert len(line.splitlines()) == 1 and line.isascii()
-    told = json.loads(line)
-    assert list(told) == ["time", "level", "logger", "message", "request_id", "path", "odd", "error"]
-    assert told["time"] == "1970-01-01T00:00:00.250Z"
-    assert "ValueError" in told["error"] and "abc.def" not in line
+    problem = json.loads(line)
+    assert list(problem) == ["time", "level", "logger", "message", "request_id", "path", "odd", "error"]
+    assert problem["time"] == "1970-01-01T00:00:00.250Z"
+    assert "ValueError" in problem["error"] and "abc.def" not in line
 
 
 def test_text_log_is_one_line_that_no_client_can_break() -> None:
@@ -258,35 +263,35 @@ def test_stop_refuses_work_ends_streams_puts_jobs_back_and_exits_0(
         assert service.wait() == 0
         assert not processes_of(job)
     store = Store.open(tmp_path)
-    found = store.jobs.get(SERVICE, job)
+    value = store.jobs.get(SERVICE, job)
     store.close()
-    assert (found.state, found.attempt) == ("queued", 1)
+    assert (value.state, value.attempt) == ("queued", 1)
 
 
 def test_stop_ends_a_check_that_would_take_long(tmp_path: Path) -> None:
     fifo = tmp_path / "never.ply"
     os.mkfifo(fifo)  # who opens it waits for a writer, for ever
-    ending, ended = threading.Event(), []
+    ending, ends = threading.Event(), []
     limits = SandboxLimits(300.0, 1 << 33, ending)
 
     def run() -> None:
         with pytest.raises(ServiceUnavailable):
             check(AssetKind.SPLATS, fifo, tmp_path, limits)
-        ended.append(True)
+        ends.append(True)
 
     thread = threading.Thread(target=run)
     thread.start()
     assert thread.is_alive()
     ending.set()
     thread.join(30)
-    assert ended == [True]
+    assert ends == [True]
 
 
 def test_routes_are_described_without_another_host(client: TestClient) -> None:
     page = client.get("/docs").text
-    asked = re.findall(r"(?:src|href|url)[=:]\s*['\"]([^'\"]+)", page)
-    assert {"openapi.json", "docs/swagger-ui-bundle.js", "docs/swagger-ui.css"} <= set(asked)
-    assert all(client.get(f"/{address}").status_code == 200 for address in asked if address != "data:,")
+    parameters = re.findall(r"(?:src|href|url)[=:]\s*['\"]([^'\"]+)", page)
+    assert {"openapi.json", "docs/swagger-ui-bundle.js", "docs/swagger-ui.css"} <= set(parameters)
+    assert all(client.get(f"/{address}").status_code == 200 for address in parameters if address != "data:,")
     assert "//" not in page.replace("<!-- ", "").split("<script>")[0]
     assert client.get("/redoc").status_code == 404
 
@@ -297,18 +302,18 @@ class Idle:
     def stop(self) -> None: ...
 
 
-async def nothing(*_: Any) -> None:
+async def do_nothing(*_: Any) -> None:
     """No application."""
 
 
 def test_second_sigint_ends_the_notice() -> None:
     stopping = Stopping(EventStreams(1, 1), cast("Supervisor", Idle()), notice_seconds=600)
-    server = AnnouncingServer(uvicorn.Config(nothing, lifespan="off"), stopping, 1, print)
+    server = AnnouncingServer(uvicorn.Config(do_nothing, lifespan="off"), stopping, 1, print)
     server.handle_exit(signal.SIGINT, None)
-    again = threading.Timer(0.3, server.handle_exit, (signal.SIGINT, None))
+    timer = threading.Timer(0.3, server.handle_exit, (signal.SIGINT, None))
 
     async def stop() -> None:
-        again.start()
+        timer.start()
         with anyio.fail_after(60):
             await stopping.begin(lambda: server.force_exit)
 
@@ -316,12 +321,12 @@ def test_second_sigint_ends_the_notice() -> None:
     assert server.force_exit
 
 
-WATCHED: list[Callable[[str, tuple[Any, ...]], None]] = []  # an audit hook stays for good, so it asks here
+AUDIT_HOOKS: list[Callable[[str, tuple[Any, ...]], None]] = []  # an audit hook stays for good, so it asks here
 TOUCHES = {
     "open", "sqlite3.connect", "os.mkdir", "os.remove", "os.rename", "os.rmdir", "os.scandir", "os.listdir",
     "shutil.rmtree", "subprocess.Popen", "glob.glob",
 }  # fmt: skip
-sys.addaudithook(lambda event, given: [watch(event, given) for watch in WATCHED] and None)
+sys.addaudithook(lambda event, given: [watch(event, given) for watch in AUDIT_HOOKS] and None)
 
 
 @contextmanager
@@ -329,54 +334,65 @@ def touches_on_the_loop(client: TestClient, patch: pytest.MonkeyPatch) -> Iterat
     """What the thread of the event loop does to our files and the database."""
     assert client.portal is not None
     loop, root = client.portal.call(threading.get_ident), str(parts_of(client).store.files.root)
-    ours = (root, str(Path(__file__).parents[2] / "service" / "web"))
-    seen: list[str] = []
+    roots = (root, str(Path(__file__).parents[2] / "service" / "web"))
+    touches: list[str] = []
 
-    def note(what: str) -> None:
+    def note(operation: str) -> None:
         if threading.get_ident() == loop:
-            seen.append(what)
+            touches.append(operation)
 
-    def heard(event: str, given: tuple[Any, ...]) -> None:
-        place = str(given[0]) if given else ""
-        if event in TOUCHES and (place.startswith(ours) or not event.startswith(("open", "os.", "glob"))):
+    def on_audit(event: str, arguments: tuple[Any, ...]) -> None:
+        place = str(arguments[0]) if arguments else ""
+        if event in TOUCHES and (place.startswith(roots) or not event.startswith(("open", "os.", "glob"))):
             note(f"{event} {place}")
 
     def noting(name: str, original: Callable[..., Any]) -> Callable[..., Any]:
-        return lambda *given, **more: (note(name), original(*given, **more))[1]
+        return lambda *arguments, **keywords: (note(name), original(*arguments, **keywords))[1]
 
     for cls, names in ((Database, ("read", "write")), (DataDirectory, ("free_bytes", "draft", "scratch"))):
         for name in names:
             patch.setattr(cls, name, noting(f"{cls.__name__}.{name}", getattr(cls, name)))
-    WATCHED.append(heard)
+    AUDIT_HOOKS.append(on_audit)
     try:
-        yield seen
+        yield touches
     finally:
-        WATCHED.remove(heard)
+        AUDIT_HOOKS.remove(on_audit)
 
 
 def test_no_route_touches_files_or_the_database_on_the_event_loop(
-    client: TestClient, uploaded: Uploaded, lift: dict[str, Any], scene: TinyScene, monkeypatch: pytest.MonkeyPatch
+    client: TestClient,
+    scene_assets: SceneAssets,
+    lift: dict[str, Any],
+    scene: TinyScene,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    asked = {"lift": lift["id"], "text": "apple", "view": "left"}
-    bodies = {"/lift": uploaded.order(stride=0), "/tradeoff": uploaded.order(stride=0)}
-    with touches_on_the_loop(client, monkeypatch) as seen:
+    parameters = {"lift": lift["id"], "text": "apple", "view": "left"}
+    bodies = {"/lift": scene_assets.order(stride=0), "/tradeoff": scene_assets.order(stride=0)}
+    with touches_on_the_loop(client, monkeypatch) as touches:
         for method, path in every_route(app_of(client)):
             if method == "DELETE" or path.endswith("/cancel"):
                 continue  # of things that other tests need: `address` names none below
-            where = address(path, lift["id"], "splats" if method == "PUT" else uploaded.cameras)
-            body = {"json": bodies.get(path, {**asked, "text": ["apple"]})} if method == "POST" else {}
-            known = set(asked) if path.startswith("/query") else {"lift", "view"} if path == "/render" else set()
-            known -= (
+            address_of_route = address(path, lift["id"], "splats" if method == "PUT" else scene_assets.cameras)
+            body = {"json": bodies.get(path, {**parameters, "text": ["apple"]})} if method == "POST" else {}
+            parameter_names = (
+                set(parameters) if path.startswith("/query") else {"lift", "view"} if path == "/render" else set()
+            )
+            parameter_names -= (
                 {"view"}
                 if path in ("/query/scores", "/query/selection", "/query/splats", "/query/objects")
                 else set()
             )
-            how: dict[str, Any] = {"content": scene.splats} if method == "PUT" else body
-            client.request(method, where, params={name: asked[name] for name in known if method == "GET"}, **how)
+            options: dict[str, Any] = {"content": scene.splats} if method == "PUT" else body
+            client.request(
+                method,
+                address_of_route,
+                params={name: parameters[name] for name in parameter_names if method == "GET"},
+                **options,
+            )
         client.delete(address("/jobs/{job}", "0" * 32, ""))
-        client.delete(f"/assets/{uploaded.splats}")  # refused: a lift needs it
+        client.delete(f"/assets/{scene_assets.splats}")  # refused: a lift needs it
         client.put("/assets/cameras", content=b"no cameras")
-        assert not seen
+        assert not touches
 
 
 def test_upload_to_a_stalled_disk_keeps_nobody_else_waiting(
@@ -413,39 +429,39 @@ def test_few_requests_begin_at_a_time_and_none_waits_for_slow_ones(
     monkeypatch: pytest.MonkeyPatch, seconds: float, at_once: int
 ) -> None:
     monkeypatch.setattr(layers, "TURN_SECONDS", seconds)
-    begun: list[str] = []
+    started_names: list[str] = []
 
     async def ask_all() -> None:
         go_on = anyio.Event()
 
         async def app(scope: Any, receive: Any, send: Any) -> None:
-            begun.append(scope["path"])
+            started_names.append(scope["path"])
             if scope["path"] == "/slow":
                 await go_on.wait()
 
         turns: Any = layers.ConcurrencyLimit(app)
-        async with anyio.create_task_group() as asked:
+        async with anyio.create_task_group() as parameters:
             for path in ["/slow"] * 2 * layers.PLACES + ["/healthz"]:
-                asked.start_soon(turns, {"type": "http", "path": path}, None, None)
-            while "/healthz" not in begun or begun.count("/slow") < at_once:
+                parameters.start_soon(turns, {"type": "http", "path": path}, None, None)
+            while "/healthz" not in started_names or started_names.count("/slow") < at_once:
                 await anyio.sleep(0.001)
-            assert begun.count("/slow") == at_once
+            assert started_names.count("/slow") == at_once
             go_on.set()
-        assert begun.count("/slow") == 2 * layers.PLACES
+        assert started_names.count("/slow") == 2 * layers.PLACES
 
     anyio.run(ask_all)
 
 
-def test_settings_are_bounded_before_they_are_looked_at(client: TestClient, uploaded: Uploaded) -> None:
+def test_settings_are_bounded_before_they_are_looked_at(client: TestClient, scene_assets: SceneAssets) -> None:
     for settings in (
         {f"name{number}": 1 for number in range(SETTINGS + 1)},
         {"n" * 10_000: 1},
         {"preset": "x" * 10_000},
     ):
         for path in ("/lift", "/tradeoff"):
-            told = assert_problem(client.post(path, json=uploaded.order() | {"settings": settings}))
-            assert (told["status"], told["argument"]) == (422, "settings")
-            assert f"at most {SETTINGS} settings" in told["expected"]
+            problem = assert_problem(client.post(path, json=scene_assets.order() | {"settings": settings}))
+            assert (problem["status"], problem["argument"]) == (422, "settings")
+            assert f"at most {SETTINGS} settings" in problem["expected"]
 
 
 # Lists
@@ -455,9 +471,9 @@ def test_settings_are_bounded_before_they_are_looked_at(client: TestClient, uplo
     "wrong", [{"like": [{}] * 200_000}, {"like": ["x", *[3] * 30]}, {"text": [1] * 200_000}, {"like": [["x"] * 9000]}]
 )
 def test_body_is_refused_for_the_first_thing_that_is_wrong_and_not_for_all(wrong: dict[str, Any]) -> None:
-    with pytest.raises(ValidationError) as told:
+    with pytest.raises(ValidationError) as problem:
         Question.model_validate({"text": ["apple"], **wrong})
-    assert told.value.error_count() == 1
+    assert problem.value.error_count() == 1
 
 
 @pytest.mark.parametrize(
@@ -470,13 +486,15 @@ def test_body_of_more_values_than_any_question_has_is_not_parsed(client: TestCli
 
 
 def test_pack_counts_once_and_packs_are_bounded(tmp_path: Path) -> None:
-    with guarded(tmp_path / "data") as house:
-        body = house.body()
-        many = house.ask("alice", "POST", "/lift", json=body | {"features": body["features"] * 10_000})
-        assert many.status_code == 202 and many.json()["features"] == body["features"]
-        others = [f"sha256:{number:064x}" for number in range(PACKS + 1)]
-        told = assert_problem(house.ask("alice", "POST", "/lift", json=body | {"features": others}))
-        assert (told["argument"], told["status"]) == ("features", 422) and f"at most {PACKS}" in told["expected"]
+    with keyed_server(tmp_path / "data") as server:
+        body = server.body()
+        response = server.ask("alice", "POST", "/lift", json=body | {"features": body["features"] * 10_000})
+        assert response.status_code == 202 and response.json()["features"] == body["features"]
+        other_packs = [f"sha256:{number:064x}" for number in range(PACKS + 1)]
+        problem = assert_problem(server.ask("alice", "POST", "/lift", json=body | {"features": other_packs}))
+        assert (problem["argument"], problem["status"]) == ("features", 422) and f"at most {PACKS}" in problem[
+            "expected"
+        ]
 
 
 def test_page_of_long_names_is_no_longer_than_others(client: TestClient) -> None:
@@ -484,32 +502,32 @@ def test_page_of_long_names_is_no_longer_than_others(client: TestClient) -> None
     names = [f"{number:03}" + "\U0001f600" * 490 for number in range(700)]
     cameras["frames"] = [cameras["frames"][0] | {"file_path": f"{name}.png"} for name in names]
     route = f"/assets/{put(client, AssetKind.CAMERAS, json.dumps(cameras).encode())}/names"
-    found: list[str] = []
+    value: list[str] = []
     cursor: int | None = 0
     while cursor is not None:
         reply = client.get(route, params={"cursor": cursor})
         assert len(reply.content) < 2 << 20
-        found += reply.json()["names"]
+        value += reply.json()["names"]
         cursor = reply.json()["next"]
-    assert found == names
+    assert value == names
 
 
 def test_small_pages_together_are_the_large_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.content.STREAMED_RECORDS", 2)
-    with guarded(tmp_path / "data") as house:
+    with keyed_server(tmp_path / "data") as server:
         for _ in range(3):
-            house.store.jobs.submit(SERVICE, house.order)
+            server.store.jobs.submit(SERVICE, server.order)
         for path, count in (("jobs", 6), ("lifts", 1), ("assets", 3)):
-            whole = house.ask("boss", "GET", f"/{path}").json()
-            found, cursor = [], {}
+            full = server.ask("boss", "GET", f"/{path}").json()
+            value, cursor = [], {}
             while cursor is not None:
-                page = house.ask("boss", "GET", f"/{path}", params={"limit": 2} | cursor).json()
+                page = server.ask("boss", "GET", f"/{path}", params={"limit": 2} | cursor).json()
                 assert len(page[path]) <= 2
-                found += page[path]
+                value += page[path]
                 cursor = None if page["next"] is None else {"cursor": page["next"]}
-            assert whole == {path: found, "next": None} and len(found) == count
+            assert full == {path: value, "next": None} and len(value) == count
             for wrong in ({"cursor": "x"}, {"limit": 0}):
-                assert house.ask("boss", "GET", f"/{path}", params=wrong).status_code == 422
+                assert server.ask("boss", "GET", f"/{path}", params=wrong).status_code == 422
 
 
 def test_very_many_names_are_told_apart_in_pages(client: TestClient) -> None:
@@ -518,10 +536,10 @@ def test_very_many_names_are_told_apart_in_pages(client: TestClient) -> None:
     names = [f"{long}{number:04}" for number in range(SHOWN_CHARACTERS // 400 + 1)]
     document["frames"] = [frame | {"file_path": f"images/{name}.png"} for name in names]
     asset = put(client, AssetKind.CAMERAS, json.dumps(document).encode())
-    told = client.get(f"/assets/{asset}")
-    assert "names" not in told.json()["counts"] and len(told.content) < 10_000
-    first = client.get(told.json()["links"]["names"], params={"limit": 500}).json()
-    rest = client.get(told.json()["links"]["names"], params={"cursor": first["next"]}).json()
+    problem = client.get(f"/assets/{asset}")
+    assert "names" not in problem.json()["counts"] and len(problem.content) < 10_000
+    first = client.get(problem.json()["links"]["names"], params={"limit": 500}).json()
+    rest = client.get(problem.json()["links"]["names"], params={"cursor": first["next"]}).json()
     assert sorted(first["names"] + rest["names"]) == names and rest["next"] is None
     assert client.delete(f"/assets/{asset}").status_code == 204
 
@@ -530,30 +548,30 @@ def test_lift_of_very_many_views_tells_their_names_apart_in_pages(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lifted = [f"{'a' * 100}{number:04}" for number in range(3000)]
-    with guarded(tmp_path / "data", views=lifted) as house:
-        path = f"/lifts/{house.done}"
-        told = house.ask("alice", "GET", path)
-        assert (told.json()["views"], told.json()["view_count"]) == ([], 3000) and len(told.content) < 4000
-        assert told.json()["diagnostics"] == {"warnings": ["x"]}  # and no names of views in it
-        assert house.ask("alice", "GET", "/lifts").json()["lifts"] == [told.json()]
+    with keyed_server(tmp_path / "data", views=lifted) as server:
+        path = f"/lifts/{server.lift_job}"
+        problem = server.ask("alice", "GET", path)
+        assert (problem.json()["views"], problem.json()["view_count"]) == ([], 3000) and len(problem.content) < 4000
+        assert problem.json()["diagnostics"] == {"warnings": ["x"]}  # and no names of views in it
+        assert server.ask("alice", "GET", "/lifts").json()["lifts"] == [problem.json()]
         numbers = {"width": 1, "height": 1, "fx": 1, "fy": 1, "cx": 1, "cy": 1, "viewmat": [[1.0]]}
         page = Frame({"views": [{"name": name, **numbers} for name in (lifted[7], "another")], "more": True})
-        monkeypatch.setattr(NoQueries, "call", lambda *given: page, raising=False)
-        views = house.ask("alice", "GET", told.json()["links"]["views"], params={"limit": 2}).json()
+        monkeypatch.setattr(NoQueries, "call", lambda *arguments: page, raising=False)
+        views = server.ask("alice", "GET", problem.json()["links"]["views"], params={"limit": 2}).json()
         assert [(view["name"], view["lifted"]) for view in views["views"]] == [(lifted[7], True), ("another", False)]
         assert views["next"] == 2
-    with guarded(tmp_path / "few") as house:
-        told = house.ask("alice", "GET", f"/lifts/{house.done}").json()
-        assert (told["views"], told["view_count"]) == (["v"], 1)
+    with keyed_server(tmp_path / "few") as server:
+        problem = server.ask("alice", "GET", f"/lifts/{server.lift_job}").json()
+        assert (problem["views"], problem["view_count"]) == (["v"], 1)
 
 
 def test_every_answer_tells_browsers_to_guess_and_frame_nothing(client: TestClient) -> None:
     for path in ("/", "/docs", "/healthz", "/nowhere", "/assets", "/lifts/x"):
-        told = client.get(path).headers
-        assert (told["x-content-type-options"], told["x-frame-options"]) == ("nosniff", "DENY"), path
-        assert told["cross-origin-resource-policy"] == "same-origin", path
-        assert "default-src 'none'" in told["content-security-policy"], path
-        assert "frame-ancestors 'none'" in told["content-security-policy"], path
+        problem = client.get(path).headers
+        assert (problem["x-content-type-options"], problem["x-frame-options"]) == ("nosniff", "DENY"), path
+        assert problem["cross-origin-resource-policy"] == "same-origin", path
+        assert "default-src 'none'" in problem["content-security-policy"], path
+        assert "frame-ancestors 'none'" in problem["content-security-policy"], path
     policy = client.get("/").headers["content-security-policy"]
     assert "script-src 'self' 'wasm-unsafe-eval'; style-src 'self';" in policy  # its own files alone
     assert "http" not in policy and "unsafe-inline" not in policy and "'unsafe-eval'" not in policy
@@ -562,8 +580,8 @@ def test_every_answer_tells_browsers_to_guess_and_frame_nothing(client: TestClie
 def test_log_of_one_thing_again_and_again_is_thinned_out() -> None:
     now = [0.0]
     sparing, access = LogRateLimit(lambda: now[0]), logging.LogRecord("service.access", 20, "x", 1, "m", (), None)
-    repeated = [logging.LogRecord("service.jobs", 40, "x", 1, "m", (), None) for _ in range(10_000)]
-    assert sum(map(sparing.filter, repeated)) == SAME_A_MINUTE
+    records = [logging.LogRecord("service.jobs", 40, "x", 1, "m", (), None) for _ in range(10_000)]
+    assert sum(map(sparing.filter, records)) == SAME_A_MINUTE
     assert all(sparing.filter(access) for _ in range(1000))
     now[0] = 61
     late = logging.LogRecord("service.jobs", 40, "x", 1, "m", (), None)

@@ -36,26 +36,26 @@ def photos_zip(method: str) -> bytes:
 
 
 def mutated(content: bytes, seed: int) -> bytes:
-    generator, changed = random.Random(seed), bytearray(content)
+    generator, mutant = random.Random(seed), bytearray(content)
     for _ in range(generator.choice((1, 1, 3))):
-        place = generator.randrange(len(changed))
+        place = generator.randrange(len(mutant))
         if generator.random() < 0.8:
-            changed[place] = generator.randrange(256)
+            mutant[place] = generator.randrange(256)
         else:
-            del changed[place : place + generator.randrange(1, 9)]
-    return bytes(changed)
+            del mutant[place : place + generator.randrange(1, 9)]
+    return bytes(mutant)
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_mutated_zip_is_read_or_refused_as_photos(method: str, tmp_path: Path) -> None:
-    content, path, refused = photos_zip(method), tmp_path / "photos.zip", 0
+    content, path, refusals = photos_zip(method), tmp_path / "photos.zip", 0
     for seed in range(150):
         path.write_bytes(mutated(content, seed))
         try:
             assert describe_photos(path)["photos"] > 0
         except InvalidPhotos:
-            refused += 1
-    assert refused > 50
+            refusals += 1
+    assert refusals > 50
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -63,8 +63,8 @@ def test_photo_of_a_zip_that_broke_since_its_upload_is_not_found(method: str, tm
     path = tmp_path / "photos.zip"
     path.write_bytes(photos_zip(method))
     index = PhotoIndexes().of(path)
-    opened = index.open("a")
-    assert opened is not None and b"".join(opened[2]) == photo()
+    file = index.open("a")
+    assert file is not None and b"".join(file[2]) == photo()
     path.write_bytes(path.read_bytes()[:20])
     with pytest.raises(NotFound, match="photos"):
         index.open("a")
@@ -83,11 +83,11 @@ def test_size_of_a_photo_in_a_broken_zip_is_refused_as_an_image(method: str, tmp
         path.write_bytes(mutated(photos_zip(method), seed))
         try:
             with zipfile.ZipFile(path) as archive:
-                beside = PhotosBeside(zipfile.Path(archive))
+                sibling_photos = PhotosBeside(zipfile.Path(archive))
         except (zipfile.BadZipFile, NotImplementedError, ValueError):
             continue
         try:
-            header = beside.header("a.png")
+            header = sibling_photos.header("a.png")
             outcomes.add(header and header.stored)
         except InvalidInput as error:
             outcomes.add(error.expected)

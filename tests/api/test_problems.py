@@ -22,9 +22,9 @@ from service.child import error_of, fault_of
 from service.models import COMPARED
 from service.problems import TABLE, problem_of
 
-from .conftest import Uploaded
+from .conftest import SceneAssets
 
-NOBODY = "0" * 32
+UNKNOWN_ID = "0" * 32
 NO_ASSET = "sha256:" + "0" * 64
 
 
@@ -56,23 +56,23 @@ def assert_problem(reply: Any) -> dict[str, Any]:
     ],
 )
 def test_bad_order_is_refused_before_it_is_a_job(
-    client: TestClient, uploaded: Uploaded, change: dict[str, Any], status: int, kind: str
+    client: TestClient, scene_assets: SceneAssets, change: dict[str, Any], status: int, kind: str
 ) -> None:
     before = len(client.get("/jobs").json()["jobs"])
-    content = json.dumps(uploaded.order() | change)
+    content = json.dumps(scene_assets.order() | change)
     reply = client.post("/lift", content=content, headers={"Content-Type": "application/json"})
     body = assert_problem(reply)
     assert (body["status"], body["type"]) == (status, f"/problems/{kind}")
     assert len(client.get("/jobs").json()["jobs"]) == before
 
 
-def test_assets_in_a_wrong_place_are_refused(client: TestClient, uploaded: Uploaded) -> None:
-    body = assert_problem(client.post("/lift", json=uploaded.order() | {"splats": uploaded.cameras}))
+def test_assets_in_a_wrong_place_are_refused(client: TestClient, scene_assets: SceneAssets) -> None:
+    body = assert_problem(client.post("/lift", json=scene_assets.order() | {"splats": scene_assets.cameras}))
     assert body["status"] == 404 and "cameras" in body["got"]
 
 
 @pytest.mark.parametrize(
-    ("method", "path", "more", "argument", "expected", "got"),
+    ("method", "path", "options", "argument", "expected", "got"),
     [
         ("POST", "/query", {"content": b'{"text": ["\xc4pfel"]}', "headers": {"Content-Type": "application/json"}},
          "body", "JSON in UTF-8", "bytes that are none"),
@@ -85,9 +85,9 @@ def test_assets_in_a_wrong_place_are_refused(client: TestClient, uploaded: Uploa
     ],
 )  # fmt: skip
 def test_refusal_names_the_argument_and_what_was_expected(
-    client: TestClient, method: str, path: str, more: dict[str, Any], argument: str, expected: str, got: str
+    client: TestClient, method: str, path: str, options: dict[str, Any], argument: str, expected: str, got: str
 ) -> None:
-    body = assert_problem(client.request(method, path, **more))
+    body = assert_problem(client.request(method, path, **options))
     assert (body["argument"], body["expected"], body["got"]) == (argument, expected, got) and body["hint"]
 
 
@@ -133,12 +133,12 @@ JSON = {"Content-Type": "application/json"}
 
 
 def test_bodies_of_json_come_plain_and_bounded(client: TestClient) -> None:
-    told = assert_problem(
+    problem = assert_problem(
         client.post("/lift", content=gzip.compress(b"{}"), headers=JSON | {"Content-Encoding": "gzip"})
     )
-    assert (told["status"], told["argument"]) == (415, "Content-Encoding")
-    told = assert_problem(client.post("/lift", content=b" " * 2_000_000, headers=JSON))
-    assert (told["status"], told["argument"], told["expected"]) == (413, "body", "at most 1048576 bytes")
+    assert (problem["status"], problem["argument"]) == (415, "Content-Encoding")
+    problem = assert_problem(client.post("/lift", content=b" " * 2_000_000, headers=JSON))
+    assert (problem["status"], problem["argument"], problem["expected"]) == (413, "body", "at most 1048576 bytes")
 
 
 @pytest.mark.parametrize(
@@ -152,15 +152,15 @@ def test_bodies_of_json_come_plain_and_bounded(client: TestClient) -> None:
 def test_parameters_are_single_and_of_bounded_size(
     client: TestClient, query: str, argument: str, expected: str
 ) -> None:
-    told = assert_problem(client.get(f"/query?text=apple&{query}"))
-    assert (told["status"], told["argument"], told["expected"]) == (422, argument, expected)
-    told = assert_problem(client.get("/assets?limit=1&limit=2"))
-    assert (told["status"], told["argument"]) == (422, "limit")
+    problem = assert_problem(client.get(f"/query?text=apple&{query}"))
+    assert (problem["status"], problem["argument"], problem["expected"]) == (422, argument, expected)
+    problem = assert_problem(client.get("/assets?limit=1&limit=2"))
+    assert (problem["status"], problem["argument"]) == (422, "limit")
 
 
 def test_media_type_of_json_may_be_in_capitals(client: TestClient) -> None:
-    told = assert_problem(client.post("/lift", content=b"{}", headers={"Content-Type": "Application/JSON"}))
-    assert told["argument"] == "splats"
+    problem = assert_problem(client.post("/lift", content=b"{}", headers={"Content-Type": "Application/JSON"}))
+    assert problem["argument"] == "splats"
 
 
 THRESHOLD = "auto, valley, paper, otsu, stability, or a number from -1 to 1"
@@ -170,10 +170,10 @@ EXAMPLE = f"{NOTATIONS}, or a vector of 1 to 65536 finite numbers"
 @pytest.mark.parametrize("media", [None, "application/x-www-form-urlencoded", "text/plain"])
 def test_json_that_nothing_calls_json_is_told_of_the_header(client: TestClient, media: str | None) -> None:
     headers = {} if media is None else {"Content-Type": media}
-    told = assert_problem(client.post("/query", content=b'{"text": ["apple"]}', headers=headers))
-    assert (told["status"], told["argument"], told["expected"]) == (415, "Content-Type", "application/json")
-    assert told["got"] == ("nothing" if media is None else repr(media))
-    assert "Content-Type: application/json" in told["hint"]
+    problem = assert_problem(client.post("/query", content=b'{"text": ["apple"]}', headers=headers))
+    assert (problem["status"], problem["argument"], problem["expected"]) == (415, "Content-Type", "application/json")
+    assert problem["got"] == ("nothing" if media is None else repr(media))
+    assert "Content-Type: application/json" in problem["hint"]
 
 
 @pytest.mark.parametrize(
@@ -187,10 +187,10 @@ def test_json_that_nothing_calls_json_is_told_of_the_header(client: TestClient, 
     ],
 )
 def test_what_is_no_json_says_where_and_no_object_says_so(client: TestClient, body: bytes, got: str | None) -> None:
-    told = assert_problem(client.post("/query", content=body, headers=JSON))
-    assert (told["status"], told["argument"]) == (422 if got is None else 400, "body")
-    assert told["expected"] == ("a JSON object" if got is None else "JSON")
-    assert got is None or told["got"].startswith(got), told
+    problem = assert_problem(client.post("/query", content=body, headers=JSON))
+    assert (problem["status"], problem["argument"]) == (422 if got is None else 400, "body")
+    assert problem["expected"] == ("a JSON object" if got is None else "JSON")
+    assert got is None or problem["got"].startswith(got), problem
 
 
 @pytest.mark.parametrize(
@@ -212,13 +212,13 @@ def test_what_is_no_json_says_where_and_no_object_says_so(client: TestClient, bo
     ],
 )
 def test_field_of_a_query_says_what_it_takes(client: TestClient, body: str, argument: str, expected: str) -> None:
-    told = assert_problem(client.post("/query", content=body, headers=JSON))
-    assert (told["status"], told["argument"], told["expected"]) == (422, argument, expected)
-    assert len(told["got"]) < 200
+    problem = assert_problem(client.post("/query", content=body, headers=JSON))
+    assert (problem["status"], problem["argument"], problem["expected"]) == (422, argument, expected)
+    assert len(problem["got"]) < 200
 
 
 @pytest.mark.parametrize(
-    ("path", "body", "argument", "known"),
+    ("path", "body", "argument", "known_names"),
     [
         ("/query", {"negative": ["x"]}, "negative", "negatives"),
         ("/query", {"x" * 500: 1}, "x" * 80, "text"),
@@ -228,44 +228,44 @@ def test_field_of_a_query_says_what_it_takes(client: TestClient, body: str, argu
     ],
 )
 def test_unknown_field_is_refused_with_the_known_ones(
-    client: TestClient, path: str, body: dict[str, Any], argument: str, known: str
+    client: TestClient, path: str, body: dict[str, Any], argument: str, known_names: str
 ) -> None:
     order = {} if path == "/query" else {"splats": NO_ASSET, "cameras": NO_ASSET, "features": [NO_ASSET]}
-    told = assert_problem(client.post(path, json=order | body))
-    assert (told["status"], told["argument"]) == (422, argument)
-    assert told["expected"].startswith("one of ") and known in told["expected"]
-    assert told["got"] in (repr(argument.rpartition(".")[2]), "an unknown setting")
+    problem = assert_problem(client.post(path, json=order | body))
+    assert (problem["status"], problem["argument"]) == (422, argument)
+    assert problem["expected"].startswith("one of ") and known_names in problem["expected"]
+    assert problem["got"] in (repr(argument.rpartition(".")[2]), "an unknown setting")
 
 
 @pytest.mark.parametrize("name", ["text", "negatives"])
 def test_texts_have_a_length_together(client: TestClient, name: str) -> None:
     for texts in (["a" * 1000] * 4 + ["b"], ["a" * 126] * 32):
-        told = assert_problem(client.post("/query", json={"text": ["apple"], name: texts}))
-        assert (told["status"], told["argument"]) == (422, name)
-        assert told["expected"] == f"texts of at most 4000 characters together, which are {len(''.join(texts))}"
+        problem = assert_problem(client.post("/query", json={"text": ["apple"], name: texts}))
+        assert (problem["status"], problem["argument"]) == (422, name)
+        assert problem["expected"] == f"texts of at most 4000 characters together, which are {len(''.join(texts))}"
     assert "4000" not in client.post("/query", json={"text": ["apple"], name: ["a" * 125] * 32}).text
 
 
 def test_missing_parameter_and_a_value_of_another_type_are_told(client: TestClient) -> None:
-    told = assert_problem(client.get("/render"))
-    assert (told["argument"], told["expected"], told["got"]) == ("view", "a value", "nothing")
+    problem = assert_problem(client.get("/render"))
+    assert (problem["argument"], problem["expected"], problem["got"]) == ("view", "a value", "nothing")
     order = {"splats": NO_ASSET, "cameras": NO_ASSET, "features": [NO_ASSET]}
-    told = assert_problem(client.post("/tradeoff", json=order | {"budget_s": True}))
-    assert (told["argument"], told["expected"], told["got"]) == ("budget_s", "a number", "True")
-    told = assert_problem(client.post("/lift", json=order | {"settings": {"power": None}}))
-    assert (told["argument"], told["expected"]) == ("settings.power", "a boolean, a number or a text")
+    problem = assert_problem(client.post("/tradeoff", json=order | {"budget_s": True}))
+    assert (problem["argument"], problem["expected"], problem["got"]) == ("budget_s", "a number", "True")
+    problem = assert_problem(client.post("/lift", json=order | {"settings": {"power": None}}))
+    assert (problem["argument"], problem["expected"]) == ("settings.power", "a boolean, a number or a text")
 
 
 def test_settings_have_the_types_that_the_document_shows(client: TestClient) -> None:
     order = {"splats": NO_ASSET, "cameras": NO_ASSET, "features": [NO_ASSET]}
-    shown = client.get("/openapi.json").json()["components"]["schemas"]
+    schemas = client.get("/openapi.json").json()["components"]["schemas"]
     for path, schema, left_out in (("/lift", "LiftRequest", set()), ("/tradeoff", "TradeoffRequest", {COMPARED})):
-        fields = shown[schema]["properties"]["settings"]
+        fields = schemas[schema]["properties"]["settings"]
         assert set(fields["properties"]) == set(LiftSettings.model_fields) - left_out
         assert fields["additionalProperties"] is False
         assert fields["properties"]["stride"]["type"] == "integer"
-        told = assert_problem(client.post(path, json=order | {"settings": {"stride": "2"}}))
-        assert (told["status"], told["argument"], told["expected"]) == (422, "stride", "a valid integer")
+        problem = assert_problem(client.post(path, json=order | {"settings": {"stride": "2"}}))
+        assert (problem["status"], problem["argument"], problem["expected"]) == (422, "stride", "a valid integer")
         for example in fields["examples"]:  # right, so it is the assets that are missed
             assert client.post(path, json=order | {"settings": example}).status_code == 404
 
@@ -278,20 +278,22 @@ def test_every_route_refuses_what_it_does_not_declare(client: TestClient) -> Non
     assert "Problem" in document["components"]["schemas"]
     assert "HTTPValidationError" not in document["components"]["schemas"]
     operations = [
-        (path, method, one) for path, methods in document["paths"].items() for method, one in methods.items()
+        (path, method, entry) for path, methods in document["paths"].items() for method, entry in methods.items()
     ]
     for path, method, operation in operations:
         if path in FREE:
             continue
-        declared = [parameter["name"] for parameter in operation.get("parameters", ()) if parameter["in"] == "query"]
-        address = re.sub(r"\{\w+\}", NOBODY, path.replace("{asset}", NO_ASSET if method != "put" else "splats"))
+        declared_names = [
+            parameter["name"] for parameter in operation.get("parameters", ()) if parameter["in"] == "query"
+        ]
+        address = re.sub(r"\{\w+\}", UNKNOWN_ID, path.replace("{asset}", NO_ASSET if method != "put" else "splats"))
         body: dict[str, Any] = {"json": {"text": ["x"]}} if method == "post" and path.startswith("/query") else {}
-        told = assert_problem(client.request(method, address, params={"colour": "red"}, **body))
-        assert (told["status"], told["type"]) == (422, "/problems/invalid-request"), (method, path, told)
+        problem = assert_problem(client.request(method, address, params={"colour": "red"}, **body))
+        assert (problem["status"], problem["type"]) == (422, "/problems/invalid-request"), (method, path, problem)
         if method != "post":  # where the body is told of first
-            assert (told["argument"], told["got"]) == ("colour", "'colour'"), (method, path, told)
-            expected = f"one of {', '.join(declared)}" if declared else "no parameters"
-            assert set(told["expected"].split(", ")) == set(expected.split(", ")), (method, path, told)
+            assert (problem["argument"], problem["got"]) == ("colour", "'colour'"), (method, path, problem)
+            expected = f"one of {', '.join(declared_names)}" if declared_names else "no parameters"
+            assert set(problem["expected"].split(", ")) == set(expected.split(", ")), (method, path, problem)
 
 
 @pytest.mark.parametrize(

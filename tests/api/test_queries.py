@@ -26,8 +26,8 @@ from service.models import AssetKind
 from service.query_client import Frame
 from service.store.files import DataDirectory
 
-from .conftest import Uploaded, parts_of, put
-from .following import ended
+from .conftest import SceneAssets, parts_of, put
+from .following import wait_for_end
 from .test_problems import assert_problem
 from .tiny_scene import (
     CHANNELS,
@@ -71,8 +71,8 @@ def of_lamp(answer: dict[str, Any]) -> bool:
 def test_word_finds_its_cluster_in_numbers_objects_scores_and_a_mask(
     client: TestClient, lift: dict[str, Any], cluster: int
 ) -> None:
-    asked = {"text": WORDS[cluster], "view": "middle", "threshold": 0.5}
-    answer = client.get("/query", params=asked).json()
+    parameters = {"text": WORDS[cluster], "view": "middle", "threshold": 0.5}
+    answer = client.get("/query", params=parameters).json()
     assert answer["lift"] == lift["id"]  # left out of the request: there is only one
     rows = range(cluster * SPLATS_A_CLUSTER, (cluster + 1) * SPLATS_A_CLUSTER)
     assert {splat["splat"] for splat in answer["top"]} <= set(rows)
@@ -80,13 +80,17 @@ def test_word_finds_its_cluster_in_numbers_objects_scores_and_a_mask(
     assert best == sorted(best, reverse=True)
     assert 0.8 * SPLATS_A_CLUSTER <= answer["count"] <= 1.2 * SPLATS_A_CLUSTER
     assert answer["threshold"]["value"] == 0.5 and answer["threshold"]["method"] == "fixed"
-    found = client.get(answer["links"]["objects"]).json()
-    assert (found["lift"], found["count"], found["threshold"]) == (lift["id"], answer["count"], answer["threshold"])
-    (thing,) = found["objects"]
+    objects = client.get(answer["links"]["objects"]).json()
+    assert (objects["lift"], objects["count"], objects["threshold"]) == (
+        lift["id"],
+        answer["count"],
+        answer["threshold"],
+    )
+    (entry,) = objects["objects"]
     middle = (cluster - 1) * 1.2
-    assert answer["box"]["low"][0] <= thing["box"]["low"][0] < middle < thing["box"]["high"][0]
-    assert thing["centre"][0] == pytest.approx(middle, abs=0.2)
-    assert thing["splats"] + found["unassigned_splats"] == found["count"] and thing["score"] >= 0.5
+    assert answer["box"]["low"][0] <= entry["box"]["low"][0] < middle < entry["box"]["high"][0]
+    assert entry["centre"][0] == pytest.approx(middle, abs=0.2)
+    assert entry["splats"] + objects["unassigned_splats"] == objects["count"] and entry["score"] >= 0.5
     scores = array(client.get(answer["links"]["scores"]).content)
     assert (scores.shape, scores.dtype) == ((3 * SPLATS_A_CLUSTER,), np.float32)
     assert scores[answer["top"][0]["splat"]] == pytest.approx(best[0]) == scores.max()
@@ -113,14 +117,14 @@ def test_vector_is_asked_by_post_and_so_is_all_that_belongs_to_it(client: TestCl
     answer = client.post("/query", json=body).json()
     assert of_lamp(answer) and answer["like"] == [f"a vector of {CHANNELS} channels"]
     assert (answer["links"]["mask"], answer["links"]["object"]) == ("/query/mask", "/query/splats?what=object")
-    asked = {"like": "region:left:0:2", "unlike": "middle:6,12", "lift": lift["id"]}
-    by_get = array(client.get("/query/scores", params=asked).content)
+    parameters = {"like": "region:left:0:2", "unlike": "middle:6,12", "lift": lift["id"]}
+    by_get = array(client.get("/query/scores", params=parameters).content)
     np.testing.assert_allclose(array(client.post(answer["links"]["scores"], json=body).content), by_get, atol=1e-5)
     assert array(client.post("/query/selection", json=body).content).sum() == answer["count"]
     for name in ("mask", "attention"):
         assert picture(client.post(answer["links"][name], json=body).content).shape[:2] == (HEIGHT, WIDTH)
-    found, coloured = (client.post(answer["links"][name], json=body) for name in ("object", "coloured"))
-    assert (len(rows_of(found.content)), len(rows_of(coloured.content))) == (answer["count"], 3 * SPLATS_A_CLUSTER)
+    objects, coloured = (client.post(answer["links"][name], json=body) for name in ("object", "coloured"))
+    assert (len(rows_of(objects.content)), len(rows_of(coloured.content))) == (answer["count"], 3 * SPLATS_A_CLUSTER)
     assert assert_problem(client.post("/query/splats?what=mesh", json=body))["argument"] == "what"
     for size in (1e-300, 1e300):  # it has a direction too
         body = {"like": [(size * codebook()[2].astype(float)).tolist()], "lift": lift["id"]}
@@ -128,32 +132,40 @@ def test_vector_is_asked_by_post_and_so_is_all_that_belongs_to_it(client: TestCl
 
 
 def test_words_and_examples_make_one_query(client: TestClient, lift: dict[str, Any]) -> None:
-    both = {"text": ["apple"], "like": ["middle:26,12"], "negatives": ["book"], "threshold": 0.5, "lift": lift["id"]}
-    by_post, by_get = client.post("/query", json=both).json(), client.get("/query", params=both).json()
+    combined = {
+        "text": ["apple"],
+        "like": ["middle:26,12"],
+        "negatives": ["book"],
+        "threshold": 0.5,
+        "lift": lift["id"],
+    }
+    by_post, by_get = client.post("/query", json=combined).json(), client.get("/query", params=combined).json()
     assert by_post == by_get
     assert client.get(by_post["links"]["mask"]).status_code == 200
     assert by_post["count"] > 1.5 * SPLATS_A_CLUSTER
 
 
 def test_answer_says_what_is_known_of_presence(client: TestClient, lift: dict[str, Any]) -> None:
-    asked = {"lift": lift["id"], "text": "lamp"}
+    parameters = {"lift": lift["id"], "text": "lamp"}
     for route in ("/query", "/query/objects"):
-        told = client.get(route, params=asked).json()
-        assert told["clear"] is True and told["present"] is None and "200 words" in told["reason"]
-    kept = client.get("/query", params=asked | {"absent": "keep"}).json()
-    assert "absent=keep" in kept["links"]["objects"] and kept["count"] > 0
-    nothing = client.get("/query", params=asked | {"negatives": "book", "threshold": 1}).json()
-    assert (nothing["clear"], nothing["count"]) == (False, 0)
+        presence = client.get(route, params=parameters).json()
+        assert presence["clear"] is True and presence["present"] is None and "200 words" in presence["reason"]
+    kept_answer = client.get("/query", params=parameters | {"absent": "keep"}).json()
+    assert "absent=keep" in kept_answer["links"]["objects"] and kept_answer["count"] > 0
+    empty = client.get("/query", params=parameters | {"negatives": "book", "threshold": 1}).json()
+    assert (empty["clear"], empty["count"]) == (False, 0)
 
 
 def test_words_of_a_pack_need_no_encoder_of_the_operator(
-    client: TestClient, uploaded: Uploaded, tmp_path: Path
+    client: TestClient, scene_assets: SceneAssets, tmp_path: Path
 ) -> None:
     words = TableEncoder("phrases", ["left thing", "right thing"], codebook()[[0, 2]])
-    views = {name: Regions(found, codebook()) for name, found in labels().items()}
+    views = {name: Regions(view_labels, codebook()) for name, view_labels in labels().items()}
     write_pack(tmp_path / "pack", views, {"text_space": "prompts"}, table=words)
     pack = put(client, AssetKind.FEATURES, (tmp_path / "pack").read_bytes())
-    job = ended(client, client.post("/lift", json=uploaded.order() | {"features": [pack]}).headers["location"])
+    job = wait_for_end(
+        client, client.post("/lift", json=scene_assets.order() | {"features": [pack]}).headers["location"]
+    )
     lift = client.get(job["links"]["lift"]).json()
     assert (lift["text_space"], lift["words"]) == ("prompts", ["left thing", "right thing"])
     for text in ("Left_thing", "right thing"):
@@ -174,21 +186,21 @@ def test_picture_has_the_size_of_its_view_and_a_tag(client: TestClient, lift: di
     params = {"lift": lift["id"], "view": "left"} | ({} if path == "/render" else {"text": "apple"})
     reply = client.get(path, params=params)
     assert reply.headers["content-type"] == "image/png" and picture(reply.content).shape[:2] == (HEIGHT, WIDTH)
-    for known in (reply.headers["etag"], "*"):  # any picture at all is one that exists
-        again = client.get(path, params=params, headers={"If-None-Match": known})
-        assert (again.status_code, again.content, again.headers["etag"]) == (304, b"", reply.headers["etag"])
+    for etag in (reply.headers["etag"], "*"):  # any picture at all is one that exists
+        second = client.get(path, params=params, headers={"If-None-Match": etag})
+        assert (second.status_code, second.content, second.headers["etag"]) == (304, b"", reply.headers["etag"])
     other = client.get(path, params=params | {"view": "right"}, headers={"If-None-Match": reply.headers["etag"]})
     assert other.status_code == 200
-    nothing = client.get(path, params=params | {"view": "behind"}, headers={"If-None-Match": "*"})
-    assert assert_problem(nothing)["status"] == 404
+    empty = client.get(path, params=params | {"view": "behind"}, headers={"If-None-Match": "*"})
+    assert assert_problem(empty)["status"] == 404
 
 
 def test_every_question_has_a_tag_of_its_own(client: TestClient, lift: dict[str, Any]) -> None:
-    def tag(path: str = "/query/mask", **more: Any) -> str:
-        params = {"like": "middle:26,12", "lift": lift["id"]} | ({"view": "middle"} if "mask" in path else {}) | more
+    def tag(path: str = "/query/mask", **extra: Any) -> str:
+        params = {"like": "middle:26,12", "lift": lift["id"]} | ({"view": "middle"} if "mask" in path else {}) | extra
         reply = client.get(path, params=params)
-        again = client.get(path, params=params, headers={"If-None-Match": reply.headers["etag"]})
-        assert (reply.status_code, again.status_code, again.content) == (200, 304, b"")
+        second = client.get(path, params=params, headers={"If-None-Match": reply.headers["etag"]})
+        assert (reply.status_code, second.status_code, second.content) == (200, 304, b"")
         return reply.headers["etag"]
 
     changes: list[dict[str, Any]] = [
@@ -200,30 +212,32 @@ def test_every_question_has_a_tag_of_its_own(client: TestClient, lift: dict[str,
 
 
 def test_render_shows_colours_features_or_depth(client: TestClient, lift: dict[str, Any]) -> None:
-    asked = {"lift": lift["id"], "view": "middle"}
-    plain, features, depth = (
-        client.get("/render", params=asked | {"channel": channel}) for channel in ("rgb", "pca", "depth")
+    parameters = {"lift": lift["id"], "view": "middle"}
+    colours, features, depth = (
+        client.get("/render", params=parameters | {"channel": channel}) for channel in ("rgb", "pca", "depth")
     )
-    assert len({reply.headers["etag"] for reply in (plain, features, depth)}) == 3
-    assert picture(features.content).shape == picture(plain.content).shape == (HEIGHT, WIDTH, 3)
-    assert (picture(features.content) != picture(plain.content)).any()
-    with Image.open(io.BytesIO(depth.content)) as shown:
-        assert (shown.size, shown.mode) == ((WIDTH, HEIGHT), "L")
-        near, far = (float(shown.info[name]) for name in ("depth-near", "depth-far"))
+    assert len({reply.headers["etag"] for reply in (colours, features, depth)}) == 3
+    assert picture(features.content).shape == picture(colours.content).shape == (HEIGHT, WIDTH, 3)
+    assert (picture(features.content) != picture(colours.content)).any()
+    with Image.open(io.BytesIO(depth.content)) as depth_image:
+        assert (depth_image.size, depth_image.mode) == ((WIDTH, HEIGHT), "L")
+        near, far = (float(depth_image.info[name]) for name in ("depth-near", "depth-far"))
     assert DISTANCE - 0.5 < near < far < DISTANCE + 0.5
-    lacking = assert_problem(client.get("/render", params=asked | {"channel": "cluster"}))
+    lacking = assert_problem(client.get("/render", params=parameters | {"channel": "cluster"}))
     assert lacking["type"] == "/problems/invalid-query" and "aggregation" in lacking["detail"]
 
 
 def test_camera_of_no_file_sees_what_a_view_sees(client: TestClient, lift: dict[str, Any]) -> None:
     """The same pose gives the same picture, and an entry of the list of views is a camera."""
-    own = {"width": WIDTH, "height": HEIGHT, "fx": FOCAL, "viewmat": POSE}
-    named = {view["name"]: view for view in client.get(f"/lifts/{lift['id']}/views").json()["views"]}
+    own_camera = {"width": WIDTH, "height": HEIGHT, "fx": FOCAL, "viewmat": POSE}
+    views_by_name = {view["name"]: view for view in client.get(f"/lifts/{lift['id']}/views").json()["views"]}
     for path in PICTURES:
-        asked = {"lift": lift["id"]} | ({} if path == "/render" else {"text": ["lamp"]})
-        by_name = client.post(path, json=asked | {"view": "middle"}).content
-        for camera in (own, named["middle"]):
-            assert (picture(client.post(path, json=asked | {"camera": camera}).content) == picture(by_name)).all()
+        parameters = {"lift": lift["id"]} | ({} if path == "/render" else {"text": ["lamp"]})
+        by_name = client.post(path, json=parameters | {"view": "middle"}).content
+        for camera in (own_camera, views_by_name["middle"]):
+            assert (
+                picture(client.post(path, json=parameters | {"camera": camera}).content) == picture(by_name)
+            ).all()
 
 
 # Splats, and what is too large for the pipe
@@ -258,9 +272,9 @@ def test_too_little_disk_is_said_before_anything_is_made(
     client: TestClient, lift: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(DataDirectory, "free_bytes", lambda files: 0)
-    asked = {**LAMP, "lift": lift["id"]}
-    assert assert_problem(client.get("/query/splats", params=asked))["type"] == "/problems/no-space"
-    assert client.get("/query", params=asked).status_code == 200
+    parameters = {**LAMP, "lift": lift["id"]}
+    assert assert_problem(client.get("/query/splats", params=parameters))["type"] == "/problems/no-space"
+    assert client.get("/query", params=parameters).status_code == 200
 
 
 def test_large_array_is_sent_from_a_file(
@@ -268,8 +282,8 @@ def test_large_array_is_sent_from_a_file(
 ) -> None:
     content = bytes(3 * BLOCK_BYTES + 7)
 
-    def call(wanted: dict[str, Any], waiter: object) -> Frame:
-        Path(wanted["draft"]).write_bytes(content)
+    def call(request: dict[str, Any], waiter: object) -> Frame:
+        Path(request["draft"]).write_bytes(content)
         return Frame({})
 
     monkeypatch.setattr(parts_of(client).queries, "call", call)
@@ -296,11 +310,11 @@ def test_draft_is_sent_without_its_name_and_closed_however_that_ends(tmp_path: P
     (tmp_path / "draft").write_bytes(content)
     reply = Draft(tmp_path / "draft", BINARY, filename="object.ply", headers={})
     (tmp_path / "draft").unlink()
-    sent: list[bytes] = []
+    frames: list[bytes] = []
 
     async def send(message: Any) -> None:
-        sent.append(message.get("body", b""))
-        if leaves and len(sent) == 3:
+        frames.append(message.get("body", b""))
+        if leaves and len(frames) == 3:
             raise OSError("gone")
 
     async def receive() -> Any:
@@ -309,15 +323,15 @@ def test_draft_is_sent_without_its_name_and_closed_however_that_ends(tmp_path: P
     with pytest.raises(ClientDisconnect) if leaves else contextlib.nullcontext():
         anyio.run(reply, {"type": "http", "asgi": {"spec_version": "2.4"}}, receive, send)
     assert reply.file.closed
-    assert max(map(len, sent)) == BLOCK_BYTES
-    assert leaves or b"".join(sent) == content
+    assert max(map(len, frames)) == BLOCK_BYTES
+    assert leaves or b"".join(frames) == content
 
 
 # What is refused
 
 
 @pytest.mark.parametrize(
-    ("path", "asked", "status", "argument"),
+    ("path", "parameters", "status", "argument"),
     [
         ("/query", {}, 422, "query"),
         ("/query", {"text": ""}, 422, "text.0"),
@@ -345,10 +359,10 @@ def test_draft_is_sent_without_its_name_and_closed_however_that_ends(tmp_path: P
     ],
 )
 def test_question_that_leads_nowhere_names_what_is_wrong(
-    client: TestClient, lift: dict[str, Any], path: str, asked: dict[str, Any], status: int, argument: str
+    client: TestClient, lift: dict[str, Any], path: str, parameters: dict[str, Any], status: int, argument: str
 ) -> None:
-    told = assert_problem(client.get(path, params={"lift": lift["id"]} | asked))
-    assert (told["status"], told.get("argument")) == (status, argument), told
+    problem = assert_problem(client.get(path, params={"lift": lift["id"]} | parameters))
+    assert (problem["status"], problem.get("argument")) == (status, argument), problem
 
 
 @pytest.mark.parametrize(
@@ -373,8 +387,8 @@ def test_body_that_cannot_be_answered_names_what_is_wrong(
 ) -> None:
     if body.get("camera"):
         body = body | {"camera": {"width": WIDTH, "height": HEIGHT, "fx": FOCAL, "viewmat": POSE} | body["camera"]}
-    told = assert_problem(client.post(path, json={"lift": lift["id"]} | body))
-    assert (told["status"], told.get("argument")) == (422, argument), told
+    problem = assert_problem(client.post(path, json={"lift": lift["id"]} | body))
+    assert (problem["status"], problem.get("argument")) == (422, argument), problem
 
 
 # Many words at once, and those of an uploaded table
@@ -390,17 +404,17 @@ def own_table(client: TestClient) -> str:
 
 def test_every_splat_gets_its_word_of_the_table(client: TestClient, lift: dict[str, Any], own_table: str) -> None:
     body = {"lift": lift["id"], "table": own_table, "view": "middle"}
-    told = client.post("/query/segment", json=body).json()
-    found = {word["word"]: word for word in told["found"]}
-    assert (set(found), told["words"], told["encoder"]) == ({"fruit", "novel", "light"}, 4, "table")
-    assert found["fruit"]["box"]["high"][0] < found["novel"]["box"]["low"][0]
+    answer = client.post("/query/segment", json=body).json()
+    words_by_name = {word["word"]: word for word in answer["found"]}
+    assert (set(words_by_name), answer["words"], answer["encoder"]) == ({"fruit", "novel", "light"}, 4, "table")
+    assert words_by_name["fruit"]["box"]["high"][0] < words_by_name["novel"]["box"]["low"][0]
     labels = array(client.post("/query/segment/labels", json=body).content)
-    assert (labels == 0).sum() == told["none"]
-    own = labels[2 * SPLATS_A_CLUSTER :]
-    assert set(own.tolist()) - {0} == {found["light"]["value"]}
-    seen = Image.open(io.BytesIO(client.post("/query/segment/map", json=body).content))
-    legend = json.loads(seen.text["legend"])  # pyright: ignore[reportAttributeAccessIssue]: of a PNG
-    values = np.asarray(seen)[HEIGHT // 2]
+    assert (labels == 0).sum() == answer["none"]
+    last_labels = labels[2 * SPLATS_A_CLUSTER :]
+    assert set(last_labels.tolist()) - {0} == {words_by_name["light"]["value"]}
+    label_map = Image.open(io.BytesIO(client.post("/query/segment/map", json=body).content))
+    legend = json.loads(label_map.text["legend"])  # pyright: ignore[reportAttributeAccessIssue]: of a PNG
+    values = np.asarray(label_map)[HEIGHT // 2]
     assert [legend[str(values[column])] for column in PLACES.values()] == ["fruit", "novel", "light"]
     assert picture(client.post("/query/segment/picture", json=body).content).shape[1] > WIDTH
 
@@ -416,42 +430,44 @@ def test_what_this_is_names_the_nearest_words(client: TestClient, lift: dict[str
 def test_texts_are_asked_as_words_and_others_are_refused_with_those_that_can_be(
     client: TestClient, lift: dict[str, Any], own_table: str
 ) -> None:
-    asked = {"lift": lift["id"], "table": own_table}
-    answer = client.get("/query", params=asked | {"text": "two old lights"}).json()
+    parameters = {"lift": lift["id"], "table": own_table}
+    answer = client.get("/query", params=parameters | {"text": "two old lights"}).json()
     assert answer["wording"] == [{"text": "two old lights", "word": "light", "match": "head", "how": "head"}]
-    assert client.get("/query", params=asked | {"text": "light"}).json()["wording"] == []
-    problem = assert_problem(client.get("/query", params=asked | {"text": "boaat"}))
+    assert client.get("/query", params=parameters | {"text": "light"}).json()["wording"] == []
+    problem = assert_problem(client.get("/query", params=parameters | {"text": "boaat"}))
     assert (problem["argument"], problem["nearest"]) == ("text.0", ["boat"])
-    words = client.get("/query/words", params=asked | {"text": "no"}).json()
+    words = client.get("/query/words", params=parameters | {"text": "no"}).json()
     assert (words["open_vocabulary"], words["words"]) == (False, [{"word": "novel", "typed": "novel"}])
-    assert "nearest" not in assert_problem(client.get("/query/words", params=asked | {"lift": "0" * 32}))
+    assert "nearest" not in assert_problem(client.get("/query/words", params=parameters | {"lift": "0" * 32}))
     for vocabulary in ({}, {"table": own_table}, {"encoder": "default"}):  # no name of a file of the server
-        refused = assert_problem(client.get("/query", params={"lift": lift["id"], "text": "boaat"} | vocabulary))
-        assert refused["nearest"] and ".safetensors" not in refused["detail"]
+        refusal = assert_problem(client.get("/query", params={"lift": lift["id"], "text": "boaat"} | vocabulary))
+        assert refusal["nearest"] and ".safetensors" not in refusal["detail"]
 
 
 def test_words_that_come_with_an_order_are_those_of_the_lift(
-    client: TestClient, uploaded: Uploaded, own_table: str
+    client: TestClient, scene_assets: SceneAssets, own_table: str
 ) -> None:
-    job = ended(client, client.post("/lift", json=uploaded.order() | {"table": own_table}).headers["location"])
-    asked = {"lift": job["id"], "text": "fruit"}
-    assert client.get("/query", params=asked).json()["present"] is not False
-    assert client.get("/query/words", params=asked).json()["words"][0]["word"] == "fruit"
+    job = wait_for_end(
+        client, client.post("/lift", json=scene_assets.order() | {"table": own_table}).headers["location"]
+    )
+    parameters = {"lift": job["id"], "text": "fruit"}
+    assert client.get("/query", params=parameters).json()["present"] is not False
+    assert client.get("/query/words", params=parameters).json()["words"][0]["word"] == "fruit"
     assert set(client.get("/query/words", params={"lift": job["id"]}).json()["here"]) == {"fruit", "novel", "light"}
-    assert assert_problem(client.get("/query", params=asked | {"encoder": "default"}))["nearest"]
+    assert assert_problem(client.get("/query", params=parameters | {"encoder": "default"}))["nearest"]
     assert client.delete(f"/assets/{own_table}").status_code == 409
     narrow = client.put("/assets/table", content=text_table(CHANNELS - 1)).json()["id"]
-    wrong = client.post("/lift", json=uploaded.order() | {"table": narrow})
+    wrong = client.post("/lift", json=scene_assets.order() | {"table": narrow})
     assert assert_problem(wrong)["argument"] == "table"
     assert client.delete(f"/jobs/{job['id']}?with_lift=true").status_code == 204
 
 
 def test_an_uploaded_table_answers_questions(client: TestClient, lift: dict[str, Any], own_table: str) -> None:
-    asked = {"lift": lift["id"], "text": "light", "table": own_table, "view": "middle"}
-    answer = client.get("/query", params=asked).json()
+    parameters = {"lift": lift["id"], "text": "light", "table": own_table, "view": "middle"}
+    answer = client.get("/query", params=parameters).json()
     assert {splat["splat"] // SPLATS_A_CLUSTER for splat in answer["top"]} == {2}
     for link in answer["links"].values():
         assert client.get(link).status_code == 200
     for wrong, status in ((lift["splats"], 422), ("sha256:" + "0" * 64, 404)):
-        assert assert_problem(client.get("/query", params=asked | {"table": wrong}))["status"] == status
-    assert assert_problem(client.get("/query", params=asked | {"encoder": "default"}))["argument"] == "table"
+        assert assert_problem(client.get("/query", params=parameters | {"table": wrong}))["status"] == status
+    assert assert_problem(client.get("/query", params=parameters | {"encoder": "default"}))["argument"] == "table"

@@ -37,7 +37,7 @@ from tests.crash.conftest import address_of, until
 from tests.crash.server import NoQueries
 
 from .conftest import parts_of
-from .guarded import guarded
+from .guarded import keyed_server
 from .test_slow_clients import running
 from .tiny_scene import CHANNELS, WORDS
 
@@ -68,17 +68,17 @@ class Calls:
 
     def begin(self, name: str, waiter: Waiter, after: str = "open") -> None:
         """Call, and return once it waits or is asked."""
-        known, asked = self.worker.waiting, {"operation": "query", "name": name, "after": after}
+        waiting_before, call = self.worker.waiting, {"operation": "query", "name": name, "after": after}
 
         def run() -> None:
             try:
-                self.came[name] = self.worker.call(asked, waiter).header["name"]
+                self.came[name] = self.worker.call(call, waiter).header["name"]
             except SplatliftError as error:
                 self.came[name] = error.kind
 
         self._threads.append(threading.Thread(target=run))
         self._threads[-1].start()
-        until(lambda: self.worker.waiting > known or name in self.came or self.worker._busy_with is not None)
+        until(lambda: self.worker.waiting > waiting_before or name in self.came or self.worker._busy_with is not None)
 
     def end(self) -> None:
         """Wait for all of them."""
@@ -89,26 +89,26 @@ class Calls:
 @pytest.fixture
 def start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Start]:
     """Start workers that stand in for the query process."""
-    original, started = client.subprocess.Popen, list[QueryClient]()
+    original, clients = client.subprocess.Popen, list[QueryClient]()
     (tmp_path / "at once").touch()
 
-    def run(command: list[str], **how: Any) -> Any:
-        return original([command[0], "-c", STAND_IN, str(tmp_path), command[3]], **how)
+    def run(command: list[str], **options: Any) -> Any:
+        return original([command[0], "-c", STAND_IN, str(tmp_path), command[3]], **options)
 
     def begin(*, seconds: float = 120.0, of_a_key: int | None = None, waiting: int = 16) -> QueryClient:
         limits = QueryLimits(waiting, seconds, scenes=1, cache_bytes=0, encoder="lvis", of_a_key=of_a_key)
-        started.append(QueryClient(limits))
-        started[-1].start()
-        return started[-1]
+        clients.append(QueryClient(limits))
+        clients[-1].start()
+        return clients[-1]
 
     monkeypatch.setattr(client.subprocess, "Popen", run)
     yield begin
     (tmp_path / "open").touch()
-    for worker in started:
+    for worker in clients:
         worker.stop()
 
 
-def asked(folder: Path) -> list[tuple[str, list[str]]]:
+def read_calls(folder: Path) -> list[tuple[str, list[str]]]:
     """The calls that were asked, with those that were told to wait behind each."""
     return [tuple(json.loads(line)) for line in (folder / "asked").read_text().splitlines()]
 
@@ -122,8 +122,8 @@ def test_keys_take_turns_however_many_calls_one_has(start: Start, tmp_path: Path
     until(lambda: calls.worker.waiting == 5)
     (tmp_path / "open").touch()
     calls.end()
-    assert [first for first, _ in asked(tmp_path)] == ["a0", "b0", "a1", "b1", "a2", "a3"]
-    assert sorted(asked(tmp_path)[1][1]) == ["a1", "a2", "a3", "b1"]  # so that one pass answers all of them
+    assert [first for first, _ in read_calls(tmp_path)] == ["a0", "b0", "a1", "b1", "a2", "a3"]
+    assert sorted(read_calls(tmp_path)[1][1]) == ["a1", "a2", "a3", "b1"]  # so that one pass answers all of them
     assert calls.came == {name: name for name in ("a0", "a1", "a2", "a3", "b0", "b1")}
 
 
@@ -137,7 +137,7 @@ def test_call_whose_client_left_is_not_asked(start: Start, tmp_path: Path) -> No
     calls.begin("last", stays)
     (tmp_path / "open").touch()
     calls.end()
-    assert asked(tmp_path) == [("first", []), ("last", [])] and calls.came["last"] == "last"
+    assert read_calls(tmp_path) == [("first", []), ("last", [])] and calls.came["last"] == "last"
 
 
 @pytest.mark.parametrize(("of_a_key", "waiting", "share"), [(2, 16, 2), (16, 4, 3)])
@@ -220,19 +220,22 @@ class Patient(NoQueries):
 
 @pytest.mark.parametrize("method", ["GET", "POST"])
 def test_closed_connection_is_a_client_that_left(tmp_path: Path, method: str) -> None:
-    with guarded(tmp_path / "data") as house:
-        lift, secret = house.done, house.secrets["alice"]
+    with keyed_server(tmp_path / "data") as lifts_server:
+        lift, secret = lifts_server.lift_job, lifts_server.secrets["alice"]
     body = json.dumps({"text": ["x"], "lift": lift})
     path = f"/query/scores?text=x&lift={lift}" if method == "GET" else "/query/scores"
     head = f"{method} {path} HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {secret}\r\n"
-    sent = {"GET": "\r\n", "POST": f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n{body}"}
+    request_heads = {
+        "GET": "\r\n",
+        "POST": f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n{body}",
+    }
     queries = Patient()
-    chosen = {"text_spaces": {"t": "lvis"}}
-    with running(tmp_path / "data", queries=cast("QueryClient", queries), **chosen) as server:
+    server_settings = {"text_spaces": {"t": "lvis"}}
+    with running(tmp_path / "data", queries=cast("QueryClient", queries), **server_settings) as server:
         with socket.create_connection(address_of(server), timeout=60) as connection:
-            connection.sendall((head + sent[method]).encode())
+            connection.sendall((head + request_heads[method]).encode())
             until(lambda: queries.waiters)
-            assert not queries.waiters[0].disconnected and queries.waiters[0].key == house.ids["alice"]
+            assert not queries.waiters[0].disconnected and queries.waiters[0].key == lifts_server.ids["alice"]
         until(lambda: queries.waiters[0].disconnected)
         until(lambda: not server.server_state.connections)
 
@@ -258,12 +261,12 @@ QUESTIONS: list[dict[str, Any]] = [
 def request_of(client: TestClient, lift: dict[str, Any]) -> Callable[..., dict[str, Any]]:
     """A request as the query process gets it."""
     parts = parts_of(client)
-    here = replace(parts, caller=LOCAL_ADMIN)  # as for a caller who sees the lift
-    record = here.store.lifts.get(here.owner, lift["id"])
+    parts_of_admin = replace(parts, caller=LOCAL_ADMIN)  # as for a caller who sees the lift
+    record = parts_of_admin.store.lifts.get(parts_of_admin.owner, lift["id"])
 
-    def make(operation: str = "scores", **asked: Any) -> dict[str, Any]:
-        body = Question.model_validate({"lift": lift["id"], **asked})
-        return query_request(operation, body, record, here) | {"view": "left", "top": 3}
+    def make(operation: str = "scores", **fields: Any) -> dict[str, Any]:
+        body = Question.model_validate({"lift": lift["id"], **fields})
+        return query_request(operation, body, record, parts_of_admin) | {"view": "left", "top": 3}
 
     return make
 
@@ -271,41 +274,41 @@ def request_of(client: TestClient, lift: dict[str, Any]) -> Callable[..., dict[s
 @pytest.fixture
 def passes(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The number of words of each pass over the features."""
-    seen: list[int] = []
+    passes_of_rows: list[int] = []
     original = ask.cosines
 
-    def counted(features: Any, norms: Any, rows: Any) -> Any:
-        seen.append(len(rows))
+    def count_rows(features: Any, norms: Any, rows: Any) -> Any:
+        passes_of_rows.append(len(rows))
         return original(features, norms, rows)
 
-    monkeypatch.setattr(ask, "cosines", counted)
-    return seen
+    monkeypatch.setattr(ask, "cosines", count_rows)
+    return passes_of_rows
 
 
-def told(frame: Frame) -> tuple[object, bytes]:
+def frame_parts(frame: Frame) -> tuple[object, bytes]:
     return frame.header, frame.body
 
 
 def test_questions_asked_together_are_answered_as_alone_to_the_bit(request_of: Callable[..., dict[str, Any]]) -> None:
-    requests = [request_of(operation, **asked) for asked in QUESTIONS for operation in ("scores", "query", "mask")]
-    together = Answers(scenes=1, cache_bytes=1 << 20)
-    found = [told(reply_to(requests[first:], together)) for first in range(len(requests))]
-    alone = [told(reply_to([request], Answers(scenes=1, cache_bytes=0))) for request in requests]
-    assert found == alone
-    assert sum("fault" in header for header, _ in found if isinstance(header, dict)) == 3
-    assert len({body for _, body in found}) > len(QUESTIONS)
+    requests = [request_of(operation, **fields) for fields in QUESTIONS for operation in ("scores", "query", "mask")]
+    shared = Answers(scenes=1, cache_bytes=1 << 20)
+    replies = [frame_parts(reply_to(requests[first:], shared)) for first in range(len(requests))]
+    single = [frame_parts(reply_to([request], Answers(scenes=1, cache_bytes=0))) for request in requests]
+    assert replies == single
+    assert sum("fault" in header for header, _ in replies if isinstance(header, dict)) == 3
+    assert len({body for _, body in replies}) > len(QUESTIONS)
 
 
 def test_large_answer_is_a_file_and_the_same_bytes(
     request_of: Callable[..., dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked, kept = {"draft": str(tmp_path / "draft")}, Answers(scenes=1, cache_bytes=1 << 20)
-    requests = [request_of(operation, text=["apple"]) | asked for operation in ("scores", "mask", "attention")]
-    small = [reply_to([request], kept).body for request in requests]
+    read_calls, cached = {"draft": str(tmp_path / "draft")}, Answers(scenes=1, cache_bytes=1 << 20)
+    requests = [request_of(operation, text=["apple"]) | read_calls for operation in ("scores", "mask", "attention")]
+    small = [reply_to([request], cached).body for request in requests]
     assert all(small) and not list(tmp_path.iterdir())
     monkeypatch.setattr(answers, "PIPE_BYTES", 10)
     for request, content in zip(requests, small, strict=True):
-        assert reply_to([request], kept) == Frame({}) and (tmp_path / "draft").read_bytes() == content
+        assert reply_to([request], cached) == Frame({}) and (tmp_path / "draft").read_bytes() == content
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="/proc tells the environment of a process")
@@ -327,8 +330,8 @@ def test_what_would_take_minutes_is_refused_before_it_begins(
 ) -> None:
     monkeypatch.setattr(answers, bound, 60)
     export = {"of": of, "of_view": None, "words": None, "parts": []}
-    asked = request_of("export", text=["apple"]) | export
-    (fault,) = reply_to([asked], Answers(scenes=1, cache_bytes=0)).header.values()
+    read_calls = request_of("export", text=["apple"]) | export
+    (fault,) = reply_to([read_calls], Answers(scenes=1, cache_bytes=0)).header.values()
     assert (fault["kind"], fault["argument"]) == ("invalid-query", argument) and "at most" in fault["expected"]
 
 
@@ -336,12 +339,12 @@ def test_questions_asked_together_take_one_pass_within_cache_and_memory(
     request_of: Callable[..., dict[str, Any]], passes: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     requests = [request_of(text=[word], threshold=k / 8) for k in range(4) for word in WORDS]
-    for cache_bytes, taken in ((1 << 20, [12]), (5 * (AN_ANSWER + len("apple")), [5, 5, 2])):
-        together = Answers(scenes=1, cache_bytes=cache_bytes)
+    for cache_bytes, cached in ((1 << 20, [12]), (5 * (AN_ANSWER + len("apple")), [5, 5, 2])):
+        shared = Answers(scenes=1, cache_bytes=cache_bytes)
         passes.clear()
         for first in range(len(requests)):
-            reply_to(requests[first:], together)
-        assert passes == taken
+            reply_to(requests[first:], shared)
+        assert passes == cached
     passes.clear()
     monkeypatch.setattr(answers, "PRODUCT_BYTES", 8 * 4 * 60)
     reply_to(requests, Answers(scenes=1, cache_bytes=1 << 20))
@@ -352,30 +355,30 @@ def test_what_is_kept_stays_within_its_size_over_many_different_questions(
     request_of: Callable[..., dict[str, Any]],
 ) -> None:
     limit = 10 * AN_ANSWER + 2 * AN_IMAGE
-    kept = Answers(scenes=1, cache_bytes=limit)
+    answers = Answers(scenes=1, cache_bytes=limit)
     sizes = []
     for number in range(300):
         operation = "mask" if number % 3 == 0 else "scores"
-        reply_to([request_of(operation, text=["apple"], threshold=number / 300)], kept)
-        sizes.append(kept.kept_bytes)
+        reply_to([request_of(operation, text=["apple"], threshold=number / 300)], answers)
+        sizes.append(answers.kept_bytes)
     assert max(sizes) <= limit and min(sizes[50:]) > limit / 2
 
 
 def test_objects_of_an_answer_are_made_once_for_all_its_masks(
     request_of: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made: list[int] = []
-    monkeypatch.setattr("liftcore.query.objects.objects", lambda *both: made.append(0) or objects(*both))
-    kept = Answers(scenes=1, cache_bytes=1 << 20)
-    reply_to([request_of("scores", text=["apple"])], kept)
-    before = kept.kept_bytes
-    reply_to([request_of("objects", text=["apple"])], kept)
-    assert kept.kept_bytes == before + 4 * 60 + (2 << 10)
+    calls: list[int] = []
+    monkeypatch.setattr("liftcore.query.objects.objects", lambda *arguments: calls.append(0) or objects(*arguments))
+    answers = Answers(scenes=1, cache_bytes=1 << 20)
+    reply_to([request_of("scores", text=["apple"])], answers)
+    before = answers.kept_bytes
+    reply_to([request_of("objects", text=["apple"])], answers)
+    assert answers.kept_bytes == before + 4 * 60 + (2 << 10)
     for view in ("left", "middle", "left"):
-        reply_to([request_of("mask", text=["apple"]) | {"view": view}], kept)
-    assert len(made) == 1
-    reply_to([request_of("mask", text=["lamp"])], kept)
-    assert len(made) == 2
+        reply_to([request_of("mask", text=["apple"]) | {"view": view}], answers)
+    assert len(calls) == 1
+    reply_to([request_of("mask", text=["lamp"])], answers)
+    assert len(calls) == 2
 
 
 def test_question_counts_with_its_answer() -> None:
@@ -401,8 +404,8 @@ def test_calls_of_a_worker_that_dies_are_answered_by_the_next(
     replies: list[int] = []
 
     def run(number: int) -> None:
-        asked = {"text": "book", "lift": lift["id"], "threshold": 0.5 + number / 100}
-        replies.append(client.get("/query", params=asked).status_code)
+        parameters = {"text": "book", "lift": lift["id"], "threshold": 0.5 + number / 100}
+        replies.append(client.get("/query", params=parameters).status_code)
 
     threads = [threading.Thread(target=run, args=(number,)) for number in range(4)]
     for thread in threads:

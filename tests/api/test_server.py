@@ -33,8 +33,8 @@ from service.routes.operations import WEB
 from service.settings import ServiceSettings, encoder_label, encoder_spec
 from tests.crash.conftest import until
 
-from .conftest import Uploaded
-from .following import ended
+from .conftest import SceneAssets
+from .following import wait_for_end
 from .tiny_scene import TinyScene, colmap_zip, make_scene
 
 ROOT = Path(__file__).parents[2]
@@ -66,7 +66,7 @@ def test_server_process_does_the_main_job_and_its_log_holds_no_secret(
             assert client.get("/healthz").json() == {"status": "ok"}
             contents = {"splats": scene.splats, "cameras": scene.cameras, "features": scene.features}
             ids = [client.put(f"/assets/{kind}", content=body).json()["id"] for kind, body in contents.items()]
-            job = ended(client, client.post("/lift", json=Uploaded(*ids).order()).headers["location"])
+            job = wait_for_end(client, client.post("/lift", json=SceneAssets(*ids).order()).headers["location"])
             assert job["state"] == "succeeded", job
             answer = client.get("/query", params={"text": "lamp", "view": "right"}).json()
             assert answer["top"][0]["splat"] >= 40
@@ -81,24 +81,24 @@ def test_server_process_does_the_main_job_and_its_log_holds_no_secret(
     text = (tmp_path / "log").read_text()
     assert "the-secret" not in text
     assert "SPLATLIFT_HEADER_SECONDS is no setting any more" in text
-    told = [json.loads(line) for line in text.splitlines()]
-    access = [line for line in told if line["logger"] == "service.access" and line["request_id"] == "mine"]
+    messages = [json.loads(line) for line in text.splitlines()]
+    access = [line for line in messages if line["logger"] == "service.access" and line["request_id"] == "mine"]
     assert [line["status"] for line in access] == [200, 404, 422, 422, 422]
-    wanted = {"method", "route", "path", "status", "seconds", "received", "sent"}
-    assert all(wanted <= line.keys() for line in access)
+    expected_keys = {"method", "route", "path", "status", "seconds", "received", "sent"}
+    assert all(expected_keys <= line.keys() for line in access)
     assert access[-1]["received"] == len(b"the-secret") and access[-1]["sent"] > 0
 
 
-@pytest.mark.parametrize("allowed", ["", "10.0.0.0/8,127.0.0.1"])
+@pytest.mark.parametrize("allowed_proxies", ["", "10.0.0.0/8,127.0.0.1"])
 def test_client_of_a_proxy_is_believed_where_the_operator_names_the_proxy(
-    allowed: str, tmp_path: Path, table: Path, monkeypatch: pytest.MonkeyPatch
+    allowed_proxies: str, tmp_path: Path, table: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("SPLATLIFT_FORWARDED_ALLOW", allowed)
+    monkeypatch.setenv("SPLATLIFT_FORWARDED_ALLOW", allowed_proxies)
     with (tmp_path / "log").open("w") as stderr, server(tmp_path / "data", table, stderr=stderr) as address:
         httpx.get(f"{address}/healthz", headers={"X-Forwarded-For": "192.0.2.7"})
-    told = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
-    clients = [line["client"] for line in told if line["logger"] == "service.access"]
-    assert clients == ["192.0.2.7" if allowed else "127.0.0.1"]
+    messages = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
+    clients = [line["client"] for line in messages if line["logger"] == "service.access"]
+    assert clients == ["192.0.2.7" if allowed_proxies else "127.0.0.1"]
 
 
 def test_server_that_speaks_json_says_one_object_when_it_is_ready_and_nothing_after(tmp_path: Path) -> None:
@@ -107,9 +107,9 @@ def test_server_that_speaks_json_says_one_object_when_it_is_ready_and_nothing_af
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path, env=environment) as process:
         assert process.stdout is not None
         try:
-            told = json.loads(process.stdout.readline())
-            assert told == {"address": told["address"], "data": str(tmp_path / "kept")}
-            assert httpx.get(f"{told['address']}/healthz").json() == {"status": "ok"}
+            messages = json.loads(process.stdout.readline())
+            assert messages == {"address": messages["address"], "data": str(tmp_path / "kept")}
+            assert httpx.get(f"{messages['address']}/healthz").json() == {"status": "ok"}
         finally:
             process.send_signal(signal.SIGTERM)
         assert (process.stdout.read(), process.wait(60)) == ("", 0)
@@ -125,7 +125,7 @@ def test_http_process_loads_neither_torch_nor_numba_nor_hdbscan() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "messages"),
     [
         (["--host", "0.0.0.0"], "a loopback address such as 127.0.0.1, as there are no keys"),
         (["--host", "example.org"], "a loopback address"),
@@ -136,16 +136,16 @@ def test_http_process_loads_neither_torch_nor_numba_nor_hdbscan() -> None:
     ],
 )
 def test_setting_that_cannot_be_is_one_line_at_the_start(
-    arguments: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    arguments: list[str], messages: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["serve", *arguments, "--data", str(tmp_path / "data")]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("splatlift: ") and told in said and said.count("\n") == 1
+    output = capsys.readouterr().err
+    assert output.startswith("splatlift: ") and messages in output and output.count("\n") == 1
     assert not (tmp_path / "data").exists()
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "messages"),
     [
         (None, "No such file"),
         (b"", "an empty file"),
@@ -157,20 +157,20 @@ def test_setting_that_cannot_be_is_one_line_at_the_start(
     ],
 )
 def test_text_table_that_is_none_is_told_at_the_start(
-    content: bytes | None, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    content: bytes | None, messages: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     table = tmp_path / "words.safetensors"
     if content is not None:
         table.write_bytes(content)
     assert main(["serve", "--encoder", f"table:{table}", "--data", str(tmp_path / "data")]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("splatlift: encoder: expected ") and told in said and str(table) in said
-    assert said.count("\n") == 1 and not (tmp_path / "data").exists()
+    output = capsys.readouterr().err
+    assert output.startswith("splatlift: encoder: expected ") and messages in output and str(table) in output
+    assert output.count("\n") == 1 and not (tmp_path / "data").exists()
 
 
 def test_taken_port_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
         assert main(["serve", "--port", str(port), "--data", str(tmp_path / "data")]) == 2
     assert "free port" in capsys.readouterr().err
 
@@ -181,8 +181,8 @@ def test_variable_that_is_no_json_is_one_line(
     monkeypatch.setenv("SPLATLIFT_TEXT_SPACES", "{bad")
     for command in (["serve"], ["keys", "list"]):
         assert main([*command, "--data", str(tmp_path)]) == 2
-        said = capsys.readouterr().err
-        assert "SPLATLIFT_TEXT_SPACES: expected JSON, got '{bad'" in said and said.count("\n") == 1
+        output = capsys.readouterr().err
+        assert "SPLATLIFT_TEXT_SPACES: expected JSON, got '{bad'" in output and output.count("\n") == 1
 
 
 def test_settings_come_from_the_environment_and_the_command_line_wins(
@@ -209,9 +209,9 @@ def test_encoder_is_chosen_by_text_space_and_never_by_the_client(tmp_path: Path)
         assert encoder_spec(settings, space, None) == encoder_spec(settings, space, space) == encoder
     assert encoder_spec(settings, "clip", "default") == "lvis"
     assert encoder_spec(settings, "none", "clip") == "open_clip:X@w.pt"
-    for space, asked in (("clip", "table:secret"), ("none", None)):
+    for space, encoder_name in (("clip", "table:secret"), ("none", None)):
         with pytest.raises(InvalidRequest, match="expected"):
-            encoder_spec(settings, space, asked)
+            encoder_spec(settings, space, encoder_name)
 
 
 def test_default_encoder_stands_in_for_other_spaces_only_where_the_operator_chose_it(tmp_path: Path) -> None:
@@ -220,10 +220,10 @@ def test_default_encoder_stands_in_for_other_spaces_only_where_the_operator_chos
         with pytest.raises(InvalidRequest, match="SPLATLIFT_TEXT_SPACES"):
             encoder_spec(untouched, space, None)
         assert encoder_spec(untouched, space, "default") == "lvis"
-    chosen = ServiceSettings.model_validate({"data": tmp_path, "encoder": "minilm"})
-    assert encoder_spec(chosen, "dino", None) == encoder_spec(chosen, "", None) == "minilm"
+    server_settings = ServiceSettings.model_validate({"data": tmp_path, "encoder": "minilm"})
+    assert encoder_spec(server_settings, "dino", None) == encoder_spec(server_settings, "", None) == "minilm"
     with pytest.raises(InvalidRequest, match="none"):
-        encoder_spec(chosen, "none", None)
+        encoder_spec(server_settings, "none", None)
 
 
 def test_encoder_is_told_without_its_file() -> None:
@@ -243,15 +243,15 @@ def test_built_page_is_of_these_sources() -> None:
     digest = hashlib.sha256()
     for name in sorted(sources):
         digest.update(f"{name}\0{(web / name).read_text(encoding='utf-8')}\0".encode())
-    told = f"sources sha256:{digest.hexdigest()}"
+    messages = f"sources sha256:{digest.hexdigest()}"
     for name in ("page.js", "page.css"):
-        assert told in (WEB / name).read_text(encoding="utf-8").split("\n", 1)[0], "run `make web`"
+        assert messages in (WEB / name).read_text(encoding="utf-8").split("\n", 1)[0], "run `make web`"
     assert (WEB / "page.html").read_text(encoding="utf-8").count(f"?{digest.hexdigest()[:16]}") == 2
 
 
 def test_page_knows_every_field_of_a_question() -> None:
-    built = WEB.parent / "src" / "question.json"
-    assert json.loads(built.read_text(encoding="utf-8")) == page_fields(), "run `make web`"
+    built_file = WEB.parent / "src" / "question.json"
+    assert json.loads(built_file.read_text(encoding="utf-8")) == page_fields(), "run `make web`"
 
 
 def test_page_names_its_libraries_and_no_registry() -> None:
@@ -294,15 +294,15 @@ def test_lift_is_shown_by_links_until_it_is_interrupted(folder: Path) -> None:
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as server:
         assert server.stdout is not None
         line = server.stdout.readline()
-        found = re.match(r"(http://127\.0\.0\.1:\d+)/\?lift=(\w+) ", line)
-        assert found, line
-        with httpx.Client(base_url=found[1], timeout=600) as client:
-            assert client.get(f"/?lift={found[2]}").status_code == 200
-            assert client.get(f"/lifts/{found[2]}").json()["count"] == 60
+        match = re.match(r"(http://127\.0\.0\.1:\d+)/\?lift=(\w+) ", line)
+        assert match, line
+        with httpx.Client(base_url=match[1], timeout=600) as client:
+            assert client.get(f"/?lift={match[2]}").status_code == 200
+            assert client.get(f"/lifts/{match[2]}").json()["count"] == 60
             answer = client.get("/query", params={"like": "region:left:0:2", "threshold": 0.5}).json()
             assert answer["count"] == 20
             assert client.get("/render", params={"view": "middle"}).status_code == 200
-            deleted = client.delete(f"/jobs/{found[2]}", params={"with_lift": True})
+            deleted = client.delete(f"/jobs/{match[2]}", params={"with_lift": True})
             assert deleted.status_code == 204
         server.send_signal(signal.SIGINT)
         assert server.wait(timeout=600) == 0
@@ -342,12 +342,12 @@ def test_lift_in_memory_is_shown_until_it_is_interrupted_or_killed(folder: Path)
         ) as process,
     ):
         assert process.stdout is not None
-        told = [process.stdout.readline().strip() for _ in range(4)]
-        assert told == ["splats", "cameras", "splats", "the page one that ended with status 2"]
+        messages = [process.stdout.readline().strip() for _ in range(4)]
+        assert messages == ["splats", "cameras", "splats", "the page one that ended with status 2"]
         line = process.stdout.readline()
-        found = re.match(r"(http://127\.0\.0\.1:\d+)/\?lift=(\w+) ", line)
-        assert found, line
-        with httpx.Client(base_url=found[1], timeout=600) as client:
+        match = re.match(r"(http://127\.0\.0\.1:\d+)/\?lift=(\w+) ", line)
+        assert match, line
+        with httpx.Client(base_url=match[1], timeout=600) as client:
             assert client.get("/query", params={"like": "splat:45", "threshold": 0.5}).json()["count"] == 20
             assert client.get("/render", params={"view": "middle"}).status_code == 200
         process.send_signal(signal.SIGINT)
@@ -355,18 +355,21 @@ def test_lift_in_memory_is_shown_until_it_is_interrupted_or_killed(folder: Path)
         assert not list(folder.glob("splatlift*"))
         assert process.stdin is not None
         print(file=process.stdin, flush=True)
-        found = re.match(r"http://(127\.0\.0\.1):(\d+)/", process.stdout.readline())
-        assert found
+        match = re.match(r"http://(127\.0\.0\.1):(\d+)/", process.stdout.readline())
+        assert match
         process.kill()  # as a notebook's kernel may be
-    until(lambda: not _answers(found[1], int(found[2])) and not list(folder.glob("splatlift*")))
+    until(lambda: not _answers(match[1], int(match[2])) and not list(folder.glob("splatlift*")))
     assert "Fatal" not in (folder / "stderr").read_text()
 
 
 def test_lift_whose_files_moved_is_told(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "s.ply").unlink()
-    for lift, told in (("l.safetensors", "its splats at"), ("f.safetensors", "expected lift as LIFT, got features")):
+    for lift, messages in (
+        ("l.safetensors", "its splats at"),
+        ("f.safetensors", "expected lift as LIFT, got features"),
+    ):
         assert main(["view", str(folder / lift), "--no-browser"]) == 2
-        assert told in capsys.readouterr().err
+        assert messages in capsys.readouterr().err
 
 
 def test_view_removes_no_folder_that_show_did_not_make(
@@ -384,10 +387,10 @@ def test_view_removes_no_folder_that_show_did_not_make(
 
 def test_view_tells_of_a_port_or_a_folder_that_cannot_be(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lift = str(folder / "l.safetensors")
-    for arguments, told in (([lift, "--port", "99999"], "port"), ([str(folder)], "a folder")):
+    for arguments, messages in (([lift, "--port", "99999"], "port"), ([str(folder)], "a folder")):
         assert main(["view", *arguments, "--no-browser"]) == 2
-        said = capsys.readouterr().err
-        assert told in said and said.count("\n") == 1
+        output = capsys.readouterr().err
+        assert messages in output and output.count("\n") == 1
 
 
 def _answers(host: str, port: int) -> bool:

@@ -32,11 +32,11 @@ HEAD = b"PUT /assets/splats HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5000\
 JSON_HEAD = (
     b"POST /lift HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 5000\r\n\r\n"
 )
-Served = Callable[..., AbstractContextManager[tuple[str, int]]]
+Serve = Callable[..., AbstractContextManager[tuple[str, int]]]
 
 
 @contextmanager
-def served(data: Path, **settings: Any) -> Iterator[tuple[str, int]]:
+def serve(data: Path, **settings: Any) -> Iterator[tuple[str, int]]:
     """A server in a thread: host and port."""
     with running(data, **settings) as server:
         yield address_of(server)
@@ -45,11 +45,16 @@ def served(data: Path, **settings: Any) -> Iterator[tuple[str, int]]:
 @contextmanager
 def running(data: Path, queries: QueryClient | None = None, **settings: Any) -> Iterator[uvicorn.Server]:
     """That server, to look into it; without a query process, unless one is given."""
-    chosen = ServiceSettings.model_validate({"data": data, "disk_floor_bytes": 0, "notice_seconds": 0, **settings})
-    store = Store.open(chosen.data)
+    server_settings = ServiceSettings.model_validate(
+        {"data": data, "disk_floor_bytes": 0, "notice_seconds": 0, **settings}
+    )
+    store = Store.open(server_settings.data)
     worker = queries or cast("QueryClient", NoQueries())
     try:
-        with listening(create_app(chosen, store, Supervisor(store, job_limits(chosen)), worker), chosen) as server:
+        with listening(
+            create_app(server_settings, store, Supervisor(store, job_limits(server_settings)), worker),
+            server_settings,
+        ) as server:
             yield server
     finally:
         store.close()
@@ -63,7 +68,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def live(data: Path) -> Iterator[tuple[str, int]]:
     """A server."""
-    with served(data) as address:
+    with serve(data) as address:
         yield address
 
 
@@ -75,19 +80,19 @@ def client_of(address: tuple[str, int]) -> Iterator[socket.socket]:
 
 def answer(client: socket.socket) -> tuple[bytes, bytes]:
     """Head and body of all that comes until the server closes; fails when it does not."""
-    said = b""
+    response = b""
     try:
         while piece := client.recv(1 << 16):
-            said += piece
+            response += piece
     except ConnectionResetError:  # what we still sent met a closed door
         pass
-    head, _, body = said.partition(b"\r\n\r\n")
+    head, _, body = response.partition(b"\r\n\r\n")
     return head, body
 
 
-def assert_problem(said: tuple[bytes, bytes], status: int, kind: str) -> None:
-    head, body = said
-    assert head.startswith(f"HTTP/1.1 {status} ".encode()), said
+def assert_problem(response: tuple[bytes, bytes], status: int, kind: str) -> None:
+    head, body = response
+    assert head.startswith(f"HTTP/1.1 {status} ".encode()), response
     assert b"content-type: application/problem+json" in head.lower()
     assert b"connection: close" in head.lower()
     problem = json.loads(body)
@@ -96,10 +101,10 @@ def assert_problem(said: tuple[bytes, bytes], status: int, kind: str) -> None:
 
 
 def test_clients_that_trickle_slow_nobody_and_leave_nothing(live: tuple[str, int], data: Path) -> None:
-    begun = (b"G", b"GET / HTTP/1.1\r\nHost: localhost\r\nX: ", HEAD, JSON_HEAD)
+    openings = (b"G", b"GET / HTTP/1.1\r\nHost: localhost\r\nX: ", HEAD, JSON_HEAD)
     with contextlib.ExitStack() as stack:
-        clients = [stack.enter_context(client_of(live)) for _ in range(10 * len(begun))]
-        for client, head in zip(clients, begun * 10, strict=True):
+        clients = [stack.enter_context(client_of(live)) for _ in range(10 * len(openings))]
+        for client, head in zip(clients, openings * 10, strict=True):
             client.sendall(head)
         for _ in range(3):
             for client in clients:
@@ -163,11 +168,11 @@ def test_connection_that_is_used_again_and_again_is_not_closed_for_others(
             stack.enter_context(client_of(address))
         for _ in range(8):  # each is over between two looks of the server, ten of which come in a second
             busy.sendall(HEALTH)
-            said = b""
-            while not said.endswith(b'{"status":"ok"}'):
+            response = b""
+            while not response.endswith(b'{"status":"ok"}'):
                 piece = busy.recv(1 << 16)
                 assert piece, "the connection was closed"
-                said += piece
+                response += piece
             time.sleep(0.08)
         until(lambda: len(server.server_state.connections) < 3)
 
@@ -187,8 +192,8 @@ def test_no_answer_waits_for_the_client_to_confirm_the_one_before(tmp_path: Path
 
 def test_two_lengths_of_a_body_are_refused_and_the_connection_is_closed(live: tuple[str, int]) -> None:
     with client_of(live) as client:
-        both = b"Content-Length: 4\r\nTransfer-Encoding: chunked\r\nContent-Type: application/json\r\n\r\n"
-        client.sendall(b"POST /lift HTTP/1.1\r\nHost: localhost\r\n" + both + b"0\r\n\r\n" + HEALTH)
+        two_lengths = b"Content-Length: 4\r\nTransfer-Encoding: chunked\r\nContent-Type: application/json\r\n\r\n"
+        client.sendall(b"POST /lift HTTP/1.1\r\nHost: localhost\r\n" + two_lengths + b"0\r\n\r\n" + HEALTH)
         head, body = answer(client)
     assert head.startswith(b"HTTP/1.1 422 ") and b"connection: close" in head.lower()
     assert json.loads(body)["argument"] == "Content-Length"  # and nothing comes after it
@@ -198,20 +203,20 @@ def test_body_a_few_times_too_long_is_answered(live: tuple[str, int]) -> None:
     url = f"http://127.0.0.1:{live[1]}/lift"
     with httpx.Client(timeout=PATIENCE_SECONDS) as client:
         for _ in range(2):  # a connection that were closed at once would often be reset before the answer is read
-            said = client.post(url, content=b"0" * (12 << 20), headers={"Content-Type": "application/json"})
-            assert said.status_code == 413 and "connection" not in said.headers
+            response = client.post(url, content=b"0" * (12 << 20), headers={"Content-Type": "application/json"})
+            assert response.status_code == 413 and "connection" not in response.headers
 
 
 def test_upload_that_announces_too_much_is_refused_before_it_is_sent(tmp_path: Path) -> None:
     limits = {f"max_{kind}_bytes": 1000 for kind in AssetKind}
-    with served(tmp_path / "data", **limits) as address:
+    with serve(tmp_path / "data", **limits) as address:
         for kind, length in itertools.product(AssetKind, (1001, 10**19)):
             with client_of(address) as client:
                 expects = f"Expect: 100-continue\r\nContent-Length: {length}\r\nConnection: close\r\n\r\n"
                 client.sendall(f"PUT /assets/{kind} HTTP/1.1\r\nHost: localhost\r\n{expects}".encode())
-                said = answer(client)
-            assert_problem(said, 413, "too-large")
-            assert ("hint" in json.loads(said[1])) == (kind is AssetKind.FEATURES)
+                response = answer(client)
+            assert_problem(response, 413, "too-large")
+            assert ("hint" in json.loads(response[1])) == (kind is AssetKind.FEATURES)
 
 
 def test_answer_does_not_wait_for_the_rest_of_a_body_that_nobody_reads(live: tuple[str, int]) -> None:

@@ -22,9 +22,9 @@ from service.store.owners import SERVICE
 from service.store.recovery import back_up
 from service.store.store import Store, collect
 
-from .conftest import Uploaded, app_of, serving
-from .following import ended
-from .guarded import Guarded, address, bearer, every_route, guarded, make_key
+from .conftest import SceneAssets, app_of, serving
+from .following import wait_for_end
+from .guarded import KeyedServer, address, bearer, every_route, keyed_server, make_key
 from .tiny_scene import TinyScene, colmap_zip, labels, masks
 
 StoredData = tuple[Path, dict[str, Any]]  # a data directory, and its contents over HTTP
@@ -40,7 +40,7 @@ def stored_data(tmp_path_factory: pytest.TempPathFactory, scene: TinyScene, tabl
         for kind, body in {"cameras": colmap_zip(), "masks": masks({"left": labels()["left"][0]}),
                            "table": scene.table}.items():  # fmt: skip
             assert client.put(f"/assets/{kind}", content=body).status_code == 201
-        job = ended(client, client.post("/lift", json=Uploaded(*ids).order()).headers["location"])
+        job = wait_for_end(client, client.post("/lift", json=SceneAssets(*ids).order()).headers["location"])
         assert job["state"] == "succeeded", job
         for change in ({"name": "first"}, {"world": {"up": [0, -1, 0], "metres_per_unit": 0.5}}, {"name": "last"}):
             assert client.patch(f"/lifts/{job['id']}", json=change).status_code == 200
@@ -86,12 +86,14 @@ def test_rebuild_makes_the_database_of_the_files(
     strange = data / "lifts" / f"{'0' * 32}.safetensors"
     strange.write_bytes(b"no lift")
     assert main(["store", "rebuild", "--data", str(data), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert (found["lifts"], found["assets"]) == (
+    report = json.loads(capsys.readouterr().out)
+    assert (report["lifts"], report["assets"]) == (
         1, {"splats": 1, "cameras": 2, "features": 1, "masks": 1, "table": 1}
     )  # fmt: skip
-    assert [left["file"] for left in found["left"]] == [str(path.relative_to(data)) for path in (broken, strange)]
-    assert "trade-offs" in found["lost"] and "keys" in found["lost"]
+    assert [remaining["file"] for remaining in report["left"]] == [
+        str(path.relative_to(data)) for path in (broken, strange)
+    ]
+    assert "trade-offs" in report["lost"] and "keys" in report["lost"]
     with serving(data, table) as client:
         assert contents_of(client) == contents
     store = Store.open(data)
@@ -125,12 +127,15 @@ def test_changes_of_a_lift_that_are_damaged_or_of_photos_that_are_gone_cost_no_l
 ) -> None:
     data, contents = copied_data
     (changes,) = data.glob("lifts/*.json")
-    for text, left, name in (('{"name": "x", "photos": "sha256:%s"}' % ("0" * 64), 0, "x"), ('{"name": 7}', 1, None)):
+    for text, remaining, name in (
+        ('{"name": "x", "photos": "sha256:%s"}' % ("0" * 64), 0, "x"),
+        ('{"name": 7}', 1, None),
+    ):
         (data / DATABASE).unlink()
         changes.write_text(text)
         assert main(["store", "rebuild", "--data", str(data), "--json"]) == 0
-        found = json.loads(capsys.readouterr().out)
-        assert (found["lifts"], len(found["left"])) == (1, left) and changes.exists() == (not left)
+        report = json.loads(capsys.readouterr().out)
+        assert (report["lifts"], len(report["left"])) == (1, remaining) and changes.exists() == (not remaining)
         store = Store.open(data)
         lift = store.lifts.get(SERVICE, contents["lift"]["id"])
         assert (lift.name, lift.photos) == (name, None)
@@ -156,7 +161,7 @@ def test_rebuild_that_was_cut_off_does_not_let_the_server_start(
     for name in (DATABASE, "generation"):
         (data / name).unlink()
 
-    def cut_off(*given: Any) -> None:
+    def cut_off(*arguments: Any) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("service.store.recovery._add_lift", cut_off)
@@ -175,8 +180,8 @@ def test_lift_whose_splats_are_gone_is_left_out(copied_data: StoredData, capsys:
     (splats,) = data.glob("blobs/*/*.ply")
     splats.unlink()
     assert main(["store", "rebuild", "--data", str(data)]) == 0
-    said = capsys.readouterr().out
-    assert "0 lifts" in said and "left out" in said and splats.stem in said
+    output = capsys.readouterr().out
+    assert "0 lifts" in output and "left out" in output and splats.stem in output
 
 
 def test_rebuild_beside_a_server_or_nowhere_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -190,28 +195,28 @@ def test_rebuild_beside_a_server_or_nowhere_is_one_line(tmp_path: Path, capsys: 
     assert not (tmp_path / "nowhere").exists()
 
 
-def without_keys(server: Guarded) -> None:
+def without_keys(server: KeyedServer) -> None:
     """As after the loss of the database that held them."""
     with server.store.database.write() as connection:
         connection.execute("DELETE FROM keys")
 
 
-def statuses(server: Guarded, secret: str | None = None) -> dict[str, int]:
+def statuses(server: KeyedServer, secret: str | None = None) -> dict[str, int]:
     """What each route answers that needs a key; no body, so what is let in is refused for that or found missing."""
     headers = {} if secret is None else bearer(secret)
-    found = {}
+    report = {}
     for method, path in every_route(app_of(server.client)):
         if required_scope(method, path) is not None:
-            asked = address(path, "0" * 32, "sha256:" + "0" * 64)
-            found[f"{method} {path}"] = server.client.request(method, asked, headers=headers).status_code
-    return found
+            route_address = address(path, "0" * 32, "sha256:" + "0" * 64)
+            report[f"{method} {path}"] = server.client.request(method, route_address, headers=headers).status_code
+    return report
 
 
 def test_lost_keys_open_no_door(tmp_path: Path) -> None:
-    with guarded(tmp_path / "data", allowed_hosts="proxy.example") as server:
+    with keyed_server(tmp_path / "data", allowed_hosts="proxy.example") as server:
         without_keys(server)
-        found = statuses(server, server.secrets["boss"])
-        assert len(found) > 20 and set(found.values()) == {401}, found
+        report = statuses(server, server.secrets["boss"])
+        assert len(report) > 20 and set(report.values()) == {401}, report
         assert server.client.get("/assets", headers={"Host": "proxy.example"}).status_code == 401
         assert "securitySchemes" in server.client.get("/openapi.json").json()["components"]
         _, secret = make_key(server.store, "read")
@@ -228,7 +233,7 @@ def test_database_of_a_release_that_did_not_remember_keys_is_remembered(tmp_path
 
 
 def test_keys_required_closes_a_service_that_never_had_one(tmp_path: Path) -> None:
-    with guarded(tmp_path / "data", keys="required") as server:
+    with keyed_server(tmp_path / "data", keys="required") as server:
         without_keys(server)
         (tmp_path / "data" / "keys.required").unlink()
         assert set(statuses(server).values()) == {401}
@@ -236,7 +241,7 @@ def test_keys_required_closes_a_service_that_never_had_one(tmp_path: Path) -> No
 
 
 def test_keys_none_asks_nobody_for_one_and_stays_on_this_machine(tmp_path: Path) -> None:
-    with guarded(tmp_path / "data", keys="none") as server:
+    with keyed_server(tmp_path / "data", keys="none") as server:
         for secret in (None, server.secrets["bob"], "no-key"):
             assert not {401, 403} & set(statuses(server, secret).values())
         assert len(server.client.get("/jobs").json()["jobs"]) == 3

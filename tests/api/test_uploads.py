@@ -22,7 +22,7 @@ from service.store.store import Store
 from service.uploads import STEP, AssetIntake, Intake
 from tests.crash.server import standing_in
 
-from .conftest import Uploaded, parts_of
+from .conftest import SceneAssets, parts_of
 from .test_problems import assert_problem
 from .tiny_scene import (
     TinyScene,
@@ -33,37 +33,37 @@ from .tiny_scene import (
 
 
 def test_same_bytes_are_the_same_asset_however_they_come(
-    client: TestClient, uploaded: Uploaded, scene: TinyScene
+    client: TestClient, scene_assets: SceneAssets, scene: TinyScene
 ) -> None:
     digest, half = hashlib.sha256(scene.splats).hexdigest(), len(scene.splats) // 2
     pieces = (part for part in (scene.splats[:half], scene.splats[half:]))  # of unknown number
     reply = client.put("/assets/splats", content=pieces, params={"sha256": digest.upper()})
-    assert (reply.status_code, reply.json()["id"]) == (200, uploaded.splats)
-    assert uploaded.splats == f"sha256:{digest}"
+    assert (reply.status_code, reply.json()["id"]) == (200, scene_assets.splats)
+    assert scene_assets.splats == f"sha256:{digest}"
 
 
-def test_asset_is_posted_with_its_kind_and_no_form_is_taken(client: TestClient, uploaded: Uploaded) -> None:
-    content = client.get(f"/assets/{uploaded.cameras}/content").content
-    again = client.post("/assets", params={"kind": "cameras"}, content=content)
-    assert (again.status_code, again.json()["id"]) == (200, uploaded.cameras)
+def test_asset_is_posted_with_its_kind_and_no_form_is_taken(client: TestClient, scene_assets: SceneAssets) -> None:
+    content = client.get(f"/assets/{scene_assets.cameras}/content").content
+    second = client.post("/assets", params={"kind": "cameras"}, content=content)
+    assert (second.status_code, second.json()["id"]) == (200, scene_assets.cameras)
     assert client.post("/assets", content=content).status_code == 422
     assert client.post("/assets", params={"kind": "camera"}, content=content).status_code == 422
     for method, path in (("PUT", "/assets/cameras"), ("POST", "/assets?kind=cameras"), ("POST", "/lifts")):
-        told = assert_problem(client.request(method, path, files={"file": content}))
-        assert (told["status"], told["argument"]) == (415, "Content-Type"), path
-        assert "curl -T" in told["hint"]
+        problem = assert_problem(client.request(method, path, files={"file": content}))
+        assert (problem["status"], problem["argument"]) == (415, "Content-Type"), path
+        assert "curl -T" in problem["hint"]
 
 
-def test_packs_are_named_anew_as_assets_of_their_own(client: TestClient, uploaded: Uploaded) -> None:
-    at = f"/assets/{uploaded.features}"
+def test_packs_are_named_anew_as_assets_of_their_own(client: TestClient, scene_assets: SceneAssets) -> None:
+    at = f"/assets/{scene_assets.features}"
     before = client.get(at).json()["counts"]
-    made = client.patch(at, json={"text_space": "minilm", "encoder": "a CNN"})
-    assert made.status_code == 201 and made.headers["location"] != at
-    assert made.json()["counts"] == before | {"text_space": "minilm", "encoder": "a CNN"}
+    renamed_pack = client.patch(at, json={"text_space": "minilm", "encoder": "a CNN"})
+    assert renamed_pack.status_code == 201 and renamed_pack.headers["location"] != at
+    assert renamed_pack.json()["counts"] == before | {"text_space": "minilm", "encoder": "a CNN"}
     assert client.patch(at, json={"text_space": "minilm", "encoder": "a CNN"}).status_code == 200
-    assert client.patch(at, json={}).json()["id"] == uploaded.features
+    assert client.patch(at, json={}).json()["id"] == scene_assets.features
     assert client.get(at).json()["counts"] == before
-    assert_problem(client.patch(f"/assets/{uploaded.splats}", json={"encoder": "x"}))
+    assert_problem(client.patch(f"/assets/{scene_assets.splats}", json={"encoder": "x"}))
     for wrong in ({"encoder": ""}, {"text_space": "a\nb"}, {"words": "x"}):
         assert assert_problem(client.patch(at, json=wrong))["status"] == 422
 
@@ -73,20 +73,22 @@ def test_pack_that_was_damaged_or_lost_on_the_disk_is_not_named_anew(client: Tes
     asset = client.put("/assets/features", content=pack).json()["id"]
     (path,) = (parts_of(client).store.files.root / "blobs").glob(f"*/{asset.removeprefix('sha256:')}*")
     path.write_bytes(bytes(len(pack)))
-    told = assert_problem(client.patch(f"/assets/{asset}", json={"encoder": "x"}))
-    assert (told["status"], told["type"]) == (422, "/problems/invalid-features") and str(path) not in str(told)
+    problem = assert_problem(client.patch(f"/assets/{asset}", json={"encoder": "x"}))
+    assert (problem["status"], problem["type"]) == (422, "/problems/invalid-features") and str(path) not in str(
+        problem
+    )
     path.unlink()
     assert assert_problem(client.patch(f"/assets/{asset}", json={"encoder": "x"}))["status"] == 404
     assert client.delete(f"/assets/{asset}").status_code == 204
 
 
 def test_pack_that_takes_too_long_to_name_anew_is_told_as_a_slow_upload_is(
-    client: TestClient, uploaded: Uploaded, monkeypatch: pytest.MonkeyPatch
+    client: TestClient, scene_assets: SceneAssets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(assets, "run_sandboxed", lambda *given: None)
-    told = assert_problem(client.patch(f"/assets/{uploaded.features}", json={"encoder": "slow"}))
-    assert (told["status"], told["type"]) == (422, "/problems/invalid-features")
-    assert "takes longer" in told["got"]
+    monkeypatch.setattr(assets, "run_sandboxed", lambda *arguments: None)
+    problem = assert_problem(client.patch(f"/assets/{scene_assets.features}", json={"encoder": "slow"}))
+    assert (problem["status"], problem["type"]) == (422, "/problems/invalid-features")
+    assert "takes longer" in problem["got"]
 
 
 def test_long_header_of_a_pack_is_changed_outside_of_the_server(
@@ -96,26 +98,28 @@ def test_long_header_of_a_pack_is_changed_outside_of_the_server(
     header = scene.features[8 : 8 + length] + b" " * (16 << 20)
     long = len(header).to_bytes(8, "little") + header + scene.features[8 + length :]
     at = f"/assets/{client.put('/assets/features', content=long).json()['id']}"
-    fed: list[int] = []
+    chunk_sizes: list[int] = []
     feed = AssetIntake.feed
-    monkeypatch.setattr(AssetIntake, "feed", lambda intake, block: (fed.append(len(block)), feed(intake, block))[1])
+    monkeypatch.setattr(
+        AssetIntake, "feed", lambda intake, block: (chunk_sizes.append(len(block)), feed(intake, block))[1]
+    )
     monkeypatch.setattr(safetensors_file, "with_metadata", Mock(side_effect=AssertionError("in the server")))
-    made = client.patch(at, json={"encoder": "another"})
-    assert made.status_code == 201 and made.json()["counts"]["encoder"] == "another"
-    assert sum(fed) < 1 << 20  # what it begins with is padded no more
+    renamed_pack = client.patch(at, json={"encoder": "another"})
+    assert renamed_pack.status_code == 201 and renamed_pack.json()["counts"]["encoder"] == "another"
+    assert sum(chunk_sizes) < 1 << 20  # what it begins with is padded no more
 
 
 def test_files_sent_as_another_kind_are_told_where_they_belong(client: TestClient, scene: TinyScene) -> None:
-    told = assert_problem(client.put("/assets/splats", content=scene.cameras))
-    assert "cameras" in told["got"] and "/assets/cameras" in told["hint"]
+    problem = assert_problem(client.put("/assets/splats", content=scene.cameras))
+    assert "cameras" in problem["got"] and "/assets/cameras" in problem["hint"]
 
 
 def test_asset_keeps_the_warnings_of_inspect(client: TestClient, tmp_path: Path) -> None:
     (tmp_path / "table").write_bytes(text_table(words=("apple", "book", "the Apple")))
-    warned = inspect_file(tmp_path / "table")["warnings"]
+    warnings = inspect_file(tmp_path / "table")["warnings"]
     asset = client.put("/assets/table", content=(tmp_path / "table").read_bytes())
-    assert asset.status_code == 201 and asset.json()["warnings"] == warned != []
-    assert client.get(asset.headers["location"]).json()["warnings"] == warned
+    assert asset.status_code == 201 and asset.json()["warnings"] == warnings != []
+    assert client.get(asset.headers["location"]).json()["warnings"] == warnings
     assert client.delete(asset.headers["location"]).status_code == 204
 
 
@@ -142,11 +146,16 @@ def test_asset_keeps_the_warnings_of_inspect(client: TestClient, tmp_path: Path)
     ],
 )
 def test_content_is_sent_whole_in_parts_or_not_again(
-    client: TestClient, uploaded: Uploaded, scene: TinyScene, headers: dict[str, str], status: int, part: slice | None
+    client: TestClient,
+    scene_assets: SceneAssets,
+    scene: TinyScene,
+    headers: dict[str, str],
+    status: int,
+    part: slice | None,
 ) -> None:
-    tag = f'"{uploaded.splats.removeprefix("sha256:")}"'
-    asked = {name: value.replace("{tag}", tag) for name, value in headers.items()}
-    reply = client.get(f"/assets/{uploaded.splats}/content", headers=asked)
+    tag = f'"{scene_assets.splats.removeprefix("sha256:")}"'
+    request_headers = {name: value.replace("{tag}", tag) for name, value in headers.items()}
+    reply = client.get(f"/assets/{scene_assets.splats}/content", headers=request_headers)
     assert reply.status_code == status
     if part is None:
         assert assert_problem(reply)["type"] == "/problems/range-not-satisfiable"
@@ -155,24 +164,24 @@ def test_content_is_sent_whole_in_parts_or_not_again(
         assert (reply.content, reply.headers["etag"]) == (scene.splats[part], tag)
 
 
-def test_asset_in_use_stays(client: TestClient, uploaded: Uploaded, lift: dict[str, object]) -> None:
-    for asset in (uploaded.splats, uploaded.cameras, uploaded.features):
+def test_asset_in_use_stays(client: TestClient, scene_assets: SceneAssets, lift: dict[str, object]) -> None:
+    for asset in (scene_assets.splats, scene_assets.cameras, scene_assets.features):
         reply = client.delete(f"/assets/{asset}")
         assert (reply.status_code, reply.json()["type"]) == (409, "/problems/in-use")
         assert str(lift["id"]) in reply.json()["hint"]
         assert client.get(f"/assets/{asset}/content").status_code == 200
 
 
-@pytest.mark.parametrize("left", [None, b"", b"another"])
+@pytest.mark.parametrize("remaining", [None, b"", b"another"])
 def test_file_that_somebody_damaged_is_told_and_an_upload_mends_it(
-    client: TestClient, data: Path, left: bytes | None
+    client: TestClient, data: Path, remaining: bytes | None
 ) -> None:
     rows = splat_rows()
     rows[:, 1] += 0.5
     content = ply(rows)
     path = client.put("/assets/splats", content=content).headers["location"]
     [blob] = (data / "blobs").glob(f"*/{path.removeprefix('/assets/sha256:')}*")
-    blob.unlink() if left is None else blob.write_bytes(left)
+    blob.unlink() if remaining is None else blob.write_bytes(remaining)
     assert assert_problem(client.get(f"{path}/content"))["status"] == 404
     assert client.put("/assets/splats", content=content).status_code == 200
     assert client.get(f"{path}/content").content == content
@@ -184,25 +193,25 @@ MiB = 1 << 20
 
 
 @pytest.fixture
-def most(monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
+def largest_draft(monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
     """The bytes of the largest draft so far."""
-    written: list[int] = []
+    sizes: list[int] = []
     original = Intake.close
 
     def close(intake: Intake) -> None:
-        written.append(0 if intake._file is None else intake._file.tell())
+        sizes.append(0 if intake._file is None else intake._file.tell())
         original(intake)
 
     monkeypatch.setattr(Intake, "close", close)
-    return lambda: max(written, default=0)
+    return lambda: max(sizes, default=0)
 
 
 def put(store: Store, headers: dict[str, str]) -> Any:
     """Upload 64 MiB, whose number nobody says before, in pieces of one; a test client would join them."""
 
     def pieces() -> Iterator[dict[str, Any]]:
-        for left in reversed(range(64)):
-            yield {"type": "http.request", "body": bytes(MiB), "more_body": left > 0}
+        for remaining in reversed(range(64)):
+            yield {"type": "http.request", "body": bytes(MiB), "more_body": remaining > 0}
         yield {"type": "http.disconnect"}
 
     with standing_in(store, "answer", disk_floor_bytes=1 << 30) as (client, _):
@@ -219,27 +228,31 @@ def put(store: Store, headers: dict[str, str]) -> Any:
 
 
 def test_disk_keeps_its_floor_when_the_body_is_of_unknown_length(
-    store: Store, most: Callable[[], int], monkeypatch: pytest.MonkeyPatch
+    store: Store, largest_draft: Callable[[], int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    room = 10 * MiB
+    free_bytes = 10 * MiB
 
     def free(files: DataDirectory) -> int:
-        return files.floor_bytes + room - sum(draft.stat().st_size for draft in (files.root / "tmp").glob("*.splats"))
+        return (
+            files.floor_bytes
+            + free_bytes
+            - sum(draft.stat().st_size for draft in (files.root / "tmp").glob("*.splats"))
+        )
 
     monkeypatch.setattr(DataDirectory, "free_bytes", free)
     assert assert_problem(put(store, {}))["type"] == "/problems/no-space"
-    assert 0 < most() <= room
+    assert 0 < largest_draft() <= free_bytes
     assert not any((store.files.root / "tmp").iterdir())
 
 
-@pytest.mark.parametrize("left", [0, 1, 10 * MiB])
+@pytest.mark.parametrize("remaining", [0, 1, 10 * MiB])
 def test_key_with_little_room_writes_no_large_draft(
-    store: Store, most: Callable[[], int], left: int, monkeypatch: pytest.MonkeyPatch
+    store: Store, largest_draft: Callable[[], int], remaining: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if not left:  # not a byte is taken
+    if not remaining:  # not a byte is taken
         monkeypatch.setattr(Intake, "feed", Mock(side_effect=AssertionError))
-    _, secret = store.keys.create("small", parse_scopes(["write"]), Quota(max_bytes=left))
+    _, secret = store.keys.create("small", parse_scopes(["write"]), Quota(max_bytes=remaining))
     reply = put(store, {"Authorization": f"Bearer {secret}"})
     assert assert_problem(reply)["type"] == "/problems/over-quota"
-    assert most() <= left
-    assert (most() > 0) == (left > STEP)
+    assert largest_draft() <= remaining
+    assert (largest_draft() > 0) == (remaining > STEP)

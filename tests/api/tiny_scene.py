@@ -99,11 +99,11 @@ def colmap_zip() -> bytes:
 def labels() -> dict[str, np.ndarray]:
     """View -> [1, 24, 32] i32, the cluster that owns each column."""
     columns = np.arange(WIDTH) + 0.5
-    found = {}
+    label_maps = {}
     for name, x in VIEWS.items():
         world = (columns - WIDTH / 2) * DISTANCE / FOCAL + x
-        found[name] = np.broadcast_to(np.digitize(world, [-0.6, 0.6]).astype(np.int32), (1, HEIGHT, WIDTH))
-    return found
+        label_maps[name] = np.broadcast_to(np.digitize(world, [-0.6, 0.6]).astype(np.int32), (1, HEIGHT, WIDTH))
+    return label_maps
 
 
 def codebook(channels: int = CHANNELS) -> np.ndarray:

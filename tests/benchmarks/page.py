@@ -19,7 +19,7 @@ import httpx
 import numpy as np
 from safetensors.numpy import save
 
-from tests.api.following import ended
+from tests.api.following import wait_for_end
 from tests.api.tiny_scene import PROPERTIES, cameras_json, make_scene, ply
 from tests.browser.conftest import browsing, serving
 from tests.browser.looking import READY
@@ -146,7 +146,7 @@ def lift_at(address: str, files: tuple[bytes, bytes, bytes]) -> int:
         put = dict(zip(("splats", "cameras", "features"), files, strict=True))
         ids = {kind: client.put(f"/assets/{kind}", content=body).json()["id"] for kind, body in put.items()}
         order = ids | {"features": [ids["features"]], "settings": {"preset": "row-sum"}}
-        job = ended(client, client.post("/lift", json=order).headers["location"])
+        job = wait_for_end(client, client.post("/lift", json=order).headers["location"])
         return client.get(f"/lifts/{job['id']}").json()["count"]
 
 

@@ -35,36 +35,46 @@ class Browser:
     """One window.
 
     ``faults`` keeps what its scripts say of errors: uncaught ones, those of the console, and what the policy of the
-    page's contents refused; ``asked`` the addresses of all its requests.
+    page's contents refused; ``requests`` the addresses of all its requests.
     """
 
-    def __init__(self, process: subprocess.Popen[bytes], told: int, heard: int) -> None:
-        self._process, self._told, self._heard = process, told, heard
+    def __init__(self, process: subprocess.Popen[bytes], writer: int, reader: int) -> None:
+        self._process, self._writer, self._reader = process, writer, reader
         self._buffer, self._last, self._session = b"", 0, ""
         self.faults: list[str] = []
-        self.asked: list[str] = []
+        self.requests: list[str] = []
 
     @classmethod
     @contextlib.contextmanager
-    def started(cls, program: str, profile: Path, *more: str) -> Iterator[Self]:
-        """A browser with an empty profile and ``more`` options; gone at the end."""
-        (theirs_in, told), (heard, theirs_out) = os.pipe(), os.pipe()
+    def launch(cls, program: str, profile: Path, *options: str) -> Iterator[Self]:
+        """A browser with an empty profile and ``options`` options; gone at the end."""
+        (theirs_in, writer), (reader, theirs_out) = os.pipe(), os.pipe()
         # Chromium looks for its pipes at 3 and 4, where this process has other things.
-        moved = f'exec "$@" 3<&{theirs_in} 4>&{theirs_out}'
-        command = ["bash", "-c", moved, "bash", program, *OPTIONS, *more, f"--user-data-dir={profile}", "about:blank"]
+        redirect = f'exec "$@" 3<&{theirs_in} 4>&{theirs_out}'
+        command = [
+            "bash",
+            "-c",
+            redirect,
+            "bash",
+            program,
+            *OPTIONS,
+            *options,
+            f"--user-data-dir={profile}",
+            "about:blank",
+        ]
         quiet = subprocess.DEVNULL
         process = subprocess.Popen(command, stdout=quiet, stderr=quiet, pass_fds=(theirs_in, theirs_out))
         os.close(theirs_in)
         os.close(theirs_out)
         try:
-            browser = cls(process, told, heard)
+            browser = cls(process, writer, reader)
             browser._attach()
             yield browser
         finally:
             process.kill()
             process.wait()
-            os.close(told)
-            os.close(heard)
+            os.close(writer)
+            os.close(reader)
 
     def _attach(self) -> None:
         pages = [info for info in self._call("Target.getTargets")["targetInfos"] if info["type"] == "page"]
@@ -117,14 +127,14 @@ class Browser:
 
     def key(self, name: str, *, shift: bool = False, ctrl: bool = False) -> None:
         """Press a key and let it go."""
-        told = {
+        event = {
             "key": name,
             "modifiers": SHIFT * shift + CTRL * ctrl,
             "windowsVirtualKeyCode": KEYS.get(name, ord(name[0].upper())),
         }
         text = {"text": "\r" if name == "Enter" else name} if name == "Enter" or (len(name) == 1 and not ctrl) else {}
-        self._call("Input.dispatchKeyEvent", type="keyDown" if text else "rawKeyDown", **told, **text)
-        self._call("Input.dispatchKeyEvent", type="keyUp", **told)
+        self._call("Input.dispatchKeyEvent", type="keyDown" if text else "rawKeyDown", **event, **text)
+        self._call("Input.dispatchKeyEvent", type="keyUp", **event)
 
     def window(self, width: int, height: int, scheme: str = "dark", zoom: int = 1) -> None:
         """The window's size in CSS pixels, whether its user likes it ``dark`` or ``light``, and device pixels a CSS
@@ -139,8 +149,10 @@ class Browser:
     def violations(self) -> dict[str, list[str]]:
         """What axe finds on the page that is not minor: elements by rule."""
         self.value(f"(() => {{ {AXE}; }})()")
-        found = self.value("axe.run(document).then(all => all.violations)")
-        return {rule["id"]: [node["html"] for node in rule["nodes"]] for rule in found if rule["impact"] != "minor"}
+        problems = self.value("axe.run(document).then(all => all.violations)")
+        return {
+            rule["id"]: [node["html"] for node in rule["nodes"]] for rule in problems if rule["impact"] != "minor"
+        }
 
     def screenshot(self) -> str:
         """The window as a PNG, in base64."""
@@ -149,8 +161,8 @@ class Browser:
     def give(self, selector: str, files: list[Path]) -> None:
         """Choose files in an input for them."""
         node = self._call("DOM.getDocument")["root"]["nodeId"]
-        found = self._call("DOM.querySelector", nodeId=node, selector=selector)["nodeId"]
-        self._call("DOM.setFileInputFiles", nodeId=found, files=[str(file) for file in files])
+        node_id = self._call("DOM.querySelector", nodeId=node, selector=selector)["nodeId"]
+        self._call("DOM.setFileInputFiles", nodeId=node_id, files=[str(file) for file in files])
 
     def drop(self, files: list[Path]) -> None:
         """Drag files of this machine over the middle of the window, and let them go there."""
@@ -169,7 +181,7 @@ class Browser:
         message: dict[str, Any] = {"id": self._last, "method": method, "params": parameters}
         if self._session:
             message["sessionId"] = self._session
-        os.write(self._told, json.dumps(message).encode() + b"\0")
+        os.write(self._writer, json.dumps(message).encode() + b"\0")
         while True:
             answer = self._next()
             self._note(answer.get("method"), answer.get("params", {}))
@@ -178,23 +190,25 @@ class Browser:
                     raise AssertionError(f"{method}: {answer['error']}")
                 return answer["result"]
 
-    def _note(self, method: str | None, told: dict[str, Any]) -> None:
+    def _note(self, method: str | None, params: dict[str, Any]) -> None:
         if method == "Runtime.exceptionThrown":
-            self.faults.append(str(told["exceptionDetails"]))
-        elif method == "Runtime.consoleAPICalled" and told["type"] == "error":
-            self.faults.append(str(told["args"]))
+            self.faults.append(str(params["exceptionDetails"]))
+        elif method == "Runtime.consoleAPICalled" and params["type"] == "error":
+            self.faults.append(str(params["args"]))
         elif (
-            method == "Log.entryAdded" and told["entry"]["level"] == "error" and told["entry"]["source"] != "network"
+            method == "Log.entryAdded"
+            and params["entry"]["level"] == "error"
+            and params["entry"]["source"] != "network"
         ):
-            self.faults.append(told["entry"]["text"])
+            self.faults.append(params["entry"]["text"])
         elif method == "Network.requestWillBeSent":
-            self.asked.append(told["request"]["url"])
+            self.requests.append(params["request"]["url"])
 
     def _next(self) -> dict[str, Any]:
         while b"\0" not in self._buffer:
-            if not select.select([self._heard], [], [], PATIENCE_SECONDS)[0]:
+            if not select.select([self._reader], [], [], PATIENCE_SECONDS)[0]:
                 raise AssertionError("the browser says nothing")
-            block = os.read(self._heard, 1 << 16)
+            block = os.read(self._reader, 1 << 16)
             if not block:
                 raise AssertionError("the browser has gone")
             self._buffer += block

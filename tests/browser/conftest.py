@@ -14,7 +14,7 @@ import pytest
 from service.app import assemble
 from service.settings import ServiceSettings
 from service.store.store import Store
-from tests.api.following import ended
+from tests.api.following import wait_for_end
 from tests.api.tiny_scene import make_scene
 from tests.crash.conftest import address_of, listening
 
@@ -24,7 +24,7 @@ NO_BROWSER = "no Chromium on this machine (apt-get install chromium)"
 
 
 @dataclass(frozen=True)
-class Served:
+class PageServer:
     """Where the service is, and its one lift."""
 
     address: str
@@ -35,38 +35,40 @@ class Served:
 @contextlib.contextmanager
 def serving(data: Path, **settings: Any) -> Iterator[tuple[str, Store]]:
     """A server on a free port: its address and its store."""
-    chosen = ServiceSettings.model_validate({"data": data, "disk_floor_bytes": 0, **settings})
-    store = Store.open(chosen.data)
+    server_settings = ServiceSettings.model_validate({"data": data, "disk_floor_bytes": 0, **settings})
+    store = Store.open(server_settings.data)
     try:
-        with listening(assemble(chosen, store), chosen) as server:
+        with listening(assemble(server_settings, store), server_settings) as server:
             yield "http://{}:{}".format(*address_of(server)), store
     finally:
         store.close()
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PageServer]:
     if chromium() is None:
         pytest.skip(NO_BROWSER)
     folder, scene = tmp_path_factory.mktemp("page"), make_scene()
     (folder / "table.safetensors").write_bytes(scene.table)
     with serving(folder / "data", encoder=f"table:{folder}/table.safetensors") as (address, store):
         with httpx.Client(base_url=address, timeout=60) as client:
-            put = {kind: getattr(scene, kind) for kind in ("splats", "cameras", "features")}
-            ids = {kind: client.put(f"/assets/{kind}", content=body).json()["id"] for kind, body in put.items()}
+            bodies = {kind: getattr(scene, kind) for kind in ("splats", "cameras", "features")}
+            ids = {kind: client.put(f"/assets/{kind}", content=body).json()["id"] for kind, body in bodies.items()}
             order = ids | {"features": [ids["features"]], "settings": {"preset": "row-sum", "objects": True}}
-            job = ended(client, client.post("/lift", json=order).headers["location"])
+            job = wait_for_end(client, client.post("/lift", json=order).headers["location"])
         assert job["state"] == "succeeded", job
-        yield Served(address, job["id"], store)
+        yield PageServer(address, job["id"], store)
 
 
 @pytest.fixture
-def other_lift(served: Served) -> Iterator[str]:
+def other_lift(server: PageServer) -> Iterator[str]:
     """Another lift of the same scene."""
-    with httpx.Client(base_url=served.address, timeout=60) as client:
-        known = client.get(f"/lifts/{served.lift}").json()
-        order = {name: known[name] for name in ("splats", "cameras", "features")} | {"settings": {"preset": "mean"}}
-        job = ended(client, client.post("/lift", json=order).headers["location"])["id"]
+    with httpx.Client(base_url=server.address, timeout=60) as client:
+        lift_document = client.get(f"/lifts/{server.lift}").json()
+        order = {name: lift_document[name] for name in ("splats", "cameras", "features")} | {
+            "settings": {"preset": "mean"}
+        }
+        job = wait_for_end(client, client.post("/lift", json=order).headers["location"])["id"]
         yield job
         assert client.delete(f"/jobs/{job}?with_lift=true").status_code == 204
 
@@ -77,10 +79,10 @@ def browsing(profile: Path, *options: str) -> Iterator[Browser]:
     program = chromium()
     if program is None:
         pytest.skip(NO_BROWSER)
-    with Browser.started(program, profile, *options) as browser:
+    with Browser.launch(program, profile, *options) as browser:
         yield browser
         assert browser.faults == []
-        assert all(address.startswith(("http://127.0.0.1:", "blob:", "data:")) for address in browser.asked)
+        assert all(address.startswith(("http://127.0.0.1:", "blob:", "data:")) for address in browser.requests)
 
 
 @pytest.fixture(scope="module")

@@ -10,12 +10,12 @@ READY = (
     "globalThis.splatlift?.lift && document.querySelector('#loading').hidden && "
     "(splatlift.viewer ? splatlift.viewer.settled : document.querySelector('#render').naturalWidth > 0)"
 )
-FOUND = (
+FIND_COLOUR = (
     "!document.querySelector('#stage').classList.contains('asking') && splatlift.ask.questions.length && "
     "splatlift.ask.questions.every(asked => asked.answer && (asked.things.length || !asked.count)) && "
     "(!splatlift.viewer || splatlift.viewer.settled)"
 )
-TROUBLE = "!document.querySelector('#toast').hidden && document.querySelector('#toast').classList.contains('bad')"
+ERROR_SHOWN = "!document.querySelector('#toast').hidden && document.querySelector('#toast').classList.contains('bad')"
 AMBER, SKY = "255,176,0", "56,182,255"  # colours of the first and the second question
 # Columns of the picture, in hundredths of its width, of pixels whose hue is near to a colour's.
 COLUMNS = """((wanted, near, canvas) => {
@@ -59,4 +59,4 @@ def splat_at(browser: Browser, row: int) -> tuple[float, float]:
 def ask(browser: Browser, words: str) -> None:
     browser.write("#words", words)
     browser.press("#query button.main")
-    browser.until(FOUND)
+    browser.until(FIND_COLOUR)

@@ -24,7 +24,7 @@ from tests.still_life.scene import still_life
 from tests.unit.scene.camera_files import binary_files, text_files, write_files
 
 from .browser import Browser
-from .conftest import Served, serving
+from .conftest import PageServer, serving
 from .looking import AMBER, READY, ask, columns, text_of
 
 pytestmark = pytest.mark.slow
@@ -49,11 +49,11 @@ POINT = "document.querySelector('#chart .point')"
 
 @pytest.fixture
 def files(tmp_path: Path) -> dict[str, Path]:
-    scene, found = make_scene(), {}
+    scene, paths = make_scene(), {}
     for name in ("splats.ply", "cameras.json", "features.safetensors", "table.safetensors"):
-        found[name.split(".")[0]] = tmp_path / name
+        paths[name.split(".")[0]] = tmp_path / name
         (tmp_path / name).write_bytes(getattr(scene, name.split(".")[0]))
-    return found
+    return paths
 
 
 @pytest.fixture
@@ -108,10 +108,10 @@ def test_dropped_files_are_planned_compared_and_cancelled(empty: Browser, files:
 
 
 def test_lift_file_asks_for_what_it_was_made_of_and_opens(
-    empty: Browser, served: Served, files: dict[str, Path], tmp_path: Path
+    empty: Browser, server: PageServer, files: dict[str, Path], tmp_path: Path
 ) -> None:
     (tmp_path / "brought.safetensors").write_bytes(
-        httpx.get(f"{served.address}/lifts/{served.lift}/features").content
+        httpx.get(f"{server.address}/lifts/{server.lift}/features").content
     )
     empty.drop([tmp_path / "brought.safetensors"])
     empty.until("document.querySelector('.file .state')?.textContent.includes('was made of')")
@@ -123,11 +123,11 @@ def test_lift_file_asks_for_what_it_was_made_of_and_opens(
 
 
 def test_lift_file_looks_again_for_what_came_while_it_looked(
-    empty: Browser, served: Served, files: dict[str, Path], tmp_path: Path
+    empty: Browser, server: PageServer, files: dict[str, Path], tmp_path: Path
 ) -> None:
     """The answers to its first look, taken before anything was sent, come after all is there."""
     lift = tmp_path / "brought.safetensors"
-    lift.write_bytes(httpx.get(f"{served.address}/lifts/{served.lift}/features").content)
+    lift.write_bytes(httpx.get(f"{server.address}/lifts/{server.lift}/features").content)
     empty.value(HELD_ANSWERS)
     empty.drop([lift])
     empty.until("held.length === 2")
@@ -148,12 +148,12 @@ def test_dropped_folder_brings_its_cameras(empty: Browser, files: dict[str, Path
     names = empty.value("[...document.querySelectorAll('.file.done .name')].map(name => name.textContent)")
     assert sorted(names) == ["model.zip", "point_cloud.ply"] and "3 views" in text_of(empty, "#sent")
     empty.until("splatlift.viewer?.draft")
-    drawn = empty.value("[...splatlift.viewer.cones.geometry.attributes.position.array]")
+    cone_positions = empty.value("[...splatlift.viewer.cones.geometry.attributes.position.array]")
     empty.drop([files["cameras"]])  # the same cameras
     empty.until("splatlift.viewer.cones.geometry.attributes.position.count === 3 * 16")
     empty.until("splatlift.bring.cameras[0].name !== 'left.png'")
-    same = empty.value("[...splatlift.viewer.cones.geometry.attributes.position.array]")
-    assert len(drawn) == 3 * 16 * 3 and drawn == pytest.approx(same, abs=1e-5)
+    same_positions = empty.value("[...splatlift.viewer.cones.geometry.attributes.position.array]")
+    assert len(cone_positions) == 3 * 16 * 3 and cone_positions == pytest.approx(same_positions, abs=1e-5)
 
 
 def test_binary_and_text_colmap_model_are_drawn_as_they_are_lifted(empty: Browser, tmp_path: Path) -> None:
@@ -170,19 +170,19 @@ def test_binary_and_text_colmap_model_are_drawn_as_they_are_lifted(empty: Browse
             assert np.array(view["viewmat"]) == pytest.approx(camera.viewmat, abs=1e-6), (folder, view["name"])
 
 
-@pytest.mark.parametrize("beside", [False, True], ids=["alone", "with its cameras"])
+@pytest.mark.parametrize("in_folder", [False, True], ids=["alone", "with its cameras"])
 def test_folder_of_a_sog_is_sent_as_one_file(
-    empty: Browser, files: dict[str, Path], tmp_path: Path, beside: bool
+    empty: Browser, files: dict[str, Path], tmp_path: Path, in_folder: bool
 ) -> None:
     with zipfile.ZipFile(SOG_FILE) as archive:
         archive.extractall(tmp_path / "my garden" / "splats")
-    if beside:
+    if in_folder:
         write_inria_cameras(read_cameras(files["cameras"]), tmp_path / "my garden" / "cameras.json")
     empty.drop([tmp_path / "my garden"])
-    names = ["cameras.json"] * beside + ["my garden.sog"]
+    names = ["cameras.json"] * in_folder + ["my garden.sog"]
     empty.until(f"document.querySelectorAll('.file.done').length === {len(names)}")
-    told = "[...document.querySelectorAll('.file.done .name')].map(name => name.textContent).sort()"
-    assert empty.value(told) == names
+    file_names = "[...document.querySelectorAll('.file.done .name')].map(name => name.textContent).sort()"
+    assert empty.value(file_names) == names
     assert f"{read_splats(SOG_FILE).count} splats" in text_of(empty, "#sent")
 
 
@@ -247,8 +247,8 @@ def test_lift_file_waits_for_other_cameras_after_wrong_ones(
 
 def test_scenes_that_others_make_and_delete_are_followed(empty: Browser, files: dict[str, Path]) -> None:
     with httpx.Client(base_url=empty.value("location.origin")) as other:
-        put = {kind: other.put(f"/assets/{kind}", content=file.read_bytes()) for kind, file in files.items()}
-        ids = {kind: reply.json()["id"] for kind, reply in put.items() if kind != "table"}
+        asset_ids = {kind: other.put(f"/assets/{kind}", content=file.read_bytes()) for kind, file in files.items()}
+        ids = {kind: reply.json()["id"] for kind, reply in asset_ids.items() if kind != "table"}
         order = ids | {"features": [ids["features"]], "settings": {"preset": "row-sum"}}
         job = other.post("/lift", json=order).json()["id"]
         empty.press("#tab-bring")
@@ -259,21 +259,21 @@ def test_scenes_that_others_make_and_delete_are_followed(empty: Browser, files: 
         empty.until("!document.querySelector('#empty').hidden && !splatlift.lift")
 
 
-def test_table_of_words_is_dropped_and_named_by(browser: Browser, served: Served, files: dict[str, Path]) -> None:
+def test_table_of_words_is_dropped_and_named_by(browser: Browser, server: PageServer, files: dict[str, Path]) -> None:
     browser.window(1200, 800)
-    browser.open(served.address)
+    browser.open(server.address)
     browser.until(READY)
     browser.drop([files["table"]])
     browser.until("document.querySelector('.file.done')")
     browser.press("#tab-name")
     browser.until("document.querySelectorAll('#vocabulary option').length === 3")
     table = browser.value("document.querySelectorAll('#vocabulary option')[1].value")
-    assert httpx.delete(f"{served.address}/assets/{table}").status_code == 204
+    assert httpx.delete(f"{server.address}/assets/{table}").status_code == 204
 
 
-def test_lift_takes_a_name_and_photos(browser: Browser, served: Served, tmp_path: Path) -> None:
+def test_lift_takes_a_name_and_photos(browser: Browser, server: PageServer, tmp_path: Path) -> None:
     browser.window(1200, 800)
-    browser.open(served.address)
+    browser.open(server.address)
     browser.until(READY)
     browser.press("#tab-bring")
     browser.until("document.querySelector('#lifts input')")
@@ -321,8 +321,8 @@ def test_strangers_files_become_an_object_that_lights_up(browser: Browser, tmp_p
         assert page.value("document.querySelector('#jobs .failed')") is None
         page.until(READY)
         ask(page, "mug")
-        lit = columns(page, AMBER)
-        assert len(lit) > 2000 and page.value("splatlift.ask.now.things.length") >= 1
+        lit_columns = columns(page, AMBER)
+        assert len(lit_columns) > 2000 and page.value("splatlift.ask.now.things.length") >= 1
         low, high = page.value("(({low, high}) => [low, high])(splatlift.ask.now.things[0].box)")
         assert low[0] < -2.7 < high[0] and low[1] < -1.5 < high[1]  # where the mug stands
         page.press("#tab-bring")
@@ -337,9 +337,9 @@ def test_strangers_files_become_an_object_that_lights_up(browser: Browser, tmp_p
 def test_dropped_scene_is_seen_planned_and_named_and_the_next_is_another_order(
     empty: Browser, files: dict[str, Path], tmp_path: Path
 ) -> None:
-    named = tmp_path / "my garden.ply"
-    named.write_bytes(files["splats"].read_bytes())
-    empty.drop([named, files["cameras"], files["features"]])
+    garden = tmp_path / "my garden.ply"
+    garden.write_bytes(files["splats"].read_bytes())
+    empty.drop([garden, files["cameras"], files["features"]])
     empty.until("splatlift.viewer?.draft && document.querySelector('#plan').textContent.includes('60 splats')")
     assert empty.value("splatlift.viewer.cones.geometry.attributes.position.count") == 3 * 16  # three cameras
     assert empty.value("document.querySelector('#empty').hidden") is True

@@ -7,20 +7,21 @@ from collections.abc import Iterator
 import pytest
 
 from .browser import Browser
-from .conftest import Served
+from .conftest import PageServer
 from .looking import AMBER, READY, ask, columns, text_of
 
 pytestmark = pytest.mark.slow
 COMPARE = "#panel-ask [data-compare]"
-BOTH = "splatlift.beside.scene && splatlift.beside.left.settled && splatlift.viewer.settled"
+BOTH_SETTLED = "splatlift.beside.scene && splatlift.beside.left.settled && splatlift.viewer.settled"
 PLACES = "[splatlift.viewer, splatlift.beside.left].map(side => side.place3d)"
-SHARED = f"{BOTH} && (([one, other]) => one.every((value, axis) => Math.abs(value - other[axis]) < 1e-6))({PLACES})"
+SAME_PLACE = "(([one, other]) => one.every((value, axis) => Math.abs(value - other[axis]) < 1e-6))"
+SHARED = f"{BOTH_SETTLED} && {SAME_PLACE}({PLACES})"
 
 
 @pytest.fixture
-def page(browser: Browser, served: Served) -> Iterator[Browser]:
+def page(browser: Browser, server: PageServer) -> Iterator[Browser]:
     browser.window(1200, 700)
-    browser.open(served.address)
+    browser.open(server.address)
     browser.until(READY)
     yield browser
     browser.open("about:blank#")
@@ -55,30 +56,30 @@ def test_two_words_are_seen_beside_each_other_with_one_camera(page: Browser) -> 
 def test_link_opens_both_sides_and_back_leaves_one(page: Browser) -> None:
     ask(page, "lamp")
     page.press(COMPARE)
-    page.until(BOTH)
+    page.until(BOTH_SETTLED)
     page.value("document.querySelector('#cut').value = document.querySelector('#cut').max")
     for event in ("input", "change"):
         page.value(f"document.querySelector('#cut').dispatchEvent(new Event('{event}'))")
-    page.until(f"location.search.includes('threshold') && {BOTH}")
+    page.until(f"location.search.includes('threshold') && {BOTH_SETTLED}")
     sides = "['#beside-said', '#right-said'].map(side => document.querySelector(side).textContent)"
     left, right = page.value(sides)
     assert left != right and "lamp" in left and "lamp" in right
     address = page.value("location.href")
     page.open("about:blank#")
     page.open(address)
-    page.until(f"{READY} && {BOTH} && splatlift.ask.now.answer")
+    page.until(f"{READY} && {BOTH_SETTLED} && splatlift.ask.now.answer")
     assert page.value(sides) == [left, right]
     page.press("#end-compare")
     page.until("!location.search.includes('beside')")
     page.value("history.back()")
-    page.until(BOTH)
+    page.until(BOTH_SETTLED)
 
 
-def test_other_lift_is_asked_the_same_beside_what_is_open(page: Browser, served: Served, other_lift: str) -> None:
+def test_other_lift_is_asked_the_same_beside_what_is_open(page: Browser, server: PageServer, other_lift: str) -> None:
     ask(page, "lamp")
     page.press("#tab-bring")
     page.until("document.querySelector('#lifts [aria-label^=Compare]')")
     page.press("#lifts [aria-label^=Compare]")
     page.until(f"splatlift.lift?.id === '{other_lift}' && {SHARED} && splatlift.ask.now?.answer")
-    assert page.value("splatlift.beside.scene.id") == served.lift and page.value("splatlift.ask.now.text") == ["lamp"]
+    assert page.value("splatlift.beside.scene.id") == server.lift and page.value("splatlift.ask.now.text") == ["lamp"]
     assert min(columns(page, AMBER)) > 50 and min(columns(page, AMBER, canvas="#beside")) > 50

@@ -20,8 +20,8 @@ from service.store.owners import Scope
 from tests.api.tiny_scene import make_scene
 
 from .browser import Browser
-from .conftest import Served, browsing
-from .looking import AMBER, FOUND, READY, SKY, TROUBLE, ask, columns, splat_at, text_of
+from .conftest import PageServer, browsing
+from .looking import AMBER, ERROR_SHOWN, FIND_COLOUR, READY, SKY, ask, columns, splat_at, text_of
 
 EXAMPLES = "splatlift.ask.questions.flatMap(asked => [...asked.like, ...asked.unlike.map(term => `not ${term}`)])"
 SETS = "splatlift.ask.questions.flatMap(asked => asked.sets)"
@@ -46,28 +46,28 @@ BOXES = """['#render', '#mask'].map(name => {
 
 
 @pytest.fixture
-def page(browser: Browser, served: Served) -> Browser:
+def page(browser: Browser, server: PageServer) -> Browser:
     browser.window(1200, 700)
-    browser.open(served.address)
+    browser.open(server.address)
     browser.until(READY)
     return browser
 
 
-def test_first_view_is_shown_in_3d_with_its_lists(page: Browser, served: Served) -> None:
-    shown = columns(page)
-    assert shown and min(shown) < 40 and max(shown) > 60  # three clusters side by side
+def test_first_view_is_shown_in_3d_with_its_lists(page: Browser, server: PageServer) -> None:
+    visible_columns = columns(page)
+    assert visible_columns and min(visible_columns) < 40 and max(visible_columns) > 60  # three clusters side by side
     assert page.value("[...document.querySelector('#view').options].map(option => option.value)") == [
         "left", "middle", "right"
     ]  # fmt: skip
-    assert page.value("document.querySelector('#lift').value") == served.lift
+    assert page.value("document.querySelector('#lift').value") == server.lift
     assert "60 splats" in text_of(page, "#about")
 
 
 def test_word_lights_its_thing(page: Browser) -> None:
     before = columns(page)
     ask(page, "lamp")
-    lit = columns(page, AMBER)
-    assert lit and min(lit) > 50  # the lamp is the right one of three
+    lit_columns = columns(page, AMBER)
+    assert lit_columns and min(lit_columns) > 50  # the lamp is the right one of three
     assert "splats of 60" in text_of(page, "#answer") and "by itself" in text_of(page, "#why")
     assert page.value("document.querySelectorAll('#things li').length") == 1
     assert text_of(page, "#labels .label") == "lamp"
@@ -81,17 +81,17 @@ def test_word_lights_its_thing(page: Browser) -> None:
 
 def test_slider_repaints_without_a_request(page: Browser) -> None:
     ask(page, "lamp")
-    lit, asked = len(columns(page, AMBER)), len(page.asked)
+    lit_columns, requests = len(columns(page, AMBER)), len(page.requests)
     page.value("document.querySelector('#cut').value = 9")  # the most there is
     page.value("document.querySelector('#cut').dispatchEvent(new Event('input'))")
-    assert len(page.asked) == asked and "You set this." in text_of(page, "#why")
+    assert len(page.requests) == requests and "You set this." in text_of(page, "#why")
     assert page.value("document.querySelectorAll('#things button').length") == 0  # those of the cut before
     assert text_of(page, ".chip small") == str(page.value("splatlift.ask.now.count"))
-    assert len(columns(page, AMBER)) < lit
-    page.until(FOUND)  # the things follow
+    assert len(columns(page, AMBER)) < lit_columns
+    page.until(FIND_COLOUR)  # the things follow
     page.press("#auto")
-    page.until(FOUND)
-    assert len(columns(page, AMBER)) == lit
+    page.until(FIND_COLOUR)
+    assert len(columns(page, AMBER)) == lit_columns
 
 
 def test_what_lights_up_is_what_is_selected(page: Browser) -> None:
@@ -99,7 +99,7 @@ def test_what_lights_up_is_what_is_selected(page: Browser) -> None:
     passed = "splatlift.ask.painted()[0].scores.filter(score => score >= splatlift.ask.now.cut - 1e-6).length"
     ask(page, "lamp")
     assert page.value(passed) == page.value("splatlift.ask.now.answer.count") > 0
-    assert any("/query/selection" in address for address in page.asked)
+    assert any("/query/selection" in address for address in page.requests)
 
 
 def test_several_words_have_a_colour_each(page: Browser) -> None:
@@ -118,7 +118,7 @@ def test_question_is_taken_back_or_narrowed_while_it_is_asked(page: Browser) -> 
     assert not page.value("document.querySelector('#stage').classList.contains('asking')")
     page.value("document.querySelector('#words').value = 'lamp, apple'")
     page.value(f"(() => {{ {submit}; splatlift.ask.example('splat:{APPLE}', true); }})()")
-    page.until(FOUND)  # both, the one that was not narrowed too
+    page.until(FIND_COLOUR)  # both, the one that was not narrowed too
     assert page.value(WORDS) == ["lamp", "apple"]
 
 
@@ -129,17 +129,21 @@ def test_box_completes_maps_and_suggests_words(page: Browser) -> None:
     assert text_of(page, "#completions") == "apple"
     page.key("ArrowDown")
     page.key("Enter")
-    page.until(FOUND)
+    page.until(FIND_COLOUR)
     assert page.value(WORDS) == ["apple"] and page.value("document.querySelector('#advice').hidden") is True
     ask(page, "two red apples")
     assert text_of(page, "#advice") == "\u201ctwo red apples\u201d was asked as apple."
     page.write("#words", "boook")
     page.press("#query button.main")
     page.until("splatlift.ask.now?.problem")
-    told = page.value("document.body.innerText")
-    assert "is not a word that can be asked here" in told and "text.0" not in told and ".safetensors" not in told
+    page_text = page.value("document.body.innerText")
+    assert (
+        "is not a word that can be asked here" in page_text
+        and "text.0" not in page_text
+        and ".safetensors" not in page_text
+    )
     page.press("#advice button")
-    page.until(FOUND)
+    page.until(FIND_COLOUR)
     assert page.value(WORDS) == ["book"]
 
 
@@ -148,7 +152,7 @@ def test_not_sure_names_words_that_compete_as_buttons(page: Browser) -> None:
     page.value("(() => { splatlift.ask.now.answer.rivals = ['book']; splatlift.ask.show(); })()")
     assert "not sure" in text_of(page, "#chips") and "nearer" in text_of(page, "#advice")
     page.press("#advice button:nth-of-type(2)")  # but not book
-    page.until(FOUND)
+    page.until(FIND_COLOUR)
     assert page.value("document.querySelector('#but').value") == "book"
     assert "negatives=book" in page.value("location.search")
     ask(page, "apple")  # another question does not keep it
@@ -159,20 +163,20 @@ def test_click_takes_the_thing_and_another_its_patch(page: Browser) -> None:
     page.until("splatlift.things.found.length === 3")
     page.press("#scene", *splat_at(page, APPLE))
     page.until(f"{SETS}.length === 1")
-    page.until(FOUND)
+    page.until(FIND_COLOUR)
     assert page.value("splatlift.ask.now.count") == 20 and columns(page, AMBER)
     assert text_of(page, "#chips .chip").startswith("apple")
     page.press("#reset-view")
     page.until("splatlift.viewer.settled")
     page.press("#scene", *splat_at(page, LAMP), shift=True)
     page.until(f"{SETS}.length === 2")
-    page.until(FOUND)
+    page.until(FIND_COLOUR)
     assert page.value("splatlift.ask.now.count") == 40
     assert page.value("document.querySelectorAll('#catalogue-list [aria-pressed=true]').length") == 2
     page.press("#reset-view")
     page.until("splatlift.viewer.settled")
     page.press("#scene", *splat_at(page, LAMP))
-    page.until(f"{SETS}.length === 1 && {FOUND}")
+    page.until(f"{SETS}.length === 1 && {FIND_COLOUR}")
     page.press("#reset-view")
     page.until("splatlift.viewer.settled")
     page.press("#scene", *splat_at(page, LAMP))
@@ -180,24 +184,26 @@ def test_click_takes_the_thing_and_another_its_patch(page: Browser) -> None:
 
 
 @pytest.fixture
-def parted(served: Served, tmp_path: Path) -> Iterator[str]:
+def scene_with_parts(server: PageServer, tmp_path: Path) -> Iterator[str]:
     """A lift whose lamp has two parts, nodes 3 and 4: its splats of even and of odd rows."""
-    (tmp_path / "lift").write_bytes(httpx.get(f"{served.address}/lifts/{served.lift}/features").content)
-    with safe_open(tmp_path / "lift", framework="np") as opened:
-        metadata = opened.metadata()
-        tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+    (tmp_path / "lift").write_bytes(httpx.get(f"{server.address}/lifts/{server.lift}/features").content)
+    with safe_open(tmp_path / "lift", framework="np") as file:
+        metadata = file.metadata()
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     lamp, rows = int(tensors["object"][LAMP]), np.flatnonzero(tensors["object"] == tensors["object"][LAMP])
     tensors["node"][rows] = 3 + rows % 2
     tensors["node_parents"] = np.array([-1, -1, -1, lamp, lamp], np.int32)
     for name in ("node_views", "node_confidence", "node_features"):
         tensors[name] = tensors[name][[0, 1, 2, lamp, lamp]]
-    lifted = httpx.post(f"{served.address}/lifts", content=save(tensors, metadata)).raise_for_status().json()["id"]
+    lifted = httpx.post(f"{server.address}/lifts", content=save(tensors, metadata)).raise_for_status().json()["id"]
     yield lifted
-    httpx.delete(f"{served.address}/jobs/{lifted}?with_lift=true").raise_for_status()
+    httpx.delete(f"{server.address}/jobs/{lifted}?with_lift=true").raise_for_status()
 
 
-def test_things_unfold_into_parts_by_keyboard_and_by_clicks(page: Browser, served: Served, parted: str) -> None:
-    page.open(f"{served.address}/?lift={parted}")
+def test_things_unfold_into_parts_by_keyboard_and_by_clicks(
+    page: Browser, server: PageServer, scene_with_parts: str
+) -> None:
+    page.open(f"{server.address}/?lift={scene_with_parts}")
     page.until(f"{READY} && splatlift.things.nodes.size === 5")
     unfold = "document.querySelector('#catalogue-list [aria-expanded]')"
     assert page.value(f"{unfold}.getAttribute('aria-label')") == "2 parts of lamp"
@@ -206,28 +212,28 @@ def test_things_unfold_into_parts_by_keyboard_and_by_clicks(page: Browser, serve
     page.until("document.querySelectorAll('#catalogue-list .parts li').length === 2")
     assert page.value(f"document.activeElement === {unfold} && {unfold}.getAttribute('aria-expanded')") == "true"
     page.press("#catalogue-list .parts .thing")
-    page.until(f"{SETS}.join() === 'object:3' && {FOUND}")
+    page.until(f"{SETS}.join() === 'object:3' && {FIND_COLOUR}")
     assert page.value("splatlift.ask.now.count") == 10 and text_of(page, "#chips .chip").startswith("lamp: ")
     page.press("#clear")
     page.press("#reset-view")
     page.until("splatlift.viewer.settled")
-    whole, part = f"object:{page.value('splatlift.things.nodes.get(3).parent')}", "object:4"
+    object_id, part = f"object:{page.value('splatlift.things.nodes.get(3).parent')}", "object:4"
     at = splat_at(page, LAMP)
-    for taken in (whole, part):
+    for set_id in (object_id, part):
         page.press("#scene", *at)
-        page.until(f"{SETS}.join() === '{taken}' && {FOUND}")
+        page.until(f"{SETS}.join() === '{set_id}' && {FIND_COLOUR}")
     page.press("#scene", *at, alt=True)
     page.until(f"{EXAMPLES}.join() === 'splat:{LAMP}'")
     page.press("#clear")
     page.press(MODE_VIEW)
     page.until("document.querySelector('#render').naturalWidth === 32")
     page.press("#render", 27.5 / 32, 12.5 / 24)
-    page.until(f"{SETS}.join() === '{whole}' && {FOUND}")
+    page.until(f"{SETS}.join() === '{object_id}' && {FIND_COLOUR}")
     page.press("#render", 27.5 / 32, 12.5 / 24)
-    page.until(f"['object:3', 'object:4'].includes({SETS}.join()) && {FOUND}")
+    page.until(f"['object:3', 'object:4'].includes({SETS}.join()) && {FIND_COLOUR}")
 
 
-def test_thing_takes_a_name_and_is_hidden_for_good(page: Browser, served: Served) -> None:
+def test_thing_takes_a_name_and_is_hidden_for_good(page: Browser, server: PageServer) -> None:
     first = "document.querySelector('#catalogue-list .thing span').firstChild.textContent"
     page.until("splatlift.things.found.length === 3")
     page.press("#catalogue-list [title='Give it a name']")
@@ -236,76 +242,78 @@ def test_thing_takes_a_name_and_is_hidden_for_good(page: Browser, served: Served
     page.until(f"{first} === 'the mug'")
     page.press("#catalogue-list [aria-label='Hide the mug']")
     page.until("document.querySelectorAll('#catalogue-list li').length === 2")
-    page.open(served.address)
+    page.open(server.address)
     page.until(f"{READY} && splatlift.things.found.length === 3")
     assert page.value("document.querySelectorAll('#catalogue-list li').length") == 2
     assert "1 hidden thing" in text_of(page, "#catalogue-hidden")
     for change in ({"name": None}, {"hidden": False}):
-        httpx.patch(f"{served.address}/lifts/{served.lift}/objects/0", json=change).raise_for_status()
+        httpx.patch(f"{server.address}/lifts/{server.lift}/objects/0", json=change).raise_for_status()
 
 
-def test_things_are_joined_split_and_taken_apart_again(page: Browser, served: Served) -> None:
+def test_things_are_joined_split_and_taken_apart_again(page: Browser, server: PageServer) -> None:
     names = (
         "[...document.querySelectorAll('#catalogue-list .thing, #catalogue-own .thing')].map(one => one.textContent)"
     )
-    counted = f"splatlift.ask.now?.answer && splatlift.ask.now.count === {{}} && {FOUND}"
+    count_is = f"splatlift.ask.now?.answer && splatlift.ask.now.count === {{}} && {FIND_COLOUR}"
     page.until(f"{names}.length === 3")
     before = page.value(names)
-    for place, more in ((1, False), (2, True)):
-        page.press(f"#catalogue-list li:nth-child({place}) .thing", shift=more)
-        page.until(counted.format(20 * place))
+    for place, with_shift in ((1, False), (2, True)):
+        page.press(f"#catalogue-list li:nth-child({place}) .thing", shift=with_shift)
+        page.until(count_is.format(20 * place))
     page.press("#join")
-    page.until(f"{SETS}.length === 1 && {SETS}[0].startsWith('selection:') && {counted.format(40)}")
+    page.until(f"{SETS}.length === 1 && {SETS}[0].startsWith('selection:') && {count_is.format(40)}")
     page.until(f"{names}.length === 2")
-    joined = page.value("splatlift.things.shown()")
-    body = {"lift": served.lift, "of": "questions", "questions": joined}
-    with zipfile.ZipFile(io.BytesIO(httpx.post(f"{served.address}/query/export", json=body).content)) as archive:
+    objects_text = page.value("splatlift.things.shown()")
+    body = {"lift": server.lift, "of": "questions", "questions": objects_text}
+    with zipfile.ZipFile(io.BytesIO(httpx.post(f"{server.address}/query/export", json=body).content)) as archive:
         classes = json.loads(archive.read("labels.json"))["classes"]
-    assert sorted(one["splats"] for one in classes) == [20, 40]
+    assert sorted(entry["splats"] for entry in classes) == [20, 40]
     splat = page.value("splatlift.ask.now.shown.findIndex(Boolean)")
     page.press("#clear")
     page.press("#reset-view")
     page.until(f"!{SETS}.length && splatlift.viewer.settled")
     page.press("#scene", *splat_at(page, splat))
-    one = f"{SETS}.length === 1 && {SETS}[0].startsWith('selection:') && {counted.format(40)}"
-    page.until(one)
+    entry = f"{SETS}.length === 1 && {SETS}[0].startsWith('selection:') && {count_is.format(40)}"
+    page.until(entry)
     for key in ("z", "y", "z"):  # undo, redo, undo
         page.key(key, ctrl=True)
-        page.until(f"{SETS}.length === 2 && {counted.format(40)} && splatlift.things.undone" if key == "z" else one)
+        page.until(
+            f"{SETS}.length === 2 && {count_is.format(40)} && splatlift.things.undone" if key == "z" else entry
+        )
     assert page.value(names) == before
     page.press("#join")
-    page.until(f"{one} && splatlift.things.own.length === 1")
+    page.until(f"{entry} && splatlift.things.own.length === 1")
     for _ in range(2):  # deleting it gives back what it was made of, and can be undone
         for _ in ("Delete", "Really?"):
             page.press("#catalogue-own .danger")
         page.until(f"!splatlift.things.own.length && !{SETS}.length && {names}.length === 3 && splatlift.things.last")
         assert page.value(names) == before
         page.key("z", ctrl=True)
-        page.until(f"{one} && {names}.length === 2")
+        page.until(f"{entry} && {names}.length === 2")
     for _ in ("Delete", "Really?"):
         page.press("#catalogue-own .danger")
     page.until(f"!splatlift.things.own.length && !{SETS}.length")
     page.press("#catalogue-list li:last-child .thing")
-    page.until(counted.format(20))
+    page.until(count_is.format(20))
     page.press("#by-hand")
-    page.until(f"splatlift.hand.selection?.version && {counted.format(20)}")
+    page.until(f"splatlift.hand.selection?.version && {count_is.format(20)}")
     x, y = splat_at(page, page.value("splatlift.ask.now.shown.findIndex(Boolean)"))
     page.drag("#scene", (x, y), (x + 0.01, y), alt=True)
-    page.until(f"splatlift.hand.selection.step === 1 && !splatlift.hand.busy && {FOUND}")
-    left = page.value("splatlift.ask.now.count")
+    page.until(f"splatlift.hand.selection.step === 1 && !splatlift.hand.busy && {FIND_COLOUR}")
+    remaining_count = page.value("splatlift.ask.now.count")
     page.value("[...document.querySelectorAll('#hand button')].find(one => one.textContent === 'Split').click()")
     page.until("splatlift.things.own.length === 2 && splatlift.things.last")
-    assert sum(page.value("splatlift.things.own.map(one => one.count)")) == 20 and 0 < left < 20
+    assert sum(page.value("splatlift.things.own.map(one => one.count)")) == 20 and 0 < remaining_count < 20
     page.key("z", ctrl=True)
     page.until("splatlift.things.own.length === 1 && !splatlift.things.found.some(thing => thing.hidden)")
-    own = page.value("splatlift.things.own[0].id")
-    assert httpx.delete(f"{served.address}/lifts/{served.lift}/selections/{own}").status_code == 204
+    object_id = page.value("splatlift.things.own[0].id")
+    assert httpx.delete(f"{server.address}/lifts/{server.lift}/selections/{object_id}").status_code == 204
 
 
-def test_empty_selection_says_how_to_add_to_it(page: Browser, served: Served) -> None:
-    route = f"{served.address}/lifts/{served.lift}/selections"
+def test_empty_selection_says_how_to_add_to_it(page: Browser, server: PageServer) -> None:
+    route = f"{server.address}/lifts/{server.lift}/selections"
     selection = httpx.post(route, json={"name": "<b>mine</b>"}).raise_for_status().json()
-    page.open(f"{served.address}/?lift={served.lift}&sets=selection:{selection['id']}")
+    page.open(f"{server.address}/?lift={server.lift}&sets=selection:{selection['id']}")
     page.until(f"{READY} && !document.querySelector('#hand').hidden && splatlift.ask.now.answer")
     assert text_of(page, "#title") == "<b>mine</b>" and "brush" in text_of(page, "#why")
     assert selection["id"] not in text_of(page, "#found") and page.value("document.querySelector('#nearest').hidden")
@@ -313,30 +321,30 @@ def test_empty_selection_says_how_to_add_to_it(page: Browser, served: Served) ->
 
 
 def test_answer_is_corrected_by_hand_and_undone(page: Browser) -> None:
-    done = f"splatlift.hand.selection?.step === {{}} && !splatlift.hand.busy && {FOUND}"
+    is_done = f"splatlift.hand.selection?.step === {{}} && !splatlift.hand.busy && {FIND_COLOUR}"
     ask(page, "lamp")
     lamp = page.value("splatlift.ask.now.count")
     page.press("#by-hand")
-    page.until(done.format(0))
+    page.until(is_done.format(0))
     assert page.value("splatlift.ask.now.count") == lamp
     x, y = splat_at(page, APPLE)
     page.drag("#scene", (x, y - 0.2), (x, y + 0.2))
-    page.until(done.format(1))
-    both = page.value("splatlift.ask.now.count")
-    assert lamp < both and min(columns(page, AMBER)) < 50  # the apple's side lights up too
+    page.until(is_done.format(1))
+    total = page.value("splatlift.ask.now.count")
+    assert lamp < total and min(columns(page, AMBER)) < 50  # the apple's side lights up too
     page.value("history.back()")
-    page.until(done.format(0))
+    page.until(is_done.format(0))
     assert page.value("splatlift.ask.now.count") == lamp and min(columns(page, AMBER)) > 50
     page.key("z", ctrl=True, shift=True)
-    page.until(done.format(1))
+    page.until(is_done.format(1))
     page.key("z", ctrl=True)
-    page.until(done.format(0))
+    page.until(is_done.format(0))
     link = page.value("location.href")
     page.drag("#scene", (x, y - 0.2), (x, y + 0.2), alt=True)  # nothing of it is selected
-    page.until(done.format(1))
+    page.until(is_done.format(1))
     assert page.value("splatlift.ask.now.count") == lamp
     page.open(link)
-    page.until(f"{READY} && {done.format(0)}")
+    page.until(f"{READY} && {is_done.format(0)}")
     assert page.value("splatlift.ask.now.count") == lamp and text_of(page, "#chips .chip").startswith("lamp")
 
 
@@ -348,37 +356,37 @@ def test_back_undoes_what_was_asked_and_stays_on_the_page(page: Browser) -> None
     page.press("#next")
     assert page.value("history.length") == before + 2  # looking is no entry
     page.value("history.back()")
-    page.until(f"{WORDS}.join() === 'lamp' && {FOUND}")
+    page.until(f"{WORDS}.join() === 'lamp' && {FIND_COLOUR}")
     page.value("history.back()")
     page.until("!splatlift.ask.questions.length && splatlift.viewer.settled")
     page.value("history.forward()")
-    page.until(f"{WORDS}.join() === 'lamp' && {FOUND}")
+    page.until(f"{WORDS}.join() === 'lamp' && {FIND_COLOUR}")
     assert page.value("document.querySelector('#words').value") == "lamp"
 
 
 def test_click_asks_for_more_and_shift_for_less(page: Browser) -> None:
     page.press("#scene", *splat_at(page, APPLE), alt=True)
     page.until(f"{EXAMPLES}.length === 1")
-    page.until(FOUND)
+    page.until(FIND_COLOUR)
     assert page.value(EXAMPLES)[0].startswith("splat:") and int(page.value(EXAMPLES)[0][6:]) < 20  # the apple
     assert max(columns(page, AMBER)) < 50
     page.press("#scene", *splat_at(page, LAMP), shift=True)
     page.until(f"{EXAMPLES}.length === 2")
-    page.until(FOUND)
+    page.until(FIND_COLOUR)
     assert page.value(EXAMPLES)[1].startswith("not splat:")
     page.press("#examples button")
     page.until(f"{EXAMPLES}.length === 0")
     page.press("#scene", *splat_at(page, APPLE), alt=True)
-    page.until(FOUND)
+    page.until(FIND_COLOUR)
     ask(page, "lamp")
     assert page.value(EXAMPLES) == [] and page.value(WORDS) == ["lamp"]  # words after a click ask the words
 
 
 def test_double_click_goes_there_and_asks_nothing(page: Browser) -> None:
     before = page.value("splatlift.viewer.place3d")
-    there = splat_at(page, APPLE)
-    page.press("#scene", *there)
-    page.press("#scene", *there)
+    apple_position = splat_at(page, APPLE)
+    page.press("#scene", *apple_position)
+    page.press("#scene", *apple_position)
     page.until(f"splatlift.viewer.place3d.some((value, axis) => Math.abs(value - {before}[axis]) > .1)")
     assert page.value(EXAMPLES) == []
 
@@ -388,7 +396,7 @@ def test_what_is_not_there_is_said_plainly(page: Browser) -> None:
     page.value("(() => { splatlift.ask.now.answer.clear = false; splatlift.ask.show(); splatlift.ask.changed(); })()")
     assert text_of(page, "#answer") == "Nothing stands apart for \u201clamp\u201d." and not columns(page, AMBER)
     page.press("#nearest")
-    page.until(FOUND)
+    page.until(FIND_COLOUR)
     assert columns(page, AMBER) and "comes closest" in text_of(page, "#why")
     page.value(
         f"(() => {{ {ABSENT}; splatlift.ask.now.anyway = false; splatlift.ask.show(); splatlift.ask.changed(); }})()"
@@ -396,10 +404,14 @@ def test_what_is_not_there_is_said_plainly(page: Browser) -> None:
     assert text_of(page, "#answer") == "\u201clamp\u201d is not here." and not columns(page, AMBER)
     assert text_of(page, "#why") == "No view shows one." and "not here" in text_of(page, "#chips")
     page.press("#nearest")
-    page.until(FOUND)
+    page.until(FIND_COLOUR)
     assert columns(page, AMBER) and "It is not here; this is what comes closest" in text_of(page, "#why")
-    asked = [address for address in page.asked if "/query/objects" in address][-1]
-    assert "absent=keep" in asked and "threshold=auto" not in asked and "&threshold=" in page.value("location.search")
+    requests = [address for address in page.requests if "/query/objects" in address][-1]
+    assert (
+        "absent=keep" in requests
+        and "threshold=auto" not in requests
+        and "&threshold=" in page.value("location.search")
+    )
 
 
 def test_everything_is_named_and_one_word_is_seen_alone(page: Browser) -> None:
@@ -414,8 +426,8 @@ def test_everything_is_named_and_one_word_is_seen_alone(page: Browser) -> None:
     colour = page.value(f"splatlift.names.found.named_words[{lamp - 1}].colour.join()")
     page.press(f"#legend li:nth-child({lamp}) button")
     assert page.value("[...document.querySelectorAll('#labels .label')].map(label => label.textContent)") == ["lamp"]
-    lit = columns(page, colour)
-    assert lit and min(lit) > 50  # the lamp is the right one of three
+    lit_columns = columns(page, colour)
+    assert lit_columns and min(lit_columns) > 50  # the lamp is the right one of three
     page.press("#scene", *splat_at(page, APPLE))
     page.until("document.querySelector('#what-words li')")
     assert text_of(page, "#what-words li").startswith("apple") and page.value(EXAMPLES) == []
@@ -432,13 +444,13 @@ def test_everything_is_named_and_one_word_is_seen_alone(page: Browser) -> None:
     assert page.value("splatlift.names.shown") is False and min(columns(page, AMBER)) > 50
 
 
-def test_link_to_the_words_of_a_table_says_so_in_the_form(page: Browser, served: Served) -> None:
+def test_link_to_the_words_of_a_table_says_so_in_the_form(page: Browser, server: PageServer) -> None:
     scene = make_scene()
-    table = httpx.put(f"{served.address}/assets/table", content=scene.table).json()["id"]
-    page.open(f"{served.address}/?lift={served.lift}&named=*&table={table}")
+    table = httpx.put(f"{server.address}/assets/table", content=scene.table).json()["id"]
+    page.open(f"{server.address}/?lift={server.lift}&named=*&table={table}")
     page.until("splatlift.names.shown && document.querySelectorAll('#vocabulary option').length === 3")
     assert page.value("document.querySelector('#vocabulary').value") == table
-    assert httpx.delete(f"{served.address}/assets/{table}").status_code == 204
+    assert httpx.delete(f"{server.address}/assets/{table}").status_code == 204
 
 
 def test_mask_under_a_click_is_an_example(page: Browser) -> None:
@@ -447,7 +459,7 @@ def test_mask_under_a_click_is_an_example(page: Browser) -> None:
     page.press("#pick-mask")
     page.press("#render", 0.95, 0.5)
     page.until(f"{EXAMPLES}.length === 1")
-    page.until(FOUND)
+    page.until(FIND_COLOUR)
     page.until("!document.querySelector('#outline').hidden")
     (example,) = page.value(EXAMPLES)
     assert example.startswith("region:") and page.value("splatlift.ask.now.count") > 0
@@ -469,10 +481,10 @@ def test_example_that_nothing_understands_is_told_and_taken_back(page: Browser) 
     page.write("#example", "left:7,12")
     page.press("#by-example button")
     page.until(f"{EXAMPLES}.join() === 'left:7,12'")
-    page.until(FOUND)
+    page.until(FIND_COLOUR)
     page.write("#example", "nowhere:1,1")
     page.press("#by-example button")
-    page.until(TROUBLE)
+    page.until(ERROR_SHOWN)
     assert "nowhere" in text_of(page, "#toast") and page.value(EXAMPLES) == ["left:7,12"]
 
 
@@ -489,7 +501,7 @@ def test_page_works_by_keyboard_alone(page: Browser) -> None:
     assert page.value("document.activeElement.id") == "words"
     page.write("#words", "lamp")
     page.key("Enter")
-    page.until(FOUND)
+    page.until(FIND_COLOUR)
     page.value("document.querySelector('#scene').focus()")
     before = page.value("splatlift.viewer.place3d")
     for key in ("ArrowLeft", "ArrowUp", "+"):
@@ -502,13 +514,13 @@ def test_page_works_by_keyboard_alone(page: Browser) -> None:
     page.key("]")
     assert page.value("document.querySelector('#view').value") == "middle"
     page.key("Enter")  # the book lies in the middle
-    page.until(f"{SETS}.length === 1 && {FOUND}")
+    page.until(f"{SETS}.length === 1 && {FIND_COLOUR}")
     assert text_of(page, "#chips .chip").startswith("book")
     page.key("?")
     assert page.value("document.querySelector('#help').open") is True
 
 
-def test_link_opens_question_layer_and_camera_again(page: Browser, served: Served) -> None:
+def test_link_opens_question_layer_and_camera_again(page: Browser, server: PageServer) -> None:
     ask(page, "apple, lamp")
     page.value("document.querySelector('#scene').focus()")
     page.key("ArrowRight")
@@ -519,28 +531,33 @@ def test_link_opens_question_layer_and_camera_again(page: Browser, served: Serve
     page.open("about:blank#")
     page.open(link)
     page.until(READY)
-    page.until(FOUND)
+    page.until(FIND_COLOUR)
     assert page.value(WORDS) == ["apple", "lamp"] and page.value("splatlift.look.what") == "pca"
     assert page.value("splatlift.viewer.place3d") == pytest.approx(place, rel=1e-3, abs=1e-3)
     rest = "instances=2&keep=largest&weight_by=odd"
-    page.open(f"{served.address}/?lift={served.lift}&view=right&text=apple&threshold=0.5&what=odd&show=odd&{rest}")
+    page.open(f"{server.address}/?lift={server.lift}&view=right&text=apple&threshold=0.5&what=odd&show=odd&{rest}")
     page.until(READY)
-    page.until(FOUND)
+    page.until(FIND_COLOUR)
     assert page.value("[splatlift.look.view.name, splatlift.ask.now.cut]") == ["right", 0.5]
     fields = dict(page.value("[...splatlift.ask.parameters(splatlift.ask.now)]"))
-    given = {"threshold": "0.5", "instances": "2", "keep": "largest", "absent": "keep"}  # a cut holds all the same
-    assert fields == {"lift": served.lift, "text": "apple", **given}
+    parameters = {
+        "threshold": "0.5",
+        "instances": "2",
+        "keep": "largest",
+        "absent": "keep",
+    }  # a cut holds all the same
+    assert fields == {"lift": server.lift, "text": "apple", **parameters}
     assert "instances=2" in page.value("location.search") and "weight_by" not in page.value("location.search")
     assert page.value("[splatlift.look.what, splatlift.look.mode]") == ["rgb", "scene"]
-    page.open(f"{served.address}/?lift={served.lift}&text=apple&weigh=confidence")  # by the field's old name
+    page.open(f"{server.address}/?lift={server.lift}&text=apple&weigh=confidence")  # by the field's old name
     page.until(READY)
     page.until("splatlift.ask.now !== null && splatlift.ask.now !== undefined")
     fields = dict(page.value("[...splatlift.ask.parameters(splatlift.ask.now)]"))
     assert fields["weight_by"] == "confidence" and "weigh" not in fields
 
 
-def test_link_to_a_scene_that_is_gone_leaves_the_others_to_choose(page: Browser, served: Served) -> None:
-    page.open(f"{served.address}/?lift={'0' * 32}")
+def test_link_to_a_scene_that_is_gone_leaves_the_others_to_choose(page: Browser, server: PageServer) -> None:
+    page.open(f"{server.address}/?lift={'0' * 32}")
     page.until("!document.querySelector('#trouble').hidden")
     assert text_of(page, "#lift option:checked") == "Choose a scene"
     choose = "(scenes => { scenes.selectedIndex = 1; scenes.dispatchEvent(new Event('change')); })"
@@ -562,7 +579,7 @@ def test_photo_view_shows_the_mask_and_takes_examples(page: Browser) -> None:
     page.drag("#render", (20.5 / 32, 2.5 / 24), (29.5 / 32, 21.5 / 24), shift=True)
     page.until("splatlift.ask.now.unlike.length === 1")
     assert page.value("splatlift.ask.now.unlike") == ["left:box:20,2,30,22"]
-    page.until(FOUND)
+    page.until(FIND_COLOUR)
     page.until("document.querySelectorAll('#picture .mark').length === 2")
     box = page.value("document.querySelector('#picture .mark.box.unlike').getBoundingClientRect().toJSON()")
     picture = page.value("document.querySelector('#render').getBoundingClientRect().toJSON()")
@@ -575,9 +592,9 @@ def test_photo_view_shows_the_mask_and_takes_examples(page: Browser) -> None:
         assert mask == pytest.approx(picture, abs=0.1), (width, height)
 
 
-def test_page_without_webgl_shows_the_views(served: Served, tmp_path: Path) -> None:
+def test_page_without_webgl_shows_the_views(server: PageServer, tmp_path: Path) -> None:
     with browsing(tmp_path, "--disable-3d-apis") as browser:
-        browser.open(served.address)
+        browser.open(server.address)
         browser.until("globalThis.splatlift?.lift && document.querySelector('#render').naturalWidth === 32")
         assert browser.value("document.querySelector('#stage').dataset.mode") == "view"
         ask(browser, "lamp")
@@ -618,15 +635,15 @@ def test_lines_to_take_away_ask_the_same(page: Browser) -> None:
     assert names["answer"]["count"] == page.value("splatlift.ask.now.count") > 0
     assert names["answer"]["threshold"]["value"] == pytest.approx(page.value("splatlift.ask.now.cut"))
     addresses = ["object", "boxes", "mask", "scores", "coloured"]
-    asked = f"{json.dumps(addresses)}.map(what => fetch(splatlift.take.address(what)).then(reply => reply.status))"
-    assert page.value(f"Promise.all({asked})") == [200] * 5
+    requests = f"{json.dumps(addresses)}.map(what => fetch(splatlift.take.address(what)).then(reply => reply.status))"
+    assert page.value(f"Promise.all({requests})") == [200] * 5
 
 
-def test_page_asks_for_a_key_where_one_is_needed(page: Browser, served: Served) -> None:
+def test_page_asks_for_a_key_where_one_is_needed(page: Browser, server: PageServer) -> None:
     """From here on the service is closed."""
-    key, secret = served.store.keys.create("page", frozenset({Scope.READ}), Quota())
+    key, secret = server.store.keys.create("page", frozenset({Scope.READ}), Quota())
     try:
-        page.open(served.address)
+        page.open(server.address)
         page.until("document.querySelector('#door').open")
         page.write("#key", "wrong")
         page.value("document.body.dataset.old = true")
@@ -638,14 +655,14 @@ def test_page_asks_for_a_key_where_one_is_needed(page: Browser, served: Served) 
         page.until("globalThis.splatlift && !document.querySelector('#empty').hidden")  # another's are not shown
         assert page.value("document.querySelector('#door').open") is False
     finally:
-        served.store.keys.revoke(key.id)
+        server.store.keys.revoke(key.id)
 
 
-def test_shared_scene_is_asked_by_its_link_and_changed_by_nobody(browser: Browser, served: Served) -> None:
+def test_shared_scene_is_asked_by_its_link_and_changed_by_nobody(browser: Browser, server: PageServer) -> None:
     """An owner makes the link on the page; who has it sees that scene, and nothing to change it with."""
-    owner, secret = served.store.keys.create("owner", frozenset({Scope.ADMIN}), Quota())
+    owner, secret = server.store.keys.create("owner", frozenset({Scope.ADMIN}), Quota())
     try:
-        browser.open(f"{served.address}/?lift={served.lift}#key={secret}")
+        browser.open(f"{server.address}/?lift={server.lift}#key={secret}")
         browser.until(f"{READY} && !location.hash && document.querySelector('#whose').textContent === 'owner'")
         browser.press("#tab-take")
         browser.write("#share-name", "Bob")
@@ -656,16 +673,16 @@ def test_shared_scene_is_asked_by_its_link_and_changed_by_nobody(browser: Browse
         browser.open("about:blank#")
         browser.open(link)
         browser.until(f"{READY} && document.querySelector('#whose').textContent.startsWith('Shared with Bob until')")
-        assert browser.value("location.href").startswith(f"{served.address}/?lift={served.lift}")
+        assert browser.value("location.href").startswith(f"{server.address}/?lift={server.lift}")
         assert link.partition("#key=")[2] not in browser.value("location.href + document.cookie")
         for selector in ("#tab-bring", "#sharing", "#by-hand", "#catalogue-list .edit"):
-            shown = f"[...document.querySelectorAll('{selector}')].some(one => one.checkVisibility())"
-            assert browser.value(shown) is False, selector
+            visible_columns = f"[...document.querySelectorAll('{selector}')].some(one => one.checkVisibility())"
+            assert browser.value(visible_columns) is False, selector
         ask(browser, "lamp")
         assert columns(browser, AMBER)
-        served.store.keys.revoke(owner.id)
-        browser.open(f"{served.address}/?again")
+        server.store.keys.revoke(owner.id)
+        browser.open(f"{server.address}/?again")
         browser.until("document.querySelector('#door').open")
     finally:
-        served.store.keys.revoke(owner.id)
+        server.store.keys.revoke(owner.id)
         browser.value("sessionStorage.clear()")

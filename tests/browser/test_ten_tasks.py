@@ -19,13 +19,13 @@ from service.routes import operations
 from tests.api.tiny_scene import make_scene
 
 from .browser import Browser
-from .conftest import Served, serving
-from .looking import AMBER, FOUND, READY, ask, columns, splat_at, text_of
+from .conftest import PageServer, serving
+from .looking import AMBER, FIND_COLOUR, READY, ask, columns, splat_at, text_of
 
 pytestmark = pytest.mark.slow
 APPLE = 5  # a splat of it
 ZIP = "splatlift.take.everything(true).then(() => document.querySelector('#toast').textContent)"
-BOTH = "splatlift.beside.scene && splatlift.beside.left.settled && splatlift.viewer.settled"
+BOTH_SETTLED = "splatlift.beside.scene && splatlift.beside.left.settled && splatlift.viewer.settled"
 
 
 @pytest.fixture
@@ -45,67 +45,67 @@ def empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 def pictures(page: Browser, width: int) -> Callable[[str], None]:
     folder = os.environ.get("SPLATLIFT_PICTURES")
 
-    def shown(name: str) -> None:
+    def save(name: str) -> None:
         assert page.value("document.documentElement.scrollWidth") <= width, name
         assert page.violations() == {}, name
         if folder:
             (Path(folder) / f"{width}-{name}.png").write_bytes(base64.b64decode(page.screenshot()))
 
-    return shown
+    return save
 
 
 @pytest.mark.parametrize(("width", "height"), [(1440, 900), (390, 844)])
 def test_ten_tasks_are_done_without_a_manual(
-    browser: Browser, served: Served, empty: str, other_lift: str, tmp_path: Path, width: int, height: int
+    browser: Browser, server: PageServer, empty: str, other_lift: str, tmp_path: Path, width: int, height: int
 ) -> None:
-    page, shown = browser, pictures(browser, width)
+    page, save_picture = browser, pictures(browser, width)
     page.window(width, height)
     page.open(empty)  # open the example
     page.until("!document.querySelector('#empty').hidden")
-    shown("0-empty")
+    save_picture("0-empty")
     page.press("#open-example")
     page.until(READY)
     ask(page, "lamp")
     assert len(columns(page, AMBER)) > 50
-    shown("1-example")
-    page.open(f"{served.address}/?lift={served.lift}")
+    save_picture("1-example")
+    page.open(f"{server.address}/?lift={server.lift}")
     page.until(READY)
     for word in ("book", "apple", "lamp"):  # find three things
         ask(page, word)
         assert len(columns(page, AMBER)) > 50
-    shown("2-found")
+    save_picture("2-found")
     page.press("#by-hand")  # correct one
-    page.until(f"splatlift.hand.selection?.version && {FOUND}")
-    shown("3-by-hand")
+    page.until(f"splatlift.hand.selection?.version && {FIND_COLOUR}")
+    save_picture("3-by-hand")
     x, y = splat_at(page, APPLE)
     page.drag("#scene", (x, y), (x, y + 0.02))
-    page.until(f"splatlift.hand.selection.step === 1 && !splatlift.hand.busy && {FOUND}")
+    page.until(f"splatlift.hand.selection.step === 1 && !splatlift.hand.busy && {FIND_COLOUR}")
     assert page.value("splatlift.ask.now.count") > 20
     page.write("#hand .name", "lamp and a bit")  # rename it
     page.key("Enter")
     page.until("splatlift.things.own[0]?.name === 'lamp and a bit'")
     assert page.value(ZIP) == "The ZIP is here."  # export all with names
     page.press("#hand button[title='Ctrl+Z']")  # undo
-    page.until(f"splatlift.hand.selection.step === 0 && !splatlift.hand.busy && {FOUND}")
+    page.until(f"splatlift.hand.selection.step === 0 && !splatlift.hand.busy && {FIND_COLOUR}")
     assert page.value("splatlift.ask.now.count") == 20
-    own = page.value("splatlift.things.own[0].id")
+    object_id = page.value("splatlift.things.own[0].id")
     page.press("#tab-bring")  # compare two lifts
     page.until("document.querySelector('#lifts [aria-label^=Compare]')")
     page.press("#lifts [aria-label^=Compare]")
-    page.until(f"splatlift.lift?.id === '{other_lift}' && {BOTH}")
+    page.until(f"splatlift.lift?.id === '{other_lift}' && {BOTH_SETTLED}")
     ask(page, "apple")
-    assert page.value("splatlift.beside.scene.id") == served.lift
-    shown("4-compared")
+    assert page.value("splatlift.beside.scene.id") == server.lift
+    save_picture("4-compared")
     link = page.value("location.href")  # share, and come back by the link
     page.open("about:blank#")
     page.open(link)
-    page.until(f"{READY} && {BOTH} && splatlift.ask.now?.answer")
+    page.until(f"{READY} && {BOTH_SETTLED} && splatlift.ask.now?.answer")
     assert page.value("splatlift.ask.now.text") == ["apple"] and "lamp and a bit" in text_of(page, "#beside-said")
-    shown("5-link")
+    save_picture("5-link")
     page.press("#end-compare")
     (tmp_path / "again.ply").write_bytes(make_scene().splats)  # bring a scene
     page.drop([tmp_path / "again.ply"])
     page.until("document.querySelector('#sent .file.done')")
-    shown("6-brought")
+    save_picture("6-brought")
     page.press("#sent .file .away")
-    assert httpx.delete(f"{served.address}/lifts/{served.lift}/selections/{own}").status_code == 204
+    assert httpx.delete(f"{server.address}/lifts/{server.lift}/selections/{object_id}").status_code == 204

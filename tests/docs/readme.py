@@ -35,8 +35,8 @@ def shell_commands(name: str) -> list[str]:
     """What lines of the shell blocks give to ``splatlift``, whatever stands before it."""
     lines = "\n".join(blocks(name, "sh")).splitlines()
     # Not the first of `run splatlift splatlift keys`, which names a service of the compose file.
-    found = [re.search(r"(?:^|[ (])(?:\.venv/bin/)?splatlift (?!splatlift )([^#()]+)", line) for line in lines]
-    return [match[1].strip() for match in found if match]
+    matches = [re.search(r"(?:^|[ (])(?:\.venv/bin/)?splatlift (?!splatlift )([^#()]+)", line) for line in lines]
+    return [match[1].strip() for match in matches if match]
 
 
 def site_text(name: str) -> str:

@@ -52,8 +52,8 @@ def test_links_lead_to_files_and_headings(document: str) -> None:
 @pytest.mark.parametrize("document", PAGES)
 def test_sources_modules_and_make_targets_that_are_named_exist(document: str) -> None:
     sources = {code for code in inline_code(document) if re.fullmatch(r"[\w/*]+\.py", code)}
-    rooms = [ROOT / room for room in ("", "liftcore", "service")]
-    assert not [name for name in sources if not any([*room.glob(name)] for room in rooms)]
+    folders = [ROOT / folder for folder in ("", "liftcore", "service")]
+    assert not [name for name in sources if not any([*folder.glob(name)] for folder in folders)]
     assert sources or document != "ARCHITECTURE.md"
     modules = set(re.findall(r"python -m ([a-z_]+(?:\.[a-z_]+)*)", text(document)))
     assert not [name for name in modules if find_spec(name) is None]
@@ -88,47 +88,47 @@ def test_commands_of_the_guide_parse() -> None:
 def test_commands_within_sentences_and_tables_parse(document: str, capsys: pytest.CaptureFixture[str]) -> None:
     codes = [code.removeprefix(".venv/bin/") for code in inline_code(document)]
     for command in (shlex.split(code)[1:] for code in codes if code.startswith("splatlift ")):
-        known = {option for action in _actions(_commands()[command[0]]) for option in action.option_strings}
-        assert {word for word in command if word.startswith("--")} <= known, command
+        options = {option for action in _actions(_commands()[command[0]]) for option in action.option_strings}
+        assert {word for word in command if word.startswith("--")} <= options, command
         try:
             build_parser().parse_args(command)
         except SystemExit as end:  # it asks for help, names a command and no more, or has NAME for one of its words
-            said = capsys.readouterr().err
-            assert not end.code or "arguments are required" in said or "choice: 'NAME'" in said, said
+            output = capsys.readouterr().err
+            assert not end.code or "arguments are required" in output or "choice: 'NAME'" in output, output
 
 
 def test_commands_that_errors_and_hints_name_exist() -> None:
-    named = {words for room in ("liftcore", "service") for words in _named_in_sentences(ROOT / room)}
-    assert {"pack retag", "keys create", "store rebuild", "pack npy"} <= {" ".join(words) for words in named}
-    for words in named:
+    documented = {words for folder in ("liftcore", "service") for words in _named_in_sentences(ROOT / folder)}
+    assert {"pack retag", "keys create", "store rebuild", "pack npy"} <= {" ".join(words) for words in documented}
+    for words in documented:
         parser = _commands()[words[0]]
         nested = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
         assert not nested or len(words) == 1 or words[1] in nested[0].choices, words
-        known = {option for action in _actions(parser) for option in action.option_strings}
-        assert {word for word in words if word.startswith("--")} <= known, words
+        options = {option for action in _actions(parser) for option in action.option_strings}
+        assert {word for word in words if word.startswith("--")} <= options, words
 
 
-def _named_in_sentences(room: Path) -> Iterator[tuple[str, ...]]:
+def _named_in_sentences(folder: Path) -> Iterator[tuple[str, ...]]:
     """Commands with their options, of all strings of the sources but names of programs."""
-    for path in sorted(room.rglob("*.py")):
+    for path in sorted(folder.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.JoinedStr):
                 parts = (part.value if isinstance(part, ast.Constant) else "X" for part in node.values)
-                told = "".join(map(str, parts))
+                sentence = "".join(map(str, parts))
             else:
-                told = node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) else ""
-            for found in re.findall(r"splatlift ([a-z]+(?: (?:--?)?[\w./={}-]+)*)", told):
-                command, *more = found.split()
+                sentence = node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) else ""
+            for command_text in re.findall(r"splatlift ([a-z]+(?: (?:--?)?[\w./={}-]+)*)", sentence):
+                command, *words = command_text.split()
                 if command in _commands():
-                    nested = more[:1] if command in ("pack", "keys", "store") else []
-                    yield (command, *nested, *(word.rstrip(".") for word in more if word.startswith("--")))
+                    nested = words[:1] if command in ("pack", "keys", "store") else []
+                    yield (command, *nested, *(word.rstrip(".") for word in words if word.startswith("--")))
 
 
 def test_every_command_is_told_and_every_option_has_help() -> None:
     parsers = _commands()
     sentences = (code.removeprefix("splatlift ") for code in inline_code(GUIDE) if code.startswith("splatlift "))
-    told = {command.split()[0] for command in (*shell_commands(GUIDE), *sentences)}
-    assert parsers.keys() <= told and all((SERVICE_COMMANDS | COMMANDS).values())
+    sentence = {command.split()[0] for command in (*shell_commands(GUIDE), *sentences)}
+    assert parsers.keys() <= sentence and all((SERVICE_COMMANDS | COMMANDS).values())
     for name, parser in parsers.items():
         assert not [action.dest for action in _actions(parser) if action.option_strings and not action.help], name
 
@@ -191,22 +191,24 @@ def test_the_services_help_tells_every_setting_with_its_default_and_meaning(
     with pytest.raises(SystemExit, match="0"):
         build_parser().parse_args(["serve", "--help"])
     lines = capsys.readouterr().out.partition("environment variables")[2]
-    told = dict(re.findall(r"^  SPLATLIFT_([A-Z_]+), default (.*)$", lines, flags=re.MULTILINE))
-    assert told.keys() == {field.upper() for field in ServiceSettings.model_fields}
+    sentence = dict(re.findall(r"^  SPLATLIFT_([A-Z_]+), default (.*)$", lines, flags=re.MULTILINE))
+    assert sentence.keys() == {field.upper() for field in ServiceSettings.model_fields}
     for name, field in ServiceSettings.model_fields.items():
         default = field.get_default(call_default_factory=True)
-        assert told[name.upper()].split(" (")[0] == ("not set" if default in (None, ()) else str(default)), name
+        assert sentence[name.upper()].split(" (")[0] == ("not set" if default in (None, ()) else str(default)), name
         assert field.description and " ".join(field.description.split()) in " ".join(lines.split()), name
 
 
 def test_settings_of_the_service_that_are_told_exist_and_have_that_default() -> None:
-    told = dict(re.findall(r"^\| `SPLATLIFT_([A-Z_]+)` \| (.*?) \|", text(SERVICE), flags=re.MULTILINE))
-    assert {"DATA", "HOST", "KEYS", "TEXT_SPACES"} <= told.keys()
-    for name, shown in told.items():
+    sentence = dict(re.findall(r"^\| `SPLATLIFT_([A-Z_]+)` \| (.*?) \|", text(SERVICE), flags=re.MULTILINE))
+    assert {"DATA", "HOST", "KEYS", "TEXT_SPACES"} <= sentence.keys()
+    for name, documented_default in sentence.items():
         default = ServiceSettings.model_fields[name.lower()].get_default(call_default_factory=True)
-        assert shown.split(" (")[0].strip("`") == ("-" if default in (None, (), "") else str(default)), name
-    named = {name.lower() for page in PAGES for name in re.findall(r"SPLATLIFT_([A-Z_]+)", text(page))}
-    assert named - {"key"} <= ServiceSettings.model_fields.keys()
+        assert documented_default.split(" (")[0].strip("`") == ("-" if default in (None, (), "") else str(default)), (
+            name
+        )
+    documented = {name.lower() for page in PAGES for name in re.findall(r"SPLATLIFT_([A-Z_]+)", text(page))}
+    assert documented - {"key"} <= ServiceSettings.model_fields.keys()
 
 
 def _commands() -> dict[str, argparse.ArgumentParser]:

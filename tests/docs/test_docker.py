@@ -26,23 +26,23 @@ DEFAULTS = ServiceSettings.model_construct()
 def instructions() -> list[tuple[str, str]]:
     """The instructions of the Dockerfile: name and arguments, continued lines joined."""
     lines = [line for line in text("docker/Dockerfile").splitlines() if not line.startswith("#")]
-    whole = re.sub(r"\\\n\s*", "", "\n".join(lines))
-    return [(line.split()[0], line.split(maxsplit=1)[1]) for line in whole.splitlines() if line.strip()]
+    joined_lines = re.sub(r"\\\n\s*", "", "\n".join(lines))
+    return [(line.split()[0], line.split(maxsplit=1)[1]) for line in joined_lines.splitlines() if line.strip()]
 
 
-def given(name: str) -> list[str]:
-    return [arguments for found, arguments in instructions() if found == name]
+def arguments_of(name: str) -> list[str]:
+    return [arguments for instruction, arguments in instructions() if instruction == name]
 
 
 def environment() -> dict[str, str]:
-    return dict(re.findall(r"([A-Z_]+)=(\S*)", " ".join(given("ENV"))))
+    return dict(re.findall(r"([A-Z_]+)=(\S*)", " ".join(arguments_of("ENV"))))
 
 
 def services() -> dict[str, Any]:
     """Those that are this service: the proxy is built by others."""
-    found = yaml.safe_load(text("docker/compose.yaml"))["services"]
-    assert found.pop("proxy")["volumes"][0] == "./Caddyfile:/etc/caddy/Caddyfile:ro"
-    return found
+    instruction = yaml.safe_load(text("docker/compose.yaml"))["services"]
+    assert instruction.pop("proxy")["volumes"][0] == "./Caddyfile:/etc/caddy/Caddyfile:ro"
+    return instruction
 
 
 def test_the_proxy_has_the_limits_of_the_service() -> None:
@@ -55,54 +55,54 @@ def test_the_proxy_has_the_limits_of_the_service() -> None:
     assert f"request_buffers {mib}MiB" in caddy  # a body of JSON that is slow to come waits there
     assert f"splatlift:{DEFAULTS.port}" in caddy and "Host localhost" in caddy
     uploads = re.findall(r"@(\w+) \{\s+method (.+)\s+path (.+)\s+\}\s+request_body @\1 ", caddy)
-    taken = [("PUT POST", "/assets /assets/*"), ("POST", "/lifts")]
-    assert [(methods, paths) for _, methods, paths in uploads] == taken
-    assert re.findall(r"not \{\s+method (.+)\s+path (.+)", caddy) == taken
+    limits = [("PUT POST", "/assets /assets/*"), ("POST", "/lifts")]
+    assert [(methods, paths) for _, methods, paths in uploads] == limits
+    assert re.findall(r"not \{\s+method (.+)\s+path (.+)", caddy) == limits
     assert "health_uri /healthz" in caddy  # what must come through on a full disk does
 
 
 def test_the_service_believes_the_proxy_alone_about_clients() -> None:
     compose = yaml.safe_load(text("docker/compose.yaml"))
     address = compose["services"]["proxy"]["networks"]["default"]["ipv4_address"]
-    assert {one["environment"]["SPLATLIFT_FORWARDED_ALLOW"] for one in services().values()} == {address}
+    assert {service["environment"]["SPLATLIFT_FORWARDED_ALLOW"] for service in services().values()} == {address}
     (network,) = compose["networks"]["default"]["ipam"]["config"]
     default = ipaddress.ip_address(address.rpartition(":-")[2].rstrip("}"))
     assert default in ipaddress.ip_network(network["subnet"].rpartition(":-")[2].rstrip("}"))
 
 
 def health_check() -> list[str]:
-    (check,) = given("HEALTHCHECK")
+    (check,) = arguments_of("HEALTHCHECK")
     return json.loads(check.partition(" CMD ")[2])
 
 
 def test_everything_that_is_copied_is_here_and_in_the_build_context() -> None:
-    kept = [line[1:] for line in text(".dockerignore").splitlines() if line.startswith("!")]
-    copied = [words.split() for words in given("COPY") if "--from=" not in words]
+    exceptions = [line[1:] for line in text(".dockerignore").splitlines() if line.startswith("!")]
+    copied = [words.split() for words in arguments_of("COPY") if "--from=" not in words]
     assert copied
     for source in (source for words in copied for source in words[:-1]):
         assert (ROOT / source).exists(), source
-        assert any(fnmatch(source, name) for name in kept), source
-    assert {source for words in copied for source in words[:-1]} == set(kept)
+        assert any(fnmatch(source, name) for name in exceptions), source
+    assert {source for words in copied for source in words[:-1]} == set(exceptions)
 
 
 FILES = ("docker/Dockerfile", "docker/compose.yaml", "docker/compose.ray.yaml")
 
 
 def test_every_variable_is_a_setting() -> None:
-    named = set(re.findall(r"SPLATLIFT_[A-Z_]+", "".join(map(text, FILES))))
-    assert named
-    assert {name.removeprefix("SPLATLIFT_").lower() for name in named} <= ServiceSettings.model_fields.keys()
+    variables = set(re.findall(r"SPLATLIFT_[A-Z_]+", "".join(map(text, FILES))))
+    assert variables
+    assert {name.removeprefix("SPLATLIFT_").lower() for name in variables} <= ServiceSettings.model_fields.keys()
 
 
 def test_the_port_is_the_services_own_everywhere() -> None:
-    assert given("EXPOSE") == [str(DEFAULTS.port)]
+    assert arguments_of("EXPOSE") == [str(DEFAULTS.port)]
     assert f"(os.environ.get('SPLATLIFT_PORT') or {DEFAULTS.port})" in " ".join(health_check())
     for service in services().values():
         assert service["ports"] == [f"127.0.0.1:{DEFAULTS.port}:{DEFAULTS.port}"]
 
 
 def test_versions_come_from_the_lock_and_torch_is_first() -> None:
-    installs = [run for run in given("RUN") if "pip install" in run]
+    installs = [run for run in arguments_of("RUN") if "pip install" in run]
     assert "^(torch(vision)?==" in installs[0] and "requirements.lock" in installs[0]
     hashed = next(k for k, run in enumerate(installs) if "--require-hashes --requirement runtime.lock" in run)
     assert hashed > 0 and all("--no-deps" in run for run in installs[:hashed])  # else torch's needs come without
@@ -110,31 +110,31 @@ def test_versions_come_from_the_lock_and_torch_is_first() -> None:
     assert not any("--constraint requirements.lock" in run for run in installs)  # its digests would be asked of all
     locked = {line.split("==")[0].lower().replace("_", "-") for line in text("requirements.lock").splitlines()}
     assert all("--hash=sha256:" in block for block in re.split(r"\n(?=[a-z])", text("requirements.lock"))[1:])
-    needed = re.search(r"^dependencies = \[(.*?)^\]", text("pyproject.toml"), flags=re.MULTILINE | re.DOTALL)
-    assert needed is not None
-    names = {name.lower().replace("_", "-") for name in re.findall(r'"([A-Za-z0-9_.-]+)', needed[1])}
+    dependencies = re.search(r"^dependencies = \[(.*?)^\]", text("pyproject.toml"), flags=re.MULTILINE | re.DOTALL)
+    assert dependencies is not None
+    names = {name.lower().replace("_", "-") for name in re.findall(r'"([A-Za-z0-9_.-]+)', dependencies[1])}
     assert names <= locked
 
 
 def test_one_version_is_told_everywhere() -> None:
     assert f'\nversion = "{__version__}"\n' in text("pyproject.toml")
     versions = re.findall(r"^## ([\d.]+)(.*)$", text("CHANGELOG.md"), re.MULTILINE)
-    assert next(version for version, more in versions if "not released" not in more) == __version__
+    assert next(version for version, note in versions if "not released" not in note) == __version__
     assert set(re.findall(r"splatlift:([\d.]+)", text("docker/Dockerfile"))) == {__version__}
 
 
 def test_the_service_is_no_root_and_gets_its_signals() -> None:
     names = [name for name, _ in instructions()]
-    assert names.index("USER") < names.index("CMD") and given("USER") != ["root"]
-    assert json.loads(given("ENTRYPOINT")[0])[0].endswith("tini")
-    assert json.loads(given("CMD")[0]) == ["python", "-m", "service"]  # exec form: no shell between
+    assert names.index("USER") < names.index("CMD") and arguments_of("USER") != ["root"]
+    assert json.loads(arguments_of("ENTRYPOINT")[0])[0].endswith("tini")
+    assert json.loads(arguments_of("CMD")[0]) == ["python", "-m", "service"]  # exec form: no shell between
     for service in services().values():
         assert float(service["stop_grace_period"].rstrip("s")) > DEFAULTS.notice_seconds + DEFAULTS.stop_seconds
         assert service["read_only"] and service["cap_drop"] == ["ALL"] and service["mem_limit"]
 
 
 def test_what_is_written_lies_in_the_volume() -> None:
-    assert given("VOLUME") == ["/data"]
+    assert arguments_of("VOLUME") == ["/data"]
     for name in ("SPLATLIFT_DATA", "XDG_CACHE_HOME"):
         assert Path(environment()[name]).is_relative_to("/data")
     assert all("data:/data" in service["volumes"] for service in services().values())
@@ -145,7 +145,7 @@ def test_health_check_tells_a_live_server_from_a_dead_one(tmp_path: Path) -> Non
     assert program == "python"
     with ServiceProcess(tmp_path, "--behaviour", "answer") as service:
         port = os.environ | {"SPLATLIFT_PORT": str(service.client.base_url.port)}
-        asked = [sys.executable, *command]
-        assert subprocess.run(asked, env=port, capture_output=True, timeout=60, check=False).returncode == 0
+        command_line = [sys.executable, *command]
+        assert subprocess.run(command_line, env=port, capture_output=True, timeout=60, check=False).returncode == 0
         service.kill()
-        assert subprocess.run(asked, env=port, capture_output=True, timeout=60, check=False).returncode != 0
+        assert subprocess.run(command_line, env=port, capture_output=True, timeout=60, check=False).returncode != 0

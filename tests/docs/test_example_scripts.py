@@ -53,15 +53,15 @@ def test_sam_masks_become_things_that_are_exported(tiny: Path) -> None:
     for view, labels in tiny_scene.labels().items():
         masks = labels[0] == np.arange(3)[:, None, None]
         np.savez(tiny / "masks" / f"{view}.npz", masks=masks, vectors=tiny_scene.codebook())
-    told = run("sam_masks.py", tiny / "splats.ply", tiny / "cameras.json", tiny / "masks", tiny / "things.ply")
-    assert told.count("20 splats about") == 3
+    output = run("sam_masks.py", tiny / "splats.ply", tiny / "cameras.json", tiny / "masks", tiny / "things.ply")
+    assert output.count("20 splats about") == 3
     assert sorted(np.unique(lc.read_splats(tiny / "things.ply").extras["instance_id"])) == [1, 2, 3]  # 0 is none
 
 
 @pytest.mark.slow
 def test_where_is_it_tells_places_before_the_camera_that_asks(tiny: Path) -> None:
-    asked = (tiny / "lift.safetensors", "lamp", "--view", "middle", "--table", tiny / "table.safetensors")
-    x, y, z = (float(word) for word in run("where_is_it.py", *asked).split() if word[0] in "+-")
+    arguments = (tiny / "lift.safetensors", "lamp", "--view", "middle", "--table", tiny / "table.safetensors")
+    x, y, z = (float(word) for word in run("where_is_it.py", *arguments).split() if word[0] in "+-")
     assert np.allclose([x, y, z], [1.2, 0.0, tiny_scene.DISTANCE], atol=0.25)
 
 
@@ -128,5 +128,5 @@ def test_lift_and_mask_writes_masks_of_all_views_and_the_scores(tmp_path: Path) 
 @pytest.mark.slow
 def test_an_encoder_of_ones_own_passes_the_suite() -> None:
     suite = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "examples/test_my_encoder.py"]
-    told = subprocess.run(suite, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert told.returncode == 0 and "." * 5 in told.stdout, told.stdout
+    output = subprocess.run(suite, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert output.returncode == 0 and "." * 5 in output.stdout, output.stdout

@@ -75,9 +75,9 @@ def test_python_example_of_files_finds_the_apple(page: str, scene_folder: Path) 
     names = run_example(page, 'read_splats("scene.ply")')
     result, means = lc.load_lift("scene.lift.safetensors"), names["splats"].means
     assert torch.equal(result.features, names["result"].features)
-    found = names["apple"].splats
-    assert torch.equal(found, result.query(codebook()[WORDS.index("apple")]).splats)
-    assert found.any() and float(means[found, 0].max()) < 0  # the apple is the cluster on the left
+    selected = names["apple"].splats
+    assert torch.equal(selected, result.query(codebook()[WORDS.index("apple")]).splats)
+    assert selected.any() and float(means[selected, 0].max()) < 0  # the apple is the cluster on the left
     assert len(names["apple"].objects.objects) == 1
 
 
@@ -231,8 +231,8 @@ def test_questions_of_the_guide_are_answered(scene_folder: Path, capsys: pytest.
     capsys.readouterr()
     assert [command[0] for command in commands] == ["query"] * 4 + ["segment"] * 2 + ["objects", "export", "objects"]
     assert [main(command) for command in commands] == [0] * len(commands)
-    told = capsys.readouterr().out
-    assert "3 of 3 words found" in told and "middle:6,12: apple " in told
+    output = capsys.readouterr().out
+    assert "3 of 3 words found" in output and "middle:6,12: apple " in output
     assert all((scene_folder / name).is_file() for name in ("like.png", "words.png", "seen.png", "scores.ply"))
 
 
@@ -246,26 +246,26 @@ def test_another_encoders_vectors_take_the_same_weights(scene_folder: Path) -> N
 
 def test_json_examples_show_fields_that_the_service_sends() -> None:
     examples = [json.loads(block) for block in blocks(SERVICE, "json")]
-    seen = set()
+    documented_fields = set()
     for example in examples:
         model = next(model for field, model in SHAPES.items() if field in example)
         assert example.keys() <= model.model_fields.keys() | model.model_computed_fields.keys()
-        seen.add(model)
-    assert seen == set(SHAPES.values())
+        documented_fields.add(model)
+    assert documented_fields == set(SHAPES.values())
 
 
 def test_every_route_is_in_the_sites_table_and_no_other() -> None:
     rows = site_text(SERVICE).partition("| route | answer")[2]
-    named = set(re.findall(r"^\| `([A-Z]+ /[^`]*)` \| .", rows, flags=re.MULTILINE))
+    documented = set(re.findall(r"^\| `([A-Z]+ /[^`]*)` \| .", rows, flags=re.MULTILINE))
     real = set()
     for module in ROUTES:
         for route in module.router.routes:
             assert isinstance(route, APIRoute)
             real |= {f"{method} {route.path}" for method in route.methods or ()}
     in_a_sentence = {f"GET {path}" for path in OPEN if path.startswith(("/openapi", "/docs", "/web"))}
-    assert named == real - in_a_sentence
+    assert documented == real - in_a_sentence
     overview = text(SERVICE).partition("## Routes")[2].partition("\n## ")[0]
-    families = {f"/{route.split('/')[1]}" for route in named} - {"/"}
+    families = {f"/{route.split('/')[1]}" for route in documented} - {"/"}
     assert families <= set(re.findall(r"`(/[a-z]+)`", overview))
 
 
@@ -277,10 +277,10 @@ SCALE = 0.2
 
 def similarity() -> np.ndarray:
     """[4, 4], from the frame of the camera files to that of the splats."""
-    moved = np.eye(4)
-    moved[:3, :3] = SCALE * Rotation.from_euler("xyz", [10, 130, -40], degrees=True).as_matrix()
-    moved[:3, 3] = (0.5, -2.0, 1.0)
-    return moved
+    transform = np.eye(4)
+    transform[:3, :3] = SCALE * Rotation.from_euler("xyz", [10, 130, -40], degrees=True).as_matrix()
+    transform[:3, 3] = (0.5, -2.0, 1.0)
+    return transform
 
 
 def commands() -> list[list[str]]:
@@ -305,8 +305,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "data" / "transforms.json").write_text(json.dumps({**document, "ply_file_path": "sparse_pc.ply"}))
     run = tmp_path / commands()[0][1]
     run.parent.mkdir(parents=True)
-    told = similarity()[:3] / np.array([[SCALE]])
-    run.write_text(json.dumps({"transform": told.tolist(), "scale": SCALE}))
+    output = similarity()[:3] / np.array([[SCALE]])
+    run.write_text(json.dumps({"transform": output.tolist(), "scale": SCALE}))
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -321,8 +321,8 @@ def test_lift_of_nerfstudios_scene_finds_the_apple(folder: Path, capsys: pytest.
     assert "Put its run's dataparser_transforms.json beside them" in capsys.readouterr().out
     shutil.copy(*copy[1:])
     assert [main(command[1:]) for command in splatlift] == [0, 0]
-    said = capsys.readouterr().out
-    assert "dataparser_transforms.json" in said and "Put its run's" not in said
+    output = capsys.readouterr().out
+    assert "dataparser_transforms.json" in output and "Put its run's" not in output
     question = ["query", "plants.lift.safetensors", "apple", "--table", "words.safetensors", "--view", "middle"]
     assert main([*question, "--mask", "apple.png"]) == 0
     with Image.open("apple.png") as mask:
@@ -331,8 +331,8 @@ def test_lift_of_nerfstudios_scene_finds_the_apple(folder: Path, capsys: pytest.
     with zipfile.ZipFile(packed[4], "w") as archive:
         for name in packed[5:]:
             archive.write(name, Path(name).name)
-    one, other = (read_cameras(Path(path)).values() for path in ("data", packed[4]))
-    assert [view.viewmat.tolist() for view in one] == [view.viewmat.tolist() for view in other]
+    original, other = (read_cameras(Path(path)).values() for path in ("data", packed[4]))
+    assert [view.viewmat.tolist() for view in original] == [view.viewmat.tolist() for view in other]
 
 
 def test_transform_of_gsplat_is_written_and_read(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -430,8 +430,8 @@ def test_tensors_of_a_training_loop_lift_as_their_files_do(loop: dict[str, Any],
     exec(five[4], loop)
 
     write_splats(tmp_path / "scene.ply", loop["splats"])
-    named = [lc.Camera(viewmat, K, WIDTH, HEIGHT, name=name) for name, viewmat, K in loop["poses"]]
-    write_inria_cameras(lc.Cameras(tuple(named)), tmp_path / "cameras.json")
+    documented = [lc.Camera(viewmat, K, WIDTH, HEIGHT, name=name) for name, viewmat, K in loop["poses"]]
+    write_inria_cameras(lc.Cameras(tuple(documented)), tmp_path / "cameras.json")
     grids = {name: lc.FeatureGrid(loop["encode"](photo)) for name, photo in loop["photos"]}
     write_pack(tmp_path / "features.safetensors", grids, {})
     filed = lc.lift(
