@@ -258,7 +258,7 @@ class Parameters(Generic[M]):
 
 
 def get_and_post(router: APIRouter, path: str, parameters: Parameters[Any], **route: Any) -> Callable[[F], F]:
-    """Register an endpoint for a GET with parameters and for a POST with the same as JSON: its argument ``asked``."""
+    """Register an endpoint with an argument ``parameters`` for GET, and for a POST of the same as JSON."""
 
     def register(endpoint: F) -> F:
         answers = {"responses": route["responses"] | TAGGED} if "responses" in route else {}
@@ -272,7 +272,7 @@ def get_and_post(router: APIRouter, path: str, parameters: Parameters[Any], **ro
 
 
 def _reading(endpoint: F, source: Any) -> F:
-    """Return the endpoint, with the argument ``asked`` from there."""
+    """Return the endpoint, with the argument ``parameters`` from there."""
 
     @wraps(endpoint)
     def reading(**arguments: Any) -> Any:
@@ -280,7 +280,7 @@ def _reading(endpoint: F, source: Any) -> F:
 
     signature = inspect.signature(endpoint, eval_str=True)
     parameters = [
-        parameter.replace(annotation=source) if parameter.name == "asked" else parameter
+        parameter.replace(annotation=source) if parameter.name == "parameters" else parameter
         for parameter in signature.parameters.values()
     ]
     reading.__signature__ = signature.replace(parameters=parameters)  # pyright: ignore[reportAttributeAccessIssue]

@@ -42,7 +42,7 @@ from service.state import AppState, Deps
 from service.store.assets import kernel_of
 from service.store.lifts import LiftRecord
 
-# What routes ask of the query process: requests with the files of a lift and an encoder, and answers with a tag
+# Requests to the query process: requests with the files of a lift and an encoder, and answers with a tag
 
 EXPORT_BYTES = 16  # of a splat's labels
 ROW_BYTES, SCORE_BYTES = 32, 4  # of a splat in the .splat format, and in an array
@@ -60,7 +60,7 @@ MEDIA_TYPES = {
 
 
 # The body is read before this listens, as both listen to the client.
-async def _asking(request: Request, deps: Deps) -> AsyncIterator[Callable[[dict[str, Any]], Frame]]:
+async def query_process(request: Request, deps: Deps) -> AsyncIterator[Callable[[dict[str, Any]], Frame]]:
     """Ask the query process for this caller, who may leave: a query that waits then is not answered."""
     waiter = Waiter(deps.caller.key or "")
 
@@ -71,20 +71,20 @@ async def _asking(request: Request, deps: Deps) -> AsyncIterator[Callable[[dict[
 
     listening = asyncio.create_task(listen())
     try:
-        yield lambda wanted: deps.queries.call(wanted, waiter)
+        yield lambda worker_request: deps.queries.call(worker_request, waiter)
     finally:
         listening.cancel()
 
 
-Ask = Annotated[Callable[[dict[str, Any]], Frame], Depends(_asking, scope="function")]
+Ask = Annotated[Callable[[dict[str, Any]], Frame], Depends(query_process, scope="function")]
 
 
 def tagged_answer(
     request: Request, deps: AppState, worker_request: dict[str, Any], lift: LiftRecord, ask: Ask
 ) -> Response:
-    """304 when the client has it already, and nothing is asked; else it. The tag is made of all that decides it.
+    """Return the answer, or 304 if the client has it. The tag is a digest of all inputs.
 
-    What a POST asks for has no address, and so no tag.
+    The answer to a POST has no address, and so no tag.
     """
     if request.method == "POST":
         return binary_response(deps, worker_request, lift, ask, {})
@@ -154,21 +154,25 @@ def scene_request(operation: str, lift: LiftRecord, deps: AppState) -> dict[str,
     }
 
 
-def query_request(operation: str, asked: models.Question, lift: LiftRecord, deps: AppState) -> dict[str, Any]:
+def query_request(operation: str, parameters: models.Question, lift: LiftRecord, deps: AppState) -> dict[str, Any]:
     """The same with a query; texts bring their encoder, and examples of regions the lift's feature packs."""
     request: dict[str, Any] = scene_request(operation, lift, deps)
     selection_ids = [
-        str(item).removeprefix(SELECTION) for item in (*asked.sets, *asked.like, *asked.unlike) if _selects(item)
+        str(item).removeprefix(SELECTION)
+        for item in (*parameters.sets, *parameters.like, *parameters.unlike)
+        if _selects(item)
     ]
     if selection_ids:
         selections = {
             name: deps.store.selections.get(deps.owner, lift.id, name) for name in dict.fromkeys(selection_ids)
         }
         request["selections"] = {name: bits_of(deps.store.selections.bits(item)) for name, item in selections.items()}
-    request = with_encoder(request, asked, lift, deps) if asked.texts else {**request, **NO_ENCODER}
-    if any(isinstance(example, str) and example.startswith(REGION) for example in (*asked.like, *asked.unlike)):
+    request = with_encoder(request, parameters, lift, deps) if parameters.texts else {**request, **NO_ENCODER}
+    if any(
+        isinstance(example, str) and example.startswith(REGION) for example in (*parameters.like, *parameters.unlike)
+    ):
         request = with_packs(request, lift, deps, "like")
-    return request | {"query": asked.model_dump(mode="json", include=set(Query.deciding()))}
+    return request | {"query": parameters.model_dump(mode="json", include=set(Query.deciding()))}
 
 
 def _selects(example: object) -> bool:
@@ -180,16 +184,16 @@ def bits_of(bits: bytes) -> str:
     return base64.b64encode(bits).decode()
 
 
-def seen_from(asked: models.Viewpoint) -> dict[str, Any]:
+def seen_from(parameters: models.Viewpoint) -> dict[str, Any]:
     """The camera of a picture: a view of the lift, or one of the client's own.
 
     Raises:
         InvalidRequest: neither is there, or both are.
     """
-    if (asked.view is None) == (asked.camera is None):
-        expected, got = "a view's name or a camera", "nothing" if asked.view is None else "both"
+    if (parameters.view is None) == (parameters.camera is None):
+        expected, got = "a view's name or a camera", "nothing" if parameters.view is None else "both"
         raise InvalidRequest("view", expected=expected, got=got, hint="in the body of the request")
-    return {"view": asked.view} if asked.camera is None else {"camera": asked.camera.model_dump()}
+    return {"view": parameters.view} if parameters.camera is None else {"camera": parameters.camera.model_dump()}
 
 
 def with_packs(request: dict[str, Any], lift: LiftRecord, deps: AppState, argument: str) -> dict[str, Any]:
@@ -212,7 +216,7 @@ def _with_packs_here(request: dict[str, Any], lift: LiftRecord, deps: AppState) 
 
 
 def with_encoder(
-    request: dict[str, Any], asked: models.LiftQuestion | models.NodesRequest, lift: LiftRecord, deps: AppState
+    request: dict[str, Any], parameters: models.LiftQuestion | models.NodesRequest, lift: LiftRecord, deps: AppState
 ) -> dict[str, Any]:
     """The request with the encoder of its words: an uploaded table, the lift's, or one of the operator.
 
@@ -220,15 +224,18 @@ def with_encoder(
         InvalidRequest: there is none of the lift's space, or of two names.
         NotFound: there is no such table.
     """
-    names, table_id = dict(request["names"]), asked.table
-    if table_id is None and asked.encoder in (None, lift.metadata["text_space"]):  # the words that came with the lift
+    names, table_id = dict(request["names"]), parameters.table
+    if table_id is None and parameters.encoder in (
+        None,
+        lift.metadata["text_space"],
+    ):  # the words that came with the lift
         table_id = deps.store.jobs.get(deps.owner, lift.id).parameters.get("table")
     if table_id is None:
-        spec = encoder_spec(deps.settings, lift.metadata["text_space"], asked.encoder)
+        spec = encoder_spec(deps.settings, lift.metadata["text_space"], parameters.encoder)
         file = encoder_file(spec)
         if file is not None:
             names |= {str(file): "the encoder's file", f"text table {file.name}": "the text table"}
-    elif asked.table is not None and asked.encoder is not None:
+    elif parameters.table is not None and parameters.encoder is not None:
         raise InvalidRequest("table", expected="table or encoder", got="both", hint="leave one of them out")
     else:
         table = deps.store.assets.get(deps.owner, table_id)
@@ -245,88 +252,88 @@ router = APIRouter(tags=["queries"], route_class=JsonRoute)
 
 
 def bytes_of(media_type: str) -> dict[int | str, dict[str, Any]]:
-    """What OpenAPI tells of an answer that is a file."""
+    """Return the OpenAPI description of an answer that is a file."""
     return {200: {"content": {media_type: {"schema": {"type": "string", "format": "binary"}}}}}
 
 
 PNG, NPY, PLY = bytes_of(PNG_TYPE), bytes_of(NPY_TYPE), bytes_of(BINARY)
 TERMS = (*LiftQuestion.model_fields, *Query.deciding())
-ASKED, WHERE = Parameters(Question, TERMS), Parameters(Question, (*TERMS, "view", "top"))
+ANSWER, ANSWER_IN_VIEW = Parameters(Question, TERMS), Parameters(Question, (*TERMS, "view", "top"))
 IN_VIEW = Parameters(Question, (*TERMS, "view"), needs=("view",))
 PICTURE = Parameters(RenderRequest, ("lift", "view", "channel"), needs=("view",))
 
 
-@get_and_post(router, "/query", WHERE, response_model=QueryAnswer)
-def query(asked: Question, deps: Deps, ask: Ask) -> dict[str, Any]:
-    """Where it is: scores in numbers, the best splats, a box, and links to objects, splats and pictures.
+@get_and_post(router, "/query", ANSWER_IN_VIEW, response_model=QueryAnswer)
+def query(parameters: Question, deps: Deps, ask: Ask) -> dict[str, Any]:
+    """Answer a question: the number of splats, the best splats, a box, and links to objects, splats and pictures.
 
     In a body examples may be vectors; POST the same body to the links of those.
     """
-    lift = find_lift(asked.lift, deps)
-    request = query_request("query", asked, lift, deps) | {"view": asked.view, "top": asked.top}
+    lift = find_lift(parameters.lift, deps)
+    request = query_request("query", parameters, lift, deps) | {"view": parameters.view, "top": parameters.top}
     answer = ask(request).header
-    view = asked.view or lift.first_view
+    view = parameters.view or lift.first_view
     return {
         "lift": lift.id,
         "view": view,
         "text_space": lift.metadata["text_space"],
         "encoder": None if request["encoder"] is None else encoder_label(request["encoder"]),
-        "links": _answer_links(asked, lift, view, found=answer["count"] > 0),
+        "links": _answer_links(parameters, lift, view, has_objects=answer["count"] > 0),
         **answer,
     }
 
 
 @router.get("/query/words", response_model=WordsAnswer)
-def query_words(asked: Annotated[SuggestedWordsRequest, Parameter()], deps: Deps, ask: Ask) -> WordsAnswer:
-    """What can be asked: words that a text which is being typed may become, and words for what is here."""
-    lift = find_lift(asked.lift, deps)
-    request = with_encoder(scene_request("askable", lift, deps), asked, lift, deps)
-    return WordsAnswer(lift=lift.id, **ask(request | {"text": asked.text, "count": asked.limit}).header)
+def query_words(parameters: Annotated[SuggestedWordsRequest, Parameter()], deps: Deps, ask: Ask) -> WordsAnswer:
+    """List words: completions of a text, and words for the objects of the scene."""
+    lift = find_lift(parameters.lift, deps)
+    request = with_encoder(scene_request("askable", lift, deps), parameters, lift, deps)
+    return WordsAnswer(lift=lift.id, **ask(request | {"text": parameters.text, "count": parameters.limit}).header)
 
 
-@get_and_post(router, "/query/objects", ASKED, response_model=ObjectsAnswer)
-def query_objects(asked: Question, deps: Deps, ask: Ask) -> dict[str, Any]:
-    """The things that were found, splats that touch one another: where each lies, and how large it is."""
-    lift = find_lift(asked.lift, deps)
-    return {"lift": lift.id, **ask(query_request("objects", asked, lift, deps)).header}
+@get_and_post(router, "/query/objects", ANSWER, response_model=ObjectsAnswer)
+def query_objects(parameters: Question, deps: Deps, ask: Ask) -> dict[str, Any]:
+    """List the objects of an answer, groups of splats that touch: the place and size of each."""
+    lift = find_lift(parameters.lift, deps)
+    return {"lift": lift.id, **ask(query_request("objects", parameters, lift, deps)).header}
 
 
-@get_and_post(router, "/query/scores", ASKED, responses=NPY, response_class=Response)
-def query_scores(asked: Question, request: Request, deps: Deps, ask: Ask) -> Response:
-    """The score of every splat: .npy, float32 [P]."""
-    return _entity("scores", asked, request, deps, ask)
+@get_and_post(router, "/query/scores", ANSWER, responses=NPY, response_class=Response)
+def query_scores(parameters: Question, request: Request, deps: Deps, ask: Ask) -> Response:
+    """Return the score of each splat: .npy, float32 [P]."""
+    return _entity("scores", parameters, request, deps, ask)
 
 
-@get_and_post(router, "/query/selection", ASKED, responses=NPY, response_class=Response)
-def query_selection(asked: Question, request: Request, deps: Deps, ask: Ask) -> Response:
-    """Which splats were selected: .npy, bool [P]. By `auto` they are not just those at or above the threshold."""
-    return _entity("selection", asked, request, deps, ask)
+@get_and_post(router, "/query/selection", ANSWER, responses=NPY, response_class=Response)
+def query_selection(parameters: Question, request: Request, deps: Deps, ask: Ask) -> Response:
+    """Return the selected splats: .npy, bool [P]. With `auto` they are not just those at or above the threshold."""
+    return _entity("selection", parameters, request, deps, ask)
 
 
 @get_and_post(router, "/query/mask", IN_VIEW, responses=PNG, response_class=Response)
-def query_mask(asked: Question, request: Request, deps: Deps, ask: Ask) -> Response:
-    """Where it is in a view, or from a camera of your own in a body: a PNG, white where it is."""
-    return _entity("mask", asked, request, deps, ask, seen_from(asked))
+def query_mask(parameters: Question, request: Request, deps: Deps, ask: Ask) -> Response:
+    """Render the mask of a view, or of a camera in a body: a PNG, white where the selection is."""
+    return _entity("mask", parameters, request, deps, ask, seen_from(parameters))
 
 
 @get_and_post(router, "/query/attention", IN_VIEW, responses=PNG, response_class=Response)
-def query_attention(asked: Question, request: Request, deps: Deps, ask: Ask) -> Response:
-    """How well each pixel of a view, or of a camera of your own in a body, answers to it: a PNG."""
-    return _entity("attention", asked, request, deps, ask, seen_from(asked))
+def query_attention(parameters: Question, request: Request, deps: Deps, ask: Ask) -> Response:
+    """Render the scores of a view, or of a camera in a body, in colours: a PNG."""
+    return _entity("attention", parameters, request, deps, ask, seen_from(parameters))
 
 
 SPLATS_OF = "the splats that were found and no others, or all splats in the colours of their scores"
 SplatsOf = Annotated[Literal["object", "scores"], Parameter(description=SPLATS_OF)]
 
 
-@get_and_post(router, "/query/splats", ASKED, responses=PLY, response_class=Response)
-def query_splats(asked: Question, request: Request, deps: Deps, ask: Ask, what: SplatsOf = "object") -> Response:
-    """What was found, or the scene in the colours of its scores, as splats: a PLY of the dialect that was lifted."""
-    return _entity("splats", asked, request, deps, ask, {"what": what})
+@get_and_post(router, "/query/splats", ANSWER, responses=PLY, response_class=Response)
+def query_splats(parameters: Question, request: Request, deps: Deps, ask: Ask, what: SplatsOf = "object") -> Response:
+    """Return the selected splats, or all splats in the colours of their scores: a PLY of the lifted dialect."""
+    return _entity("splats", parameters, request, deps, ask, {"what": what})
 
 
 @get_and_post(router, "/render", PICTURE, responses=PNG, response_class=Response)
-def render(asked: RenderRequest, request: Request, deps: Deps, ask: Ask) -> Response:
+def render(parameters: RenderRequest, request: Request, deps: Deps, ask: Ask) -> Response:
     """The splats from a view, in their colours or in those of their features or clusters, or their depth: a PNG.
 
     Depths are those of the splats' centres along the camera's axis, weighted as the colours are. They are grey, near
@@ -334,107 +341,116 @@ def render(asked: RenderRequest, request: Request, deps: Deps, ask: Ask) -> Resp
     percentile), in scene units, with even steps between; what lies beyond has these levels too. 0 is where no splat
     is. In a body a camera of your own may stand in place of the view.
     """
-    lift = find_lift(asked.lift, deps)
-    worker_request = scene_request("render", lift, deps) | seen_from(asked) | {"channel": asked.channel}
+    lift = find_lift(parameters.lift, deps)
+    worker_request = scene_request("render", lift, deps) | seen_from(parameters) | {"channel": parameters.channel}
     return tagged_answer(request, deps, worker_request, lift, ask)
 
 
 def _entity(
-    operation: str, asked: Question, request: Request, deps: AppState, ask: Ask, more: dict[str, Any] | None = None
+    operation: str,
+    parameters: Question,
+    request: Request,
+    deps: AppState,
+    ask: Ask,
+    fields: dict[str, Any] | None = None,
 ) -> Response:
-    """What a GET names, with its tag, or what a POST asks for."""
-    lift = find_lift(asked.lift, deps)
-    return tagged_answer(request, deps, query_request(operation, asked, lift, deps) | (more or {}), lift, ask)
+    """Return the answer to a GET with its tag, or the answer to a POST."""
+    lift = find_lift(parameters.lift, deps)
+    return tagged_answer(request, deps, query_request(operation, parameters, lift, deps) | (fields or {}), lift, ask)
 
 
-def _answer_links(asked: Question, lift: LiftRecord, view: str | None, *, found: bool) -> dict[str, str]:
-    """The URLs of other looks at the same query; vectors do not fit in one, and are sent there again.
+def _answer_links(parameters: Question, lift: LiftRecord, view: str | None, *, has_objects: bool) -> dict[str, str]:
+    """Return the URLs of other answers to the same query; vectors do not fit in a URL, so POST them again.
 
-    Where nothing was ``found`` there are no objects.
+    Where nothing was ``has_objects`` there are no objects.
     """
-    links = {"lift": f"/lifts/{lift.id}", "scores": _link("/query/scores", asked, lift=lift.id)}
-    if found:
-        links["objects"] = _link("/query/objects", asked, lift=lift.id)
-        links["object"] = _link("/query/splats?what=object", asked, lift=lift.id)
-    links["coloured"] = _link("/query/splats?what=scores", asked, lift=lift.id)
+    links = {"lift": f"/lifts/{lift.id}", "scores": _link("/query/scores", parameters, lift=lift.id)}
+    if has_objects:
+        links["objects"] = _link("/query/objects", parameters, lift=lift.id)
+        links["object"] = _link("/query/splats?what=object", parameters, lift=lift.id)
+    links["coloured"] = _link("/query/splats?what=scores", parameters, lift=lift.id)
     if view is not None:
-        links["mask"] = _link("/query/mask", asked, lift=lift.id, view=view)
-        links["attention"] = _link("/query/attention", asked, lift=lift.id, view=view)
+        links["mask"] = _link("/query/mask", parameters, lift=lift.id, view=view)
+        links["attention"] = _link("/query/attention", parameters, lift=lift.id, view=view)
         links["render"] = f"/render?{urlencode({'lift': lift.id, 'view': view})}"
     return links
 
 
-def shown(example: str | tuple[float, ...]) -> str:
+def example_text(example: str | tuple[float, ...]) -> str:
     """An example as an answer names it."""
     return example if isinstance(example, str) else f"a vector of {len(example)} channels"
 
 
-def _link(path: str, asked: Question, **more: str) -> str:
-    """A route with the fields that are not as they are without being asked for, and always the threshold."""
-    if not all(isinstance(example, str) for example in (*asked.like, *asked.unlike)):
+def _link(path: str, parameters: Question, **fields: str) -> str:
+    """Return a route with the fields that differ from their defaults, and always the threshold."""
+    if not all(isinstance(example, str) for example in (*parameters.like, *parameters.unlike)):
         return path
     pairs: list[tuple[str, str]] = []
     for name in (*Query.deciding(), "encoder", "table"):
-        value = getattr(asked, name)
+        value = getattr(parameters, name)
         if name == "threshold" or value != Question.model_fields[name].default:
             pairs += [(name, str(item)) for item in (value if isinstance(value, list) else [value])]
-    return f"{path}{'&' if '?' in path else '?'}{urlencode(pairs + list(more.items()))}"
+    return f"{path}{'&' if '?' in path else '?'}{urlencode(pairs + list(fields.items()))}"
 
 
 @router.post("/query/segment", response_model=SegmentAnswer)
-def segment(asked: SegmentRequest, deps: Deps, ask: Ask) -> Response:
-    """Which of many words are there, and where: to every splat the word that it is most like, or none."""
-    lift = find_lift(asked.lift, deps)
-    request = _word_request("segment", asked, lift, deps)
+def segment(parameters: SegmentRequest, deps: Deps, ask: Ask) -> Response:
+    """List the words of a vocabulary that are in the scene; each splat has its most similar word, or none."""
+    lift = find_lift(parameters.lift, deps)
+    request = _word_request("segment", parameters, lift, deps)
     head = {"lift": lift.id, "encoder": encoder_label(request["encoder"])}
     return binary_response(deps, request | {"head": head}, lift, ask, {})
 
 
 @router.post("/query/segment/labels", responses=NPY, response_class=Response)
-def segment_labels(asked: SegmentRequest, deps: Deps, ask: Ask) -> Response:
+def segment_labels(parameters: SegmentRequest, deps: Deps, ask: Ask) -> Response:
     """The value of every splat's word, 0 for none: .npy, int32 [P]."""
-    lift = find_lift(asked.lift, deps)
-    return binary_response(deps, _word_request("word_labels", asked, lift, deps), lift, ask, {})
+    lift = find_lift(parameters.lift, deps)
+    return binary_response(deps, _word_request("word_labels", parameters, lift, deps), lift, ask, {})
 
 
 @router.post("/query/segment/map", responses=PNG, response_class=Response)
-def segment_map(asked: SegmentRequest, deps: Deps, ask: Ask) -> Response:
+def segment_map(parameters: SegmentRequest, deps: Deps, ask: Ask) -> Response:
     """The values of a view's pixels in colours, with a palette: a PNG whose text `legend` has the words by value."""
-    lift = find_lift(asked.lift, deps)
-    return binary_response(deps, _word_request("word_map", asked, lift, deps) | seen_from(asked), lift, ask, {})
+    lift = find_lift(parameters.lift, deps)
+    return binary_response(
+        deps, _word_request("word_map", parameters, lift, deps) | seen_from(parameters), lift, ask, {}
+    )
 
 
 @router.post("/query/segment/picture", responses=PNG, response_class=Response)
-def segment_picture(asked: SegmentRequest, deps: Deps, ask: Ask) -> Response:
+def segment_picture(parameters: SegmentRequest, deps: Deps, ask: Ask) -> Response:
     """A view tinted with the colours of its words, beside a drawn legend: a PNG."""
-    lift = find_lift(asked.lift, deps)
-    return binary_response(deps, _word_request("word_picture", asked, lift, deps) | seen_from(asked), lift, ask, {})
+    lift = find_lift(parameters.lift, deps)
+    return binary_response(
+        deps, _word_request("word_picture", parameters, lift, deps) | seen_from(parameters), lift, ask, {}
+    )
 
 
 @router.post("/query/export", responses=bytes_of("application/zip"), response_class=Response)
-def export(asked: ExportRequest, deps: Deps, ask: Ask) -> Response:
+def export(parameters: ExportRequest, deps: Deps, ask: Ask) -> Response:
     """All of it in one ZIP: splats with labels, names, colours, boxes and counts, and masks of the views.
 
     It holds `labels.ply`, `labels.json`, `instances.csv`, `legend.png`, `masks/VIEW.png`, `masks.json` (COCO) and
     `truth.safetensors` (masks for a trade-off).
     """
-    lift = find_lift(asked.lift, deps)
+    lift = find_lift(parameters.lift, deps)
     request: dict[str, Any] = scene_request("export", lift, deps) | NO_ENCODER | {"words": None}
-    title = [asked.of]
-    if asked.of == "questions":
-        if not asked.questions or any(question.lift not in (None, lift.id) for question in asked.questions):
+    title = [parameters.of]
+    if parameters.of == "questions":
+        if not parameters.questions or any(question.lift not in (None, lift.id) for question in parameters.questions):
             raise InvalidRequest("questions", expected="a question or more, to the same lift", got="none, or others")
-        by_name = _by_name(asked.questions)
+        by_name = _by_name(parameters.questions)
         parts = [
             {"name": name, "request": query_request("query", question, lift, deps)}
             for name, question in by_name.items()
         ]
         request, title = request | {"parts": parts}, list(by_name)
-    elif asked.of == "words" or asked.encoder is not None or asked.table is not None:
-        request = _word_request("export", asked, lift, deps)
+    elif parameters.of == "words" or parameters.encoder is not None or parameters.table is not None:
+        request = _word_request("export", parameters, lift, deps)
     name = "-".join(re.findall(r"[A-Za-z0-9]+", " ".join(title)))[:80]
     labels = list(deps.store.selections.object_labels(deps.owner, lift.id).items())
-    request |= {"of": asked.of, "of_view": asked.view, "name": name, "object_labels": labels}
+    request |= {"of": parameters.of, "of_view": parameters.view, "name": name, "object_labels": labels}
     return binary_response(deps, request, lift, ask, {})
 
 
@@ -442,7 +458,7 @@ def _by_name(questions: list[models.NamedQuestion]) -> dict[str, models.NamedQue
     """Questions by what files call them; one whose name another has gets a number."""
     by_name = dict[str, models.NamedQuestion]()
     for question in questions:
-        name = first = question.name or ", ".join(map(shown, (*question.text, *question.like, *question.sets)))
+        name = first = question.name or ", ".join(map(example_text, (*question.text, *question.like, *question.sets)))
         number = 1
         while name in by_name:
             number += 1
@@ -452,15 +468,18 @@ def _by_name(questions: list[models.NamedQuestion]) -> dict[str, models.NamedQue
 
 
 @router.post("/query/what", response_model=NearestWordsAnswer)
-def name_example(asked: NearestWordsRequest, deps: Deps, ask: Ask) -> NearestWordsAnswer:
-    """What is this? The words that a pixel, a splat, a region or a vector is most like."""
-    lift = find_lift(asked.lift, deps)
-    request = _word_request("what", asked, lift, deps) | {"example": asked.example, "top": asked.top}
+def name_example(parameters: NearestWordsRequest, deps: Deps, ask: Ask) -> NearestWordsAnswer:
+    """List the words nearest to a pixel, a splat, a region or a vector."""
+    lift = find_lift(parameters.lift, deps)
+    request = _word_request("what", parameters, lift, deps) | {"example": parameters.example, "top": parameters.top}
     return NearestWordsAnswer(
-        lift=lift.id, encoder=encoder_label(request["encoder"]), example=shown(asked.example), **ask(request).header
+        lift=lift.id,
+        encoder=encoder_label(request["encoder"]),
+        example=example_text(parameters.example),
+        **ask(request).header,
     )
 
 
-def _word_request(operation: str, asked: Words, lift: LiftRecord, deps: AppState) -> dict[str, Any]:
-    request = with_encoder(scene_request(operation, lift, deps), asked, lift, deps)
-    return _with_packs_here(request, lift, deps) | {"words": asked.words}
+def _word_request(operation: str, parameters: Words, lift: LiftRecord, deps: AppState) -> dict[str, Any]:
+    request = with_encoder(scene_request(operation, lift, deps), parameters, lift, deps)
+    return _with_packs_here(request, lift, deps) | {"words": parameters.words}

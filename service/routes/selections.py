@@ -21,7 +21,7 @@ from service.state import AppState, Deps
 from service.store.lifts import LiftRecord
 from service.store.selections import SelectionRecord, SplatSet
 
-ONE = "/lifts/{lift}/selections/{selection}"
+SELECTION_PATH = "/lifts/{lift}/selections/{selection}"
 SelectionId = Annotated[str, Path(pattern=r"^[0-9a-f]{16}$", description="the id of a selection of the lift")]
 IfMatch = Annotated[
     str | None,
@@ -36,19 +36,19 @@ def list_selections(lift: str, deps: Deps) -> models.Selections:
     """The selections of a lift, newest first."""
     record = deps.store.lifts.get(deps.owner, lift)
     selections = deps.store.selections.all(deps.owner, record.id)
-    return models.Selections(selections=[_listed(selection) for selection in selections])
+    return models.Selections(selections=[_summary(selection) for selection in selections])
 
 
 @router.post("/lifts/{lift}/selections", response_model=models.SelectionDetail, status_code=201)
-def create_selection(lift: str, asked: models.NewSelection, deps: Deps, ask: Ask) -> Response:
+def create_selection(lift: str, parameters: models.NewSelection, deps: Deps, ask: Ask) -> Response:
     """Begin a selection, with the splats of an edit or with none. Questions name it as `sets=selection:ID`."""
     record = deps.store.lifts.get(deps.owner, lift)
-    splats = _edited(asked.edit, record, deps, ask, bytes(-(-record.count // 8)))
-    selection = deps.store.selections.create(deps.owner, record.id, asked.name, splats)
+    splats = _apply_edit(parameters.edit, record, deps, ask, bytes(-(-record.count // 8)))
+    selection = deps.store.selections.create(deps.owner, record.id, parameters.name, splats)
     return _answer(selection, deps, 201, {"Location": f"/lifts/{record.id}/selections/{selection.id}"})
 
 
-@router.get(ONE, response_model=models.SelectionDetail)
+@router.get(SELECTION_PATH, response_model=models.SelectionDetail)
 def get_selection(
     lift: str,
     selection: SelectionId,
@@ -60,14 +60,14 @@ def get_selection(
     return _answer(deps.store.selections.get(deps.owner, record.id, selection), deps, bits=bits)
 
 
-@router.post(ONE + "/edits", response_model=models.SelectionDetail)
+@router.post(SELECTION_PATH + "/edits", response_model=models.SelectionDetail)
 def edit_selection(
-    lift: str, selection: SelectionId, asked: models.EditRequest, deps: Deps, ask: Ask, match: IfMatch = None
+    lift: str, selection: SelectionId, parameters: models.EditRequest, deps: Deps, ask: Ask, match: IfMatch = None
 ) -> Response:
     """Add, take away, grow, shrink or set: a step of its history, which PATCH goes back."""
     record = deps.store.lifts.get(deps.owner, lift)
     before = deps.store.selections.get(deps.owner, record.id, selection, _versions(match))
-    splats = _edited(asked, record, deps, ask, deps.store.selections.bits(before))
+    splats = _apply_edit(parameters, record, deps, ask, deps.store.selections.bits(before))
     try:  # what was worked on is the version that was read: another that came meanwhile is not overwritten
         after = deps.store.selections.extend(deps.owner, record.id, selection, splats, frozenset({before.version}))
     except VersionMismatch as error:
@@ -78,7 +78,7 @@ def edit_selection(
     return _answer(after, deps)
 
 
-@router.patch(ONE, response_model=models.SelectionDetail)
+@router.patch(SELECTION_PATH, response_model=models.SelectionDetail)
 def change_selection(
     lift: str, selection: SelectionId, change: models.SelectionChange, deps: Deps, match: IfMatch = None
 ) -> Response:
@@ -89,7 +89,7 @@ def change_selection(
     return _answer(after, deps)
 
 
-@router.delete(ONE, status_code=204)
+@router.delete(SELECTION_PATH, status_code=204)
 def delete_selection(lift: str, selection: SelectionId, deps: Deps, match: IfMatch = None) -> Response:
     """Forget a selection and its history."""
     record = deps.store.lifts.get(deps.owner, lift)
@@ -111,18 +111,22 @@ def change_object_label(
     return models.ObjectLabel(id=object_id, name=name, hidden=is_hidden)
 
 
-def _edited(asked: models.EditRequest | None, lift: LiftRecord, deps: AppState, ask: Ask, before: bytes) -> SplatSet:
+def _apply_edit(
+    parameters: models.EditRequest | None, lift: LiftRecord, deps: AppState, ask: Ask, before: bytes
+) -> SplatSet:
     """The splats after an edit of those before, by the query process; without one those."""
-    if asked is None:
+    if parameters is None:
         return SplatSet({"operation": "set"}, 0, None, before)
-    if asked.query is None:
+    if parameters.query is None:
         request = scene_request("edit", lift, deps) | NO_ENCODER
     else:
-        if asked.query.lift not in (None, lift.id):
-            raise InvalidRequest("edit.query.lift", expected="the lift of the selection", got=str(asked.query.lift))
-        request = query_request("edit", asked.query, lift, deps)
-    edit = asked.model_dump(mode="json", exclude={"query"}, exclude_none=True)
-    if asked.query is not None:
+        if parameters.query.lift not in (None, lift.id):
+            raise InvalidRequest(
+                "edit.query.lift", expected="the lift of the selection", got=str(parameters.query.lift)
+            )
+        request = query_request("edit", parameters.query, lift, deps)
+    edit = parameters.model_dump(mode="json", exclude={"query"}, exclude_none=True)
+    if parameters.query is not None:
         edit["query"] = request["query"]
     answer = ask(request | {"edit": edit, "before": bits_of(before)})
     header = answer.header
@@ -146,12 +150,12 @@ def _answer(
 ) -> Response:
     fields: dict[str, Any] = {"history": deps.store.selections.history(selection)}
     fields["bits"] = base64.b64encode(deps.store.selections.bits(selection)).decode() if bits else None
-    document = models.SelectionDetail(**_listed(selection).model_dump(), **fields)
+    document = models.SelectionDetail(**_summary(selection).model_dump(), **fields)
     content = document.model_dump(mode="json")
     return JSONResponse(content, status, headers=cache_headers(f'"{selection.version}"') | (headers or {}))
 
 
-def _listed(selection: SelectionRecord) -> models.ListedSelection:
+def _summary(selection: SelectionRecord) -> models.ListedSelection:
     path, parameters = (
         f"/lifts/{selection.lift}/selections/{selection.id}",
         f"lift={selection.lift}&sets=selection:{selection.id}",
